@@ -1,0 +1,43 @@
+# make install   the package and what it needs, in .venv
+# make demo      simulates a session, calibrates it, writes the report
+# make test      formatting, lint, types and tests, as the continuous integration does
+# make clean     removes .venv and what tools left behind
+#
+# PYTHON=... names the interpreter (3.11 or newer) that .venv is made from.
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
+
+.PHONY: install demo test clean
+
+install: $(VENV)/.installed
+
+demo: install
+	$(BIN)/pkmcal demo
+
+test: $(VENV)/.test-tools
+	@./.ci/chromium $(VENV)/.chromium-tried
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+	$(BIN)/pytest -n 2
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Stamps: a second call does nothing until pyproject.toml changes. The installation is editable,
+# so the sources need no stamp.
+$(VENV)/.made:
+	PYTHON="$(PYTHON)" ./.ci/venv $(VENV)
+	@touch $@
+
+$(VENV)/.installed: pyproject.toml $(VENV)/.made
+	$(PIP) install --quiet --editable .
+	@touch $@
+
+$(VENV)/.test-tools: pyproject.toml $(VENV)/.installed
+	$(PIP) install --quiet --editable '.[test]'
+	@touch $@

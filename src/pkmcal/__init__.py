@@ -1,0 +1,54 @@
+"""pkmcal calibrates parallel kinematic machines from photographs.
+
+    >>> import pkmcal
+    >>> result = pkmcal.calibrate("session")                      # doctest: +SKIP
+    >>> machine = pkmcal.load_mechanism("out/mechanism.yaml")     # doctest: +SKIP
+
+Names below are imported when they are first used, so that ``import pkmcal`` and the command
+line's help stay quick: OpenCV and SciPy alone take most of a second.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from pkmcal import errors
+
+if TYPE_CHECKING:
+    from pkmcal.calibration import calibrate
+    from pkmcal.cameras import load_camera
+    from pkmcal.mechanisms import Machine, load_mechanism
+    from pkmcal.session import load_session
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Machine",
+    "__version__",
+    "calibrate",
+    "errors",
+    "load_camera",
+    "load_mechanism",
+    "load_session",
+]
+
+_HOMES = {
+    "Machine": "pkmcal.mechanisms",
+    "calibrate": "pkmcal.calibration",
+    "load_camera": "pkmcal.cameras",
+    "load_mechanism": "pkmcal.mechanisms",
+    "load_session": "pkmcal.session",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'pkmcal' has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,109 @@
+"""What every central camera offers, whatever its lens or mirror.
+
+A central camera maps rays through one point to pixels. Everything behind the image works
+with rays, so a camera model is these four functions and a test of its field. A model is one
+file in this folder with one final subclass; :func:`camera_models` finds it, the conformance
+test runs over it, nothing else is edited.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.files import Schema
+
+
+PositivePair = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
+PositiveSize = tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
+
+
+class CameraSchema(Schema):
+    """The fields that every camera file has; a model's own schema adds to them."""
+
+    image_size: PositiveSize = Field(description="[width, height] in pixels")
+    focal: PositivePair = Field(description="[fx, fy] in pixels")
+    center: tuple[float, float] = Field(description="[cx, cy] in pixels, pixel centres at integers")
+
+
+@dataclass(frozen=True)
+class Camera(ABC):
+    """Intrinsics of one central camera.
+
+    image_size : (width, height) in pixels.
+    parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and
+        center, none for the rest. Pixel centres are at integers, as in OpenCV.
+    """
+
+    model: ClassVar[str]
+    parameter_names: ClassVar[tuple[str, ...]]
+    schema: ClassVar[type[Schema]]
+
+    image_size: tuple[int, int]
+    parameters: Array
+
+    @abstractmethod
+    def project(self, points: Array) -> Array:
+        """Pixels (..., 2) of points (..., 3) in the camera frame; NaN outside the valid field."""
+
+    @abstractmethod
+    def project_jacobians(self, points: Array) -> tuple[Array, Array]:
+        """Derivatives of :meth:`project`: by the point (..., 2, 3), by parameters (..., 2, n)."""
+
+    @abstractmethod
+    def ray(self, pixels: Array) -> Array:
+        """Unit viewing rays (..., 3) of pixels (..., 2); NaN where no ray meets the pixel."""
+
+    def ray_jacobians(self, pixels: Array) -> tuple[Array, Array]:
+        """Derivatives of :meth:`ray`: by the pixel (..., 3, 2), by parameters (..., 3, n).
+
+        From the implicit function project(ray) = pixel, so no model writes it again: with
+        J = d project/d ray, a change of the pixel turns the ray by J's inverse on the ray's
+        tangent plane, a change of the parameters by minus that times d project/d parameters.
+        """
+        rays = self.ray(pixels)
+        by_point, by_parameters = self.project_jacobians(rays)
+        # on the tangent plane: J d = e with ray . d = 0, a 3x3 system
+        system = np.concatenate([by_point, rays[..., None, :]], axis=-2)
+        bad = ~np.isfinite(system).all(axis=(-1, -2))
+        system = np.where(bad[..., None, None], np.eye(3), system)
+        inverse = np.linalg.inv(system)[..., :, :2]
+        inverse = np.where(bad[..., None, None], np.nan, inverse)
+        return inverse, -inverse @ by_parameters
+
+    @abstractmethod
+    def in_field(self, points: Array) -> Booleans:
+        """True where a point of the camera frame (..., 3) is imaged by this model, (...)."""
+
+    @classmethod
+    @abstractmethod
+    def from_document(cls, document: Any) -> Camera:
+        """The camera of a file's fields, checked by the model's ``schema``."""
+
+    @abstractmethod
+    def document(self) -> dict[str, Any]:
+        """The fields of a camera file, the inverse of :meth:`from_document`."""
+
+    def in_image(self, pixels: Array, margin: float = 0.0) -> Booleans:
+        """True where pixels (..., 2) lie in the image, ``margin`` px from its border; (...)."""
+        limit = np.asarray(self.image_size) - 1.0 - margin
+        with np.errstate(invalid="ignore"):
+            return np.all((pixels >= margin) & (pixels <= limit), axis=-1)
+
+
+@cache
+def camera_models() -> dict[str, type[Camera]]:
+    """Every camera model of this folder, by its name in camera files."""
+    package = __name__.rpartition(".")[0]
+    path = importlib.import_module(package).__path__
+    for module in pkgutil.iter_modules(path):
+        importlib.import_module(f"{package}.{module.name}")
+    return {cls.model: cls for cls in Camera.__subclasses__()}

@@ -1,0 +1,104 @@
+"""One family of errors: what happened, where, found and expected, next step.
+
+Every error that a user can cause or should read is a `PkmcalError`. It renders as one sentence,
+or two where there is a next step; the command line prints that, or `as_dict` under ``--json``,
+and leaves with `exit_code`. Anything else that escapes is a defect of pkmcal.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Self
+
+
+class PkmcalError(Exception):
+    """Base of the family; raise one of its subclasses.
+
+    what : the sentence's core, for example "the camera file does not exist".
+    where : file, line or field, for example "session.yaml, line 12, stations.front.camera".
+    found, expected : what was there, and what should have been.
+    next_step : what the reader can do about it, a sentence.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str | None = None,
+        found: object = None,
+        expected: object = None,
+        next_step: str | None = None,
+    ) -> None:
+        self.what = what
+        self.where = where
+        self.found = None if found is None else str(found)
+        self.expected = None if expected is None else str(expected)
+        self.next_step = next_step
+        super().__init__(what)
+
+    def __str__(self) -> str:
+        sentence = f"{self.where}: {self.what}" if self.where else self.what
+        sentence = sentence.rstrip(".")
+        facts = [
+            f"{label} {text}"
+            for label, text in (("found", self.found), ("expected", self.expected))
+            if text is not None
+        ]
+        if facts:
+            sentence += "; " + ", ".join(facts)
+        sentence += "."
+        if self.next_step:
+            sentence += " " + _capitalised(self.next_step.rstrip(".")) + "."
+        return sentence
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Keyword arguments do not survive Exception's own pickling, and worker processes pickle.
+        return _rebuild, (type(self), self._fields())
+
+    def located(self, where: str) -> Self:
+        """Return the same error with `where` added, for callers that know the file and line."""
+        place = where if self.where is None else f"{where}: {self.where}"
+        return type(self)(**{**self._fields(), "where": place})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything above under its name, for ``--json``."""
+        return {
+            "error": type(self).__name__,
+            "exit_code": self.exit_code,
+            "message": str(self),
+            **self._fields(),
+        }
+
+    def _fields(self) -> dict[str, Any]:
+        return {
+            "what": self.what,
+            "where": self.where,
+            "found": self.found,
+            "expected": self.expected,
+            "next_step": self.next_step,
+        }
+
+
+class InputError(PkmcalError):
+    """The input is wrong: a file, a line, a field or an option."""
+
+    exit_code = 2
+
+
+class ResultError(PkmcalError):
+    """The program ran, but its result should not be used."""
+
+
+class GeometryError(PkmcalError):
+    """No usable answer here: a leg through the camera, a singular pose, no convergence."""
+
+
+def _rebuild(kind: type[PkmcalError], fields: dict[str, Any]) -> PkmcalError:
+    return kind(**fields)
+
+
+def _capitalised(sentence: str) -> str:
+    """Begin with a capital, unless the first word is a name such as joints.csv."""
+    first = sentence.partition(" ")[0]
+    return sentence[:1].upper() + sentence[1:] if first.isalpha() else sentence

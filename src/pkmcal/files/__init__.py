@@ -1,0 +1,30 @@
+"""Files in and out: YAML with line numbers, schemas, CSV tables, outputs whole or not at all."""
+
+from pkmcal.files.tables import Table, csv_text, read_csv
+from pkmcal.files.text import closest, listed, read_text, shown, wanted_file
+from pkmcal.files.validation import Schema, field_path, validate
+from pkmcal.files.writing import check_writable, staged_folder, write_bytes, write_text
+from pkmcal.files.yaml_files import Document, Keys, parse_yaml, read_yaml, yaml_text
+
+__all__ = [
+    "Document",
+    "Keys",
+    "Schema",
+    "Table",
+    "check_writable",
+    "closest",
+    "csv_text",
+    "field_path",
+    "listed",
+    "parse_yaml",
+    "read_csv",
+    "read_text",
+    "read_yaml",
+    "shown",
+    "staged_folder",
+    "validate",
+    "wanted_file",
+    "write_bytes",
+    "write_text",
+    "yaml_text",
+]

@@ -1,0 +1,206 @@
+"""CSV tables with one row a configuration: a name, then numbers; faults come with their line."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.files.text import closest, listed, read_text, shown
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)|#.*", re.IGNORECASE)
+"""Words for "no number" that programs write into cells; spreadsheets write #N/A or #VALUE!."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A CSV file of named rows.
+
+    label : the file's name in messages.
+    columns : names of the m number columns, in the file's order.
+    names : the first column, one name a row, all different.
+    values : (K, m) numbers, in the file's unit.
+    lines : the file's line (from 1) of each row.
+    """
+
+    label: str
+    columns: tuple[str, ...]
+    names: tuple[str, ...]
+    values: Array
+    lines: tuple[int, ...]
+
+    def where(self, row: int, column: int | None = None) -> str:
+        """Name file, line and column, as in "joints.csv, line 4, column leg2"."""
+        place = f"{self.label}, line {self.lines[row]}"
+        return place if column is None else f"{place}, column {self.columns[column]}"
+
+
+def read_csv(
+    path: Path | str,
+    key: str = "configuration",
+    columns: Sequence[str] | None = None,
+    label: str | None = None,
+) -> Table:
+    """Read a table whose header is `key` and then one name a number column.
+
+    columns : the only names allowed, all of them needed, in any order; None takes what is there.
+    Values come back in the file's own order of columns. A byte-order mark, any line ends, empty
+    lines and blanks around a cell are taken as they come.
+    """
+    path = Path(path)
+    label = label or path.name
+    rows = _rows(read_text(path, label), label)
+    if not rows:
+        raise InputError("the file is empty", where=label, expected=f"a header: {key},…")
+    (header_line, header), body = rows[0], rows[1:]
+    where = f"{label}, line {header_line}"
+    _check_header(header, key, columns, where)
+    if not body:
+        raise InputError("there are no rows under the header", where=label)
+    values = [_numbers(cells, header, f"{label}, line {line}") for line, cells in body]
+    lines = tuple(line for line, _ in body)
+    names = tuple(cells[0] for _, cells in body)
+    _check_names(names, lines, key, label)
+    return Table(label, tuple(header[1:]), names, np.array(values, dtype=float), lines)
+
+
+def csv_text(
+    columns: Sequence[str], names: Sequence[str], values: Array, key: str = "configuration"
+) -> str:
+    """Write a table (names K, values (K, m)) as text that `read_csv` reads back exactly."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([key, *columns])
+    rows = np.asarray(values, dtype=float).reshape(len(names), len(columns)).tolist()
+    writer.writerows([name, *map(repr, row)] for name, row in zip(names, rows, strict=True))
+    return stream.getvalue()
+
+
+def _rows(text: str, label: str) -> list[tuple[int, list[str]]]:
+    """Non-empty rows as (line, cells without surrounding blanks)."""
+    reader = csv.reader(io.StringIO(text), strict=True)
+    rows: list[tuple[int, list[str]]] = []
+    before = 0
+    try:
+        for cells in reader:
+            stripped = [cell.strip() for cell in cells]
+            if any(stripped):
+                rows.append((before + 1, stripped))
+            before = reader.line_num
+    except csv.Error as error:
+        raise InputError(
+            f"not valid CSV ({error})",
+            where=f"{label}, line {reader.line_num}",
+            next_step="Check the quotes on this line",
+        ) from None
+    return rows
+
+
+def _check_header(header: list[str], key: str, columns: Sequence[str] | None, where: str) -> None:
+    for separator, name in ((";", "semicolons"), ("\t", "tabs")):
+        if len(header) == 1 and separator in header[0]:
+            raise InputError(
+                f"the columns are separated by {name}",
+                where=where,
+                found=shown(header[0]),
+                expected="commas between columns and points in numbers",
+                next_step="Save it as CSV (comma delimited); a spreadsheet with English settings"
+                " does so",
+            )
+    if header[0] != key:
+        raise InputError(
+            "the header's first column has another name" if len(header) > 1 else "no header",
+            where=where,
+            found=shown(header[0]),
+            expected=key,
+            next_step=f"Begin the file with the line {key},<one column a number>",
+        )
+    if "" in header:
+        number = header.index("") + 1
+        raise InputError(f"column {number} of the header has no name", where=where)
+    twice = _repeated(header)
+    if twice:
+        raise InputError(f"the header names {listed(twice)} twice", where=where)
+    if len(header) == 1:
+        raise InputError("there is no column of numbers", where=where, found=key)
+    if columns is not None:
+        _check_columns(header[1:], columns, where)
+
+
+def _check_columns(found: Sequence[str], known: Sequence[str], where: str) -> None:
+    missing = [name for name in known if name not in found]
+    for name in found:
+        if name not in known:
+            guess = closest(name, missing)
+            raise InputError(
+                "this column is not known", where=where, found=name,
+                expected=guess or listed(known, 12),
+            )  # fmt: skip
+    if missing:
+        raise InputError(
+            f"column {listed(missing)} is missing", where=where, found=listed(found, 12)
+        )
+
+
+def _numbers(cells: list[str], header: list[str], where: str) -> list[float]:
+    """The row's numbers, (m,)."""
+    if len(cells) != len(header):
+        raise InputError(
+            "the row has another number of cells than the header",
+            where=where,
+            found=f"{len(cells)} cells",
+            expected=f"{len(header)} ({', '.join(header)})",
+        )
+    if not cells[0]:
+        raise InputError(f"the {header[0]} has no name", where=where)
+    return [
+        _number(cell, f"{where}, column {column}")
+        for cell, column in zip(cells[1:], header[1:], strict=True)
+    ]
+
+
+def _number(cell: str, where: str) -> float:
+    if not cell:
+        raise InputError(
+            "the cell is empty",
+            where=where,
+            expected="a number",
+            next_step="Leave the whole row out if the reading was not taken",
+        )
+    value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
+    if math.isfinite(value):
+        return value
+    if _NOT_FINITE.fullmatch(cell) or math.isinf(value):
+        what, expected = "this is not a finite number", "a number"
+    elif _NUMBER.fullmatch(cell.replace(",", ".")):
+        what, expected = "this number has a decimal comma", cell.replace(",", ".")
+    else:
+        what, expected = "this is not a number", "a number, such as 0.3476 or 1.2e-3"
+    raise InputError(what, where=where, found=shown(cell), expected=expected)
+
+
+def _check_names(names: tuple[str, ...], lines: tuple[int, ...], key: str, label: str) -> None:
+    first: dict[str, int] = {}
+    for name, line in zip(names, lines, strict=True):
+        if name in first:
+            raise InputError(
+                f"the {key} {name} stands twice, on lines {first[name]} and {line}",
+                where=f"{label}, line {line}",
+                next_step="Give each row its own name, or remove one of the two",
+            )
+        first[name] = line
+
+
+def _repeated(names: Iterable[str]) -> list[str]:
+    seen: set[str] = set()
+    # set.add returns None: the name is noted and kept only where it was there before.
+    return [name for name in names if name in seen or seen.add(name)]

@@ -1,0 +1,1 @@
+"""Pure functions of geometry: rigid motions, lines, cylinders and their edge planes."""

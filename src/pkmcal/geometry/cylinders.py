@@ -1,0 +1,126 @@
+"""Lines and cylinders before a central camera: the planes of a leg's two silhouette edges.
+
+A line is a unit direction ``u`` and a moment ``m = p x u`` for any of its points p. A
+cylinder of radius R around it shows two edges to a camera at the origin; each edge and the
+camera's centre span a plane, whose unit normal ``n`` points away from the axis: for every
+point a of the axis ``n . a = -R`` ([B] 12-13). Side 0 is ``n = cos m - sin a_perp``, side 1
+``n = -cos m - sin a_perp`` ([B] eq. 3 in its consistent form), so with the direction u away
+from the viewer's feet, u = n_1 x n_0 normalised.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.errors import GeometryError
+from pkmcal.geometry.rigid import cross, dot
+from pkmcal.arrays import Array, Booleans
+
+SIDE_SIGNS = np.array([1.0, -1.0])
+"""Sign of the moment's part of the normal, by side."""
+
+
+class EdgeNormals(NamedTuple):
+    """Normals (..., 3) with their derivatives by axis points a, b (..., 3, 3) and R (..., 3)."""
+
+    n: Array
+    dn_da: Array
+    dn_db: Array
+    dn_dradius: Array
+
+
+def line_through(a: Array, b: Array) -> tuple[Array, Array]:
+    """Unit direction u from a to b and moment m = a x u, both (..., 3)."""
+    d = b - a
+    u = d / np.sqrt(dot(d, d))[..., None]
+    return u, cross(a, u)
+
+
+def leg_is_seen(a: Array, b: Array, radius: Array) -> Booleans:
+    """False where the camera's centre lies in the cylinder: it has no silhouette there."""
+    _, m = line_through(a, b)
+    return dot(m, m) > (1.02 * np.asarray(radius)) ** 2
+
+
+def edge_normals(a_camera: Array, u_camera: Array, radius: Array) -> Array:
+    """Tangent planes of a cylinder through the camera's centre, [B] eq. 3.
+
+    a_camera, u_camera : (..., 3) point on the axis (m) and unit direction, camera frame.
+    radius : (...,) m.
+    Returns n (..., 2, 3), unit, pointing away from the axis: n . a = -radius.
+    Raises GeometryError where the centre of projection lies inside the cylinder.
+    """
+    m = cross(a_camera, u_camera)
+    distance = np.sqrt(dot(m, m))
+    if np.any(distance <= radius):
+        raise GeometryError(
+            what="a leg passes through the camera's centre of projection",
+            found=f"distance {float(np.min(distance)):.4g} m",
+            expected="more than the leg's radius",
+            next_step="check the station's pose and the drawing of the legs",
+        )
+    sin = (radius / distance)[..., None]
+    cos = np.sqrt(1 - sin**2)
+    m_unit = m / distance[..., None]
+    a_perp = cross(u_camera, m_unit)
+    return np.stack([cos * m_unit - sin * a_perp, -cos * m_unit - sin * a_perp], axis=-2)
+
+
+def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Array) -> EdgeNormals:
+    """One edge's normal and its exact derivatives, from two points of the axis.
+
+    a, b : (..., 3) points of the axis in the camera frame, a towards the base (m).
+    radius, side : (...,) m, and 0 or 1.
+
+    The normal obeys n.a = -R, n.b = -R, n.n = 1. Differentiating these three,
+    ``[a b n]^T dn = (-dR - n.da, -dR - n.db, 0)``, so dn needs one 3x3 inverse, written
+    with cross products. Where the centre of projection is inside the cylinder the
+    values are NaN: the caller leaves such edges out with :func:`leg_is_seen`.
+    """
+    u, m = line_through(a, b)
+    distance = np.sqrt(dot(m, m))
+    sin = np.where(distance > radius, radius / distance, np.nan)[..., None]
+    m_unit = m / distance[..., None]
+    sign = SIDE_SIGNS[side][..., None]
+    n = sign * np.sqrt(1 - sin**2) * m_unit - sin * cross(u, m_unit)
+    # columns of the inverse of the matrix with rows a, b, n
+    det = dot(cross(a, b), n)[..., None]
+    col_a, col_b = cross(b, n) / det, cross(n, a) / det
+    dn_da = -col_a[..., :, None] * n[..., None, :]
+    dn_db = -col_b[..., :, None] * n[..., None, :]
+    return EdgeNormals(n, dn_da, dn_db, -(col_a + col_b))
+
+
+def contour_point(a: Array, u: Array, n: Array, radius: Array, along: Array) -> Array:
+    """Points of a cylinder where the view ray grazes it: a + s u + R n, (..., 3)."""
+    return a + along[..., None] * u + np.asarray(radius)[..., None] * n
+
+
+def axis_from_normals(n0: Array, n1: Array, radius: Array) -> tuple[Array, Array]:
+    """Axis of a cylinder from its two edges: direction u and the point nearest the camera.
+
+    n0, n1 : (..., 3) normals of sides 0 and 1. radius : (...,) m.
+    [A] eq. 4 and 5, with the point solved for as errata has it: (n0 + n1) M = -2 R along
+    the bisector, orthogonal to u.
+    """
+    u = cross(n1, n0)
+    u = u / np.sqrt(dot(u, u))[..., None]
+    # both n.M = -R and u.M = 0: M lies along n0 + n1
+    s = n0 + n1
+    return u, -s * (np.asarray(radius) / (1 + dot(n0, n1)))[..., None]
+
+
+def tangent_basis(n: Array, along: Array) -> Array:
+    """Orthonormal bases (..., 3, 2) of the planes orthogonal to unit vectors n.
+
+    The first column is the part of ``along`` orthogonal to n (the ray to the middle of the
+    edge), so a turn of n towards it shifts the whole edge sideways; the second is
+    n x first, and a turn towards it tilts the edge about its middle.
+    """
+    first = along - dot(along, n)[..., None] * n
+    first = first / np.sqrt(dot(first, first))[..., None]
+    return np.stack([first, cross(n, first)], axis=-1)
+
+

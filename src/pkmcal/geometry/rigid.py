@@ -1,0 +1,130 @@
+"""Rigid motions, batched.
+
+A pose is a 4x4 matrix ``T_a_b`` that maps coordinates of frame ``b`` to frame ``a``:
+``p_a = T_a_b p_b``, so inner names cancel in products.
+
+Perturbation, stated once for the whole project: six numbers ``delta = (omega, tau)``
+change ``T = (R, t)`` from the left into ``(Exp(omega) R, t + tau)``; ``omega`` is a
+rotation vector (rad), ``tau`` a translation (m), both in the outer frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.arrays import Array
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrices: ``skew(v) @ w == cross(v, w)``. (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v)
+    out = np.zeros((*v.shape, 3), dtype=v.dtype)
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Cross product over the last axis; several times faster than ``np.cross``, same result."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape), dtype=np.result_type(a, b))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Inner product over the last axis, (..., n) x (..., n) -> (...)."""
+    return np.sum(a * b, axis=-1)
+
+
+def rotation(omega: Array) -> Array:
+    """Rotation matrices Exp(omega) of rotation vectors (rad), (..., 3) -> (..., 3, 3).
+
+    Rodrigues' formula, with its series near zero so that the limit is exact.
+    """
+    omega = np.asarray(omega, dtype=float)
+    angle2 = dot(omega, omega)[..., None, None]
+    small = angle2 < 1e-8
+    angle = np.sqrt(np.where(small, 1.0, angle2))
+    sinc = np.where(small, 1 - angle2 / 6, np.sin(angle) / angle)
+    cosc = np.where(small, 0.5 - angle2 / 24, 2 * (np.sin(angle / 2) / angle) ** 2)
+    k = skew(omega)
+    return np.eye(3) + sinc * k + cosc * (k @ k)
+
+
+def rotation_vector(rot: Array) -> Array:
+    """Rotation vectors (rad, norm at most pi) of rotation matrices, (..., 3, 3) -> (..., 3)."""
+    from scipy.spatial.transform import Rotation
+
+    rot = np.asarray(rot, dtype=float)
+    flat = Rotation.from_matrix(rot.reshape(-1, 3, 3)).as_rotvec()
+    return flat.reshape(rot.shape[:-1])
+
+
+def pose(rot: Array, t: Array) -> Array:
+    """4x4 poses from rotations (..., 3, 3) and translations (..., 3)."""
+    shape = np.broadcast_shapes(rot.shape[:-2], t.shape[:-1])
+    out = np.zeros((*shape, 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rot, t, 1.0
+    return out
+
+
+def inverse(transform: Array) -> Array:
+    """Inverse poses, (..., 4, 4) -> (..., 4, 4)."""
+    rot_t = np.swapaxes(transform[..., :3, :3], -1, -2)
+    return pose(rot_t, -(rot_t @ transform[..., :3, 3:])[..., 0])
+
+
+def apply(transform: Array, points: Array) -> Array:
+    """Points (..., 3) mapped by poses (..., 4, 4); leading axes broadcast."""
+    turned = (transform[..., :3, :3] @ points[..., None])[..., 0]
+    return turned + transform[..., :3, 3]
+
+
+def perturb(transform: Array, delta: Array) -> Array:
+    """Poses moved by six numbers each (module docstring), (..., 4, 4), (..., 6)."""
+    rot = rotation(delta[..., :3]) @ transform[..., :3, :3]
+    return pose(rot, transform[..., :3, 3] + delta[..., 3:])
+
+
+def pose_difference(transform: Array, reference: Array) -> Array:
+    """The six numbers with ``perturb(reference, delta) == transform``; (..., 6)."""
+    rot = transform[..., :3, :3] @ np.swapaxes(reference[..., :3, :3], -1, -2)
+    return np.concatenate(
+        [rotation_vector(rot), transform[..., :3, 3] - reference[..., :3, 3]], axis=-1
+    )
+
+
+def register(source: Array, target: Array, weights: Array | None = None) -> Array:
+    """Rigid motions that lay points on points: min sum w |T source - target|^2.
+
+    source, target : (..., n, 3), n >= 3 and not on one line for a unique answer.
+    weights : (..., n), none for equal ones.
+    Returns (..., 4, 4). Kabsch's solution; reflections are excluded.
+    [A] 9 and 16 in their corrected form, [B] eq. 15.
+    """
+    w = np.ones(source.shape[:-1]) if weights is None else weights
+    w = w / w.sum(axis=-1, keepdims=True)
+    mean_s = np.sum(w[..., None] * source, axis=-2)
+    mean_t = np.sum(w[..., None] * target, axis=-2)
+    ds, dt = source - mean_s[..., None, :], target - mean_t[..., None, :]
+    u, _, vt = np.linalg.svd(np.swapaxes(dt, -1, -2) @ (w[..., None] * ds))
+    u = u.copy()
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    rot = u @ vt
+    return pose(rot, mean_t - (rot @ mean_s[..., None])[..., 0])
+
+
+def look_at(position: Array, target: Array, up: Array) -> Array:
+    """``T_camera_base`` of a camera at ``position`` that looks at ``target`` (base frame, m).
+
+    Camera axes as OpenCV: z forward, x right, y down; ``up`` shows upwards in the image.
+    The caller checks that target and up are not degenerate.
+    """
+    forward = np.asarray(target, dtype=float) - position
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right = right / np.linalg.norm(right)
+    rot = np.stack([right, np.cross(forward, right), forward])
+    return pose(rot, -rot @ np.asarray(position, dtype=float))

@@ -1,0 +1,1 @@
+"""Measurements to parameters, with their uncertainty."""

@@ -1,0 +1,241 @@
+"""The joint estimate: all unknowns from all measurements, maximum likelihood and robust.
+
+Machine parameters, stations, platform poses and edge shifts are estimated together from edges,
+readings and the drawing, each divided by its standard deviation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.errors import ResultError
+from pkmcal.identify import robust as robust_weights
+from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
+from pkmcal.identify.covariance import (
+    Information,
+    data_share,
+    edge_freedom,
+    information,
+    machine_covariance,
+)
+from pkmcal.identify.gauge import Gauge, ThreeCentres, apply
+from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
+from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.solver import FIRST_DAMPING, RESTART_DAMPING, Solution, Stop, minimise
+from pkmcal.mechanisms import Machine
+
+LEAST_SCALE = 0.05
+"""Noise is not believed to be twenty times smaller than stated: noise-free simulations would
+otherwise weigh edges infinitely against readings."""
+ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """The joint estimate of B runs.
+
+    problem : with the weights in use, noise scale included. solution : states and stops.
+    weight : (B, K, G) robust weights 0..1. noise_scale : (B,). steps : (B,).
+    info : rows and covariance at the solution.
+    """
+
+    problem: Problem
+    solution: Solution
+    weight: Array
+    noise_scale: Array
+    steps: Array
+    info: Information
+
+
+def solve_batch(
+    problem: Problem, start: BatchState, *, robust: bool = True, scale_noise: bool = True
+) -> BatchResult:
+    """All runs of a problem from their starts; see :func:`bundle` for the options."""
+    n_runs = start.z.shape[0]
+    present = np.broadcast_to(
+        problem.blocks.present.astype(float), (n_runs, *problem.blocks.present.shape)
+    )
+    state, weight, steps = start, present, np.zeros(n_runs, dtype=int)
+    scale = np.ones(n_runs)
+    if robust:
+        found = robust_weights.anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
+        state, weight, steps = found.state, found.weight, steps + found.steps
+        scale = found.scale if scale_noise else scale
+    repeat = robust or scale_noise
+    damping = RESTART_DAMPING if robust else FIRST_DAMPING
+    result = _solve_weighted(problem, state, weight, scale, steps, damping)
+    for _ in range(ROUNDS if repeat else 0):
+        scale = _noise_scale(result) if scale_noise else result.noise_scale
+        if robust:
+            d = robust_weights.norms(problem, result.solution.state)
+            weight = robust_weights.final_weights(d, scale)
+        change = np.abs(scale / result.noise_scale - 1).max()
+        if max(change, 0.1 * np.abs(weight - result.weight).max()) < 1e-3:
+            break
+        state, steps = result.solution.state, result.steps
+        result = _solve_weighted(problem, state, weight, scale, steps, RESTART_DAMPING)
+    return result
+
+
+def _solve_weighted(
+    problem: Problem,
+    state: BatchState,
+    weight: Array,
+    scale: Array,
+    steps: Integers,
+    damping: float,
+) -> BatchResult:
+    """The problem solved with fixed weights (B, K, G) and noise scales (B,)."""
+    used = problem.weighted(weight / scale[:, None, None] ** 2)
+    solution = minimise(used, state, damping=damping)
+    info = information(used, solution.state)
+    return BatchResult(used, solution, weight, scale, steps + solution.steps, info)
+
+
+def _noise_scale(result: BatchResult) -> Array:
+    """Factor on the edges' stated noise that makes their chi2 equal its degrees of freedom, (B,).
+
+    The variance component of the edges' group with redundancies as weights; kept as it is
+    where fewer than five degrees of freedom remain to judge it.
+    """
+    n = result.problem.n_edge_rows
+    chi2 = np.sum(result.info.linear.value[:, :, :n] ** 2, axis=(1, 2))
+    freedom = edge_freedom(result.problem, result.info, _edge_count(result))
+    new = result.noise_scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
+    return np.where(freedom > 5, np.maximum(new, LEAST_SCALE), result.noise_scale)
+
+
+def _edge_count(result: BatchResult) -> Array:
+    """Residuals of edges in use, each counted by its robust weight, (B,)."""
+    return np.sum(result.weight, axis=(1, 2)) * result.problem.data.whiten.shape[-1]
+
+
+def bundle(
+    machine: Machine,
+    measurements: Measurements,
+    start: State,
+    *,
+    use_drawing: bool = True,
+    robust: bool = True,
+    scale_noise: bool = True,
+    gauge: Gauge | None = None,
+) -> Estimate:
+    """The joint estimate of one session.
+
+    start : every unknown's first value, see :func:`start_state`.
+    use_drawing : take the drawing's values as measurements with their tolerances; radii
+        and edge shifts keep theirs in any case.
+    robust : let go of edges that do not fit. scale_noise : estimate a common factor on the
+        edges' stated noise; otherwise it is taken as it is.
+    gauge : frames of the result, three centres by default.
+    Raises ResultError where the search cannot start or ends without an answer.
+    """
+    gauge = gauge or ThreeCentres()
+    assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing)
+    batch = batch_of(machine, assembled, start)
+    result = solve_batch(assembled.problem, batch, robust=robust, scale_noise=scale_noise)
+    stop = result.solution.stop[0]
+    if stop in (Stop.NOT_FINITE, Stop.STALLED):
+        raise ResultError(what=f"the joint estimate failed: {stop.value}")
+    return _estimate(machine, measurements, start, assembled, result, gauge)
+
+
+def start_state(
+    machine: Machine, measurements: Measurements, T_camera_base_guess: Array
+) -> State:
+    """A start: the machine's present values, poses by forward kinematics from the readings.
+
+    Readings, not seen directions: the latter lead into local minima (errata, B).
+    T_camera_base_guess : (S, 4, 4).
+    """
+    poses = machine.forward_result(measurements.joints).T_base_platform
+    n_cameras = int(np.max(measurements.camera_of_station)) + 1
+    return State(machine.values, np.asarray(T_camera_base_guess), poses, np.zeros(n_cameras))
+
+
+def _estimate(
+    machine: Machine,
+    measurements: Measurements,
+    start: State,
+    assembled: Assembled,
+    result: BatchResult,
+    gauge: Gauge,
+) -> Estimate:
+    """The result in the gauge, with everything that a report asks for."""
+    problem, found = result.problem, result.solution.state
+    solved = state_of(assembled, found, start)
+    full = machine_covariance(problem, machine, solved, result.info.covariance[0], gauge)
+    state = apply(machine, solved, gauge)
+    identified = machine.with_values(state.theta)
+    n_par = len(machine.parameters)
+    stations = np.arange(6 * problem.n_stations).reshape(-1, 6) + n_par
+    rows = problem.block_residuals(found)[0] / result.noise_scale[0]
+    covariance = full[:n_par, :n_par]
+    return Estimate(
+        machine=identified,
+        state=_with_unseen_poses(identified, measurements, assembled, state),
+        covariance=covariance,
+        station_covariance=full[stations[:, :, None], stations[:, None, :]],
+        edge_shift_sigma=np.sqrt(np.diag(result.info.covariance[0])[-problem.n_cameras :]),
+        edge_residuals=rows[assembled.row, assembled.place],
+        edge_weights=result.weight[0, assembled.row, assembled.place],
+        joint_residuals=_joint_residuals(result, assembled, measurements),
+        data_share=data_share(machine, state.theta, covariance, gauge),
+        configurations=assembled.seen,
+        statistics=_statistics(result, assembled),
+        gauge=gauge.name,
+    )
+
+
+def _with_unseen_poses(
+    machine: Machine, measurements: Measurements, assembled: Assembled, state: State
+) -> State:
+    """Poses of the configurations that no photograph shows: by the readings alone."""
+    unseen = ~assembled.seen
+    if not unseen.any():
+        return state
+    poses = state.T_base_platform.copy()
+    found = machine.forward_result(measurements.joints[unseen], poses[unseen])
+    poses[unseen] = found.T_base_platform
+    return replace(state, T_base_platform=poses)
+
+
+def _joint_residuals(
+    result: BatchResult, assembled: Assembled, measurements: Measurements
+) -> Array:
+    """Closures in standard deviations of a reading, (K, m); zero where no pose was fitted."""
+    driven = result.problem.layout.actuated >= 0
+    rows = result.info.linear.value[0, :, result.problem.n_edge_rows :]
+    out = np.zeros(measurements.joints.shape)
+    out[np.ix_(assembled.seen, result.problem.layout.actuated[driven])] = rows[:, driven]
+    return out
+
+
+def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
+    problem, linear = result.problem, result.info.linear
+    n = problem.n_edge_rows
+    kinds = np.array(assembled.priors)
+    chi2_edges = float(np.sum(linear.value[0, :, :n] ** 2))
+    chi2_joints = float(np.sum(linear.value[0, :, n:] ** 2))
+    chi2_drawing = float(np.sum(linear.shared_value[0, kinds != "gauge"] ** 2))
+    n_edges = float(_edge_count(result)[0])
+    n_joints = linear.value[0, :, n:].size
+    n_drawing = int(np.sum(kinds != "gauge"))
+    unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))
+    unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
+    return Statistics(
+        chi2=chi2_edges + chi2_joints + chi2_drawing,
+        dof=n_edges + n_joints + n_drawing - unknowns,
+        chi2_edges=chi2_edges,
+        n_edges=n_edges,
+        chi2_joints=chi2_joints,
+        n_joints=n_joints,
+        chi2_drawing=chi2_drawing,
+        n_drawing=n_drawing,
+        steps=int(result.steps[0]),
+        stopped=result.solution.stop[0].value,
+        noise_scale=float(result.noise_scale[0]),
+    )

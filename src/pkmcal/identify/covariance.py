@@ -1,0 +1,188 @@
+"""How sure the estimate is: covariance, noise scale, rank. All from exact derivatives.
+
+The covariance is the inverse of the reduced information at the solution, told in a gauge. It
+covers the noise of edges and readings and the drawing's tolerances; it does not cover errors
+of the model (joint clearance, bending, a wrong lens).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.identify.gauge import (
+    Gauge,
+    alignment,
+    carried_errors,
+    changed_frames,
+    freedoms,
+    generators,
+    projector,
+    transformation,
+)
+from pkmcal.identify.problem import State
+from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.solver import Linear, Reduced, eliminate, transposed
+from pkmcal.mechanisms import Machine
+
+RANK_TOLERANCE = 1e-9
+"""Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14
+there with exact derivatives, and real directions are many orders above."""
+
+
+class Information(NamedTuple):
+    """The problem at the solution: linear rows, elimination, shared covariance (B, na, na)."""
+
+    linear: Linear
+    reduced: Reduced
+    covariance: Array
+
+
+def information(problem: Problem, state: BatchState) -> Information:
+    """Covariance of the shared unknowns before any gauge is applied."""
+    linear = problem.linearize(state)
+    reduced = eliminate(linear, np.zeros(state.z.shape[0]))
+    n_runs, na = reduced.rows.shape[0], reduced.rows.shape[-1]
+    stacked = np.concatenate(
+        [
+            reduced.rows.reshape(n_runs, -1, na),
+            np.broadcast_to(linear.shared_by, (n_runs, *linear.shared_by.shape)),
+        ],
+        axis=1,
+    )
+    scale = np.sqrt(np.sum(stacked**2, axis=1))
+    scale = np.where(scale > 0, scale, 1.0)
+    r = np.linalg.qr(stacked / scale[:, None, :], mode="r")
+    _, s, vt = np.linalg.svd(r)
+    # a direction that nothing fixes gets a huge variance instead of a division by zero
+    s = np.maximum(s, 1e-14 * s[:, :1])
+    half = transposed(vt) / s[:, None, :] / scale[:, :, None]
+    return Information(linear, reduced, half @ transposed(half))
+
+
+def edge_freedom(problem: Problem, info: Information, count: Array) -> Array:
+    """Degrees of freedom of the edges' residuals, count - tr(hat), (B,).
+
+    count : rows in use, (B,). The hat matrix splits into the own unknowns' part Q Q^T and the
+    shared unknowns' part.
+    """
+    n = problem.n_edge_rows
+    rows, q = info.reduced.rows[:, :, :n], info.reduced.q[:, :, :n]
+    own = np.sum(q**2, axis=(1, 2, 3))
+    shared = np.sum((rows @ info.covariance[:, None]) * rows, axis=(1, 2, 3))
+    return count - own - shared
+
+
+def machine_covariance(
+    problem: Problem, machine: Machine, before: State, shared: Array, gauge: Gauge
+) -> Array:
+    """Covariance (P + 6 S) of parameters and stations, told in the gauge.
+
+    before : the solution as the solver left it. shared : (na, na) covariance there.
+    """
+    n_free, n_par = problem.free.shape[1], len(machine.parameters)
+    n_station = 6 * problem.n_stations
+    spread = np.zeros((n_par + n_station, n_free + n_station))
+    spread[:n_par, :n_free] = problem.free
+    spread[n_par:, n_free:] = np.eye(n_station)
+    e, f = alignment(machine, before, gauge)
+    after = changed_frames(machine.layout, before, e, f)
+    spread = carried_errors(machine.layout, before, e, f) @ spread
+    spread = transformation(machine, after, gauge) @ spread
+    part = shared[: n_free + n_station, : n_free + n_station]
+    out = spread @ part @ spread.T
+    return 0.5 * (out + out.T)
+
+
+def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) -> Array:
+    """1 - posterior variance / drawing variance in the gauge, (P,); 0 where both vanish."""
+    table, free = machine.parameters, machine.parameters.free_matrix()
+    first = np.argmax(free, axis=0)
+    change = projector(machine, theta, gauge)
+    spread = free - generators(machine.layout, theta) @ (change @ free)
+    drawing = np.sum((spread * table.tolerance[first]) ** 2, axis=1)
+    known = drawing > 1e-12 * table.tolerance**2
+    share = 1 - np.diag(covariance)[: len(table)] / np.where(known, drawing, 1.0)
+    return np.where(known, share, 0.0)
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of parameters: names with weights, largest first, and how well known.
+
+    information : singular value of the data in units of the drawing's tolerance; 1 means that
+    the data know it as well as the drawing does.
+    """
+
+    names: tuple[str, ...]
+    weights: tuple[float, ...]
+    information: float
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What the data alone can tell of the machine, frames aside.
+
+    n_parameters : free ones. n_frames : freedoms of the frames. rank : directions the data fix.
+    unidentified : directions that no amount of such data fixes. weak : directions that the
+    drawing knows better than the data.
+    """
+
+    n_parameters: int
+    n_frames: int
+    rank: int
+    unidentified: tuple[Direction, ...]
+    weak: tuple[Direction, ...]
+    singular_values: Array
+
+
+def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Identifiability:
+    """Rank of the data's own information, drawing left out; the problem's first run.
+
+    Poses, stations and edge shifts are eliminated, frames are taken out, and the columns are
+    scaled by the drawing's tolerances.
+    """
+    linear = problem.linearize(state)
+    rows = eliminate(linear, np.zeros(state.z.shape[0])).rows[0]
+    nz = problem.free.shape[1]
+    rows = rows.reshape(-1, rows.shape[-1])
+    q, _ = np.linalg.qr(_scaled(rows[:, nz:]))
+    first = np.argmax(problem.free, axis=0)
+    tolerance = machine.parameters.tolerance[first]
+    left = rows[:, :nz] * tolerance
+    left = left - q @ (q.T @ left)
+    theta = problem.theta(state)[0]
+    frames = freedoms(machine)
+    moved = np.linalg.lstsq(problem.free, generators(machine.layout, theta) @ frames, rcond=None)[0]
+    basis = np.linalg.qr(moved / tolerance[:, None], mode="complete")[0][:, frames.shape[1] :]
+    _, s, vt = np.linalg.svd(left @ basis, full_matrices=False)
+    directions = vt @ basis.T
+    names = [machine.parameters.names[k] for k in first]
+    lost = s < RANK_TOLERANCE * s[0]
+    made = [_direction(names, v, x) for v, x in zip(directions, s, strict=True)]
+    return Identifiability(
+        n_parameters=nz,
+        n_frames=frames.shape[1],
+        rank=int(np.sum(~lost)),
+        unidentified=tuple(m for m, gone in zip(made, lost, strict=True) if gone),
+        weak=tuple(
+            m for m, gone in zip(made, lost, strict=True) if not gone and m.information < 1
+        ),
+        singular_values=s,
+    )
+
+
+def _scaled(columns: Array) -> Array:
+    norm = np.linalg.norm(columns, axis=0)
+    return columns[:, norm > 0] / norm[norm > 0]
+
+
+def _direction(names: list[str], weights: Array, value: float) -> Direction:
+    order = np.argsort(-np.abs(weights), kind="stable")
+    order = order[np.abs(weights[order]) > 0.15 * np.abs(weights).max()][:8]
+    return Direction(
+        tuple(names[k] for k in order), tuple(float(weights[k]) for k in order), float(value)
+    )

@@ -1,0 +1,256 @@
+"""Which frames the results are told in: an explicit choice that can be changed afterwards.
+
+Neither edges nor readings know where the base frame or the platform frame is: a rigid motion
+of either, six numbers each, changes parameters, stations and poses together and no residual.
+A gauge is a set of twelve linear constraints on the joint centres that picks one choice.
+
+Frame changes, by the perturbation of :mod:`pkmcal.geometry.rigid`: E moves base coordinates,
+``A' = E A``, ``T_camera_base' = T_camera_base E^-1``, and F platform coordinates,
+``B' = F B``, ``T_base_platform' = E T_base_platform F^-1``. Twelve numbers: E's six, F's six.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import apply as move
+from pkmcal.geometry.rigid import cross, inverse, perturb, skew
+from pkmcal.identify.problem import State
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.limbs import LimbLayout
+
+
+class Gauge(Protocol):
+    """A choice of frames: linear constraints C theta = C drawing."""
+
+    @property
+    def name(self) -> str:
+        """The choice in words."""
+        ...
+
+    def constraints(self, machine: Machine) -> Array:
+        """C, (12, P): six rows on the base centres, six on the platform centres."""
+        ...
+
+
+@dataclass(frozen=True)
+class ThreeCentres:
+    """Frames by three joint centres, 3-2-1, base and platform alike.
+
+    The first leg's centre keeps its drawing value, the second lies in the drawing's direction
+    from it, the third in the drawing's plane. Legs from 0; a machine of fewer than five legs
+    uses its first three.
+    """
+
+    legs: tuple[int, int, int] = (0, 2, 4)
+
+    @property
+    def name(self) -> str:
+        """The choice in words."""
+        return "three centres: legs " + ", ".join(str(j + 1) for j in self.legs)
+
+    def constraints(self, machine: Machine) -> Array:
+        """C (12, P)."""
+        legs = self.legs if max(self.legs) < machine.n_legs else (0, 1, 2)
+        rows = [
+            _three_rows(machine.parameters.drawing, index[list(legs)])
+            for index in centre_index(machine.layout)
+        ]
+        return np.concatenate(rows)
+
+
+@dataclass(frozen=True)
+class BestFit:
+    """Frames that lay the joint centres on the drawing's by least squares ([B] eq. 15)."""
+
+    @property
+    def name(self) -> str:
+        """The choice in words."""
+        return "best fit of all centres to the drawing"
+
+    def constraints(self, machine: Machine) -> Array:
+        """C (12, P): at the least-squares fit sum(A - D) = 0 and sum(D x A) = 0, D centred."""
+        drawing = machine.parameters.drawing
+        rows = []
+        for index in centre_index(machine.layout):
+            d = drawing[index] - drawing[index].mean(axis=0)
+            block = np.zeros((6, drawing.size))
+            for axis in range(3):
+                block[:3, index[:, axis]] = np.eye(3)[:, axis, None]
+                block[3:, index[:, axis]] = skew(d)[:, :, axis].T
+            rows.append(block)
+        return np.concatenate(rows)
+
+
+def centre_index(layout: LimbLayout) -> tuple[Integers, Integers]:
+    """Positions of the legs' base and platform centres among the parameters, (L, 3) each."""
+    out: list[Integers] = []
+    for groups in (layout.base, layout.platform):
+        index = np.zeros((layout.n_legs, 3), dtype=int)
+        for group in groups:
+            index[group.legs] = group.index[:, :3]
+        out.append(index)
+    return out[0], out[1]
+
+
+def _three_rows(drawing: Array, index: Integers) -> Array:
+    """The 3-2-1 constraints of one body, (6, P)."""
+    p1, p2, p3 = drawing[index]
+    along = (p2 - p1) / np.linalg.norm(p2 - p1)
+    normal = cross(along, p3 - p1)
+    normal = normal / np.linalg.norm(normal)
+    rows = np.zeros((6, drawing.size))
+    rows[[0, 1, 2], index[0]] = 1.0
+    for row, leg, direction in ((3, 1, normal), (4, 1, cross(normal, along)), (5, 2, normal)):
+        rows[row, index[leg]] = direction
+        rows[row, index[0]] = -direction
+    return rows
+
+
+def generators(layout: LimbLayout, theta: Array) -> Array:
+    """How parameters move with the twelve numbers of a frame change, (..., P, 12)."""
+    out = np.zeros((*theta.shape, 12))
+    for body, index in enumerate(centre_index(layout)):
+        at = slice(6 * body, 6 * body + 3)
+        to = slice(6 * body + 3, 6 * body + 6)
+        out[..., index, at] = -skew(theta[..., index])
+        out[..., index, to] = np.eye(3)
+    return out
+
+
+def station_generators(T_camera_base: Array) -> Array:
+    """How stations (..., S, 4, 4) move with a frame change, (..., S, 6, 12)."""
+    out = np.zeros((*T_camera_base.shape[:-2], 6, 12))
+    out[..., :3, :3] = -T_camera_base[..., :3, :3]
+    out[..., 3:, 3:6] = -T_camera_base[..., :3, :3]
+    return out
+
+
+def pose_generators(T_base_platform: Array) -> Array:
+    """How platform poses (..., K, 4, 4) move with a frame change, (..., K, 6, 12)."""
+    rot, t = T_base_platform[..., :3, :3], T_base_platform[..., :3, 3]
+    out = np.zeros((*T_base_platform.shape[:-2], 6, 12))
+    out[..., :3, :3], out[..., 3:, 3:6] = np.eye(3), np.eye(3)
+    out[..., 3:, :3] = -skew(t)
+    out[..., :3, 6:9], out[..., 3:, 9:] = -rot, -rot
+    return out
+
+
+def freedoms(machine: Machine) -> Array:
+    """Frame changes that the machine's model allows, a basis (12, g), at the drawing's values.
+
+    All twelve for a spatial machine without fixed parameters. Fixed or tied parameters take
+    some away; a machine that moves in fewer directions keeps those that respect its motion.
+    """
+    candidates = _respecting_motion(machine.layout.motion)
+    free = machine.parameters.free_matrix()
+    moved = generators(machine.layout, machine.parameters.drawing) @ candidates
+    outside = moved - free @ np.linalg.lstsq(free, moved, rcond=None)[0]
+    _, s, vt = np.linalg.svd(outside, full_matrices=True)
+    size = np.zeros(candidates.shape[1])
+    size[: s.size] = s
+    return candidates @ vt[size < 1e-9].T
+
+
+def _respecting_motion(motion: Array) -> Array:
+    """Frame changes after which the platform still moves along ``motion``, (12, g)."""
+    if motion.shape[1] == 6:
+        return np.eye(12)
+    both = np.concatenate([np.eye(6), np.eye(6)])
+    if motion[:3].any():  # planar: each frame in the plane, and both together along its normal
+        return np.concatenate([np.eye(12)[:, [2, 3, 4, 8, 9, 10]], both[:, [5]]], axis=1)
+    # translation: each frame's origin, and both frames turned together
+    return np.concatenate([np.eye(12)[:, [3, 4, 5, 9, 10, 11]], both[:, :3]], axis=1)
+
+
+def projector(machine: Machine, theta: Array, gauge: Gauge) -> Array:
+    """What turns any result into the gauge, to first order: N C with y = -N C (theta - drawing).
+
+    theta : (..., P). Returns (..., 12, P); with it the S-transformation of the parameters is
+    ``I - G N C``, G of :func:`generators`.
+    """
+    c = gauge.constraints(machine)
+    basis = freedoms(machine)
+    if basis.shape[1] == 0:
+        return np.zeros((*theta.shape[:-1], *c.shape))
+    slope = c @ generators(machine.layout, theta) @ basis
+    return basis @ np.linalg.pinv(slope) @ c
+
+
+def alignment(machine: Machine, state: State, gauge: Gauge) -> tuple[Array, Array]:
+    """The frame changes E and F, (4, 4) each, that bring a state into the gauge.
+
+    Newton steps, each followed by an exact rigid motion of the centres.
+    """
+    e, f, theta = np.eye(4), np.eye(4), state.theta
+    for _ in range(30):
+        change = projector(machine, theta, gauge)
+        y = -change @ (theta - machine.parameters.drawing)
+        e, f = perturb(np.eye(4), y[:6]) @ e, perturb(np.eye(4), y[6:]) @ f
+        theta = moved_centres(machine.layout, state.theta, e, f)
+        if np.abs(y).max() < 1e-15:
+            break
+    return e, f
+
+
+def apply(machine: Machine, state: State, gauge: Gauge) -> State:
+    """The same machine, stations and poses told in the gauge's frames; no residual changes."""
+    return changed_frames(machine.layout, state, *alignment(machine, state, gauge))
+
+
+def changed_frames(layout: LimbLayout, state: State, e: Array, f: Array) -> State:
+    """The state after frame changes E and F, (4, 4) each."""
+    return replace(
+        state,
+        theta=moved_centres(layout, state.theta, e, f),
+        T_camera_base=state.T_camera_base @ inverse(e),
+        T_base_platform=e @ state.T_base_platform @ inverse(f),
+    )
+
+
+def moved_centres(layout: LimbLayout, theta: Array, e: Array, f: Array) -> Array:
+    """Parameters (..., P) with centres moved by E (..., 4, 4) on the base, F on the platform."""
+    out = theta.copy()
+    for transform, index in zip((e, f), centre_index(layout), strict=True):
+        out[..., index] = move(transform[..., None, :, :], theta[..., index])
+    return out
+
+
+def carried_errors(layout: LimbLayout, before: State, e: Array, f: Array) -> Array:
+    """Errors of (theta, stations) before the frame changes to those after, (n, n), n = P + 6 S.
+
+    Centres turn with their frame. A station's left perturbation (omega, tau) becomes
+    (omega, tau + [R R_E^T t_E]x omega), as ``(T E^-1)`` keeps the camera's own axes.
+    """
+    n_par, n_stations = before.theta.size, len(before.T_camera_base)
+    out = np.eye(n_par + 6 * n_stations)
+    for transform, index in zip((e, f), centre_index(layout), strict=True):
+        out[index[:, :, None], index[:, None, :]] = transform[:3, :3]
+    arm = before.T_camera_base[:, :3, :3] @ e[:3, :3].T @ e[:3, 3]
+    for s in range(n_stations):
+        at = n_par + 6 * s
+        out[at + 3 : at + 6, at : at + 3] = skew(arm[s])
+    return out
+
+
+def transformation(machine: Machine, state: State, gauge: Gauge) -> Array:
+    """S-transformation (n, n) of the errors of (theta, stations) into the gauge, n = P + 6 S.
+
+    Errors in the gauge are ``J e``: the frame change that restores the constraints is taken
+    out of parameters and stations alike. Constrained coordinates get zero variance exactly.
+    """
+    change = projector(machine, state.theta, gauge)
+    moved = np.concatenate(
+        [
+            generators(machine.layout, state.theta),
+            station_generators(state.T_camera_base).reshape(-1, 12),
+        ]
+    )
+    n = moved.shape[0]
+    out = np.eye(n)
+    out[:, : change.shape[1]] -= moved @ change
+    return out

@@ -1,0 +1,93 @@
+"""What goes into an identification and what comes out of it: plain, frozen, saveable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.mechanisms import Machine
+from pkmcal.observe.edges import EdgeSet
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Everything that was measured, nothing that was assumed.
+
+    edges : silhouette edges. joints : (K, m) readings, m or rad. joint_noise : their
+    standard deviation. n_stations : S. camera_of_station : (S,) number of the camera (file)
+    that each station uses: one edge shift is estimated for each camera.
+    """
+
+    edges: EdgeSet
+    joints: Array
+    joint_noise: float
+    n_stations: int
+    camera_of_station: Integers
+
+
+@dataclass(frozen=True)
+class State:
+    """One value of every unknown.
+
+    theta : (P,) machine parameters. T_camera_base : (S, 4, 4). T_base_platform : (K, 4, 4).
+    edge_shift : (C,) px outward, per camera.
+    """
+
+    theta: Array
+    T_camera_base: Array
+    T_base_platform: Array
+    edge_shift: Array
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """How well the model explains the data.
+
+    chi2, dof : of all residuals in use (robust weights count as fractions of a datum).
+    chi2_edges, n_edges, chi2_joints, n_joints, chi2_drawing, n_drawing : by kind of residual.
+    steps : solver steps. stopped : reason in words. noise_scale : factor by which the edges'
+    stated standard deviations had to be enlarged (or shrunk) to agree with the residuals;
+    1 when they were taken as they are.
+    """
+
+    chi2: float
+    dof: float
+    chi2_edges: float
+    n_edges: float
+    chi2_joints: float
+    n_joints: int
+    chi2_drawing: float
+    n_drawing: int
+    steps: int
+    stopped: str
+    noise_scale: float
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An identification's result, in the frames that ``gauge`` names.
+
+    machine : with the identified values. state : all unknowns.
+    covariance : (P, P) of the machine's parameters in that gauge; zero rows where fixed.
+    station_covariance : (S, 6, 6) of (omega, tau), left perturbation of T_camera_base.
+    edge_shift_sigma : (C,) px.
+    edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1.
+    joint_residuals : (K, m) in standard deviations.
+    data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
+        data decide; near 0, the value is the drawing's.
+    configurations : (K,) True where the configuration was seen and its pose estimated.
+    gauge : its name for people.
+    """
+
+    machine: Machine
+    state: State
+    covariance: Array
+    station_covariance: Array
+    edge_shift_sigma: Array
+    edge_residuals: Array
+    edge_weights: Array
+    joint_residuals: Array
+    data_share: Array
+    configurations: Booleans
+    statistics: Statistics
+    gauge: str

@@ -1,0 +1,1 @@
+"""What carries a limb's two ends: one kind a file, behind the contract of ``contract.py``."""

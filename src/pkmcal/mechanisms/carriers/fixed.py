@@ -1,0 +1,43 @@
+"""A joint centre fixed to the base: A does not move with the reading."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, final
+
+import numpy as np
+
+from pkmcal.files import Schema
+from pkmcal.mechanisms.carriers.contract import (
+    BaseCarrier,
+    CarriedPoint,
+    ParameterKind,
+)
+from pkmcal.arrays import Array
+
+
+class FixedDocument(Schema):
+    """``base: {joint: spherical, center: [x, y, z]}``, metres, base frame."""
+
+    joint: Literal["spherical", "universal"]
+    center: tuple[float, float, float]
+
+
+CENTER = tuple(ParameterKind(f"center.{axis}", "m", "center") for axis in "xyz")
+
+
+@final
+class FixedPoint(BaseCarrier):
+    """Spherical or universal joint on the base."""
+
+    joints: ClassVar = ("spherical", "universal")
+    schema: ClassVar = FixedDocument
+    parameters: ClassVar = CENTER
+
+    @staticmethod
+    def point(parameters: Array, readings: Array) -> CarriedPoint:
+        """A is the centre itself, (..., 3)."""
+        shape = np.broadcast_shapes(parameters.shape[:-1], readings.shape)
+        value = np.broadcast_to(parameters, (*shape, 3))
+        return CarriedPoint(
+            value, np.zeros((*shape, 3)), np.broadcast_to(np.eye(3), (*shape, 3, 3))
+        )

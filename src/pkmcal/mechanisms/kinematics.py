@@ -1,0 +1,145 @@
+"""Inverse and forward kinematics of any rigid-platform machine, batched over poses.
+
+Forward kinematics solves the closure for the pose by Levenberg-Marquardt from a start in the
+right assembly; each configuration of the batch has its own damping and stops on its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.geometry.rigid import perturb, pose, rotation
+from pkmcal.mechanisms.limbs import LimbLayout, closure
+from pkmcal.arrays import Array, Booleans
+
+MAX_STEPS = 60
+CONVERGED = 1e-12
+"""Closure error (m) below which a configuration is solved: 100 times rounding at 1 m."""
+NEAR_SINGULAR = 0.02
+"""Smallest singular value of the scaled inverse Jacobian below which a warning is due: a
+reading's error then moves the platform fifty times as far."""
+
+
+@dataclass(frozen=True)
+class ForwardResult:
+    """Poses found from readings, and how far to trust each.
+
+    T_base_platform : (..., 4, 4); converged : (...); error : (...) largest closure error, m.
+    singularity : (...) smallest singular value of the inverse Jacobian with rotations scaled
+        by the platform's radius: 1 is a good machine, 0 a singular pose.
+    """
+
+    T_base_platform: Array
+    converged: Booleans
+    error: Array
+    singularity: Array
+
+
+def inverse(layout: LimbLayout, theta: Array, poses: Array) -> Array:
+    """Readings (..., m) at poses T_base_platform (..., 4, 4); [B] eq. 4, q = length - offset.
+
+    Rods on a fixed centre only; the closure is then linear in the reading.
+    """
+    driven = layout.actuated >= 0
+    zeros = np.zeros((*poses.shape[:-2], int(driven.sum())))
+    at_zero = closure(layout, theta, zeros, poses)
+    return (-at_zero.value / at_zero.by_reading)[..., driven] if driven.any() else zeros
+
+
+def forward(layout: LimbLayout, theta: Array, readings: Array, start: Array) -> ForwardResult:
+    """Poses at readings (..., m), from starts (..., 4, 4); theta (..., P) broadcasts.
+
+    Unknowns are the motion's directions only, so a planar machine stays in its plane.
+    """
+    shape = np.broadcast_shapes(readings.shape[:-1], start.shape[:-2], theta.shape[:-1])
+    current = np.broadcast_to(start, (*shape, 4, 4)).copy()
+    damping = np.full(shape, 1e-6)
+    c = closure(layout, theta, readings, current)
+    cost = np.sum(c.value**2, axis=-1)
+    for _ in range(MAX_STEPS):
+        active = np.max(np.abs(c.value), axis=-1) > CONVERGED * 1e-2
+        if not active.any():
+            break
+        jac = c.by_pose @ layout.motion
+        step = -_damped_solve(jac, c.value, damping)
+        step = np.where(active[..., None], step, 0.0)
+        trial = perturb(current, step @ layout.motion.T)
+        c_trial = closure(layout, theta, readings, trial)
+        cost_trial = np.sum(c_trial.value**2, axis=-1)
+        better = cost_trial < cost
+        if not (better & active).any() and np.all(damping[active] > 1e3):
+            break
+        current = np.where(better[..., None, None], trial, current)
+        cost = np.where(better, cost_trial, cost)
+        damping = np.clip(np.where(better, damping * 0.05, damping * 30), 1e-14, 1e6)
+        c = closure(layout, theta, readings, current)
+    error = np.max(np.abs(c.value), axis=-1)
+    return ForwardResult(current, error < CONVERGED, error, singularity(layout, theta, c.by_pose))
+
+
+def _damped_solve(jac: Array, value: Array, damping: Array) -> Array:
+    """Levenberg-Marquardt step with column scaling, (..., d)."""
+    normal = np.swapaxes(jac, -1, -2) @ jac
+    scale = np.einsum("...ii->...i", normal) + 1e-300
+    normal = normal + damping[..., None, None] * scale[..., None] * np.eye(jac.shape[-1])
+    gradient = (np.swapaxes(jac, -1, -2) @ value[..., None])
+    return np.linalg.solve(normal, gradient)[..., 0]
+
+
+def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:
+    """Smallest singular value of the inverse Jacobian, dimensionless; (...).
+
+    Rotations are scaled by the platform's radius, so a row is about a unit direction; zero
+    means that the platform can move with all joints locked.
+    """
+    centres = np.concatenate([theta[..., g.index[:, :3]] for g in layout.platform], axis=-2)
+    spread = centres - centres.mean(axis=-2, keepdims=True)
+    radius = np.sqrt(np.mean(np.sum(spread**2, axis=-1), axis=-1))
+    scale = np.concatenate([np.repeat(1 / radius[..., None], 3, -1), np.ones((*radius.shape, 3))], -1)
+    jac = (by_pose * scale[..., None, :]) @ layout.motion
+    return np.linalg.svd(jac, compute_uv=False)[..., -1]
+
+
+def home_candidates(layout: LimbLayout, theta: Array, readings: Array) -> Array:
+    """Starts for a machine whose file names no home pose: the platform unturned, its joints'
+    mean above (and below) the base joints' mean, at the height that the rods reach; (k, 4, 4).
+    """
+    zero = np.zeros_like(readings)
+    ends = closure(layout, theta, zero, np.eye(4)).ends
+    shift = ends.a.mean(axis=-2) - ends.b.mean(axis=-2)
+    length = np.abs(closure(layout, theta, readings, np.eye(4)).value
+                    - closure(layout, theta, readings, np.eye(4)).distance)
+    reach = float(length.mean())
+    flat = float(np.linalg.norm((ends.b + shift - ends.a)[..., :2], axis=-1).mean())
+    height = np.sqrt(max(reach**2 - flat**2, (0.3 * reach) ** 2))
+    starts = [pose(np.eye(3), shift + np.array([0.0, 0.0, s * height])) for s in (1, -1)]
+    if layout.motion.shape[1] == 3 and layout.motion[2, 0] == 1:
+        starts = [pose(rotation(np.array([0, 0, a])), shift) for a in (0.0, 0.5, -0.5, 1.0, -1.0)]
+    return np.stack(starts)
+
+
+def assembly_modes(
+    layout: LimbLayout,
+    theta: Array,
+    readings: Array,
+    rng: np.random.Generator,
+    starts: int = 400,
+) -> Array:
+    """Distinct poses that close the machine at one set of readings (m,): (k, 4, 4).
+
+    A multi-start search: every mode returned is one; that none is missing is not proven.
+    """
+    home = home_candidates(layout, theta, readings)[0]
+    reach = float(np.abs(home[2, 3]) + 1e-9)
+    turns = rng.normal(size=(starts, 3)) * 1.2
+    shifts = rng.normal(size=(starts, 3)) * reach
+    delta = np.concatenate([turns, shifts], axis=-1) @ layout.motion @ layout.motion.T
+    found = forward(layout, theta, readings, perturb(home, delta))
+    poses = found.T_base_platform[found.converged]
+    kept: list[Array] = []
+    for candidate in poses:  # few distinct ones: a loop over results, not over work
+        if all(np.abs(candidate - other).max() > 1e-6 for other in kept):
+            kept.append(candidate)
+    return np.stack(kept) if kept else np.zeros((0, 4, 4))

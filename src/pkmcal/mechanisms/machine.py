@@ -1,0 +1,214 @@
+"""A machine: its document, its parameter table and its values; kinematics as methods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pkmcal.errors import GeometryError, InputError
+from pkmcal.geometry.rigid import pose, rotation
+from pkmcal.mechanisms import kinematics
+from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.limbs import LimbLayout, layout_of
+from pkmcal.mechanisms.parameters import ParameterTable
+from pkmcal.mechanisms.rods import CONSTANT, OFFSET
+from pkmcal.mechanisms.schema import MechanismDocument
+from pkmcal.arrays import Array
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A parallel machine with parameter values.
+
+    document : the mechanism file it was read from.
+    parameters : names, drawing values, tolerances, roles.
+    values : (P,) present values, in the table's order.
+    """
+
+    document: MechanismDocument
+    parameters: ParameterTable
+    layout: LimbLayout
+    values: Array
+
+    @property
+    def name(self) -> str:
+        """The machine's name in its file."""
+        return self.document.name
+
+    @property
+    def n_legs(self) -> int:
+        """Number of limbs."""
+        return self.layout.n_legs
+
+    @property
+    def n_joints(self) -> int:
+        """Number of readings in a configuration: one an actuated limb."""
+        return int(np.sum(self.layout.actuated >= 0))
+
+    @property
+    def joint_ranges(self) -> Array:
+        """Smallest and largest reading by the file, (m, 2) m; NaN where the file is silent.
+
+        ``range`` bounds the leg's length, so the drawing's offset is taken off.
+        """
+        legs = [leg for leg in self.document.legs if leg.length.actuated]
+        return np.array(
+            [
+                np.subtract(leg.length.range or (np.nan, np.nan), leg.length.offset)
+                for leg in legs
+            ]
+        ).reshape(-1, 2)
+
+    def with_values(self, values: Array) -> Machine:
+        """The same machine with other parameter values (P,)."""
+        return replace(self, values=np.array(values, dtype=float))
+
+    def base_centers(self) -> Array:
+        """Joint centres on the base, (L, 3) m, base frame; zero readings for moving carriers."""
+        return self._ends()[0]
+
+    def platform_centers(self) -> Array:
+        """Joint centres on the platform, (L, 3) m, platform frame."""
+        return self._ends()[1]
+
+    def radii(self) -> tuple[Array, ...]:
+        """Each leg's tube radii, m."""
+        return tuple(self.values[index] for index in self.layout.radius)
+
+    def home(self) -> Array:
+        """A start for forward kinematics: the file's home, or the platform above the base."""
+        if self.document.home is not None:
+            h = self.document.home
+            return pose(rotation(np.array(h.rotation_vector)), np.array(h.position))
+        ranges = self.joint_ranges
+        middle = np.where(np.isfinite(ranges).all(axis=1), ranges.mean(axis=1), np.nan)
+        if np.isnan(middle).any():
+            raise InputError(
+                what=f"mechanism {self.name!r} gives neither a home pose nor every leg's range",
+                expected="length.range on each actuated leg, or home: {position: [x, y, z]}",
+                next_step="add one of them, so that the right assembly can be chosen",
+            )
+        starts = kinematics.home_candidates(self.layout, self.values, middle)
+        found = kinematics.forward(self.layout, self.values, middle, starts)
+        good = np.flatnonzero(found.converged)
+        if good.size == 0:
+            raise GeometryError(
+                what=f"mechanism {self.name!r} cannot be assembled with its legs at mid-range",
+                found=f"closure error {float(found.error.min()) * 1e3:.3g} mm",
+                expected="a platform that all legs reach",
+                next_step="check the drawing's centres and ranges, or give home: {position: ...}",
+            )
+        return found.T_base_platform[good[0]]
+
+    def inverse(self, T_base_platform: Array) -> Array:
+        """Readings (n, m) at platform poses (n, 4, 4)."""
+        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        return kinematics.inverse(self.layout, self.values, poses)
+
+    def forward(self, joints: Array, start: Array | None = None) -> Array:
+        """Platform poses T_base_platform (n, 4, 4) at readings (n, m).
+
+        start : (4, 4) or (n, 4, 4), near the wanted assembly; the home pose when absent.
+        Raises GeometryError where the machine cannot be closed at the readings.
+        """
+        found = self.forward_result(joints, start)
+        if not found.converged.all():
+            bad = np.flatnonzero(~np.atleast_1d(found.converged))
+            raise GeometryError(
+                what=f"forward kinematics found no pose for {bad.size} of "
+                f"{np.size(found.converged)} configurations, first at row {bad[0]}",
+                found=f"closure error {float(np.max(found.error)) * 1e3:.3g} mm",
+                expected="readings that the machine can reach",
+                next_step="check the readings, or give a start nearer to the pose",
+            )
+        return found.T_base_platform
+
+    def forward_result(
+        self, joints: Array, start: Array | None = None
+    ) -> kinematics.ForwardResult:
+        """As :meth:`forward`, with convergence and nearness to singularity, nothing raised."""
+        readings = _checked(joints, (self.n_joints,), "joints")
+        begin = self.home() if start is None else _checked(start, (4, 4), "start")
+        return kinematics.forward(self.layout, self.values, readings, begin)
+
+    def assembly_modes(self, joints: Array, rng: np.random.Generator) -> Array:
+        """Distinct poses (k, 4, 4) that close the machine at one set of readings (m,)."""
+        readings = _checked(joints, (self.n_joints,), "joints")
+        return kinematics.assembly_modes(self.layout, self.values, readings, rng)
+
+    def to_document(self) -> dict[str, Any]:
+        """The mechanism file's fields with the present values."""
+        out = self.document.model_dump(by_alias=True, exclude_none=True, mode="json")
+        for name, value in zip(self.parameters.names, self.values, strict=True):
+            _assign(out, name, float(value))
+        return out
+
+    def _ends(self) -> tuple[Array, Array]:
+        from pkmcal.mechanisms.limbs import limb_ends
+
+        ends = limb_ends(self.layout, self.values, np.zeros(self.n_joints), np.eye(4))
+        return np.array(ends.a), np.array(ends.b)
+
+
+def machine_from_document(document: MechanismDocument) -> Machine:
+    """Build a machine from a checked mechanism file."""
+    rows = list(_parameter_rows(document))
+    names = [row[0] for row in rows]
+    table = ParameterTable(
+        names=tuple(names),
+        units=tuple(row[1] for row in rows),
+        kinds=tuple(row[2] for row in rows),
+        drawing=np.array([row[3] for row in rows]),
+        tolerance=np.array([getattr(document.tolerance, row[2]) for row in rows]),
+    ).with_roles(document.fixed, document.tied)
+    positions = {name: k for k, name in enumerate(names)}
+    return Machine(document, table, layout_of(document, positions), table.drawing.copy())
+
+
+def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator of plain rows
+    """Rows (name, unit, tolerance's name, drawing value), leg by leg."""
+    for j, leg in enumerate(document.legs, start=1):
+        for side, carriers in (("base", base_carriers()), ("platform", platform_carriers())):
+            node = getattr(leg, side)
+            for kind in carriers[node.joint].parameters:
+                path = f"legs[{j}].{side}.{kind.path}"
+                yield path, kind.unit, kind.tolerance, _value(node, kind.path)
+        kind = OFFSET if leg.length.actuated else CONSTANT
+        value = _value(leg.length, kind.path)
+        yield f"legs[{j}].length.{kind.path}", kind.unit, kind.tolerance, value
+        for t, tube in enumerate(leg.tubes, start=1):
+            yield f"legs[{j}].tubes[{t}].radius", "m", "radius", tube.radius
+
+
+def _value(node: Any, path: str) -> float:
+    """A field's value; ``center.y`` is the second number of ``center``."""
+    field, _, axis = path.partition(".")
+    value = getattr(node, field)
+    return float(value["xyz".index(axis)] if axis else value)
+
+
+def _assign(document: dict[str, Any], name: str, value: float) -> None:
+    """Write a parameter back into the file's fields at the path that is its name."""
+    keys = name.replace("]", "").replace("[", ".").split(".")
+    node: Any = document
+    for key in keys[:-1]:
+        node = node[int(key) - 1] if key.isdigit() else node[key]
+    if keys[-1] in ("x", "y", "z"):
+        node["xyz".index(keys[-1])] = value
+    else:
+        node[keys[-1]] = value
+
+
+def _checked(values: Array, tail: tuple[int, ...], name: str) -> Array:
+    array = np.asarray(values, dtype=float)
+    if array.shape[-len(tail) :] != tail:
+        raise InputError(
+            what=f"{name} has the wrong shape",
+            found=str(array.shape),
+            expected=f"(n, {', '.join(map(str, tail))})",
+        )
+    if not np.isfinite(array).all():
+        raise InputError(what=f"{name} holds a value that is not a finite number")
+    return array

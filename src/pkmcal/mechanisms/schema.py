@@ -1,0 +1,82 @@
+"""The schema of ``mechanism.yaml``; docs/files.md spells it out for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, Union
+
+from pydantic import AfterValidator, Field
+
+from pkmcal.files import Schema
+from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.rods import ActuatedLength, ConstantLength
+
+Motion = Literal["spatial", "planar", "translation"]
+
+
+def _one_of(schemas: Iterable[type[Schema]], key: str) -> Any:
+    """The union of the schemas, told apart by one key, so that errors name the right field."""
+    kinds = tuple(dict.fromkeys(schemas))
+    if len(kinds) == 1:
+        return kinds[0]
+    return Annotated[Union[kinds], Field(discriminator=key)]  # noqa: UP007 - made at run time
+
+
+BaseNode = _one_of((c.schema for c in base_carriers().values()), "joint")
+PlatformNode = _one_of((c.schema for c in platform_carriers().values()), "joint")
+LengthNode = Annotated[ActuatedLength | ConstantLength, Field(discriminator="actuated")]
+
+
+class Tube(Schema):
+    """One visible cylinder of a leg; ``from`` and ``to`` in metres from A along the leg."""
+
+    radius: Annotated[float, Field(gt=0)]
+    start: Annotated[float, Field(alias="from", ge=0)]
+    stop: Annotated[float, Field(alias="to")]
+
+    def model_post_init(self, _context: Any) -> None:
+        """A tube has a length."""
+        if self.stop <= self.start:
+            raise ValueError("tube's 'to' should be greater than its 'from'")
+
+
+class Leg(Schema):
+    """One limb: its carriers, its rod, and what a camera sees of it."""
+
+    base: BaseNode
+    platform: PlatformNode
+    length: LengthNode
+    tubes: tuple[Tube, ...] = ()
+
+
+class Tolerance(Schema):
+    """Standard deviations of the drawing's values, metres."""
+
+    center: Annotated[float, Field(gt=0)] = 0.002
+    offset: Annotated[float, Field(gt=0)] = 0.002
+    radius: Annotated[float, Field(gt=0)] = 0.0001
+
+
+class Home(Schema):
+    """A pose in the middle of the workspace; it decides which assembly the machine has."""
+
+    position: tuple[float, float, float]
+    rotation_vector: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
+    if len(legs) < 2:
+        raise ValueError("a parallel machine has at least two legs")
+    return legs
+
+
+class MechanismDocument(Schema):
+    """A whole mechanism file."""
+
+    name: str
+    motion: Motion
+    legs: Annotated[tuple[Leg, ...], AfterValidator(_some_legs)]
+    tolerance: Tolerance = Tolerance()
+    home: Home | None = None
+    fixed: tuple[str, ...] = ()
+    tied: tuple[tuple[str, ...], ...] = ()

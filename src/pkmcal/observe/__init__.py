@@ -1,0 +1,1 @@
+"""Photographs to measurements. The only place besides cameras/ that touches cv2."""

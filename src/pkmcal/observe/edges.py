@@ -1,0 +1,86 @@
+"""The one measurement that a leg gives: its silhouette edges, as planes through the camera.
+
+Everything after the image works on :class:`EdgeSet`, whatever the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+
+
+@dataclass(frozen=True)
+class EdgeSet:
+    """Silhouette edges of legs in photographs; N edges, flat arrays, all indices from 0.
+
+    station, configuration, leg, tube, side : (N,) where the edge was seen; side as in
+        :mod:`pkmcal.geometry.cylinders` (0 or 1).
+    normal : (N, 3) unit normal of the plane of edge and camera centre, camera frame,
+        pointing away from the leg's axis.
+    basis : (N, 3, 2) orthonormal tangent basis at the normal: shift first, tilt second.
+    covariance : (N, 2, 2) of the normal in that basis, rad^2.
+    shift : (N, 2) change of the normal, in that basis, when every point of the edge moves
+        outward by one pixel (rad/px).
+    span : (N, 2) first and last seen place along the leg, m from A.
+    """
+
+    station: Integers
+    configuration: Integers
+    leg: Integers
+    tube: Integers
+    side: Integers
+    normal: Array
+    basis: Array
+    covariance: Array
+    shift: Array
+    span: Array
+
+    def __len__(self) -> int:
+        return len(self.station)
+
+    def select(self, keep: Booleans | Integers) -> EdgeSet:
+        """The edges at a mask or at positions."""
+        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Something that was seen but left out, or looked for and not found, and why.
+
+    tube and side are -1 where the whole leg, leg -1 where the whole photograph is meant.
+    """
+
+    station: int
+    configuration: int
+    leg: int
+    tube: int
+    side: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the photographs of a session gave.
+
+    edges : the measurements.
+    rejected : what was left out, with its reason.
+    points, point_edge : (M, 2) sub-pixel edge points (px) and the edge that each supports,
+        for pictures and residuals.
+    T_camera_base : (S, 4, 4) poses of the stations as the search left them.
+    """
+
+    edges: EdgeSet
+    rejected: tuple[Rejection, ...]
+    points: Array
+    point_edge: Integers
+    T_camera_base: Array
+
+
+def concatenate(sets: list[EdgeSet]) -> EdgeSet:
+    """Several edge sets as one."""
+    return EdgeSet(
+        **{f.name: np.concatenate([getattr(s, f.name) for s in sets]) for f in fields(EdgeSet)}
+    )

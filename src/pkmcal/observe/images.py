@@ -1,0 +1,62 @@
+"""Photographs from disk to grey-level arrays; files that are not what they should be are named."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from pkmcal.arrays import Integers
+from pkmcal.errors import InputError
+
+PNG_END = b"IEND\xaeB`\x82"
+JPEG_END = b"\xff\xd9"
+
+
+def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
+    """One photograph as grey levels (height, width), uint8.
+
+    image_size : (width, height) that the camera file states.
+    Raises InputError for a file that is absent, cut short, no image, or of another size.
+    """
+    import cv2
+
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", where=label) from None
+    if data[:4] == b"\x89PNG" and PNG_END not in data[-64:]:
+        raise _broken(label, "a PNG file that ends early")
+    if data[:2] == b"\xff\xd8" and JPEG_END not in data[-64:]:
+        raise _broken(label, "a JPEG file that ends early")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data else None
+    if image is None:
+        raise _broken(label, "no readable image")
+    if (image.shape[1], image.shape[0]) != tuple(image_size):
+        raise InputError(
+            "the photograph has another size than its camera",
+            where=label,
+            found=f"{image.shape[1]}x{image.shape[0]} pixels",
+            expected=f"{image_size[0]}x{image_size[1]}, the camera file's image_size",
+            next_step="Use the photograph as the camera gave it, neither scaled nor cropped",
+        )
+    return image
+
+
+def _broken(label: str, found: str) -> InputError:
+    return InputError(
+        "the photograph cannot be decoded",
+        where=label,
+        found=found,
+        expected="a whole PNG or JPEG file",
+        next_step="Copy it again from the camera, or remove it: an absent photograph is allowed",
+    )
+
+
+def decode_all(
+    paths: list[Path], image_size: tuple[int, int], labels: list[str], workers: int = 2
+) -> list[Integers]:
+    """Several photographs; decoding runs beside Python on a few threads."""
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(lambda p, n: decode(p, image_size, n), paths, labels))

@@ -1,0 +1,182 @@
+"""Where the edges of every leg should lie in every photograph, from what is known so far.
+
+Arrays have the axes (..., E edges of a machine, n samples along an edge), with K photographs of
+one station before them; the E edges are the same in every photograph: each visible tube of each
+leg, side 0 then side 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras import Camera
+from pkmcal.geometry.cylinders import SIDE_SIGNS, line_through
+from pkmcal.geometry.rigid import apply, cross, dot
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.limbs import limb_ends
+
+JOINT_MARGIN = 0.006
+"""Metres left out at both ends of a tube: collars and joint housings hide or imitate edges."""
+
+
+@dataclass(frozen=True)
+class TubeList:
+    """The visible tubes of a machine, E = 2 x tubes edges.
+
+    leg, tube, side : (E,). start, stop : (E,) m along the leg from A. radius : (E,) position of
+    the radius among the machine's parameters.
+    """
+
+    leg: Integers
+    tube: Integers
+    side: Integers
+    start: Array
+    stop: Array
+    radius: Integers
+
+    def __len__(self) -> int:
+        return len(self.leg)
+
+
+def tubes_of(machine: Machine) -> TubeList:
+    """Every edge that the drawing promises, in the order leg, tube, side."""
+    rows = [
+        (j, t, side, tube.start, tube.stop, machine.layout.radius[j][t])
+        for j, leg in enumerate(machine.document.legs)
+        for t, tube in enumerate(leg.tubes)
+        for side in (0, 1)
+    ]
+    columns = [np.array(c) for c in zip(*rows, strict=True)] if rows else [np.zeros(0)] * 6
+    whole = [c.astype(int) for c in columns]
+    return TubeList(whole[0], whole[1], whole[2], columns[3], columns[4], whole[5])
+
+
+@dataclass(frozen=True)
+class LegsInCamera:
+    """Axes of the legs as a station sees them: a, b (K, L, 3) ends and u (K, L, 3), camera frame."""
+
+    a: Array
+    b: Array
+    u: Array
+
+
+def legs_in_camera(
+    machine: Machine, T_camera_base: Array, T_base_platform: Array, joints: Array
+) -> LegsInCamera:
+    """Leg axes in a camera's frame; T_camera_base (..., 4, 4) and poses (K, 4, 4) broadcast."""
+    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    camera = T_camera_base[..., None, :, :]
+    a, b = apply(camera, ends.a), apply(camera, ends.b)
+    return LegsInCamera(a, b, line_through(a, b)[0])
+
+
+@dataclass(frozen=True)
+class EdgePoints:
+    """Points along predicted edges, and how the picture of each moves.
+
+    normal : (..., E, 3) edge planes, camera frame. along : (..., E, n) place on the leg, m from
+    A. point : (..., E, n, 3) on the cylinder where the view ray grazes it, camera frame.
+    pixel : (..., E, n, 2). outward : (..., E, n, 2) unit normals of the edge in the image, away
+    from the leg. across : (..., E, n, 3) outward motion of the pixel (px) by the point's (m).
+    gain : (..., E, n) px per metre across the leg. valid : (..., E, n) has an image.
+    """
+
+    normal: Array
+    along: Array
+    point: Array
+    pixel: Array
+    outward: Array
+    across: Array
+    gain: Array
+    valid: Booleans
+
+    def by_normal(self) -> Array:
+        """Outward motion of the edge (px) by a change of its plane's normal, (..., E, n, 3).
+
+        The plane n . x = 0 turned by dn passes P + e n with e = -dn . P.
+        """
+        return -self.point * self.gain[..., None]
+
+
+def edge_points(
+    machine: Machine, camera: Camera, legs: LegsInCamera, tubes: TubeList, samples: int
+) -> EdgePoints:
+    """``samples`` points spaced evenly along every edge; leading axes as ``legs`` has them."""
+    radius = machine.values[tubes.radius]
+    a, b, u = (v[..., tubes.leg, :] for v in (legs.a, legs.b, legs.u))
+    normal, ok = plane_normals(a, u, radius, tubes)
+    first, last = visible_stretch(a, b, tubes)
+    fraction = (np.arange(samples) + 0.5) / samples
+    along = first[:, None] + np.maximum(last - first, 0.0)[..., None] * fraction
+    point = (a + radius[:, None] * normal)[..., None, :] + along[..., None] * u[..., None, :]
+    pixel = camera.project(point)
+    by_point = camera.project_jacobians(point)[0]
+    tangent = (by_point @ u[..., None, :, None])[..., 0]
+    outward = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        outward /= np.sqrt(dot(outward, outward))[..., None]
+    across = (outward[..., None, :] @ by_point)[..., 0, :]
+    gain = dot(across, normal[..., None, :])
+    sign = np.sign(gain)[..., None]
+    valid = (ok & (last > first))[..., None] & np.isfinite(gain)
+    return EdgePoints(
+        normal, along, point, pixel, outward * sign, across * sign, np.abs(gain), valid
+    )
+
+
+def plane_normals(
+    a: Array, u: Array, radius: Array, tubes: TubeList
+) -> tuple[Array, Booleans]:
+    """Edge planes (..., E, 3) of axes given per edge, and where the leg can be seen at all."""
+    m = cross(a, u)
+    distance = np.sqrt(dot(m, m))
+    ok = distance > 1.02 * radius
+    sine = np.where(ok, radius / distance, 0.0)[..., None]
+    m_unit = m / distance[..., None]
+    sign = SIDE_SIGNS[tubes.side][:, None]
+    return sign * np.sqrt(1 - sine**2) * m_unit - sine * cross(u, m_unit), ok
+
+
+def visible_stretch(a: Array, b: Array, tubes: TubeList) -> tuple[Array, Array]:
+    """First and last place of each tube that can be seen, m from A; (E,) and (..., E)."""
+    length = np.sqrt(dot(b - a, b - a))
+    return tubes.start + JOINT_MARGIN, np.minimum(tubes.stop, length) - JOINT_MARGIN
+
+
+def unobstructed(
+    machine: Machine,
+    camera: Camera,
+    legs: LegsInCamera,
+    tubes: TubeList,
+    edges: EdgePoints,
+    clearance: float,
+) -> Booleans:
+    """Points in the image, not behind another leg nor within ``clearance`` px of its outline.
+
+    The ray to the point passes another leg's axis at some distance. Nearer than that leg's
+    radius, the leg hides the point or stands behind it; a leg behind only matters where its own
+    outline spoils the point's background. (K, E, n).
+    """
+    clear = edges.valid & camera.in_image(edges.pixel, margin=4.0)
+    rays = edges.point / np.sqrt(dot(edges.point, edges.point))[..., None]
+    room = clearance / np.maximum(edges.gain, 1e-9)
+    for j in range(machine.n_legs):
+        others = machine.values[machine.layout.radius[j]]
+        if others.size == 0:
+            continue
+        a, b, u = (v[:, None, None, j] for v in (legs.a, legs.b, legs.u))
+        cosine = dot(rays, u)
+        sine2 = np.maximum(1 - cosine**2, 1e-9)
+        place = (cosine * dot(rays, a) - dot(u, a)) / sine2
+        foot = a + np.clip(place, 0, np.sqrt(dot(b - a, b - a)))[..., None] * u
+        off = cross(rays, foot)
+        distance = np.sqrt(dot(off, off))
+        depth = dot(rays, foot)
+        nearer = depth < dot(rays, edges.point)
+        spoiled = (depth > 0) & (distance < others.max() + room)
+        spoiled &= nearer | (distance > others.min() - room)
+        clear &= ~(spoiled & (tubes.leg != j)[:, None])
+    return clear

@@ -1,0 +1,187 @@
+"""Sub-pixel edge positions from grey-level profiles, free of the shading's bias.
+
+A profile across a silhouette is not a step: a cylinder's shading changes fastest just inside its
+limb. At a depth d px inside, the surface has turned by an angle e from the limb with
+cos e = 1 - d / w (w: half the leg's width in px), and diffuse light on it is a sum of 1, cos e and
+sin e: brightness c0 + c1 d + c2 sqrt(d (2 w - d)). Outside, the background is b0 + b1 d. The
+strongest gradient of such an edge, blurred by lens and pixel, lies up to a pixel off the edge
+itself; this model, blurred alike, does not. For a given edge position it is linear in its five
+brightnesses, so every trial position is one projection, the same for all profiles of a width: the
+residual over a grid of positions is a matrix product, and its minimum is the edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+
+INSIDE, OUTSIDE = 3.0, 2.0
+"""Pixels of a profile that the model explains: less is ill-conditioned, more meets the leg's
+other features and neighbours."""
+STEP = 0.5
+SHIFTS = np.arange(-1.5, 1.55, 0.1)
+"""Trial positions of the edge about the predicted one, px."""
+BRIGHTNESSES = 5
+"""Linear unknowns of the model: three inside the limb, two outside."""
+HALF_WIDTHS = np.geomspace(3.0, 60.0, 16)
+"""Half widths w (px) of legs for which the model is tabulated; the nearest is used."""
+BLURS = np.arange(0.45, 1.5, 0.1)
+"""Blurs (px, standard deviation, lens and pixel and interpolation together) that are tried."""
+ENOUGH_FOR_BLUR = 500
+"""Profiles that tell the blur to a hundredth of a pixel; more only take time."""
+GREY_NOISE = 0.6
+"""Least standard deviation (grey levels) believed of a profile's samples: 8-bit rounding and
+what the model leaves out; keeps a chance perfect fit from counting for everything."""
+MODEL_ERROR = 0.01
+"""Share of the contrast by which real profiles differ from the model; weighs the two beliefs."""
+SHADING_SLOPE, SHADING_ROOT = 0.3, 1.0
+"""Believed spread (in contrasts) of the shading's linear part per pixel, and of its root part at
+a pixel's depth. Whole profiles hardly feel it; where the leg is overexposed, and only its limb's
+flank is left, it says how much shading may hide there, so the position's sigma grows honestly."""
+SATURATED = 250
+"""Grey level from which a sample is taken as clipped."""
+MOST_CUT = -0.25
+"""Place (px) beyond which a profile must be free of saturation: its edge itself."""
+FAINT = 0.25
+"""Standard deviation (px) of a position above which a profile shows no edge."""
+
+
+@dataclass(frozen=True)
+class ProfileEdges:
+    """Edge positions in profiles: position (...) px outward from the predicted edge, its
+    standard deviation sigma (...) px from grey-level noise, and found (...)."""
+
+    position: Array
+    sigma: Array
+    found: Booleans
+
+
+def profile_offsets() -> Array:
+    """Places along a profile, px outward from the predicted edge."""
+    return np.arange(-INSIDE, OUTSIDE + STEP / 2, STEP)
+
+
+@lru_cache(maxsize=512)
+def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
+    """Places x (px outward of the edge) and the model's five brightnesses there, blurred, (n, 5)."""
+    pitch = 0.05
+    place = np.arange(-INSIDE - 8, OUTSIDE + 8, pitch)
+    inside = (place < 0).astype(float)
+    inside[np.abs(place) < pitch / 2] = 0.5
+    depth = np.clip(-place, 0.0, 2 * half_width)
+    root = np.sqrt(depth * (2 * half_width - depth))
+    columns = [inside, depth, root, 1 - inside, np.maximum(place, 0.0)]
+    reach = np.arange(-5 * blur, 5 * blur + pitch, pitch)
+    kernel = np.exp(-0.5 * ((reach - reach.mean()) / blur) ** 2)
+    smooth = [np.convolve(c, kernel / kernel.sum(), mode="same") for c in columns]
+    return place, np.stack(smooth, axis=1)
+
+
+@lru_cache(maxsize=2048)
+def _projections(blur: float, half_width: float, cut: int) -> Array:
+    """Orthonormal bases of the model's profiles at each trial position, (shifts, samples, 5).
+
+    cut : samples at the inner end that are saturated and say nothing; their rows are zero.
+    The weak beliefs about the shading are rows below the samples, whose data are zero; only the
+    samples' rows are returned, which is all that a projection of such data needs.
+    """
+    place, model = _blurred_model(blur, half_width)
+    at = profile_offsets() - SHIFTS[:, None]
+    values = np.stack([np.interp(at, place, column) for column in model.T], axis=-1)
+    values[:, :cut] = 0.0
+    beliefs = np.zeros((len(SHIFTS), 2, BRIGHTNESSES))
+    beliefs[:, 0, 1] = MODEL_ERROR / SHADING_SLOPE
+    beliefs[:, 1, 2] = MODEL_ERROR / SHADING_ROOT * np.sqrt(2 * half_width)
+    return np.linalg.qr(np.concatenate([values, beliefs], axis=1))[0][:, : at.shape[1]]
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """Averaged profiles across edges, N of them.
+
+    grey : (N, samples) at :func:`profile_offsets`. count : (N,) photograph profiles that each
+    averages. half_width : (N,) of the legs there, px. cut : (N,) samples at the inner end that
+    touch the brightest level the camera has: clipped, they would pull the edge inwards.
+    """
+
+    grey: Array
+    count: Array
+    half_width: Array
+    cut: Integers
+
+    def select(self, keep: Booleans | Integers) -> Profiles:
+        """The profiles at a mask or at positions."""
+        return Profiles(self.grey[keep], self.count[keep], self.half_width[keep], self.cut[keep])
+
+    def contrast(self) -> Array:
+        """Largest grey-level difference in each profile, (N,)."""
+        return np.maximum(np.ptp(self.grey, axis=-1), 1e-3)
+
+
+def cut_of(saturated: Booleans) -> Integers:
+    """Samples (N,) to leave out at the inner end: up to the outermost saturated one."""
+    count = saturated.shape[-1]
+    last = count - np.argmax(saturated[..., ::-1], axis=-1)
+    return np.where(saturated.any(axis=-1), last, 0)
+
+
+def residual_curves(profiles: Profiles, blur: float) -> Array:
+    """Sum of squared residuals (N, shifts) at every trial position, in squares of the contrast."""
+    scaled = profiles.grey - profiles.grey[:, -1:]
+    scaled = scaled / profiles.contrast()[:, None]
+    scaled[np.arange(scaled.shape[1]) < profiles.cut[:, None]] = 0.0
+    out = np.empty((len(scaled), len(SHIFTS)), dtype=scaled.dtype)
+    width = np.abs(np.log(profiles.half_width)[:, None] - np.log(HALF_WIDTHS)).argmin(axis=1)
+    kind = width * scaled.shape[1] + np.minimum(profiles.cut, scaled.shape[1] - 1)
+    for number in np.unique(kind):  # a few dozen combinations of width and cut
+        mine = kind == number
+        w, cut = divmod(int(number), scaled.shape[1])
+        bases = _projections(round(float(blur), 3), float(HALF_WIDTHS[w]), cut)
+        part = scaled[mine] @ bases.transpose(1, 0, 2).reshape(bases.shape[1], -1)
+        explained = np.sum(part.reshape(len(part), len(SHIFTS), -1) ** 2, axis=-1)
+        out[mine] = np.sum(scaled[mine] ** 2, axis=1, keepdims=True) - explained
+    return np.maximum(out, 0.0)
+
+
+def locate(profiles: Profiles, blur: float) -> ProfileEdges:
+    """Edge positions of profiles, with the blur in px."""
+    curves = residual_curves(profiles, blur)
+    lowest = np.argmin(curves, axis=-1)
+    best = np.clip(lowest, 1, len(SHIFTS) - 2)
+    left, here, right = (
+        np.take_along_axis(curves, (best + d)[..., None], -1)[..., 0] for d in (-1, 0, 1)
+    )
+    bend = np.maximum(left - 2 * here + right, 1e-12)
+    step = SHIFTS[1] - SHIFTS[0]
+    position = SHIFTS[best] + step * np.clip((left - right) / (2 * bend), -1, 1)
+    # neighbouring samples of a profile at half a pixel share their noise: two count as one
+    freedom = (curves.shape[-1] * 0 + profiles.grey.shape[-1] - profiles.cut) * STEP - BRIGHTNESSES
+    noise = GREY_NOISE / profiles.contrast() / np.sqrt(np.maximum(profiles.count, 1))
+    variance = here * STEP / np.maximum(freedom, 1.0) + noise**2
+    # cost(x) = residual / (variance / STEP): its second derivative is 2 / sigma^2
+    sigma = np.sqrt(2 * (variance / STEP) / (bend / step**2))
+    inside = (lowest > 0) & (lowest < len(SHIFTS) - 1)
+    enough = profiles.cut < np.searchsorted(profile_offsets(), MOST_CUT)
+    return ProfileEdges(position, sigma, inside & enough & (sigma < FAINT))
+
+
+def estimate_blur(profiles: Profiles) -> float:
+    """The blur (px) with which the model leaves least, over the profiles of one camera.
+
+    Contrast differs by edge, so each profile's residual is taken relative to its best; the
+    median over profiles decides, so that half of them may be anything.
+    """
+    whole = np.flatnonzero(profiles.cut == 0)
+    if whole.size:
+        profiles = profiles.select(whole[:: max(whole.size // ENOUGH_FOR_BLUR, 1)])
+    costs = np.stack([residual_curves(profiles, b).min(axis=-1) for b in BLURS], axis=-1)
+    floor = (GREY_NOISE / profiles.contrast()) ** 2
+    total = np.median(costs / (costs.min(axis=-1) + floor)[:, None], axis=0)
+    k = int(np.clip(np.argmin(total), 1, len(BLURS) - 2))
+    left, here, right = total[k - 1 : k + 2]
+    bend = max(left - 2 * here + right, 1e-12)
+    return float(BLURS[k] + (BLURS[1] - BLURS[0]) * np.clip((left - right) / (2 * bend), -1, 1))

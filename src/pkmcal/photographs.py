@@ -1,0 +1,219 @@
+"""Photographs of a session: found by their names, and their sizes read without decoding them."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from string import Formatter
+from typing import BinaryIO
+
+from pkmcal.errors import InputError
+from pkmcal.files import closest, listed, shown
+
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_JPEG_START = b"\xff\xd8"
+# Start-of-frame markers: FFC0 to FFCF without tables (C4), arithmetic tables (CC), JPG (C8).
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+# Markers that carry no length: TEM, restarts, start and end of image.
+_JPEG_BARE = frozenset({0x01, *range(0xD0, 0xDA)})
+_FIELDS = ("configuration", "repeat")
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One image file.
+
+    configuration : row of the session's joints that it belongs to.
+    repeat : the pattern's {repeat} part, where it has one.
+    """
+
+    configuration: int
+    repeat: str | None
+    path: Path
+
+
+def find_photographs(
+    folder: Path, pattern: str, names: Sequence[str], where: str
+) -> tuple[Photograph, ...]:
+    """Find the files that a pattern such as ``images/front/{configuration}.png`` stands for.
+
+    pattern : relative to `folder`, or absolute.
+    names : configurations in joints.csv; a file is paired with its row by name alone, never by
+        order, so that one missing photograph cannot shift the others.
+    where : place of the pattern in session.yaml, for messages.
+    Returns photographs by configuration and repeat. A configuration without one is no fault.
+    """
+    parts = _parts(pattern, where)
+    wildcard = "".join(glob.escape(text) if field is None else "*" for text, field in parts)
+    files = [
+        Path(name).as_posix()
+        for name in glob.glob(wildcard, root_dir=folder)
+        if (folder / name).is_file()
+    ]
+    if not files:
+        raise _none_found(folder, wildcard, pattern, where)
+    known = re.compile(_regex(parts, "|".join(map(re.escape, sorted(names, key=len)[::-1]))))
+    rows = {name: row for row, name in enumerate(names)}
+    found: list[Photograph] = []
+    strangers: list[str] = []
+    for name in sorted(files):
+        match = known.fullmatch(name)
+        if match is None:
+            strangers.append(name)
+            continue
+        fields = match.groupdict()
+        row = rows[fields["configuration"]]
+        found.append(Photograph(row, fields.get("repeat"), folder / name))
+    if strangers:
+        raise _stranger(strangers, parts, names, where)
+    return tuple(sorted(found, key=lambda photo: (photo.configuration, photo.repeat or "")))
+
+
+def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
+    """Return an image's (width, height) in pixels as stored, before any EXIF rotation.
+
+    PNG and JPEG: from their first bytes. Other formats are decoded by OpenCV.
+    label : the file's name in messages; the path unless told.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(24)
+            if start.startswith(_PNG_START) and start[12:16] == b"IHDR":
+                size = _pair(start[16:20], start[20:24])
+            elif start.startswith(_JPEG_START):
+                stream.seek(2)
+                size = _jpeg_size(stream)
+            else:
+                size = _decoded_size(path) if start else (0, 0)
+    except OSError as error:
+        raise InputError(
+            f"the image cannot be read ({error.strerror})", where=label or str(path)
+        ) from None
+    if min(size) > 0:
+        return size
+    raise InputError(
+        "the file is not an image that can be read" if start else "the image file is empty",
+        where=label or str(path),
+        expected="a PNG or JPEG file",
+        next_step="Copy it from the camera again, or remove it",
+    )
+
+
+def _parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
+    """Split a pattern into (text, None) and ("", field)."""
+    try:
+        pieces = list(Formatter().parse(Path(pattern).as_posix()))
+    except ValueError:
+        raise InputError("the braces do not match", where=where, found=pattern) from None
+    parts: list[tuple[str, str | None]] = []
+    for text, field, _, _ in pieces:
+        parts.append((text, None))
+        if field is None:
+            continue
+        if field not in _FIELDS:
+            guess = closest(field, _FIELDS)
+            raise InputError(
+                "this placeholder is not known",
+                where=where,
+                found=f"{{{field}}}",
+                expected=f"{{{guess}}}" if guess else "{configuration} or {repeat}",
+            )
+        parts.append(("", field))
+    if ("", "configuration") not in parts:
+        raise InputError(
+            "the pattern does not say where the configuration's name stands",
+            where=where,
+            found=shown(pattern),
+            expected="a pattern with {configuration}, such as images/front/{configuration}.png",
+        )
+    return parts
+
+
+def _regex(parts: Sequence[tuple[str, str | None]], configuration: str) -> str:
+    """The pattern as a regular expression; a field's second occurrence repeats its first."""
+    bodies = {"configuration": configuration, "repeat": "[^/]+?"}
+    seen: set[str] = set()
+    text = ""
+    for literal, field in parts:
+        if field is None:
+            text += re.escape(literal)
+        elif field in seen:
+            text += f"(?P={field})"
+        else:
+            seen.add(field)
+            text += f"(?P<{field}>{bodies[field]})"
+    return text
+
+
+def _none_found(folder: Path, wildcard: str, pattern: str, where: str) -> InputError:
+    """Say what stands where the photographs should be."""
+    place = folder / wildcard
+    while "*" in str(place):
+        place = place.parent
+    found = f"no folder {place}"
+    if place.is_dir():
+        entries = sorted(entry.name for entry in place.iterdir())
+        count = f"{len(entries)} other entries, such as {entries[0]}" if entries else "nothing"
+        found = f"{count} in {place}"
+    return InputError(
+        "there is no photograph under this pattern",
+        where=where,
+        found=found,
+        expected=f"files {pattern}",
+    )
+
+
+def _stranger(
+    files: Sequence[str], parts: Sequence[tuple[str, str | None]], names: Sequence[str], where: str
+) -> InputError:
+    """A photograph whose configuration has no readings."""
+    match = re.fullmatch(_regex(parts, "[^/]+?"), files[0])
+    name = match["configuration"] if match else files[0]
+    more = f" (one of {len(files)} such files)" if len(files) > 1 else ""
+    short = {known.lstrip("0"): known for known in names}
+    next_step = "Add its readings to the table, or move the photograph away"
+    if name.lstrip("0") in short:
+        next_step = (
+            f"The table has {short[name.lstrip('0')]} where the photograph says {name}: "
+            "write the names alike; spreadsheets drop leading zeros"
+        )
+    return InputError(
+        f"{files[0]} is of a configuration without joint readings{more}",
+        where=where,
+        found=f"configuration {name}",
+        expected=f"one of the table's {len(names)}: {listed(names)}",
+        next_step=next_step,
+    )
+
+
+def _jpeg_size(stream: BinaryIO) -> tuple[int, int]:
+    """Walk the segments to the start of frame; (0, 0) where there is none."""
+    while byte := stream.read(1):
+        if byte != b"\xff":
+            return 0, 0
+        while (marker := stream.read(1)) == b"\xff":
+            pass  # fill bytes
+        if not marker or marker[0] in _JPEG_BARE:
+            continue
+        length = int.from_bytes(stream.read(2))
+        if marker[0] in _JPEG_FRAMES:
+            frame = stream.read(5)
+            return _pair(frame[3:5], frame[1:3])
+        stream.seek(max(length - 2, 0), 1)
+    return 0, 0
+
+
+def _pair(width: bytes, height: bytes) -> tuple[int, int]:
+    return int.from_bytes(width), int.from_bytes(height)
+
+
+def _decoded_size(path: Path) -> tuple[int, int]:
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    # The stubs say that imread always returns an image; for a file it cannot read it does not.
+    return (0, 0) if image is None else (image.shape[1], image.shape[0])  # pyright: ignore[reportUnnecessaryComparison]

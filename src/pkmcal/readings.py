@@ -1,0 +1,130 @@
+"""Joint readings against their machine: columns, units, ranges, and whether the machine moved."""
+
+from __future__ import annotations
+
+import re
+from math import pi
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.files import Table, listed
+
+# A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
+# is out by less than this part of the stroke is told, and one that is further out is refused.
+_MARGIN = 0.05
+# Largest difference within K equal readings, in standard deviations: below 6 for any K under
+# a million, so more than this is movement.
+_ALIKE = 6.0
+_UNITS = ((1e-3, "millimetres", "metres", "Divide them by 1000"),
+          (pi / 180, "degrees", "radians", "Multiply them by pi/180"))  # fmt: skip
+
+
+def check_readings(table: Table, ranges: Array, noise: float) -> list[str]:
+    """Raise `InputError` for readings that cannot be this machine's; return warnings.
+
+    ranges : (m, 2) smallest and largest reading of each joint, m or rad; NaN where not known.
+    noise : standard deviation of a reading, m or rad.
+    """
+    _check_columns(table, len(ranges))
+    if len(table.names) < 2:
+        raise InputError(
+            "there is only one configuration",
+            where=table.label,
+            found=listed(table.names),
+            expected="two at least; one cannot tell a joint's place from its offset",
+            next_step="Move the machine and take more photographs; pkmcal plan proposes where to",
+        )
+    _check_units(table, ranges)
+    return _check_ranges(table, ranges) + _check_movement(table, noise)
+
+
+def _check_columns(table: Table, n_joints: int) -> None:
+    found = len(table.columns)
+    if found != n_joints:
+        raise InputError(
+            "another number of joint columns than the machine has actuated legs",
+            where=f"{table.label}, line 1",
+            found=f"{found} ({', '.join(table.columns)})",
+            expected=str(n_joints),
+        )
+    numbers = [re.fullmatch(r"leg(\d+)", name) for name in table.columns]
+    order = [int(match[1]) for match in numbers if match]
+    if len(order) == found and order != sorted(order):
+        raise InputError(
+            "the columns are not in the order of the machine's legs",
+            where=f"{table.label}, line 1",
+            found=" ".join(table.columns),
+            expected=" ".join(f"leg{number}" for number in sorted(order)),
+            next_step="Sort the columns, names and readings together",
+        )
+
+
+def _check_units(table: Table, ranges: Array) -> None:
+    """Most readings out of range, and in range once scaled: another unit, not so many mistakes."""
+    known = np.isfinite(ranges).all(axis=1)
+    if not known.any() or _inside(table.values, ranges)[:, known].mean() > 0.5:
+        return
+    for factor, unit, expected, next_step in _UNITS:
+        if _inside(table.values * factor, ranges)[:, known].mean() > 0.5:
+            column = int(np.flatnonzero(known)[0])
+            low, high = ranges[column]
+            raise InputError(
+                f"the readings look like {unit}",
+                where=table.where(0, column),
+                found=f"{table.values[0, column]:g}",
+                expected=f"{expected}, between {low:g} and {high:g}",
+                next_step=next_step,
+            )
+
+
+def _check_ranges(table: Table, ranges: Array) -> list[str]:
+    far = np.argwhere(~_inside(table.values, ranges))
+    if len(far):
+        row, column = far[0]
+        low, high = ranges[column]
+        more = f"It is one of {len(far)} such readings. " if len(far) > 1 else ""
+        raise InputError(
+            "this reading is outside the machine's range",
+            where=table.where(row, column),
+            found=f"{table.values[row, column]:g}",
+            expected=f"{low:g} to {high:g}, the range in the mechanism file",
+            next_step=f"{more}Correct the reading, or the mechanism's range",
+        )
+    near = np.argwhere(~_inside(table.values, ranges, margin=0.0))
+    if not len(near):
+        return []
+    row, column = near[0]
+    low, high = ranges[column]
+    return [
+        f"{table.where(row, column)}: the reading {table.values[row, column]:g} is slightly outside"
+        f" the range {low:g} to {high:g} of the mechanism file ({len(near)} such readings)."
+    ]
+
+
+def _check_movement(table: Table, noise: float) -> list[str]:
+    still = np.ptp(table.values, axis=0) <= _ALIKE * noise
+    if still.all():
+        raise InputError(
+            "all configurations are alike: no joint moves by more than its noise",
+            where=table.label,
+            found=f"differences of {np.ptp(table.values, axis=0).max():g} at most",
+            expected=f"much more than joints.noise, {noise:g}",
+            next_step="Check that the readings are the right ones and the noise is not too large",
+        )
+    if not still.any():
+        return []
+    names = [name for name, alike in zip(table.columns, still, strict=True) if alike]
+    return [
+        f"{table.label}: {listed(names)} never moves by more than its noise; what depends on"
+        " that movement cannot be told apart."
+    ]
+
+
+def _inside(values: Array, ranges: Array, margin: float = _MARGIN) -> np.ndarray:
+    """(K, m) True where a reading lies in its range widened by `margin` of it, or has none."""
+    low, high = ranges[:, 0], ranges[:, 1]
+    slack = margin * (high - low)
+    # Negated, so that NaN, a range that is not known, counts as inside.
+    return ~((values < low - slack) | (values > high + slack))

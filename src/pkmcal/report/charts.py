@@ -1,0 +1,172 @@
+"""Small charts as frozen views; the template ``charts.html.j2`` only draws them.
+
+Coordinates are SVG units in a box ``WIDTH`` wide, so that text keeps its size on a phone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.report.wording import count, number
+
+WIDTH = 360.0
+ROW = 18.0
+LETTER = 6.0
+"""Width of a letter of a row's label, about; ``LONGEST`` letters are shown."""
+LONGEST = 22
+OVER = 3.0
+"""Lines more than so many times as long as the middle one are cut off."""
+NORMAL_90 = 1.6449
+"""Nine tenths of a normal distribution lie within this many standard deviations."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """One row: the middle half as a bar, nine tenths as a line, the median as a mark.
+
+    leg : number from 1 for its colour, None for none. quantiles : 5, 25, 50, 75, 95 %.
+    """
+
+    label: str
+    tip: str
+    leg: int | None
+    quantiles: tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class RowChart:
+    """Boxes one under the other on one scale; ``band``: where nine tenths are expected."""
+
+    title: str
+    unit: str
+    alt: str
+    boxes: tuple[Box, ...]
+    low: float
+    high: float
+    ticks: tuple[tuple[float, str], ...]
+    band: float | None
+
+    @property
+    def left(self) -> float:
+        """Where the frame begins, behind the longest label."""
+        return 12 + LETTER * min(max(len(b.label) for b in self.boxes), LONGEST)
+
+    @property
+    def height(self) -> float:
+        """Of the whole drawing: rows, ticks and the unit under them."""
+        return ROW * len(self.boxes) + 40
+
+    def x(self, value: float) -> float:
+        """Place of a value, kept inside the frame."""
+        share = (min(max(value, self.low), self.high) - self.low) / (self.high - self.low)
+        return self.left + share * (WIDTH - self.left - 12)
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One upright bar; ``expected`` is the range to compare it with, where there is one."""
+
+    label: str
+    tip: str
+    value: float
+    expected: tuple[float, float] | None = None
+    quiet: bool = False
+
+
+@dataclass(frozen=True)
+class BarChart:
+    """Bars side by side from zero; ``curve`` is a line to compare them with, in bars and value."""
+
+    title: str
+    unit: str
+    alt: str
+    bars: tuple[Bar, ...]
+    high: float
+    ticks: tuple[tuple[float, str], ...]
+    labels: tuple[tuple[float, str], ...]
+    curve: tuple[tuple[float, float], ...] = ()
+    height: float = 200.0
+
+    @property
+    def step(self) -> float:
+        """Width of a bar with its gap."""
+        return (WIDTH - 44) / max(len(self.bars), 1)
+
+    def x(self, bar: float) -> float:
+        """Place of a bar's left side, counted from 0."""
+        return 36 + bar * self.step
+
+    def y(self, value: float) -> float:
+        """Place of a value, kept inside the frame."""
+        share = min(max(value, 0.0), self.high) / self.high
+        return self.height - 36 - share * (self.height - 46)
+
+    @property
+    def path(self) -> str:
+        """The curve as SVG path data."""
+        points = [f"{self.x(b):.1f},{self.y(v):.1f}" for b, v in self.curve]
+        return "M" + "L".join(points) if points else ""
+
+
+def ticks_between(low: float, high: float, about: int = 5) -> tuple[tuple[float, str], ...]:
+    """Round values from low to high with their text."""
+    rough = (high - low) / about
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough * 0.999)
+    places = max(0, -math.floor(math.log10(step) + 1e-9))
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
+    return tuple((k * step, number(k * step, places)) for k in range(first, last + 1))
+
+
+def box(label: str, values: Array, unit: str, places: int, leg: int | None = None) -> Box | None:
+    """A box of the finite ones of the values, None without any; its tooltip says what it shows."""
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return None
+    q = np.quantile(values, (0.05, 0.25, 0.5, 0.75, 0.95))
+    tip = (
+        f"{label}: median {number(q[2], places, signed=True)} {unit}, middle half "
+        f"{number(q[1], places, signed=True)} to {number(q[3], places, signed=True)}, "
+        f"nine tenths {number(q[0], places, signed=True)} to {number(q[4], places, signed=True)}; "
+        f"{count(values.size, 'value')}"
+    )
+    q05, q25, q50, q75, q95 = (float(v) for v in q)
+    return Box(label, tip, leg, (q05, q25, q50, q75, q95))
+
+
+def row_chart(
+    title: str, unit: str, boxes: list[Box], band: float | None, alt: str
+) -> RowChart | None:
+    """A chart symmetric about zero that holds the boxes and the band; None without boxes.
+
+    Lines far longer than the usual one end at the border: one bad group should not flatten all.
+    """
+    if not boxes:
+        return None
+    reaches = [max(abs(b.quantiles[0]), abs(b.quantiles[4])) for b in boxes]
+    reach = min(max(reaches), OVER * float(np.median(reaches)))
+    high = 1.08 * max(reach, (band or 0.0) * 1.3, 1e-12)
+    return RowChart(title, unit, alt, tuple(boxes), -high, high, ticks_between(-high, high), band)
+
+
+def bar_chart(
+    title: str,
+    unit: str,
+    bars: list[Bar],
+    labels: tuple[tuple[float, str], ...],
+    alt: str,
+    curve: tuple[tuple[float, float], ...] = (),
+) -> BarChart | None:
+    """Bars on a scale that holds them, their expected ranges and the curve; None without bars."""
+    if not bars:
+        return None
+    tops = [bar.value for bar in bars] + [v for _, v in curve]
+    tops += [bar.expected[1] for bar in bars if bar.expected]
+    high = 1.06 * max(*tops, 1e-12)
+    ticks = ticks_between(0.0, high, 4)
+    return BarChart(title, unit, alt, tuple(bars), high, ticks, labels, curve)

@@ -1,0 +1,146 @@
+"""The numbers at the top of the page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Integers
+from pkmcal.identify.problem import Estimate
+from pkmcal.observe.edges import Observation
+from pkmcal.report.centres import Centres
+from pkmcal.report.residuals import KEPT
+from pkmcal.report.toolpoint import ToolPoint
+from pkmcal.report.wording import brief, count, number
+from pkmcal.session import Session
+
+
+@dataclass(frozen=True)
+class Headline:
+    """One number that answers a question; ``values`` are (number, unit) pairs."""
+
+    question: str
+    values: tuple[tuple[str, str], ...]
+    note: str
+
+
+def headlines(
+    session: Session,
+    observation: Observation,
+    estimate: Estimate,
+    centres: tuple[Centres, ...],
+    tool: ToolPoint,
+) -> tuple[Headline, ...]:
+    """The cards in their order; those that have nothing to tell are left out."""
+    cards = (
+        _joint_sigma(centres),
+        _tool_sigma(session, tool),
+        _change(centres),
+        _tool_change(session, tool),
+        _data(session, observation, estimate),
+        _fit(estimate),
+    )
+    return tuple(card for card in cards if card)
+
+
+def _joint_sigma(centres: tuple[Centres, ...]) -> Headline:
+    """Standard deviation of a coordinate of a joint centre."""
+    sigma = np.concatenate([side.sigma for side in centres]) * 1e3
+    worst = int(np.argmax(sigma))
+    return Headline(
+        "How well are the joint centres known?",
+        ((brief(float(np.median(sigma))), "mm"),),
+        f"1σ of a coordinate, median of {len(sigma)} centres; the least certain, "
+        f"{_centre_name(centres, worst)}, {brief(float(sigma[worst]))} mm",
+    )
+
+
+def _tool_sigma(session: Session, tool: ToolPoint) -> Headline | None:
+    """Uncertainty of the platform's pose from that of the geometry."""
+    if not tool.configurations.size:
+        return None
+    where = session.configurations[tool.configurations[int(np.argmax(tool.position))]]
+    return Headline(
+        "How well is the platform's pose known?",
+        _pose_values(tool.position.mean(), tool.orientation.mean()),
+        f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
+        f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where}), "
+        f"{brief(np.rad2deg(tool.orientation.max()))}°",
+    )
+
+
+def _change(centres: tuple[Centres, ...]) -> Headline:
+    """How far the joint centres are from the drawing."""
+    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres]) * 1e3
+    worst = int(np.argmax(change))
+    return Headline(
+        "How far is the machine from its drawing?",
+        ((brief(float(change.mean())), "mm"),),
+        "mean distance of the joint centres, drawing and result laid over each other; largest "
+        f"{brief(float(change[worst]))} mm ({_centre_name(centres, worst)})",
+    )
+
+
+def _tool_change(session: Session, tool: ToolPoint) -> Headline | None:
+    """What the drawing's errors did to the platform's pose."""
+    good = np.isfinite(tool.off_position)
+    if not good.any():
+        return None
+    off, turn = tool.off_position[good], tool.off_orientation[good]
+    where = session.configurations[tool.configurations[good][int(np.argmax(off))]]
+    return Headline(
+        "What did the drawing do to the platform's pose?",
+        _pose_values(off.mean(), turn.mean()),
+        "mean error of the drawing's pose at the same readings; worst "
+        f"{brief(off.max() * 1e3)} mm (configuration {where}), {brief(np.rad2deg(turn.max()))}°",
+    )
+
+
+def _data(session: Session, observation: Observation, estimate: Estimate) -> Headline:
+    """Photographs and edges, used and not."""
+    taken = sum(len(station.photographs) for station in session.stations)
+    seen = set(zip(*(a.tolist() for a in _photograph_of(observation)), strict=True))
+    used = sum(
+        (s, photo.configuration) in seen
+        for s, station in enumerate(session.stations)
+        for photo in station.photographs
+    )
+    quiet = int(np.sum(estimate.edge_weights < KEPT))
+    return Headline(
+        "What is it based on?",
+        ((f"{used} of {taken}", "photographs"),),
+        f"{count(len(observation.edges), 'edge')} measured, {quiet} of them given less than half "
+        f"their weight; {count(len(observation.rejected), 'finding')} rejected beforehand",
+    )
+
+
+def _fit(estimate: Estimate) -> Headline:
+    """Chi-square per degree of freedom."""
+    s = estimate.statistics
+    value = s.chi2 / s.dof if s.dof > 0 else float("nan")
+    scaled = np.isfinite(s.noise_scale) and abs(s.noise_scale - 1) > 0.005
+    return Headline(
+        "Does the model explain the data?",
+        ((number(value, 2), "χ² per degree of freedom"),),
+        f"1 is expected, over {count(s.dof, 'degree')} of freedom"
+        + (
+            f"; reached after the edges' stated noise was multiplied by {number(s.noise_scale, 2)}"
+            if scaled
+            else ""
+        ),
+    )
+
+
+def _photograph_of(observation: Observation) -> tuple[Integers, Integers]:
+    return observation.edges.station, observation.edges.configuration
+
+
+def _pose_values(position: float, orientation: float) -> tuple[tuple[str, str], ...]:
+    return ((brief(position * 1e3), "mm"), (brief(float(np.rad2deg(orientation))), "°"))
+
+
+def _centre_name(centres: tuple[Centres, ...], position: int) -> str:
+    """``leg 3, platform`` of a position in the list of all base, then all platform centres."""
+    legs = len(centres[0].calibrated)
+    return f"leg {position % legs + 1}, {centres[position // legs].side}"

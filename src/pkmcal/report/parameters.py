@@ -1,0 +1,177 @@
+"""The table of parameters, and in words what the data could not decide."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.identify.problem import Estimate
+from pkmcal.mechanisms import Machine, ParameterTable
+from pkmcal.report.wording import (
+    SCALES,
+    decimals,
+    joined,
+    label,
+    legs_named,
+    number,
+    percent,
+    split_name,
+)
+
+DECIDES = 0.5
+"""Share of what is known that has to come from the data for the value to be theirs."""
+EXACT = 1e-9
+"""Standard deviations (m or rad) below this are zero but for rounding: a nanometre."""
+TIGHT = 0.95
+"""Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""
+MOST_PAIRS = 6
+SOURCES = {
+    "data": "the photographs decide",
+    "drawing": "the drawing decides more than the photographs",
+    "frame": "defines the frame",
+    "fixed": "kept at the drawing's value",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One parameter as the table shows it; texts carry sensible digits, numbers serve sorting.
+
+    leg : from 1, None for a parameter of no leg. source : a key of ``SOURCES``. share : of what
+    is known, from the data; NaN where that means nothing. note : ties, for people.
+    """
+
+    name: str
+    leg: int | None
+    label: str
+    unit: str
+    drawing: str
+    calibrated: str
+    change: str
+    sigma: str
+    numbers: tuple[float, float, float, float]
+    source: str
+    share: float
+    note: str
+
+    @property
+    def source_text(self) -> str:
+        """The source in words."""
+        return SOURCES[self.source]
+
+    @property
+    def share_text(self) -> str:
+        """The share in percent, empty where it means nothing."""
+        return percent(self.share) if np.isfinite(self.share) else ""
+
+
+@dataclass(frozen=True)
+class Group:
+    """The rows of one leg (None: of the machine)."""
+
+    leg: int | None
+    rows: tuple[Row, ...]
+
+
+def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[Group, ...]:
+    """All parameters, grouped by leg in the order of the file."""
+    table = estimate.machine.parameters
+    before = drawing.values
+    rows = [_row(table, k, float(before[k]), estimate) for k in range(len(table))]
+    legs = list(dict.fromkeys(row.leg for row in rows))
+    return tuple(Group(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
+
+
+def _row(table: ParameterTable, k: int, before: float, estimate: Estimate) -> Row:
+    factor, unit = SCALES.get(table.units[k], (1.0, table.units[k]))
+    after = float(estimate.machine.values[k])
+    variance = float(estimate.covariance[k, k])
+    sigma = np.sqrt(variance) if variance > EXACT**2 else 0.0
+    numbers = (before * factor, after * factor, (after - before) * factor, sigma * factor)
+    places = decimals(numbers[3])
+    name = table.names[k]
+    leg, path = split_name(name)
+    source = _source(table, name, sigma, float(estimate.data_share[k]))
+    return Row(
+        name=name,
+        leg=leg,
+        label=label(path),
+        unit=unit,
+        drawing=number(numbers[0], places),
+        calibrated=number(numbers[1], places),
+        change=number(numbers[2], places, signed=True),
+        sigma=number(numbers[3], places) if sigma else "–",
+        numbers=numbers,
+        source=source,
+        share=float(estimate.data_share[k]) if sigma else float("nan"),
+        note=_tie(table, name),
+    )
+
+
+def _source(table: ParameterTable, name: str, sigma: float, share: float) -> str:
+    """What decides a value."""
+    if name in table.fixed:
+        return "fixed"
+    if sigma == 0:
+        return "frame"
+    return "data" if share >= DECIDES else "drawing"
+
+
+def _tie(table: ParameterTable, name: str) -> str:
+    others = [n for group in table.tied if name in group for n in group if n != name]
+    return f"changes together with {joined(others)}" if others else ""
+
+
+def unidentified(groups: tuple[Group, ...], estimate: Estimate) -> tuple[str, ...]:
+    """Sentences: values that stayed the drawing's, then pairs that can hardly be told apart."""
+    kinds: dict[str, list[Row]] = {}
+    for group in groups:
+        for row in group.rows:
+            if row.source == "drawing":
+                kinds.setdefault(re.sub(r"tube \d+", "tube", row.label), []).append(row)
+    out = [_kind_text(kind, rows, estimate.machine.n_legs) for kind, rows in kinds.items()]
+    names = estimate.machine.parameters.names
+    out += [_pair_text(names[i], names[j], rho) for i, j, rho in tight_pairs(estimate.covariance)]
+    return tuple(out)
+
+
+def _kind_text(kind: str, rows: list[Row], all_legs: int) -> str:
+    """One sentence for parameters of one kind."""
+    legs = [row.leg for row in rows if row.leg is not None]
+    where = f" of {legs_named(legs, all_legs)}" if legs else ""
+    shares = sorted(row.share for row in rows)
+    low, high = percent(shares[0]), percent(shares[-1])
+    said = low if low == high else f"{low.removesuffix(' %')} to {high}"
+    return (
+        f"{kind.capitalize()}{where}: the photographs give {said} of what is known, so the drawing "
+        "and its tolerance decide."
+    )
+
+
+def _pair_text(first: str, second: str, rho: float) -> str:
+    what = "difference" if rho > 0 else "sum"
+    return (
+        f"{_in_words(first)} and {_in_words(second)} move together (correlation "
+        f"{number(rho, 3)}): their {what} is known far better than each alone."
+    )
+
+
+def _in_words(name: str) -> str:
+    leg, path = split_name(name)
+    return f"Leg {leg} {label(path)}" if leg else label(path)
+
+
+def tight_pairs(covariance: Array) -> list[tuple[int, int, float]]:
+    """Pairs of parameters (i, j, correlation) beyond ``TIGHT``, the tightest first.
+
+    Ties, which are one parameter under several names, are left out.
+    """
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0))
+    free = np.flatnonzero(sigma > EXACT)
+    rho = covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
+    i, j = np.nonzero(np.triu((np.abs(rho) > TIGHT) & (np.abs(rho) < 1 - 1e-9), 1))
+    order = np.argsort(-np.abs(rho[i, j]), kind="stable")[:MOST_PAIRS]
+    return [(int(free[i[n]]), int(free[j[n]]), float(rho[i[n], j[n]])) for n in order]

@@ -1,0 +1,285 @@
+"""Photographs with what was found in them drawn over, [B] Figs. 6 and 8."""
+
+from __future__ import annotations
+
+import base64
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import apply, dot, inverse
+from pkmcal.identify.problem import Estimate
+from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.observe.edges import EdgeSet
+from pkmcal.observe.images import decode
+from pkmcal.observe.predict import legs_in_camera
+from pkmcal.photographs import Photograph
+from pkmcal.report.centres import Centres
+from pkmcal.report.residuals import KEPT, SIDES, radius_positions, rms
+from pkmcal.report.wording import count, number
+from pkmcal.session import Session
+
+MOST = 12
+LARGEST_WIDTH = 640
+QUALITY = 70
+SAMPLES = 13
+"""Points of an edge's curve: a mirror bends an edge by less than a pixel between them."""
+STRAIGHT = 0.1
+"""Curves that stay within this many pixels of their chord are written as two points."""
+THREADS = 4
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A fitted edge as a polyline in pixels, (n, 2) in ``points``."""
+
+    leg: int
+    points: tuple[tuple[float, float], ...]
+    quiet: bool
+    tip: str
+
+    @property
+    def path(self) -> str:
+        """SVG path data."""
+        return "M" + "L".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A joint centre in pixels: where the calibrated model sees it, and where the drawing does."""
+
+    leg: int
+    end: str
+    calibrated: tuple[float, float]
+    drawing: tuple[float, float] | None
+    labelled: bool
+
+    @property
+    def tip(self) -> str:
+        """What it is, and how far the two are apart."""
+        if self.drawing is None:
+            return f"Leg {self.leg}, {self.end} joint"
+        away = float(np.hypot(*np.subtract(self.calibrated, self.drawing)))
+        return f"Leg {self.leg}, {self.end} joint: drawing {number(away, 1)} px away"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One photograph. jpeg : base64, empty where the file could not be read."""
+
+    station: str
+    configuration: str
+    why: str
+    width: int
+    height: int
+    jpeg: str
+    edges: tuple[Drawn, ...]
+    spots: tuple[Spot, ...]
+    rms: float
+
+    @property
+    def caption(self) -> str:
+        """Residuals and number of edges, in words."""
+        if not self.edges:
+            return "no edge in use"
+        aside = sum(edge.quiet for edge in self.edges)
+        text = count(len(self.edges), "edge") + (f", {aside} of them put aside" if aside else "")
+        return f"{text}; residuals {number(self.rms, 2)} σ"
+
+
+def pictures(
+    session: Session,
+    edges: EdgeSet,
+    estimate: Estimate,
+    shifts: Array,
+    centres: tuple[Centres, ...],
+) -> tuple[Picture, ...]:
+    """At most ``MOST`` photographs that stand for the rest. shifts : (N,) px, for tooltips."""
+    chosen = choose(session, edges, estimate.edge_residuals, estimate.configurations)
+    with ThreadPoolExecutor(THREADS) as pool:
+        shots = pool.map(lambda item: _jpeg(item[1], session.stations[item[0]].camera), chosen)
+        return tuple(
+            _picture(session, edges, estimate, shifts, centres, item, jpeg)
+            for item, jpeg in zip(chosen, shots, strict=True)
+        )
+
+
+Choice = tuple[int, Photograph, str]
+
+
+def choose(
+    session: Session, edges: EdgeSet, white: Array, posed: Booleans, most: int = MOST
+) -> list[Choice]:
+    """Photographs for the page in the session's order: (station, photograph, why).
+
+    Of every station the worst, the best, then the middle ones, in turn until there are enough.
+    posed : (K,) True where the pose was estimated.
+    """
+    queues = [_queue(session, edges, white, posed, s) for s in range(len(session.stations))]
+    taken: list[Choice] = []
+    while len(taken) < most and any(queues):
+        for queue in queues:
+            if queue and len(taken) < most:
+                taken.append(queue.pop(0))
+    return sorted(taken, key=lambda item: (item[0], item[1].configuration))
+
+
+def _queue(session: Session, edges: EdgeSet, white: Array, posed: Booleans, s: int) -> list[Choice]:
+    """A station's photographs in the order of their worth to the reader.
+
+    Ranked by all residuals alike: edges that were put aside are what a reader wants to see.
+    """
+    first = {photo.configuration: photo for photo in reversed(session.stations[s].photographs)}
+    here = edges.station == s
+    level: dict[int, float] = {}
+    for k in first:
+        if posed[k]:
+            mine = white[here & (edges.configuration == k)]
+            level[k] = rms(mine, np.ones(len(mine)))
+    ranked = sorted((k for k in level if np.isfinite(level[k])), key=lambda k: -level[k])
+    blind = [k for k in level if k not in ranked]
+    middle = len(ranked) // 2
+    order = list(dict.fromkeys([*ranked[:1], *ranked[-1:], *ranked[middle:], *ranked, *blind]))
+    names: dict[int, str] = {}
+    if len(ranked) > 1:
+        names = {ranked[-1]: "best of this station", ranked[0]: "worst of this station"}
+    return [(s, first[k], names.get(k, "")) for k in order]
+
+
+def _jpeg(photo: Photograph, camera: Camera) -> str:
+    """The photograph in grey, small, as base64; empty where it is not there any more."""
+    import cv2
+
+    try:
+        image = decode(photo.path, camera.image_size, photo.path.name)
+    except InputError:
+        return ""
+    if image.shape[1] > LARGEST_WIDTH:
+        height = max(1, round(image.shape[0] * LARGEST_WIDTH / image.shape[1]))
+        image = cv2.resize(image, (LARGEST_WIDTH, height), interpolation=cv2.INTER_AREA)
+    packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    return base64.b64encode(packed.tobytes()).decode("ascii")
+
+
+def _picture(
+    session: Session,
+    edges: EdgeSet,
+    estimate: Estimate,
+    shifts: Array,
+    centres: tuple[Centres, ...],
+    choice: Choice,
+    jpeg: str,
+) -> Picture:
+    s, photo, why = choice
+    k = photo.configuration
+    station = session.stations[s]
+    mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
+    width, height = station.camera.image_size
+    return Picture(
+        station=station.name,
+        configuration=session.configurations[k],
+        why=why,
+        width=width,
+        height=height,
+        jpeg=jpeg,
+        edges=_drawn(session, edges, estimate, shifts, mine, s, k),
+        spots=_spots(session, estimate, centres, s, k),
+        rms=rms(estimate.edge_residuals[mine], estimate.edge_weights[mine]),
+    )
+
+
+def _drawn(
+    session: Session,
+    edges: EdgeSet,
+    estimate: Estimate,
+    shifts: Array,
+    mine: Integers,
+    s: int,
+    k: int,
+) -> tuple[Drawn, ...]:
+    """The fitted edges of one photograph."""
+    curves = edge_curves(session, edges, estimate, mine, s, k)
+    out: list[Drawn] = []
+    for n, curve in zip(mine.tolist(), curves, strict=True):
+        points = straightened(curve[np.isfinite(curve).all(axis=-1)])
+        if len(points) > 1:
+            quiet = bool(estimate.edge_weights[n] < KEPT)
+            leg = int(edges.leg[n]) + 1
+            line = tuple((float(x), float(y)) for x, y in points)
+            out.append(Drawn(leg, line, quiet, _edge_tip(edges, estimate, shifts, n)))
+    return tuple(out)
+
+
+def edge_curves(
+    session: Session, edges: EdgeSet, estimate: Estimate, mine: Integers, s: int, k: int
+) -> Array:
+    """Curves (n, SAMPLES, 2) px of the edges ``mine`` in the picture of station s.
+
+    The predicted contour's rays, each turned into the measured plane: r - (r . n) n.
+    """
+    machine, state = estimate.machine, estimate.state
+    legs = legs_in_camera(
+        machine, state.T_camera_base[s], state.T_base_platform[k], session.joints[k]
+    )
+    part = edges.select(mine)
+    fraction = np.linspace(0, 1, SAMPLES)
+    along = part.span[:, :1] + (part.span[:, 1:] - part.span[:, :1]) * fraction
+    radius = machine.values[radius_positions(machine, part)]
+    axis = legs.a[part.leg][:, None] + along[..., None] * legs.u[part.leg][:, None]
+    normal = part.normal[:, None]
+    rays = axis + radius[:, None, None] * normal
+    rays = rays - dot(rays, normal)[..., None] * normal
+    return session.stations[s].camera.project(rays)
+
+
+def straightened(curve: Array) -> Array:
+    """The two ends (2, 2) of a curve (n, 2) that is straight, else the curve."""
+    if len(curve) < 3:
+        return curve
+    chord = curve[-1] - curve[0]
+    off = curve - curve[0]
+    area = chord[0] * off[:, 1] - chord[1] * off[:, 0]
+    straight = np.abs(area).max() <= STRAIGHT * np.hypot(*chord)
+    return curve[[0, -1]] if straight else curve
+
+
+def _edge_tip(edges: EdgeSet, estimate: Estimate, shifts: Array, n: int) -> str:
+    across, tilt = estimate.edge_residuals[n]
+    return (
+        f"Leg {edges.leg[n] + 1}, tube {edges.tube[n] + 1}, {SIDES[edges.side[n]]} edge: "
+        f"{number(float(shifts[n]), 2, signed=True)} px outward; residual "
+        f"{number(float(across), 1, signed=True)} σ across, "
+        f"{number(float(tilt), 1, signed=True)} σ tilt; "
+        f"weight {number(float(estimate.edge_weights[n]), 2)}"
+    )
+
+
+def _spots(
+    session: Session, estimate: Estimate, centres: tuple[Centres, ...], s: int, k: int
+) -> tuple[Spot, ...]:
+    """Joint centres in the picture, by the result and by the drawing laid over it."""
+    state, camera = estimate.state, session.stations[s].camera
+    pose, joints = state.T_base_platform[k], session.joints[k]
+    base, platform = (side.T_calibrated_drawing for side in centres)
+    after = limb_ends(estimate.machine.layout, estimate.machine.values, joints, pose)
+    old_pose = inverse(base) @ pose @ platform
+    before = limb_ends(session.machine.layout, session.machine.values, joints, old_pose)
+    out: list[Spot] = []
+    labelled: set[int] = set()
+    for end, new, old in (("base", after.a, before.a), ("platform", after.b, before.b)):
+        seen = camera.project(apply(state.T_camera_base[s], new))
+        drawn = camera.project(apply(state.T_camera_base[s] @ base, old))
+        inside = camera.in_image(seen)
+        for j in np.flatnonzero(inside).tolist():
+            cross = _pair(drawn[j]) if np.isfinite(drawn[j]).all() else None
+            out.append(Spot(j + 1, end, _pair(seen[j]), cross, j not in labelled))
+            labelled.add(j)
+    return tuple(out)
+
+
+def _pair(point: Array) -> tuple[float, float]:
+    return round(float(point[0]), 1), round(float(point[1]), 1)

@@ -1,0 +1,229 @@
+"""The geometry before and after, [B] Fig. 7: joint centres at home, errors drawn enlarged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import PkmcalError
+from pkmcal.geometry.rigid import apply
+from pkmcal.identify.problem import Estimate
+from pkmcal.report.centres import Centres
+from pkmcal.report.charts import WIDTH
+from pkmcal.report.wording import brief, number
+from pkmcal.session import Session
+
+ELLIPSE = 2.0
+"""Standard deviations that ellipses and ellipsoids reach."""
+SHARE = 0.22
+"""Part of the machine's radius that the large errors should span once enlarged."""
+MARGIN = 30.0
+NEAR = 9.0
+"""SVG units within which two labels are written as one."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint centre at home, base frame, m.
+
+    drawing, shown : (3,) by the drawing, and with the error enlarged. spread : (3, 3) covariance
+    enlarged alike. leg : from 1.
+    """
+
+    leg: int
+    side: str
+    drawing: Array
+    shown: Array
+    spread: Array
+    tip: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All joint centres, base and platform in turn; ``factor`` enlarges the errors."""
+
+    factor: float
+    joints: tuple[Joint, ...]
+
+    @property
+    def tiny(self) -> bool:
+        """True where no ellipse reaches out of its mark, some hundredth of the machine."""
+        size = np.ptp(np.array([joint.drawing for joint in self.joints]), axis=0).max()
+        largest = max(float(np.trace(joint.spread)) for joint in self.joints)
+        return ELLIPSE * np.sqrt(largest) < 0.012 * float(size)
+
+    def of_side(self, side: str) -> tuple[Joint, ...]:
+        """The joints of base or platform, by leg."""
+        return tuple(joint for joint in self.joints if joint.side == side)
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A joint in a plane view, SVG units. ellipse : rx, ry, angle in degrees."""
+
+    leg: int
+    side: str
+    drawing: tuple[float, float]
+    shown: tuple[float, float]
+    ellipse: tuple[float, float, float]
+    tip: str
+
+
+@dataclass(frozen=True)
+class View:
+    """The scene from one direction. limbs : pairs of ends, drawing then shown.
+
+    grid : (horizontal?, place, text). labels : (x, y, text).
+    """
+
+    title: str
+    alt: str
+    width: float
+    height: float
+    axes: tuple[str, str]
+    marks: tuple[Mark, ...]
+    limbs: tuple[tuple[tuple[float, float], ...], ...]
+    grid: tuple[tuple[bool, float, str], ...]
+    labels: tuple[tuple[float, float, str], ...]
+
+
+def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...]) -> Scene:
+    """Joint centres at home with their errors enlarged by a round factor."""
+    home = _home(session, estimate)
+    placed = {"base": np.eye(4), "platform": home}
+    size = float(np.ptp(np.concatenate([c.drawing for c in centres]), axis=0).max()) / 2
+    factor = enlargement(centres, size)
+    joints: list[Joint] = []
+    for side in centres:
+        T = placed[side.side]
+        drawing = apply(T, side.drawing)
+        shown = drawing + factor * (apply(T, side.calibrated) - drawing)
+        spread = factor**2 * T[:3, :3] @ side.blocks @ T[:3, :3].T
+        for j in range(len(drawing)):
+            tip = _tip(j + 1, side, j)
+            joints.append(Joint(j + 1, side.side, drawing[j], shown[j], spread[j], tip))
+    return Scene(factor, tuple(joints))
+
+
+def enlargement(centres: tuple[Centres, ...], size: float) -> float:
+    """1, 2 or 5 times a power of ten, so that large errors span ``SHARE`` of the size (m)."""
+    change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
+    reach = max(np.quantile(change, 0.9), ELLIPSE * max(c.sigma.max() for c in centres), 1e-9)
+    wanted = max(SHARE * size / reach, 1.0)
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return max(m * power for m in (1, 2, 5) if m * power <= wanted * (1 + 1e-9))
+
+
+def views(scene: Scene) -> tuple[View, View]:
+    """From above, and from the side that parts the base joints best."""
+    base = np.array([joint.drawing for joint in scene.of_side("base")])
+    gaps = [np.diff(np.sort(base[:, axis])).min() for axis in (0, 1)]
+    across = int(np.argmax(gaps))
+    return (
+        _view(scene, "From above", (0, 1)),
+        _view(scene, "From the side", (across, 2)),
+    )
+
+
+def _home(session: Session, estimate: Estimate) -> Array:
+    """The drawing's home pose; where the drawing has none, the first pose that was seen."""
+    try:
+        return session.machine.home()
+    except PkmcalError:
+        return estimate.state.T_base_platform[int(np.argmax(estimate.configurations))]
+
+
+def _tip(leg: int, side: Centres, j: int) -> str:
+    dx, dy, dz = (number(float(v) * 1e3, 3, signed=True) for v in side.change[j])
+    return (
+        f"Leg {leg}, {side.side}: {dx}, {dy}, {dz} mm from the drawing (x, y, z); "
+        f"σ {brief(float(side.sigma[j]) * 1e3)} mm"
+    )
+
+
+def _view(scene: Scene, title: str, axes: tuple[int, int]) -> View:
+    """Project the scene on two axes, the second one upwards."""
+    pick = list(axes)
+    drawn = np.array([joint.drawing[pick] for joint in scene.joints])
+    shown = np.array([joint.shown[pick] for joint in scene.joints])
+    corners = np.concatenate([drawn, shown])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    scale = (WIDTH - 2 * MARGIN) / (high - low).max()
+    width, height = WIDTH, float((high - low)[1] * scale + 2 * MARGIN)
+    left = (width - float((high - low)[0]) * scale) / 2
+
+    def place(point: Array) -> tuple[float, float]:
+        x, y = (point - low) * scale
+        return round(left + float(x), 1), round(height - MARGIN - float(y), 1)
+
+    names = ("x", "y", "z")
+    marks = tuple(
+        Mark(
+            j.leg, j.side, place(d), place(s), _ellipse(j.spread[np.ix_(pick, pick)], scale), j.tip
+        )
+        for j, d, s in zip(scene.joints, drawn, shown, strict=True)
+    )
+    return View(
+        title=title,
+        alt=f"{title}: joint centres by the drawing and as calibrated, errors enlarged "
+        f"{scene.factor:g} times",
+        width=width,
+        height=height,
+        axes=(names[axes[0]], names[axes[1]]),
+        marks=marks,
+        limbs=_limbs(marks),
+        grid=_grid(low, high, place),
+        labels=_labels(marks, (width / 2, height / 2)),
+    )
+
+
+def _limbs(marks: tuple[Mark, ...]) -> tuple[tuple[tuple[float, float], ...], ...]:
+    """Ends of each leg by the drawing."""
+    half = len(marks) // 2
+    return tuple((a.drawing, b.drawing) for a, b in zip(marks[:half], marks[half:], strict=True))
+
+
+def _ellipse(spread: Array, scale: float) -> tuple[float, float, float]:
+    """Half axes (SVG units) and turn (degrees, y downwards) of ``ELLIPSE`` sigma."""
+    values, vectors = np.linalg.eigh(spread)
+    ry, rx = ELLIPSE * scale * np.sqrt(np.maximum(values, 0))
+    angle = -np.rad2deg(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    return round(float(rx), 2), round(float(ry), 2), round(float(angle), 1)
+
+
+def _grid(
+    low: Array, high: Array, place: Callable[[Array], tuple[float, float]]
+) -> tuple[tuple[bool, float, str], ...]:
+    """Lines every 100 mm (or a round multiple), with their coordinate."""
+    step = 0.1 * max(1, round(float((high - low).max()) / 0.6))
+    lines: list[tuple[bool, float, str]] = []
+    for axis, level in ((0, False), (1, True)):
+        first, last = math.ceil(low[axis] / step - 0.3), math.floor(high[axis] / step + 0.3)
+        for k in range(first, last + 1):
+            point = low.copy()
+            point[axis] = k * step
+            lines.append((level, place(point)[axis], number(k * step * 1e3, 0)))
+    return tuple(lines)
+
+
+def _labels(
+    marks: tuple[Mark, ...], centre: tuple[float, float]
+) -> tuple[tuple[float, float, str], ...]:
+    """Leg numbers beside their marks, away from the middle; those that would meet share one."""
+    placed: list[tuple[float, float, list[int]]] = []
+    for mark in marks:
+        dx, dy = mark.drawing[0] - centre[0], mark.drawing[1] - centre[1]
+        away = max(math.hypot(dx, dy), 1e-6)
+        x, y = mark.drawing[0] + 13 * dx / away, mark.drawing[1] + 13 * dy / away
+        near = [p for p in placed if math.hypot(p[0] - x, p[1] - y) < NEAR]
+        if near and mark.leg not in near[0][2]:
+            near[0][2].append(mark.leg)
+        elif not near:
+            placed.append((x, y, [mark.leg]))
+    return tuple(
+        (round(x, 1), round(y + 4, 1), " ".join(str(n) for n in legs)) for x, y, legs in placed
+    )

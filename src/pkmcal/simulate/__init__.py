@@ -1,0 +1,25 @@
+"""Sessions with known truth: photographs, edges, joint readings; for tests, studies, demos.
+
+Modules from bottom to top: shapes, surfaces, casting, render and scene make one photograph;
+stations, configurations and truth draw what is in a session; session writes it; edges gives
+measurements without photographs; demo holds the demonstration's settings.
+"""
+
+from pkmcal.simulate.edges import EdgeNoise, simulate_edges
+from pkmcal.simulate.render import Sensor
+from pkmcal.simulate.session import simulate_session
+from pkmcal.simulate.stations import StationPose
+from pkmcal.simulate.truth import Settings, Truth, draw_truth, load_truth, true_machine
+
+__all__ = [
+    "EdgeNoise",
+    "Sensor",
+    "Settings",
+    "StationPose",
+    "Truth",
+    "draw_truth",
+    "load_truth",
+    "simulate_edges",
+    "simulate_session",
+    "true_machine",
+]

@@ -1,0 +1,275 @@
+"""The scene of a session: the machine as its drawing shows it, in a room with a table.
+
+The room, the lamps and the surfaces are drawn from one seed and stay for the whole session, as
+in a laboratory; only the machine moves. Sizes follow the machine's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import apply, rotation
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.simulate.casting import Part, Scene
+from pkmcal.simulate.shapes import Ball, Box, Cylinder, Wall
+from pkmcal.simulate.surfaces import (
+    Checks,
+    Clouds,
+    Lamp,
+    Lighting,
+    Material,
+    Slats,
+    SmoothNoise,
+    WavyStripes,
+)
+
+Z = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Discs:
+    """The two plates that carry the joints.
+
+    base, platform : (3,) centre of the face towards the joints; base frame, platform frame.
+    base_radius, platform_radius : m. side : +1 where the platform stands above the base along
+    the frames' z, -1 below. thickness : m.
+    """
+
+    base: Array
+    platform: Array
+    base_radius: float
+    platform_radius: float
+    side: float
+    thickness: float
+
+
+def discs_of(machine: Machine) -> Discs:
+    """Plates outside the joints, along the frames' z, as wide as the joints need."""
+    ends = limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), np.eye(4))
+    a, b = np.array(ends.a), np.array(ends.b)
+    rise = float(apply(machine.home(), b)[:, 2].mean() - a[:, 2].mean())
+    side = -1.0 if rise < -1e-3 else 1.0
+    ball = float(_ball_radii(machine).max())
+    width_a, width_b = (
+        float(np.linalg.norm(p[:, :2] - p[:, :2].mean(axis=0), axis=1).max()) for p in (a, b)
+    )
+    base, platform = a.mean(axis=0), b.mean(axis=0)
+    base[2] = (side * a[:, 2]).min() * side - side * 2.2 * ball
+    platform[2] = (side * b[:, 2]).max() * side + side * 2.2 * ball
+    return Discs(
+        base, platform, width_a + 3.5 * ball, width_b + 2.0 * ball, side, max(0.012, 0.8 * ball)
+    )
+
+
+@dataclass(frozen=True)
+class Finish:
+    """Materials of the machine's parts; tubes from the base end to the platform end."""
+
+    paint: Material
+    steel: Material
+    joint: Material
+    base: Material
+    platform: Material
+
+    @classmethod
+    def from_noise(cls, noise: SmoothNoise) -> Finish:
+        """White paint, turned steel, blackened joints, a stained base, a milled platform."""
+        return cls(
+            paint=Material(0.8, Clouds(noise, 0.012, 0.03), gloss=0.3, sharpness=40.0),
+            steel=Material(0.38, Clouds(noise, 0.004, 0.05), gloss=0.45, brushed=True, mirror=0.3),
+            joint=Material(0.035, gloss=0.45, sharpness=60.0, mirror=0.06),
+            base=Material(0.16, Clouds(noise, 0.015, 0.25), gloss=0.05, sharpness=12.0),
+            platform=Material(0.27, Clouds(noise, 0.02, 0.08), gloss=0.12, sharpness=10.0),
+        )
+
+
+def machine_parts(
+    machine: Machine, discs: Discs, finish: Finish, T_base_platform: Array, joints: Array
+) -> list[Part]:
+    """The machine at one pose (4, 4) and its readings (m,)."""
+    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    balls = _ball_radii(machine)
+    up_base, up_platform = discs.side * Z, discs.side * T_base_platform[:3, 2]
+    centre = apply(T_base_platform, discs.platform)
+    parts = [
+        Part(Cylinder(discs.base, -up_base, discs.base_radius, discs.thickness), finish.base),
+        Part(
+            Cylinder(centre, up_platform, discs.platform_radius, discs.thickness), finish.platform
+        ),
+        Part(
+            Cylinder(
+                centre + discs.thickness * up_platform,
+                up_platform,
+                0.28 * discs.platform_radius,
+                1.5 * discs.thickness,
+            ),
+            finish.joint,
+        ),
+    ]
+    for j in range(machine.n_legs):
+        a, b = ends.a[j], ends.b[j]
+        parts += _leg(machine, j, a, b, finish)
+        parts += _joint(a, -up_base, float((a - discs.base) @ up_base), balls[j, 0], finish)
+        parts += _joint(b, up_platform, float((centre - b) @ up_platform), balls[j, 1], finish)
+    return parts
+
+
+def _joint(centre: Array, way: Array, height: float, radius: float, finish: Finish) -> list[Part]:
+    """A ball, and the post from it to its plate."""
+    post = Cylinder(centre, way, 0.6 * radius, height)
+    return [Part(Ball(centre, radius), finish.joint), Part(post, finish.joint)]
+
+
+def _leg(machine: Machine, j: int, a: Array, b: Array, finish: Finish) -> list[Part]:
+    """The leg's tubes, cut off where the leg ends, and the neck between joint and first tube."""
+    length = float(np.linalg.norm(b - a))
+    u = (b - a) / length
+    tubes = machine.document.legs[j].tubes
+    parts: list[Part] = []
+    for t, (tube, radius) in enumerate(zip(tubes, machine.radii()[j], strict=True)):
+        stop = min(tube.stop, length)
+        if stop > tube.start:
+            material = finish.paint if t == 0 and len(tubes) > 1 else finish.steel
+            shape = Cylinder(a + tube.start * u, u, float(radius), stop - tube.start)
+            parts.append(Part(shape, material))
+    if tubes and tubes[0].start > 0:
+        neck = Cylinder(a, u, 0.8 * float(machine.radii()[j][0]), tubes[0].start)
+        parts.append(Part(neck, finish.joint))
+    return parts
+
+
+def _ball_radii(machine: Machine) -> Array:
+    """Joint balls a little wider than the tube that they hold, (L, 2) m at A and at B."""
+    spare = 0.01
+    return np.array(
+        [[1.2 * r[0], 1.5 * r[-1]] if len(r) else [spare, spare] for r in machine.radii()]
+    )
+
+
+@dataclass(frozen=True)
+class Room:
+    """Everything but the machine: parts and lamps."""
+
+    parts: tuple[Part, ...]
+    lighting: Lighting
+
+    def with_machine(self, parts: list[Part]) -> Scene:
+        """The scene with the machine in one pose."""
+        return Scene((*parts, *self.parts), self.lighting)
+
+
+def room_of(discs: Discs, reach: float, noise: SmoothNoise, rng: np.random.Generator) -> Room:
+    """A room around a machine; cameras stand within ``reach`` (m) of the base disc's centre."""
+    size = max(discs.base_radius, discs.platform_radius)
+    reach = max(reach, 2.5 * size)
+    middle = discs.base - discs.side * discs.thickness * Z
+    if discs.side < 0:  # a machine that hangs from its base has no table under it
+        middle = middle - 4.0 * size * Z
+    parts = _table(middle, size, noise, rng)
+    floor = middle[2] - 2.2 * size
+    parts += _walls(middle, floor, reach, noise, rng)
+    for azimuth in 2 * np.pi * (np.arange(11) + rng.uniform(-0.4, 0.4, 11)) / 11:
+        parts.append(_furniture(middle, floor, size, reach, azimuth, noise, rng))
+    lamps = _lamps(middle, size, reach, rng)
+    bulbs = [
+        Part(Ball(lamp.place, lamp.radius), Material(0.0, emission=3.0), False) for lamp in lamps
+    ]
+    return Room((*parts, *bulbs), Lighting(lamps, sky=0.26, ground=0.13))
+
+
+def _table(middle: Array, size: float, noise: SmoothNoise, rng: np.random.Generator) -> list[Part]:
+    half = np.array([1.75, 1.6, 0.05]) * size
+    turn = rotation(rng.uniform(-np.pi, np.pi) * Z)
+    pattern = WavyStripes(noise, 0.42 * size, 0.42)
+    top = Box(middle - half[2] * Z, turn, half)
+    leg = Box(middle - size * Z, turn, np.array([0.5, 0.5, 0.9]) * size)
+    return [
+        Part(top, Material(0.30, pattern, gloss=0.04, sharpness=8.0)),
+        Part(leg, Material(0.05)),
+    ]
+
+
+def _walls(
+    middle: Array, floor: float, reach: float, noise: SmoothNoise, rng: np.random.Generator
+) -> list[Part]:
+    """Floor, ceiling and four walls, none of them plain."""
+    patterns = [
+        Slats(0.17 * reach, np.inf, 0.35),
+        Clouds(noise, 0.045 * reach, 0.30),
+        WavyStripes(noise, 0.5 * reach, 0.25),
+        Clouds(noise, 0.012 * reach, 0.16),
+    ]
+    turn = rng.uniform(0, 2 * np.pi)
+    parts = [
+        Part(
+            Wall(np.array([*middle[:2], floor]), Z),
+            Material(0.32, Slats(0.12 * reach, 0.06 * reach, 0.3)),
+            False,
+        ),
+        Part(
+            Wall(np.array([*middle[:2], floor + 4.5 * reach]), -Z),
+            Material(0.6, Slats(0.6 * reach, 0.6 * reach, 0.7)),
+            False,
+        ),
+    ]
+    for k, pattern in enumerate(np.array(patterns, dtype=object)[rng.permutation(4)]):
+        angle = turn + np.pi / 2 * k
+        inward = -np.array([np.cos(angle), np.sin(angle), 0.0])
+        wall = Wall(middle - inward * reach * rng.uniform(2.6, 3.4), inward)
+        parts.append(Part(wall, Material(rng.uniform(0.12, 0.3), pattern), False))
+    return parts
+
+
+def _furniture(
+    middle: Array,
+    floor: float,
+    size: float,
+    reach: float,
+    azimuth: float,
+    noise: SmoothNoise,
+    rng: np.random.Generator,
+) -> Part:
+    """A box or a post behind the cameras' ring, which the camera opposite sees."""
+    distance = reach * rng.uniform(1.45, 2.3)
+    place = middle + distance * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    height = middle[2] - floor + size * rng.uniform(0.1, 2.6)
+    place[2] = floor
+    material = [
+        Material(0.45, Checks(0.3 * size, 0.18)),
+        Material(0.04),
+        Material(0.35, Clouds(noise, 0.05 * size, 0.45)),
+        Material(0.12, Checks(0.22 * size, 0.3)),
+        Material(0.6, Clouds(noise, 0.2 * size, 0.1)),
+    ][rng.integers(5)]
+    if rng.random() < 0.25:
+        return Part(Cylinder(place, Z, size * rng.uniform(0.06, 0.2), height), material, False)
+    lean = rotation(np.array([*rng.normal(0, 0.03, 2), rng.uniform(-np.pi, np.pi)]))
+    half = np.array([*rng.uniform(0.1, 0.45, 2) * size, height / 2])
+    return Part(Box(place + lean.T @ (half[2] * Z), lean, half), material, False)
+
+
+def _lamps(middle: Array, size: float, reach: float, rng: np.random.Generator) -> tuple[Lamp, ...]:
+    """A key lamp with shadows, a weaker one across, one from above and behind."""
+    azimuth = rng.uniform(0, 2 * np.pi)
+    lamps: list[Lamp] = []
+    for turn, elevation, distance, power in (
+        (0.0, rng.uniform(40, 60), 1.8, 1.25),
+        (rng.uniform(100, 150), rng.uniform(20, 35), 1.9, 0.55),
+        (rng.uniform(200, 260), rng.uniform(55, 75), 2.2, 0.45),
+    ):
+        a, e = azimuth + np.deg2rad(turn), np.deg2rad(elevation)
+        way = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+        lamps.append(
+            Lamp(
+                middle + (distance * reach) * way + size * Z,
+                0.16 * size,
+                power,
+                distance * reach,
+                shadows=not lamps,
+            )
+        )
+    return tuple(lamps)

@@ -1,0 +1,198 @@
+"""A whole session on disk, as a user would make it, with the truth beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Integers
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.files import csv_text, staged_folder, yaml_text
+from pkmcal.mechanisms import Machine, mechanism_text
+from pkmcal.simulate.render import Sensor, View, photograph, render
+from pkmcal.simulate.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
+from pkmcal.simulate.surfaces import SmoothNoise
+from pkmcal.simulate.truth import FILE, Settings, Truth, draw_truth, stream, truth_document
+
+Progress = Callable[[int, int], None]
+
+
+def simulate_session(
+    folder: Path | str,
+    drawing: Machine,
+    camera: Camera | Sequence[Camera],
+    settings: Settings | None = None,
+    *,
+    seed: int = 0,
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> Truth:
+    """Write a session into a new folder, whole or not at all; the truth goes to truth.json.
+
+    camera : one for all stations, or one a station. workers : threads that render; the result
+    does not depend on their number. progress : called with photographs done and in all.
+    """
+    settings = settings or Settings()
+    folder = Path(folder)
+    cameras = _cameras(camera, settings)
+    _check(folder, drawing)
+    truth = draw_truth(drawing, cameras, settings, seed)
+    with staged_folder(folder) as stage:
+        _write_texts(stage, drawing, cameras, settings, truth)
+        _write_photographs(stage, cameras, settings.sensor, truth, workers, progress)
+    return truth
+
+
+@dataclass(frozen=True)
+class Studio:
+    """Everything that photographs of one session share; views : by station."""
+
+    truth: Truth
+    discs: Discs
+    finish: Finish
+    room: Room
+    views: tuple[View, ...]
+    sensor: Sensor
+
+    @classmethod
+    def of(cls, truth: Truth, cameras: Sequence[Camera], sensor: Sensor) -> Studio:
+        """Draw the room, and work out each camera's rays once."""
+        seeds = stream(truth.seed, "room").spawn(2)
+        noise = SmoothNoise.from_rng(np.random.default_rng(seeds[0]))
+        discs = discs_of(truth.machine)
+        places = np.array([pose.position for pose in truth.rough])
+        reach = float(np.linalg.norm(places - discs.base, axis=1).max())
+        room = room_of(discs, reach, noise, np.random.default_rng(seeds[1]))
+        known = {id(camera): View.of(camera) for camera in {id(c): c for c in cameras}.values()}
+        views = tuple(known[id(camera)] for camera in cameras)
+        return cls(truth, discs, Finish.from_noise(noise), room, views, sensor)
+
+    def photograph(self, index: int) -> Integers:
+        """The session's photograph number ``index``: 8 bits, (H, W)."""
+        station, k = self.truth.photographs[index]
+        poses, joints = self.truth.T_base_platform, self.truth.joints
+        seeds = stream(self.truth.seed, "photographs").spawn(len(self.truth.photographs))
+        rng = np.random.default_rng(seeds[index])
+        parts = machine_parts(self.truth.machine, self.discs, self.finish, poses[k], joints[k])
+        scene = self.room.with_machine(parts)
+        light = render(scene, self.views[station], self.truth.T_camera_base[station], rng)
+        return photograph(light, self.sensor, rng)
+
+
+def _cameras(camera: Camera | Sequence[Camera], settings: Settings) -> tuple[Camera, ...]:
+    """One camera for each station."""
+    n = settings.n_stations
+    cameras = (camera,) * n if isinstance(camera, Camera) else tuple(camera)
+    if len(cameras) != n or n == 0:
+        raise InputError(
+            what="the simulation needs one camera for all stations, or one for each",
+            found=f"{len(cameras)} cameras for {n} stations",
+            expected=f"1 or {n}",
+        )
+    return cameras
+
+
+def _check(folder: Path, drawing: Machine) -> None:
+    """Raise InputError for what would waste the work."""
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(
+            what="the folder for the simulated session is not empty",
+            where=str(folder),
+            expected="a new or empty folder",
+            next_step="name another folder, or remove what is in this one",
+        )
+    if not any(len(radii) for radii in drawing.radii()):
+        raise InputError(
+            what=f"mechanism {drawing.name!r} has no tubes, so its photographs would show no legs",
+            expected="tubes: [{radius: ..., from: ..., to: ...}] on its legs",
+        )
+
+
+def _write_texts(
+    stage: Path, drawing: Machine, cameras: Sequence[Camera], settings: Settings, truth: Truth
+) -> None:
+    """Everything but the photographs."""
+    same = all(camera is cameras[0] for camera in cameras)
+    files = {
+        name: "cameras/camera.yaml" if same else f"cameras/{name}.yaml" for name in truth.stations
+    }
+    columns = [f"leg{j + 1}" for j, leg in enumerate(drawing.document.legs) if leg.length.actuated]
+    texts = {
+        "mechanism.yaml": mechanism_text(drawing),
+        "session.yaml": yaml_text(_session_document(settings, truth, files)),
+        "joints.csv": csv_text(columns, truth.configurations, truth.readings),
+        FILE: json.dumps(truth_document(truth), indent=1) + "\n",
+    }
+    for name, camera in zip(truth.stations, cameras, strict=True):
+        texts[files[name]] = yaml_text(camera.document())
+    for name, text in texts.items():
+        path = stage / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _session_document(
+    settings: Settings, truth: Truth, camera_files: dict[str, str]
+) -> dict[str, Any]:
+    return {
+        "pkmcal": 1,
+        "mechanism": "mechanism.yaml",
+        "joints": {"file": "joints.csv", "noise": settings.joint_noise},
+        "stations": {
+            name: {
+                "camera": camera_files[name],
+                "images": f"images/{name}/{{configuration}}.png",
+                "observe": "legs",
+                "pose": {
+                    "position": list(pose.position),
+                    "look_at": list(pose.look_at),
+                    "up": list(pose.up),
+                },
+            }
+            for name, pose in zip(truth.stations, truth.rough, strict=True)
+        },
+    }
+
+
+def _write_photographs(
+    stage: Path,
+    cameras: Sequence[Camera],
+    sensor: Sensor,
+    truth: Truth,
+    workers: int,
+    progress: Progress | None,
+) -> None:
+    """Render and write all photographs; NumPy releases the interpreter, so threads are enough."""
+    studio = Studio.of(truth, cameras, sensor)
+    for name in truth.stations:
+        (stage / "images" / name).mkdir(parents=True)
+    total = len(truth.photographs)
+    with ThreadPoolExecutor(max(1, workers)) as pool:
+        jobs = [pool.submit(_write_one, stage, studio, k) for k in range(total)]
+        try:
+            for done, job in enumerate(as_completed(jobs), start=1):
+                job.result()
+                if progress is not None:
+                    progress(done, total)
+        finally:
+            for job in jobs:
+                job.cancel()
+
+
+def _write_one(stage: Path, studio: Studio, index: int) -> None:
+    import cv2
+
+    truth = studio.truth
+    station, k = truth.photographs[index]
+    ok, data = cv2.imencode(".png", studio.photograph(index))
+    if not ok:
+        raise OSError(f"photograph {index} could not be encoded as PNG")
+    path = stage / "images" / truth.stations[station] / f"{truth.configurations[k]}.png"
+    path.write_bytes(data.tobytes())

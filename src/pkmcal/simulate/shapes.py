@@ -1,0 +1,268 @@
+"""Convex shapes that rays meet: cylinders, balls, boxes and the walls of a room.
+
+All coordinates are in one outer frame (base), m. Inside the renderer vectors have their
+components first, (3, n): that keeps NumPy's inner loops long. ``d`` are unit directions of rays
+from one common ``origin``, which lies outside every shape.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+
+_BALLS_ALONG = 8
+"""Bounding balls in a row over a long shape: one ball over a leg would cover the picture."""
+
+
+class Shape(ABC):
+    """What a ray can hit; a convex body, so it never shadows a lit point of its own."""
+
+    @abstractmethod
+    def enter(self, origin: Array, d: Array) -> Array:
+        """Distance (n,) to the first hit of rays from origin (3,) along d (3, n); inf at a miss."""
+
+    @abstractmethod
+    def normal(self, points: Array) -> Array:
+        """Outward unit normals (3, n) at surface points (3, n)."""
+
+    def face(self, points: Array) -> Integers:
+        """Number (n,) of the smooth face, 0 to 2, that surface points (3, n) lie on."""
+        return np.zeros(points.shape[1], dtype=np.int16)
+
+    @abstractmethod
+    def local(self, points: Array) -> Array:
+        """Surface points (3, n) in the shape's own frame, for its pattern."""
+
+    @abstractmethod
+    def balls(self) -> tuple[Array, Array]:
+        """Centres (3, k) and radii (k,) of balls that together contain the shape."""
+
+    def veil(self, light: Array, d: Array, distance: Array, spread: float) -> Array:
+        """Part (n,) of a lamp of radius ``spread`` at ``light`` that the shape hides.
+
+        The points in question lie at ``distance`` (n,) from the lamp along d (3, n). Here all
+        or nothing; round shapes give a soft border.
+        """
+        del spread
+        return (self.enter(light, d) < distance - 1e-9).astype(float)
+
+
+def inner(d: Array, v: Array) -> Array:
+    """Inner products (n,) of vectors (3, n) with one vector (3,)."""
+    return d[0] * v[0] + d[1] * v[1] + d[2] * v[2]
+
+
+def _soft(clearance: Array, width: Array, where: Booleans) -> Array:
+    """Hidden part of a lamp whose image at the shape is ``width`` in radius, by clearance (m)."""
+    x = np.clip(0.5 - clearance / (2 * width), 0, 1)
+    return np.where(where, x * x * (3 - 2 * x), 0.0)
+
+
+@final
+@dataclass(frozen=True)
+class Cylinder(Shape):
+    """A closed cylinder: centre of its first cap (3,), unit axis (3,), radius and length (m)."""
+
+    start: Array
+    axis: Array
+    radius: float
+    length: float
+
+    def enter(self, origin: Array, d: Array) -> Array:
+        """Quadratic of the infinite cylinder, cut to its length, and the cap that faces."""
+        o, along, du, b = self._along(origin, d)
+        a = 1 - du * du
+        c = o @ o - along**2 - self.radius**2
+        with np.errstate(invalid="ignore", divide="ignore"):
+            t = (-b - np.sqrt(b * b - a * c)) / a
+            s = along + t * du
+            t = np.where((t > 0) & (s >= 0) & (s <= self.length), t, np.inf)
+            if 0 <= along <= self.length:
+                return t  # neither cap can be seen from between their planes
+            t_cap = ((0.0 if along < 0 else self.length) - along) / du
+            inside = (c + t_cap * (2 * b + a * t_cap) <= 0) & (t_cap > 0)
+            return np.where(inside, np.minimum(t, t_cap), t)
+
+    def normal(self, points: Array) -> Array:
+        """Radial on the side, along the axis on the caps."""
+        s, radial, rho = self._place(points)
+        cap_normal = np.where(s > self.length / 2, 1.0, -1.0) * self.axis[:, None]
+        side_normal = radial / np.maximum(rho, 1e-12)
+        return np.where(self._on_cap(s, rho), cap_normal, side_normal)
+
+    def face(self, points: Array) -> Integers:
+        """The side and either cap."""
+        s, _, rho = self._place(points)
+        return np.where(self._on_cap(s, rho), 1 + (s > self.length / 2), 0).astype(np.int16)
+
+    def local(self, points: Array) -> Array:
+        """Two coordinates across the axis and one along it."""
+        return _frame_of(self.axis) @ (points - self.start[:, None])
+
+    def balls(self) -> tuple[Array, Array]:
+        """A row along the axis, or one ball round a disc."""
+        n = _BALLS_ALONG if self.length > 4 * self.radius else 1
+        s = (np.arange(n) + 0.5) * self.length / n
+        radius = np.hypot(self.radius, self.length / (2 * n))
+        return self.start[:, None] + self.axis[:, None] * s, np.full(n, radius)
+
+    def veil(self, light: Array, d: Array, distance: Array, spread: float) -> Array:
+        """By how far the ray misses: a tube at its nearest approach, a disc in its middle plane."""
+        o, along, du, b = self._along(light, d)
+        a = np.maximum(1 - du * du, 1e-9)
+        across2 = o @ o - along**2
+        if self.length > self.radius:
+            t = -b / a
+            s = along + t * du
+            # a hard end: where tube and rod meet, two soft ends would let light through
+            between = (s >= 0) & (s <= self.length)
+        else:
+            t = (self.length / 2 - along) / np.where(np.abs(du) < 1e-9, 1e-9, du)
+            between = np.ones(t.shape, dtype=bool)
+        miss = np.sqrt(np.maximum(across2 + t * (2 * b + a * t), 0.0)) - self.radius
+        width = spread * np.maximum(1 - t / distance, 0.0) + 1e-6
+        return _soft(miss, width, between & (t > 0) & (t < distance))
+
+    def _place(self, points: Array) -> tuple[Array, Array, Array]:
+        """Places along the axis (n,), vectors from the axis (3, n) and their lengths (n,)."""
+        p = points - self.start[:, None]
+        s = inner(p, self.axis)
+        radial = p - s * self.axis[:, None]
+        return s, radial, np.sqrt(np.einsum("in,in->n", radial, radial))
+
+    def _on_cap(self, s: Array, rho: Array) -> Booleans:
+        """Whichever surface is nearer: points are known to 1e-12 m, so only rims are in doubt."""
+        return np.minimum(s, self.length - s) < np.abs(self.radius - rho)
+
+    def _along(self, origin: Array, d: Array) -> tuple[Array, float, Array, Array]:
+        """Origin from the start, its place on the axis, and the rays' parts along and across."""
+        o = origin - self.start
+        along = float(o @ self.axis)
+        du = inner(d, self.axis)
+        return o, along, du, inner(d, o) - along * du
+
+
+@final
+@dataclass(frozen=True)
+class Ball(Shape):
+    """A sphere: centre (3,) and radius (m)."""
+
+    centre: Array
+    radius: float
+
+    def enter(self, origin: Array, d: Array) -> Array:
+        """Nearer root of the quadratic."""
+        o = origin - self.centre
+        b = inner(d, o)
+        with np.errstate(invalid="ignore"):
+            t = -b - np.sqrt(b * b - (o @ o - self.radius**2))
+        return np.where(t > 0, t, np.inf)
+
+    def normal(self, points: Array) -> Array:
+        """Away from the centre."""
+        return (points - self.centre[:, None]) / self.radius
+
+    def local(self, points: Array) -> Array:
+        """From the centre."""
+        return points - self.centre[:, None]
+
+    def balls(self) -> tuple[Array, Array]:
+        """Itself."""
+        return self.centre[:, None], np.array([self.radius])
+
+    def veil(self, light: Array, d: Array, distance: Array, spread: float) -> Array:
+        """By how far the ray misses."""
+        o = light - self.centre
+        t = -inner(d, o)
+        miss = np.sqrt(np.maximum(o @ o - t * t, 0.0)) - self.radius
+        width = spread * np.maximum(1 - t / distance, 0.0) + 1e-6
+        return _soft(miss, width, (t > 0) & (t < distance))
+
+
+@final
+@dataclass(frozen=True)
+class Box(Shape):
+    """A block: centre (3,), rows of ``rot`` (3, 3) its axes, half its sizes (3,)."""
+
+    centre: Array
+    rot: Array
+    half: Array
+
+    def enter(self, origin: Array, d: Array) -> Array:
+        """The last of the three slabs to be entered, before the first is left."""
+        o = self.rot @ (origin - self.centre)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inv = 1 / (self.rot @ d)
+            near = -o[:, None] * inv - self.half[:, None] * np.abs(inv)
+            far = -o[:, None] * inv + self.half[:, None] * np.abs(inv)
+        first, last = near.max(axis=0), far.min(axis=0)
+        return np.where((first < last) & (first > 0), first, np.inf)
+
+    def normal(self, points: Array) -> Array:
+        """Of the face that the point lies nearest to."""
+        q, face = self.local(points), self.face(points)
+        sign = np.sign(np.take_along_axis(q, face[None], axis=0)[0])
+        return self.rot.T[:, face] * sign
+
+    def face(self, points: Array) -> Integers:
+        """The axis that it is square to; opposite faces are never seen side by side."""
+        return np.argmin(self.half[:, None] - np.abs(self.local(points)), axis=0)
+
+    def local(self, points: Array) -> Array:
+        """Along the box's axes, from its centre."""
+        return self.rot @ (points - self.centre[:, None])
+
+    def balls(self) -> tuple[Array, Array]:
+        """A row along the longest axis."""
+        k = int(np.argmax(self.half))
+        across = float(np.linalg.norm(np.delete(self.half, k)))
+        n = _BALLS_ALONG if self.half[k] > 2 * across else 1
+        s = (2 * (np.arange(n) + 0.5) / n - 1) * self.half[k]
+        radius = np.hypot(across, self.half[k] / n)
+        return self.centre[:, None] + self.rot[k][:, None] * s, np.full(n, radius)
+
+
+@final
+@dataclass(frozen=True)
+class Wall(Shape):
+    """A wall, floor or ceiling without end: a point on it and its unit normal into the room."""
+
+    point: Array
+    inward: Array
+
+    def enter(self, origin: Array, d: Array) -> Array:
+        """Where the ray falls onto the plane from inside."""
+        height = float((origin - self.point) @ self.inward)
+        with np.errstate(divide="ignore"):
+            t = -height / inner(d, self.inward)
+        return np.where(t > 0, t, np.inf)
+
+    def normal(self, points: Array) -> Array:
+        """Into the room."""
+        return np.broadcast_to(self.inward[:, None], points.shape)
+
+    def local(self, points: Array) -> Array:
+        """Two coordinates in the plane, the third zero."""
+        return _frame_of(self.inward) @ (points - self.point[:, None])
+
+    def balls(self) -> tuple[Array, Array]:
+        """Everything."""
+        return self.point[:, None], np.array([np.inf])
+
+    def veil(self, light: Array, d: Array, distance: Array, spread: float) -> Array:
+        """Nothing: lamps hang inside the room."""
+        del light, d, spread
+        return np.zeros(distance.shape)
+
+
+def _frame_of(axis: Array) -> Array:
+    """Rows of an orthonormal frame whose third is the axis; its second is as upright as can be."""
+    up = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    first = np.cross(up, axis)
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first), axis])

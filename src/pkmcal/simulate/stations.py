@@ -1,0 +1,133 @@
+"""Where simulated cameras stand: round the machine, or in its middle for a mirror."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.cameras import Camera
+from pkmcal.geometry.rigid import apply, inverse, look_at, rotation
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.limbs import limb_ends
+
+_PANORAMIC = np.deg2rad(95)
+"""A camera that sees more than this off its axis sees all legs from their middle."""
+_NEAREST = np.deg2rad(35)
+"""Half the angle under which the machine is seen at most; nearer, legs hide each other."""
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class StationPose:
+    """A camera's place as people give it, base frame, m: as ``pose`` in session.yaml."""
+
+    position: Vector
+    look_at: Vector
+    up: Vector = (0.0, 0.0, 1.0)
+
+    def T_camera_base(self) -> Array:
+        """(4, 4), base to camera coordinates."""
+        return look_at(np.array(self.position), np.array(self.look_at), np.array(self.up))
+
+
+def joints_at_home(machine: Machine) -> tuple[Array, Array]:
+    """Joint centres A and B (L, 3) with the platform at home, base frame, m."""
+    home = machine.home()
+    ends = limb_ends(machine.layout, machine.values, machine.inverse(home[None])[0], home)
+    return np.array(ends.a), np.array(ends.b)
+
+
+def default_stations(
+    machine: Machine, cameras: tuple[Camera, ...], rng: np.random.Generator
+) -> tuple[StationPose, ...]:
+    """One place for each camera: evenly round the machine, not quite regular, as by hand."""
+    a, b = joints_at_home(machine)
+    start = rng.uniform(0, 2 * np.pi)
+    poses: list[StationPose] = []
+    for k, camera in enumerate(cameras):
+        half = view_angle(camera)
+        if half > _PANORAMIC:
+            poses.append(_inside(a, b, rng))
+        else:
+            azimuth = start + 2 * np.pi * k / len(cameras) + np.deg2rad(rng.uniform(-8, 8))
+            poses.append(_outside(a, b, min(half, _NEAREST), azimuth, rng))
+    return tuple(poses)
+
+
+def view_angle(camera: Camera) -> float:
+    """Smallest angle (rad) from the image's middle to its border, or to the field's rim."""
+    width, height = camera.image_size
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    borders = np.array([[0, middle[1]], [width - 1, middle[1]], [middle[0], 0]])
+    borders = np.concatenate([borders, [[middle[0], height - 1]]])
+    steps = np.linspace(0, 1, 60)[:, None, None]
+    rays = camera.ray(middle + steps * (borders - middle))
+    cosine = np.clip(rays @ camera.ray(middle), -1, 1)
+    return float(np.nanmax(np.arccos(cosine), axis=0).min())
+
+
+def rough_pose(
+    T_camera_base: Array, distance: float, shift: float, turn: float, rng: np.random.Generator
+) -> StationPose:
+    """A pose by hand: off by ``shift`` (m) and ``turn`` (rad) in random directions.
+
+    distance : from the camera to what it looks at, m.
+    """
+    T_base_camera = inverse(T_camera_base)
+    axis, way = rng.normal(size=(2, 3))
+    rot = rotation(turn * axis / np.linalg.norm(axis)) @ T_base_camera[:3, :3]
+    position = T_base_camera[:3, 3] + shift * way / np.linalg.norm(way)
+    # nobody writes more digits than a tenth of a millimetre by hand
+    return StationPose(
+        _rounded(position), _rounded(position + distance * rot[:, 2]), _rounded(-rot[:, 1])
+    )
+
+
+def _rounded(v: Array) -> Vector:
+    x, y, z = (round(float(c), 4) for c in v)
+    return x, y, z
+
+
+def _outside(
+    a: Array, b: Array, half: float, azimuth: float, rng: np.random.Generator
+) -> StationPose:
+    """On a ring from which the machine fills the picture, low, or high for a flat machine."""
+    points = np.concatenate([a, b])
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    flat = np.ptp(points[:, 2]) < 0.25 * radius
+    elevation = np.deg2rad(rng.uniform(42, 55) if flat else rng.uniform(7, 17))
+    # more than the machine at home, because the platform moves and plates reach beyond joints
+    distance = 1.18 * radius / np.sin(half)
+    way = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
+         np.sin(elevation)]
+    )  # fmt: skip
+    target = centre + rng.uniform(-0.03, 0.03, 3) * radius
+    up = np.array([*rng.normal(0, 0.04, 2), 1.0])
+    return StationPose(_rounded(centre + distance * way), _rounded(target), _rounded(up))
+
+
+def _inside(a: Array, b: Array, rng: np.random.Generator) -> StationPose:
+    """Between the legs, a little above the base joints, looking at the platform."""
+    middle, rise = a.mean(axis=0), b.mean(axis=0) - a.mean(axis=0)
+    width = float(np.linalg.norm(a - middle, axis=1).max())
+    position = middle + 0.15 * rise + np.array([*rng.uniform(-0.15, 0.15, 2), 0.0]) * width
+    angle = rng.uniform(0, 2 * np.pi)
+    target = position + rise + np.array([*rng.uniform(-0.03, 0.03, 2), 0.0]) * width
+    up = (float(np.cos(angle)), float(np.sin(angle)), 0.0)
+    return StationPose(_rounded(position), _rounded(target), _rounded(np.array(up)))
+
+
+def share_in_image(
+    machine: Machine, camera: Camera, T_camera_base: Array, T_base_platform: Array, joints: Array
+) -> Array:
+    """Part of each leg that lies in the image, (K, L), for poses (K, 4, 4) and readings (K, m)."""
+    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    along = np.linspace(0.06, 0.96, 12)[:, None]
+    points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
+    pixels = camera.project(apply(T_camera_base, points))
+    return camera.in_image(pixels, margin=6.0).mean(axis=-1)

@@ -1,0 +1,294 @@
+"""YAML files and schemas: lines kept, every fault told."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import Field
+
+from pkmcal.errors import InputError
+from pkmcal.files import (
+    Schema,
+    closest,
+    field_path,
+    listed,
+    parse_yaml,
+    read_yaml,
+    shown,
+    validate,
+    yaml_text,
+)
+
+
+def write(tmp_path, content, name="a.yaml"):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def fault(function, *arguments, **keywords):
+    """The message of the InputError that a call raises."""
+    with pytest.raises(InputError) as caught:
+        function(*arguments, **keywords)
+    return str(caught.value)
+
+
+# YAML
+
+WORDS = """\
+number: 1e-5
+small: 3.0e-06
+name: 010
+on: no
+day: 2024-01-01
+time: 12:30
+nothing: ~
+flag: true
+list: [1, 2.5, .inf]
+"""
+
+
+def test_scalars_follow_yaml_1_2(tmp_path):
+    data = read_yaml(write(tmp_path, WORDS)).data
+    assert data == {
+        "number": 1e-5,
+        "small": 3e-6,
+        "name": 10,
+        "on": "no",
+        "day": "2024-01-01",
+        "time": "12:30",
+        "nothing": None,
+        "flag": True,
+        "list": [1, 2.5, math.inf],
+    }
+    assert type(data["list"][0]) is int
+
+
+def test_explicit_text_and_numbers(tmp_path):
+    data = read_yaml(write(tmp_path, "a: !!str 5\nb: '5'\nc: !!float 5\n5: x\n")).data
+    assert data == {"a": "5", "b": "5", "c": 5.0, "5": "x"}
+
+
+def test_lines_of_values_lists_and_missing_fields(tmp_path):
+    document = read_yaml(write(tmp_path, "a:\n  b:\n    - 1\n    - c: 2\n"))
+    assert document.where("a", "b", 1, "c") == "a.yaml, line 4, a.b[2].c"
+    assert document.where("a", "b", 0) == "a.yaml, line 3, a.b[1]"
+    assert document.where("a", "missing") == "a.yaml, line 1, a.missing"
+    assert document.where("missing") == "a.yaml, missing"
+    assert document.where() == "a.yaml"
+
+
+def test_aliases_and_merges(tmp_path):
+    text = "- &leg {r: 1, s: 2}\n- <<: *leg\n  s: 3\n- *leg\n- &own\n  <<: *leg\n  s: 4\n- *own\n"
+    document = read_yaml(write(tmp_path, f"legs:\n{text}"))
+    legs = document.data["legs"]
+    assert legs[:4] == [{"r": 1, "s": 2}, {"r": 1, "s": 3}, {"r": 1, "s": 2}, {"r": 1, "s": 4}]
+    assert legs[4] == legs[3]
+    assert document.lines["legs", 1, "s"] == 4
+
+
+def test_bom_and_windows_line_ends(tmp_path):
+    path = write(tmp_path, b"\xef\xbb\xbfa: 1\r\nb: 2\r\n")
+    assert read_yaml(path).data == {"a": 1, "b": 2}
+    assert read_yaml(path).lines["b",] == 2
+
+
+def test_a_label_stands_for_the_path(tmp_path):
+    path = write(tmp_path, "a: [1", "b.yaml")
+    assert fault(read_yaml, path, "cameras/b.yaml").startswith("cameras/b.yaml, line ")
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        ("", ["a.yaml: the file is empty", "expected keys and values"]),
+        ("# only a comment\n", ["the file is empty"]),
+        ("- 1\n- 2\n", ["the top of the file is not a mapping", "found [1, 2]", "key: value"]),
+        ("a: 1\nb: [1, 2\nc: 3\n", ["a.yaml, line 3: not valid YAML", "Check indentation"]),
+        ("a: 1\n\tb: 2\n", ["a.yaml, line 2: not valid YAML"]),
+        ("a: 1\n---\nb: 2\n", ["not valid YAML"]),
+        ("a:\n  x: 1\n  y: 2\n  x: 3\n", ["line 4, a.x: the key x stands twice, on lines 2 and 4"]),
+        ("a: !!python/object:os.system x\n", ["line 1: the tag", "is not allowed"]),
+        ("a: !!set {x}\n", ["is not allowed"]),
+        ("a: !!int many\n", ["'many' is not a usable int"]),
+        ("? [1, 2]\n: x\n", ["a key is a list or a mapping"]),
+        ("a: &a [*a]\n", ["repeats without end"]),
+        ("a: " + "[" * 3000 + "\n", ["not valid YAML", "nested too deeply"]),
+        (b"a: 1\nb: caf\xe9\n", ["a.yaml, line 2: the file is not UTF-8", "0xe9", "Save it as"]),
+        (b"a: \x00\n", ["not a text file", "#x0000"]),
+    ],
+)  # fmt: skip
+def test_yaml_faults(tmp_path, content, parts):
+    message = fault(read_yaml, write(tmp_path, content))
+    if content.startswith("a: [[" if isinstance(content, str) else b"a: [["):
+        assert any(part in message for part in parts)  # whichever limit is met first
+    else:
+        for part in parts:
+            assert part in message
+
+
+def test_a_bomb_of_aliases_is_refused(tmp_path):
+    lines = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
+    lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 12)]
+    assert "far too often" in fault(read_yaml, write(tmp_path, "\n".join(lines)))
+
+
+def test_missing_file_names_its_neighbour(tmp_path):
+    write(tmp_path, "a: 1", "session.yaml")
+    message = fault(read_yaml, tmp_path / "sesion.yaml")
+    assert "sesion.yaml: the file does not exist" in message
+    assert "there is session.yaml" in message
+    assert "its folder does not exist either" in fault(read_yaml, tmp_path / "no" / "a.yaml")
+
+
+def test_a_folder_is_no_file(tmp_path):
+    assert "this is a folder" in fault(read_yaml, tmp_path)
+
+
+plain = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False)
+    | st.text(st.characters(exclude_categories=["Cs"])),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.text(st.characters(exclude_categories=["Cs", "Cc"])), inner, max_size=4
+        )
+    ),
+    max_leaves=20,
+)
+
+
+@settings(deadline=None)
+@given(st.dictionaries(st.text("abcdef<0123e.-", min_size=1), plain, max_size=5))
+def test_yaml_written_reads_back_the_same(data):
+    back = parse_yaml(yaml_text(data), Path("a.yaml")).data if data else {}
+    assert back == data
+    assert repr(back) == repr(data)  # 1 and 1.0, True and 1 are equal, but not the same
+
+
+def test_yaml_text_keeps_short_lists_on_one_line_and_the_order():
+    assert yaml_text({"b": [0.5, 1.0], "a": {"c": 1e-6}}) == "b: [0.5, 1.0]\na: {c: 1.0e-06}\n"
+
+
+# schemas
+
+
+class Crank(Schema):
+    """A crank."""
+
+    joint: Literal["crank"]
+    arm: Annotated[float, Field(gt=0)] = Field(description="the arm's length, m")
+
+
+class Fixed(Schema):
+    """A point."""
+
+    joint: Literal["fixed"]
+    center: tuple[float, float, float]
+
+
+class Machine(Schema):
+    """A machine of the tests."""
+
+    name: str
+    count: int = Field(description="how many, such as 6")
+    legs: tuple[Annotated[Crank | Fixed, Field(discriminator="joint")], ...] = ()
+    notes: dict[str, Fixed] = Field(default={})
+    kind: Literal["a", "b"] = "a"
+    limit: Annotated[float, Field(ge=0, le=1)] = 0.5
+    pair: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
+    crank: Crank | None = None
+
+
+BASE = "name: m\ncount: 2\n"
+
+
+def check(tmp_path, text):
+    return validate(read_yaml(write(tmp_path, text)), Machine)
+
+
+def test_a_valid_document_becomes_the_model(tmp_path):
+    machine = check(tmp_path, BASE + "legs:\n- {joint: fixed, center: [1, 2, 3.5]}\n")
+    assert machine.legs == (Fixed(joint="fixed", center=(1, 2, 3.5)),)
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("count: 2\n", ["a.yaml, name: this is missing"]),
+        ("name: m\n", ["a.yaml, count: this is missing; expected how many, such as 6"]),
+        (BASE + "lgs: []\n", ["line 3, lgs: this key is not known; found lgs, expected legs ("]),
+        (BASE + "zzzzz: 1\n", ["line 3, zzzzz", "expected count, crank, kind, legs"]),
+        (BASE + "kind: c\n", ["line 3, kind", "found 'c', expected 'a' or 'b'"]),
+        (BASE + "limit: 2\n", ["line 3, limit", "found 2, expected a number of 1 or less"]),
+        (BASE + "limit: .nan\n", ["limit: this is not a finite number", "expected a number"]),
+        (BASE + "limit: true\n", ["found true, expected a number"]),
+        (BASE + "limit:\n", ["found nothing, expected a number"]),
+        (BASE + "limit: '0.5'\n", ["found '0.5', expected a number"]),
+        (BASE + "pair: [1]\n", ["line 3, pair: this has too few entries", "at least 2"]),
+        (BASE + "pair: [1, 2, 3]\n", ["pair: this has too many entries", "at most 2"]),
+        (BASE + "crank: {joint: crank}\n", ["crank.arm: this is missing", "the arm's length, m"]),
+        (BASE + "crank: 5\n", ["line 3, crank", "found 5, expected keys and values"]),
+        ("name: 5\ncount: 2\n", ["line 1, name", "found 5, expected text"]),
+        ("name: m\ncount: 2.5\n", ["line 2, count", "found 2.5, expected"]),
+        (BASE + "legs: 3\n", ["line 3, legs", "expected a list, such as [1, 2, 3]"]),
+        (BASE + "legs:\n- {joint: crnk}\n", ["line 4, legs[1]", "found crnk, expected one of "]),
+        (BASE + "legs:\n- {arm: 1}\n", ["line 4, legs[1]: no valid joint", "crank, fixed"]),
+        (BASE + "legs:\n- joint: crank\n  arm: -1\n", ["line 5, legs[1].arm", "above 0"]),
+        (
+            BASE + "legs:\n- joint: crank\n  arn: 1\n",
+            ["legs[1].arn", "arm (known here: arm, joint"],
+        ),
+        (
+            BASE + "legs:\n- joint: fixed\n  center: [1, 2]\n",
+            ["line 5, legs[1].center: this has too few entries; found [1, 2], expected 3 entries"],
+        ),
+        (BASE + "notes:\n  x: {joint: fixed}\n", ["line 4, notes.x.center: this is missing"]),
+    ],
+)
+def test_schema_faults(tmp_path, text, parts):
+    message = fault(check, tmp_path, text)
+    for part in parts:
+        assert part in message
+
+
+def test_all_faults_are_told_in_the_order_of_the_file(tmp_path):
+    message = fault(check, tmp_path, "count: x\nkind: c\nlimit: 3\nname: m\n")
+    assert message.startswith("a.yaml, line 1, count")
+    assert message.endswith("Then look at line 2, kind and line 3, limit.")
+
+
+def test_a_validators_own_sentence_is_kept(tmp_path):
+    class Ordered(Schema):
+        low: float
+        high: float
+
+        def model_post_init(self, _context):
+            if self.low >= self.high:
+                raise ValueError("low should be below high")
+
+    class Outer(Schema):
+        inner: Ordered
+
+    document = read_yaml(write(tmp_path, "inner:\n  low: 2\n  high: 1\n"))
+    assert fault(validate, document, Outer) == ("a.yaml, line 1, inner: low should be below high.")
+
+
+# words
+
+
+def test_words_for_messages():
+    assert field_path(("legs", 0, "base", "center", 2)) == "legs[1].base.center[3]"
+    assert closest("Camrea", ["camera", "images"]) == "camera"
+    assert closest("zzz", ["camera", "images"]) is None
+    assert listed(["a"]) == "a"
+    assert listed(["a", "b", "c"]) == "a, b and c"
+    assert listed([str(n) for n in range(20)]) == "0, 1, 2, 3, 4 and 15 more"
+    assert shown(None) == "nothing"
+    assert len(shown("x" * 500)) == 60

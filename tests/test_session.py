@@ -1,0 +1,373 @@
+"""Sessions: what loads, and the sentence for everything that can be wrong with one."""
+
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from pkmcal.errors import InputError
+from pkmcal.session import load_session
+
+SESSION = """\
+pkmcal: 1
+mechanism: gough-stewart
+joints: {file: joints.csv, noise: 3.0e-6}
+stations:
+  front:
+    camera: cameras/front.yaml
+    images: images/front/{configuration}.png
+    observe: legs
+    pose:
+      position: [0.0, -1.0, 0.2]
+      look_at: [0.0, 0.0, 0.2]
+      up: [0, 0, 1]
+"""
+CAMERA = "model: pinhole\nimage_size: [8, 6]\nfocal: [9.0, 9.0]\ncenter: [3.5, 2.5]\n"
+JOINTS = """\
+configuration,leg1,leg2,leg3,leg4,leg5,leg6
+0000,0.36,0.37,0.38,0.39,0.40,0.41
+0001,0.46,0.45,0.44,0.43,0.42,0.40
+0002,0.40,0.41,0.38,0.36,0.46,0.35
+"""
+
+
+def image(path, width=8, height=6):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.full((height, width), 128, np.uint8))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A session of one station and three configurations that loads."""
+    (tmp_path / "cameras").mkdir()
+    (tmp_path / "session.yaml").write_text(SESSION)
+    (tmp_path / "cameras" / "front.yaml").write_text(CAMERA)
+    (tmp_path / "joints.csv").write_text(JOINTS)
+    for name in ("0000", "0001", "0002"):
+        image(tmp_path / "images" / "front" / f"{name}.png")
+    return tmp_path
+
+
+def change(folder, name, old, new):
+    path = folder / name
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def fault(folder):
+    with pytest.raises(InputError) as caught:
+        load_session(folder)
+    return str(caught.value)
+
+
+# what loads
+
+
+def test_a_session(folder):
+    session = load_session(folder)
+    assert session.configurations == ("0000", "0001", "0002")
+    assert session.joints.shape == (3, 6)
+    assert session.joints[1, 5] == 0.40
+    assert session.joint_noise == 3e-6
+    assert session.machine.n_joints == 6
+    assert session.warnings == ()
+    assert session.board is None
+    (front,) = session.stations
+    assert (front.name, front.observe, front.camera_file) == ("front", "legs", "cameras/front.yaml")
+    assert front.camera.image_size == (8, 6)
+    assert [photo.configuration for photo in front.photographs] == [0, 1, 2]
+    assert front.photographs[2].path == folder / "images/front/0002.png"
+    assert front.T_camera_base @ [0, 0, 0.2, 1] == pytest.approx([0, 0, 1, 1])
+
+
+def test_the_file_itself_may_be_named(folder):
+    assert load_session(folder / "session.yaml").folder == folder
+    assert load_session(str(folder)).folder == folder
+
+
+def test_the_resolved_document_is_plain_and_complete(folder):
+    document = json.loads(json.dumps(load_session(folder).document))
+    assert document["stations"]["front"]["photographs"][0] == "images/front/0000.png"
+    assert document["stations"]["front"]["pose"]["up"] == [0, 0, 1]
+    assert document["joints"]["readings"]["0002"][0] == 0.40
+    assert document["board"] is None
+
+
+def test_rows_and_photographs_pair_by_name(folder):
+    header, *rows = JOINTS.splitlines(keepends=True)
+    (folder / "joints.csv").write_text(header + "".join(reversed(rows)))
+    session = load_session(folder)
+    for photo in session.stations[0].photographs:
+        assert session.configurations[photo.configuration] == photo.path.stem
+
+
+def test_a_configuration_without_photograph_is_a_warning(folder):
+    (folder / "images/front/0001.png").unlink()
+    (warning,) = load_session(folder).warnings
+    assert warning.startswith("joints.csv: no station has a photograph of configuration 0001 (1 of")
+
+
+def test_two_stations_need_not_photograph_the_same(folder):
+    image(folder / "images/left/0001.png")
+    (folder / "images/front/0001.png").unlink()
+    left = SESSION[SESSION.index("  front:") : SESSION.index("    pose:")]
+    with (folder / "session.yaml").open("a") as stream:
+        stream.write(left.replace("  front:", "  left:").replace("images/front", "images/left"))
+    session = load_session(folder)
+    assert session.warnings == ()
+    assert [len(station.photographs) for station in session.stations] == [2, 1]
+    assert session.stations[1].T_camera_base is None
+
+
+def test_repeats_and_absolute_patterns(folder):
+    for path in (folder / "images/front").iterdir():
+        path.unlink()
+    for name in ("0000_1", "0000_2", "0001_x_1"):
+        image(folder / f"elsewhere/{name}.png")
+    change(folder, "joints.csv", "0001,", "0001_x,")
+    pattern = f"{folder}/elsewhere/{{configuration}}_{{repeat}}.png"
+    change(folder, "session.yaml", "images/front/{configuration}.png", pattern)
+    photos = load_session(folder).stations[0].photographs
+    assert [(p.configuration, p.repeat) for p in photos] == [(0, "1"), (0, "2"), (1, "1")]
+
+
+def test_a_folder_for_each_configuration(folder):
+    for name in ("0000", "0001"):
+        image(folder / f"shots/{name}/front-{name}.png")
+    change(
+        folder, "session.yaml", "images/front/{configuration}.png",
+        "./shots/{configuration}/front-{configuration}.png",
+    )  # fmt: skip
+    photos = load_session(folder).stations[0].photographs
+    assert [photo.configuration for photo in photos] == [0, 1]
+
+
+def test_hidden_files_are_no_photographs(folder):
+    (folder / "images/front/._0001.png").write_bytes(b"what some systems leave behind")
+    assert len(load_session(folder).stations[0].photographs) == 3
+
+
+def test_a_mechanism_file_beside_the_session(folder):
+    from pkmcal.mechanisms import catalogue
+
+    (folder / "mechanism.yaml").write_text(catalogue()["gough-stewart"].read_text())
+    change(folder, "session.yaml", "gough-stewart", "mechanism.yaml")
+    assert load_session(folder).machine.n_joints == 6
+
+
+def test_column_names_are_free(folder):
+    change(folder, "joints.csv", "leg1,leg2,leg3,leg4,leg5,leg6", "a,b,c,leg1,d,e")
+    assert load_session(folder).joints.shape == (3, 6)
+
+
+def test_a_board(folder):
+    (folder / "board.yaml").write_text("type: charuco\n")
+    change(folder, "session.yaml", "pkmcal: 1", "pkmcal: 1\nboard: board.yaml")
+    session = load_session(folder)
+    assert session.board == folder / "board.yaml"
+    assert session.warnings == ("session.yaml, line 2, board: no station observes the board.",)
+    change(folder, "session.yaml", "observe: legs", "observe: board")
+    assert load_session(folder).warnings == ()
+
+
+def test_a_reading_slightly_out_of_range_is_a_warning(folder):
+    change(folder, "joints.csv", "0.46,0.45", "0.486,0.45")
+    (warning,) = load_session(folder).warnings
+    assert "line 3, column leg1: the reading 0.486 is slightly outside" in warning
+
+
+def test_a_joint_that_never_moves_is_a_warning(folder):
+    change(folder, "joints.csv", "0.41,0.38,0.36", "0.41,0.3800001,0.36")
+    change(folder, "joints.csv", "0.45,0.44", "0.45,0.38")
+    (warning,) = load_session(folder).warnings
+    assert warning.startswith("joints.csv: leg3 never moves by more than its noise")
+
+
+def test_importing_pkmcal_is_light():
+    heavy = ["cv2", "scipy", "plotly", "numpy", "pydantic"]
+    code = f"import sys, pkmcal; print([m for m in {heavy} if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+# what is wrong with a file
+
+EDITS = [
+    # session.yaml
+    ("session.yaml", "pkmcal: 1", "pkmcal: 2",
+     ["session.yaml, line 1, pkmcal: this version", "found 2, expected 1"]),
+    ("session.yaml", "pkmcal: 1", "pkmcal: true", ["found true, expected 1"]),
+    ("session.yaml", "pkmcal: 1\n", "", ["session.yaml, pkmcal: this is missing", "pkmcal: 1"]),
+    ("session.yaml", "camera:", "camrea:",
+     ["line 6, stations.front.camrea: this key is not known; found camrea, expected camera ("]),
+    ("session.yaml", "    camera: cameras/front.yaml\n", "",
+     ["line 5, stations.front.camera: this is missing", "for example cameras/front.yaml"]),
+    ("session.yaml", "observe: legs", "observe: leg", ["line 8", "found 'leg', expected 'legs'"]),
+    ("session.yaml", "3.0e-6", "0", ["line 3, joints.noise", "found 0, expected a number above 0"]),
+    ("session.yaml", "noise: 3.0e-6", "noise: 3 um", ["joints.noise", "'3 um', expected a number"]),
+    ("session.yaml", ", noise: 3.0e-6", "", ["joints.noise: this is missing", "in metres or rad"]),
+    ("session.yaml", "[0.0, -1.0, 0.2]", "[0.0, -1.0]",
+     ["line 10, stations.front.pose.position: this has too few entries",
+      "found [0.0, -1.0], expected the camera's place"]),
+    ("session.yaml", SESSION[SESSION.index("stations:"):], "stations: {}\n",
+     ["line 4, stations: this has too few entries"]),
+    # files that it names
+    ("session.yaml", "joints.csv", "joint.csv",
+     ["line 3, joints.file: there is no such file; found joint.csv", "(there is joints.csv)"]),
+    ("session.yaml", "cameras/front.yaml", "cameras/back.yaml",
+     ["line 6, stations.front.camera: there is no such file", "cameras/back.yaml"]),
+    ("session.yaml", "cameras/front.yaml", "cameras", ["this is a folder, not a file"]),
+    ("session.yaml", "gough-stewart", "gough-stuart",
+     ["session.yaml, line 2, mechanism", "found gough-stuart, expected gough-stewart"]),
+    ("session.yaml", "gough-stewart", "mechanism.yaml",
+     ["session.yaml, line 2, mechanism: there is no such file; found mechanism.yaml"]),
+    ("session.yaml", "observe: legs", "observe: board",
+     ["line 8, stations.front.observe: station front observes a board", "board: board.yaml"]),
+    ("session.yaml", "pkmcal: 1", "pkmcal: 1\nboard: board.yaml",
+     ["line 2, board: there is no such file"]),
+    ("cameras/front.yaml", "focal: [9.0, 9.0]", "focal: [9.0, -9.0]",
+     ["cameras/front.yaml, line 3, focal[2]", "a number above 0"]),
+    # pictures' pattern
+    ("session.yaml", "{configuration}", "0000",
+     ["line 7, stations.front.images: the pattern does not say", "'images/front/0000.png'"]),
+    ("session.yaml", "{configuration}", "{configration}",
+     ["placeholder is not known; found {configration}, expected {configuration}"]),
+    ("session.yaml", "{configuration}", "{configuration", ["the braces do not match"]),
+    ("session.yaml", "images/front/{", "images/back/{",
+     ["line 7, stations.front.images: there is no photograph", "no folder ", "images/back",
+      "expected files images/back/{configuration}.png"]),
+    ("session.yaml", "{configuration}.png", "{configuration}.PNG",
+     ["there is no photograph", "3 other entries, such as 0000.png"]),
+    # rough pose
+    ("session.yaml", "up: [0, 0, 1]", "up: [0, 1, 0]",
+     ["line 9, stations.front.pose: up does not fix", "0 degrees from the line of sight"]),
+    ("session.yaml", "up: [0, 0, 1]", "up: [0, 0, 0]", ["up does not fix"]),
+    ("session.yaml", "look_at: [0.0, 0.0, 0.2]", "look_at: [0.0, -1.0, 0.2]",
+     ["line 9, stations.front.pose: the camera looks at its own position"]),
+    # joints.csv
+    ("joints.csv", ",leg6", "", ["line 2: the row has another number of cells"]),
+    ("joints.csv", "leg1,leg2", "leg2,leg1",
+     ["joints.csv, line 1: the columns are not in the order", "expected leg1 leg2 leg3"]),
+    ("joints.csv", "0001,", "0000,", ["line 3: the configuration 0000 stands twice, on lines 2"]),
+    ("joints.csv", "0.37", "nan", ["line 2, column leg2: this is not a finite number"]),
+    ("joints.csv", "0.37", "0.87",
+     ["line 2, column leg2: this reading is outside", "found 0.87, expected 0.345 to 0.485"]),
+    ("joints.csv", "0001,", "1,",
+     ["images/front/0001.png is of a configuration without joint readings",
+      "session.yaml, line 7, stations.front.images", "found configuration 0001",
+      "The table has 1 where the photograph says 0001", "leading zeros"]),
+    ("joints.csv", JOINTS[JOINTS.index("0001"):], "",
+     ["joints.csv: there is only one configuration; found 0000, expected two"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "old", "new", "parts"), EDITS)
+def test_a_wrong_line(folder, name, old, new, parts):
+    change(folder, name, old, new)
+    message = fault(folder)
+    for part in parts:
+        assert part in message
+
+
+# what is wrong with the whole
+
+
+def test_no_such_folder(tmp_path):
+    assert "there is no such session folder" in fault(tmp_path / "none")
+
+
+def test_a_folder_without_session(folder):
+    inner = folder / "runs" / "monday"
+    inner.mkdir(parents=True)
+    (folder / "session.yaml").rename(inner / "session.yaml")
+    message = fault(folder / "runs")
+    assert "the folder holds no session.yaml; found sessions in monday below it" in message
+    assert "pkmcal new DIR" in fault(folder)
+
+
+def test_another_number_of_columns(folder):
+    rows = (line.rpartition(",")[0] for line in JOINTS.splitlines())
+    (folder / "joints.csv").write_text("\n".join(rows))
+    message = fault(folder)
+    assert "joints.csv, line 1: another number of joint columns" in message
+    assert "found 5 (leg1, leg2, leg3, leg4, leg5), expected 6" in message
+
+
+def scaled(factor):
+    header, *rows = JOINTS.splitlines()
+    for row in rows:
+        name, *cells = row.split(",")
+        header += f"\n{name}," + ",".join(repr(float(cell) * factor) for cell in cells)
+    return header
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit", "step"),
+    [(1e3, "millimetres", "Divide them by 1000"), (180 / np.pi, "degrees", "Multiply them by")],
+)
+def test_another_unit(folder, factor, unit, step):
+    (folder / "joints.csv").write_text(scaled(factor))
+    message = fault(folder)
+    assert f"joints.csv, line 2, column leg1: the readings look like {unit}" in message
+    assert step in message
+
+
+def test_one_reading_in_millimetres_is_a_mistake_of_its_own(folder):
+    change(folder, "joints.csv", "0.37", "370")
+    assert "line 2, column leg2: this reading is outside" in fault(folder)
+
+
+def test_more_readings_out_of_range_are_counted(folder):
+    change(folder, "joints.csv", "0.36,0.37", "0.96,0.97")
+    assert "It is one of 2 such readings. Correct" in fault(folder)
+
+
+def test_all_configurations_alike(folder):
+    header, row, *_ = JOINTS.splitlines()
+    rows = [row, row.replace("0000", "0001").replace("0.36", "0.360001"), row.replace("0000", "2")]
+    (folder / "joints.csv").write_text("\n".join([header, *rows]))
+    message = fault(folder)
+    assert "joints.csv: all configurations are alike" in message
+    assert "joints.noise, 3e-06" in message
+
+
+def test_only_one_configuration_photographed(folder):
+    for name in ("0001", "0002"):
+        (folder / f"images/front/{name}.png").unlink()
+    assert "only one configuration has photographs; found 0000" in fault(folder)
+
+
+def test_a_photograph_without_readings(folder):
+    image(folder / "images/front/0003.png")
+    image(folder / "images/front/0004.png")
+    message = fault(folder)
+    assert "images/front/0003.png is of a configuration without joint readings" in message
+    assert "(one of 2 such files)" in message
+    assert "expected one of the table's 3: 0000, 0001 and 0002" in message
+
+
+def test_a_photograph_of_another_size(folder):
+    image(folder / "images/front/0001.png", 16, 12)
+    message = fault(folder)
+    assert "images/front/0001.png: the photograph has another size than its camera" in message
+    assert "found 16x12, expected 8x6 (cameras/front.yaml)" in message
+    assert "unscaled" in message
+    image(folder / "images/front/0001.png", 6, 8)
+    assert "turned by a quarter" in fault(folder)
+
+
+def test_a_file_that_is_no_image(folder):
+    (folder / "images/front/0001.png").write_bytes(b"")
+    assert fault(folder).startswith("images/front/0001.png: the image file is empty")
+
+
+def test_one_stations_photographs_under_two_names(folder):
+    station = SESSION[SESSION.index("  front:") :]
+    with (folder / "session.yaml").open("a") as stream:
+        stream.write(station.replace("  front:", "  left:"))
+    message = fault(folder)
+    assert "stations.left.images: station left has the photographs of station front" in message

@@ -1,0 +1,106 @@
+"""CSV tables: what is taken as it comes, and every fault with its line."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pkmcal.errors import InputError
+from pkmcal.files import csv_text, read_csv, write_text
+
+HEADER = "configuration,leg1,leg2\n"
+
+
+def write(tmp_path, content):
+    path = tmp_path / "t.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def fault(function, *arguments, **keywords):
+    """The message of the InputError that a call raises."""
+    with pytest.raises(InputError) as caught:
+        function(*arguments, **keywords)
+    return str(caught.value)
+
+
+def test_a_table(tmp_path):
+    path = write(
+        tmp_path, b"\xef\xbb\xbfconfiguration, leg1 ,leg2\r\n\r\n001,1e-3,-.5\r\n02,2,3.\r\n"
+    )
+    table = read_csv(path)
+    assert table.columns == ("leg1", "leg2")
+    assert table.names == ("001", "02")
+    assert table.lines == (3, 4)
+    np.testing.assert_array_equal(table.values, [[1e-3, -0.5], [2, 3]])
+    assert table.where(1, 0) == "t.csv, line 4, column leg1"
+
+
+def test_lines_count_through_quoted_cells(tmp_path):
+    table = read_csv(write(tmp_path, 'configuration,x\n"a\nb",1\nc,2\n'))
+    assert table.names == ("a\nb", "c")
+    assert table.lines == (2, 4)
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        ("", ["t.csv: the file is empty", "configuration,…"]),
+        ("\n\n", ["the file is empty"]),
+        (HEADER, ["no rows under the header"]),
+        ("configuration;leg1;leg2\n1;0,3;0,4\n", ["line 1", "separated by semicolons", "Save it"]),
+        ("configuration\tleg1\n1\t0.3\n", ["separated by tabs"]),
+        ("leg1,leg2\n1,2\n", ["first column has another name", "found 'leg1'", "configuration"]),
+        ("configuration\n1\n", ["no column of numbers"]),
+        ("configuration,leg1,leg1\n1,2,3\n", ["the header names leg1 twice"]),
+        ("configuration,leg1,\n1,2,3\n", ["column 3 of the header has no name"]),
+        (HEADER + "1,2\n", ["line 2: the row has another number of cells", "found 2 cells"]),
+        (HEADER + "1,2,3,4\n", ["found 4 cells, expected 3 (configuration, leg1, leg2)"]),
+        (HEADER + ",2,3\n", ["line 2: the configuration has no name"]),
+        (HEADER + "1,,3\n", ["line 2, column leg1: the cell is empty", "Leave the whole row out"]),
+        (HEADER + "1,2,nan\n", ["column leg2: this is not a finite number", "found 'nan'"]),
+        (HEADER + "1,2,-Inf\n", ["this is not a finite number"]),
+        (HEADER + "1,2,1e999\n", ["this is not a finite number"]),
+        (HEADER + "1,2,#N/A\n", ["this is not a finite number"]),
+        (HEADER + "1,2,abc\n", ["this is not a number; found 'abc'"]),
+        (HEADER + "1,2,1_000\n", ["this is not a number"]),
+        (HEADER + '1,2,"0,35"\n', ["decimal comma; found '0,35', expected 0.35"]),
+        (
+            HEADER + "1,2,3\n2,2,3\n1,4,5\n",
+            ["line 4: the configuration 1 stands twice, on lines 2"],
+        ),
+        (HEADER + '1,2,"3\n', ["not valid CSV", "Check the quotes"]),
+    ],
+)
+def test_csv_faults(tmp_path, content, parts):
+    message = fault(read_csv, write(tmp_path, content))
+    for part in parts:
+        assert part in message
+
+
+def test_csv_columns_that_are_asked_for(tmp_path):
+    path = write(tmp_path, HEADER + "1,2,3\n")
+    assert read_csv(path, columns=["leg2", "leg1"]).columns == ("leg1", "leg2")
+    message = fault(read_csv, path, columns=["leg1", "leg2", "leg3"])
+    assert "column leg3 is missing; found leg1, leg2" in message.replace(" and ", ", ")
+    assert "found leg2, expected lag2." in fault(read_csv, path, columns=["leg1", "lag2"])
+
+
+cells = st.text(st.characters(exclude_categories=["Cs", "Cc", "Zs", "Zl", "Zp"]), min_size=1)
+
+
+@settings(deadline=None)
+@given(
+    st.lists(cells, unique=True, min_size=1, max_size=4).filter(lambda c: "configuration" not in c),
+    st.lists(cells, unique=True, min_size=1, max_size=6),
+    st.randoms(use_true_random=False),
+)
+def test_csv_written_reads_back_the_same(tmp_path_factory, columns, names, random):
+    values = np.array([[random.gauss(0, 10.0 ** random.randint(-9, 9)) for _ in columns]
+                       for _ in names])  # fmt: skip
+    path = tmp_path_factory.mktemp("csv") / "t.csv"
+    write_text(path, csv_text(columns, names, values))
+    table = read_csv(path)
+    assert table.columns == tuple(columns)
+    assert table.names == tuple(names)
+    np.testing.assert_array_equal(table.values, values)
