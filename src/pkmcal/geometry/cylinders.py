@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import GeometryError
 from pkmcal.geometry.rigid import cross, dot
-from pkmcal.arrays import Array, Booleans
 
 SIDE_SIGNS = np.array([1.0, -1.0])
 """Sign of the moment's part of the normal, by side."""
@@ -68,7 +68,7 @@ def edge_normals(a_camera: Array, u_camera: Array, radius: Array) -> Array:
     return np.stack([cos * m_unit - sin * a_perp, -cos * m_unit - sin * a_perp], axis=-2)
 
 
-def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Array) -> EdgeNormals:
+def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Integers) -> EdgeNormals:
     """One edge's normal and its exact derivatives, from two points of the axis.
 
     a, b : (..., 3) points of the axis in the camera frame, a towards the base (m).
@@ -122,5 +122,3 @@ def tangent_basis(n: Array, along: Array) -> Array:
     first = along - dot(along, n)[..., None] * n
     first = first / np.sqrt(dot(first, first))[..., None]
     return np.stack([first, cross(n, first)], axis=-1)
-
-

@@ -127,9 +127,7 @@ def _blocks(
     )
 
 
-def _data(
-    edges: EdgeSet, joints: Array, blocks: Blocks, row: Integers, place: Integers
-) -> Data:
+def _data(edges: EdgeSet, joints: Array, blocks: Blocks, row: Integers, place: Integers) -> Data:
     shape = blocks.leg.shape
     basis = np.zeros((1, *shape, 1, 3, 2))
     whiten = np.zeros((1, *shape, 2, 2))

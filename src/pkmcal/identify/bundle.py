@@ -46,7 +46,7 @@ class BatchResult:
     solution: Solution
     weight: Array
     noise_scale: Array
-    steps: Array
+    steps: Integers
     info: Information
 
 
@@ -58,7 +58,8 @@ def solve_batch(
     present = np.broadcast_to(
         problem.blocks.present.astype(float), (n_runs, *problem.blocks.present.shape)
     )
-    state, weight, steps = start, present, np.zeros(n_runs, dtype=int)
+    state, weight = start, present
+    steps: Integers = np.zeros(n_runs, dtype=int)
     scale = np.ones(n_runs)
     if robust:
         found = robust_weights.anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
@@ -143,9 +144,7 @@ def bundle(
     return _estimate(machine, measurements, start, assembled, result, gauge)
 
 
-def start_state(
-    machine: Machine, measurements: Measurements, T_camera_base_guess: Array
-) -> State:
+def start_state(machine: Machine, measurements: Measurements, T_camera_base_guess: Array) -> State:
     """A start: the machine's present values, poses by forward kinematics from the readings.
 
     Readings, not seen directions: the latter lead into local minima (errata, B).

@@ -168,9 +168,7 @@ def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Id
         n_frames=frames.shape[1],
         rank=int(np.sum(~lost)),
         unidentified=tuple(m for m, gone in zip(made, lost, strict=True) if gone),
-        weak=tuple(
-            m for m, gone in zip(made, lost, strict=True) if not gone and m.information < 1
-        ),
+        weak=tuple(m for m, gone in zip(made, lost, strict=True) if not gone and m.information < 1),
         singular_values=s,
     )
 

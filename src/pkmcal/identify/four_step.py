@@ -53,7 +53,8 @@ class Axes:
 @dataclass(frozen=True)
 class FourSteps:
     """The steps' results: base (B, L, 3), offsets (B, L), platform (B, L, 3),
-    T_camera_base (B, S, 4, 4); m, frames by three centres."""
+    T_camera_base (B, S, 4, 4); m, frames by three centres.
+    """
 
     base: Array
     offsets: Array
@@ -157,9 +158,7 @@ def _consecutive(axes: Axes, both: Booleans) -> Array:
     return step * use[:, :, None]
 
 
-def platform_by_registration(
-    axes: Axes, b_photo: Array, drawing: Array, gauge: Array
-) -> Array:
+def platform_by_registration(axes: Axes, b_photo: Array, drawing: Array, gauge: Array) -> Array:
     """Step 4 corrected: platform centres (B, L, 3) from those in the photographs."""
     enough = axes.seen.sum(axis=1) >= 3
     weight = np.broadcast_to(axes.seen[enough], b_photo[:, enough].shape[:-1]).astype(float)
@@ -195,9 +194,7 @@ def platform_by_distances(axes: Axes, b_photo: Array, drawing: Array, gauge: Arr
     return minimise_dense(rows, start).state.reshape(-1, *drawing.shape)
 
 
-def solve(
-    machine: Machine, axes: Axes, a_camera: Array, found: Booleans, form: Form
-) -> FourSteps:
+def solve(machine: Machine, axes: Axes, a_camera: Array, found: Booleans, form: Form) -> FourSteps:
     """Steps 2 to 4 from the base centres in the camera frames, all runs at once.
 
     a_camera : (B, S, L, 3) with (S, L) whether found; the machine's values start the search.
@@ -233,31 +230,47 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
         edges.station * len(measurements.joints) + edges.configuration, return_inverse=True
     )
     n_legs = machine.n_legs
-    group = index * n_legs + edges.leg
+    u, point, seen = _axes_of_groups(
+        edges,
+        linear.edge_radii(machine, edges),
+        weights,
+        index * n_legs + edges.leg,
+        len(photo) * n_legs,
+    )
+    station, configuration = np.divmod(photo, len(measurements.joints))
+    readings = leg_readings(machine.layout, measurements.joints[configuration])
+    full = (1, len(photo), n_legs)
+    return Axes(
+        station,
+        configuration,
+        seen.reshape(full[1:]),
+        u.reshape(*full, 3),
+        point.reshape(*full, 3),
+        readings[None],
+    )
+
+
+def _axes_of_groups(
+    edges: EdgeSet, radius: Array, weights: Array, group: Integers, n_groups: int
+) -> tuple[Array, Array, Booleans]:
+    """Direction, point (n, 3) and whether both sides count, of each group of edges."""
     weight = np.where(weights > 0.5, 1 / np.trace(edges.covariance, axis1=1, axis2=2), 0.0)
-    radii = machine.radii()
-    radius = np.array([radii[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)])
-    shape = (len(photo) * n_legs,)
-    normal, right = np.zeros((*shape, 3, 3)), np.zeros((*shape, 3))
-    sides = np.zeros((2, *shape, 3))
-    np.add.at(normal, group, weight[:, None, None] * edges.normal[:, :, None] * edges.normal[:, None])
-    np.add.at(right, group, -(weight * radius)[:, None] * edges.normal)
-    np.add.at(sides, (edges.side, group), weight[:, None] * edges.normal)
-    seen = np.all(np.linalg.norm(sides, axis=-1) > 0, axis=0)
-    total = np.maximum(np.bincount(group, weight, shape[0]), 1e-300)
+    weighted = weight[:, None] * edges.normal
+    normal, right = np.zeros((n_groups, 3, 3)), np.zeros((n_groups, 3))
+    sides = np.zeros((2, n_groups, 3))
+    np.add.at(normal, group, weighted[:, :, None] * edges.normal[:, None])
+    np.add.at(right, group, -radius[:, None] * weighted)
+    np.add.at(sides, (edges.side, group), weighted)
+    both = np.linalg.norm(sides, axis=-1) > 0
+    seen = both[0] & both[1]
+    total = np.maximum(np.bincount(group, weight, n_groups), 1e-300)
     normal = np.where(seen[:, None, None], normal / total[:, None, None], np.eye(3))
     u = np.linalg.eigh(normal)[1][..., 0]
     u = u * np.where(dot(u, cross(sides[1], sides[0])) < 0, -1.0, 1.0)[:, None]
     # n.M = -R in the plane across the axis, and u.M = 0
     across = normal + u[:, :, None] * u[:, None, :]
     point = np.linalg.solve(across, (right / total[:, None])[..., None])[..., 0]
-    station, configuration = np.divmod(photo, len(measurements.joints))
-    readings = leg_readings(machine.layout, measurements.joints[configuration])
-    full = (1, len(photo), n_legs)
-    return Axes(
-        station, configuration, seen.reshape(full[1:]), u.reshape(*full, 3),
-        point.reshape(*full, 3), readings[None],
-    )
+    return u, point, seen
 
 
 def through_centres(machine: Machine, edges: EdgeSet, centres: Array) -> EdgeSet:
@@ -267,14 +280,12 @@ def through_centres(machine: Machine, edges: EdgeSet, centres: Array) -> EdgeSet
     centres : (S, L, 3) m, camera frames; edges of a NaN centre stay as they are.
     """
     a = centres[edges.station, edges.leg]
-    known = np.isfinite(a).all(axis=-1)
+    known: Booleans = np.all(np.isfinite(a), axis=-1)
     a = np.where(known[:, None], a, 0.0)
     along = np.swapaxes(edges.basis, -1, -2) @ a[..., None]
     gain = edges.covariance @ along
     spread = np.maximum((np.swapaxes(along, -1, -2) @ gain)[..., 0], 1e-300)
-    radii = machine.radii()
-    radius = np.array([radii[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)])
-    miss = np.where(known, dot(edges.normal, a) + radius, 0.0)
+    miss = np.where(known, dot(edges.normal, a) + linear.edge_radii(machine, edges), 0.0)
     change = (edges.basis @ gain)[..., 0] * (miss[:, None] / spread)
     normal = edges.normal - change
     return replace(edges, normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True))
@@ -300,7 +311,7 @@ def four_step(
         edges = through_centres(machine, edges, found_linear.centres)
     axes = axes_from_edges(machine, replace(measurements, edges=edges), found_linear.weights)
     a_camera = found_linear.centres[None]
-    found = np.isfinite(found_linear.centres).all(axis=-1)
+    found: Booleans = np.all(np.isfinite(found_linear.centres), axis=-1)
     if form == "printed":
         a_camera, found = centres_from_axes(axes, measurements.n_stations)
     _check(machine, found, T_camera_base_guess)

@@ -67,7 +67,7 @@ def weighted(n: Array, radius: Array, weight: Array) -> tuple[Array, Array]:
 
 
 def residuals(n: Array, radius: Array, a: Array) -> Array:
-    """n . A + R, (..., n) m: how far A lies from each edge's plane moved in by the radius."""
+    """N . A + R, (..., n) m: how far A lies from each edge's plane moved in by the radius."""
     return (n @ a[..., None])[..., 0] + radius
 
 
@@ -75,7 +75,8 @@ def scale_of(r: Array, present: Array) -> Array:
     """Standard deviation (...) from the median of |r| over the present ones, n - 3 counted."""
     count = np.sum(present > 0, axis=-1)
     ordered = np.sort(np.where(present > 0, np.abs(r), np.inf), axis=-1)
-    median = np.take_along_axis(ordered, (count // 2)[..., None] * (count > 0)[..., None], -1)[..., 0]
+    middle = np.where(count > 0, count // 2, 0)[..., None]
+    median = np.take_along_axis(ordered, middle, axis=-1)[..., 0]
     return 1.4826 * (1 + 5 / np.maximum(count - 3, 1)) * np.maximum(median, 1e-12)
 
 
@@ -180,7 +181,7 @@ def centres(
         return out
 
     n, present = spread(edges.normal, (3,)), spread(np.ones(len(edges)))
-    radius = spread(_radii(machine, edges))
+    radius = spread(edge_radii(machine, edges))
     noise = spread(edges.basis @ edges.covariance @ np.swapaxes(edges.basis, -1, -2), (3, 3))
     rng = np.random.default_rng(0) if rng is None else rng
     a, weight, covariance = solve(n, radius, present, noise, method, rng)
@@ -256,6 +257,7 @@ def _places(group: Integers, n_groups: int) -> tuple[Integers, int]:
     return place, int(np.bincount(group, minlength=n_groups).max())
 
 
-def _radii(machine: Machine, edges: EdgeSet) -> Array:
+def edge_radii(machine: Machine, edges: EdgeSet) -> Array:
+    """The machine's present radius of the tube that each edge bounds, (N,) m."""
     radii = machine.radii()
     return np.array([radii[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)])

@@ -8,7 +8,7 @@ averaged; drawing errors uniform within 2 mm. Runs are batched.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from pkmcal.identify.assembly import prior_rows
 from pkmcal.identify.axis_measurements import AxisNoise, as_edges, from_coordinates, to_coordinates
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.covariance import information
-from pkmcal.identify.four_step import Axes, centres_from_axes, solve
+from pkmcal.identify.four_step import Axes, Form, centres_from_axes, solve
 from pkmcal.identify.gauge import ThreeCentres, centre_index, freedoms, generators, projector
 from pkmcal.identify.residuals import BatchState, Blocks, Data, Problem
 from pkmcal.mechanisms import Machine, load_mechanism
@@ -34,11 +34,12 @@ CHUNK = 25
 @dataclass(frozen=True)
 class Settings:
     """[A] 4.3. drawing_error, joint_noise : m, standard deviations of uniform errors ("variance
-    equal to 2 mm"). distance, height : of the cameras, m. poses : per station."""
+    equal to 2 mm"). distance, height : of the cameras, m. poses : per station.
+    """
 
     poses: int = 15
     legs_seen: int = 4
-    noise: AxisNoise = AxisNoise()
+    noise: AxisNoise = field(default_factory=AxisNoise)
     joint_noise: float = 3e-6
     drawing_error: float = 0.002
     distance: float = 0.9
@@ -48,7 +49,8 @@ class Settings:
 
 class Truth(NamedTuple):
     """Simulated runs: theta (B, P), T_camera_base (S, 4, 4), T_base_platform (B, K, 4, 4),
-    measured joints (B, K, m), axis coordinates (B, K, G, 4)."""
+    measured joints (B, K, m), axis coordinates (B, K, G, 4).
+    """
 
     theta: Array
     T_camera_base: Array
@@ -61,7 +63,8 @@ class Accuracy(NamedTuple):
     """RMSE over runs, m and rad. base_xy to offset : the thirty parameters in the frames of
     centres 1, 3 and 5. displacement, orientation : mean error of the end-effector, [A] eq. 20,
     in those frames; the last two with frames registered on all centres, so that the error of
-    the frames' own definition by three joints is left out."""
+    the frames' own definition by three joints is left out.
+    """
 
     base_xy: float
     base_z: float
@@ -83,7 +86,8 @@ class Accuracy(NamedTuple):
 @dataclass(frozen=True)
 class Study:
     """Accuracy by method (the bound has no end-effector), chi2 over degrees of freedom of each
-    run, solver steps of each run, and runs that converged to the right answer."""
+    run, solver steps of each run, and runs that converged to the right answer.
+    """
 
     accuracy: dict[str, Accuracy]
     chi2_per_dof: Array
@@ -94,8 +98,11 @@ class Study:
 def study_machine() -> Machine:
     """The catalogue's Gough-Stewart platform with its radii held: axes do not need them."""
     machine = load_mechanism("gough-stewart")
-    radii = [n for n, k in zip(machine.parameters.names, machine.parameters.kinds, strict=True)
-             if k == "radius"]
+    radii = [
+        n
+        for n, k in zip(machine.parameters.names, machine.parameters.kinds, strict=True)
+        if k == "radius"
+    ]
     return replace(machine, parameters=machine.parameters.with_roles(fixed=tuple(radii)))
 
 
@@ -105,8 +112,9 @@ def stations(settings: Settings) -> Array:
     return np.stack(
         [
             look_at(
-                np.array([settings.distance * np.cos(a), settings.distance * np.sin(a),
-                          settings.height]),
+                np.array(
+                    [settings.distance * np.cos(a), settings.distance * np.sin(a), settings.height]
+                ),
                 np.array([0.0, 0.0, settings.height]),
                 np.array([0.0, 0.0, 1.0]),
             )
@@ -154,9 +162,7 @@ def _uniform(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> 
     return rng.uniform(-1, 1, shape) * np.sqrt(3) * sigma
 
 
-def _readings(
-    machine: Machine, settings: Settings, runs: int, rng: np.random.Generator
-) -> Array:
+def _readings(machine: Machine, settings: Settings, runs: int, rng: np.random.Generator) -> Array:
     """Readings (B, K, 6): distinct corners of the legs' ranges per station, or uniform."""
     low, high = machine.joint_ranges.T
     if not settings.extreme:
@@ -222,7 +228,8 @@ def four_steps(machine: Machine, settings: Settings, truth: Truth) -> Iterator[t
     axes = measured_axes(machine, settings, truth)
     a_camera, found = centres_from_axes(axes, 3)
     base, platform = centre_index(machine.layout)
-    for name, form in (("four steps as printed", "printed"), ("four steps", "corrected")):
+    forms: dict[str, Form] = {"four steps as printed": "printed", "four steps": "corrected"}
+    for name, form in forms.items():
         steps = solve(machine, axes, a_camera, found, form)
         theta = np.broadcast_to(machine.parameters.drawing, truth.theta.shape).copy()
         theta[:, base], theta[:, platform] = steps.base, steps.platform
@@ -325,7 +332,8 @@ def study(
     all_truth = _together(truths)
     none = (float("nan"),) * 4
     table = {
-        name: _summary(machine, np.concatenate(part), none) if name == "bound"
+        name: _summary(machine, np.concatenate(part), none)
+        if name == "bound"
         else accuracy(machine, np.concatenate(part), all_truth, np.random.default_rng(seed + 1))
         for name, part in parts.items()
     }

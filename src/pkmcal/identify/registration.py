@@ -161,5 +161,3 @@ def minimise_dense(
 ) -> Solution:
     """Batched Levenberg-Marquardt on plain vectors (B, n)."""
     return minimise(Dense(rows, np.arange(len(start))), start)
-
-

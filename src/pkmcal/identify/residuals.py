@@ -71,7 +71,8 @@ class Data:
 @dataclass(frozen=True)
 class BatchState:
     """Unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
-    T_base_platform (B, K, 4, 4), edge_shift (B, C)."""
+    T_base_platform (B, K, 4, 4), edge_shift (B, C).
+    """
 
     z: Array
     T_camera_base: Array

@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.residuals import BatchState, Problem
-from pkmcal.identify.solver import RESTART_DAMPING, minimise
+from pkmcal.identify.solver import FIRST_DAMPING, RESTART_DAMPING, minimise
 
 FULL, NONE = 4.0, 6.5
 """Weights are 1 up to FULL and 0 from NONE standard deviations: of clean edges 3 in 10^4 lose
@@ -63,15 +63,16 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
     """
     state, steps = start, 0
     d = norms(problem, state)
-    cut = np.full(d.shape[0], np.inf)
+    cut = 4 * WIDE * np.maximum(robust_scale(d), least_scale)
     for _ in range(STAGES):
         aim = WIDE * np.maximum(robust_scale(d), least_scale)
-        new_cut = np.minimum(cut, np.maximum(aim, cut / 4 if np.isfinite(cut).all() else aim))
+        new_cut = np.minimum(cut, np.maximum(aim, cut / 4))
         settled = np.all(new_cut > 0.8 * cut)
         cut = new_cut
         c2 = cut[:, None, None] ** 2
         weight = np.where(np.isfinite(d), (c2 / (c2 + np.nan_to_num(d) ** 2)) ** 2, 0.0)
-        found = minimise(problem.weighted(weight), state, 1, RESTART_DAMPING if steps else 1e-5)
+        damping = RESTART_DAMPING if steps else FIRST_DAMPING
+        found = minimise(problem.weighted(weight), state, max_steps=1, damping=damping)
         state, steps = found.state, steps + 1
         d = norms(problem, state)
         if settled:

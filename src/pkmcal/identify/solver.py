@@ -41,9 +41,7 @@ class Stop(Enum):
         "readings belong to the photographs"
     )
     STEPS = "the step limit was reached before convergence; start nearer, or allow more steps"
-    NOT_FINITE = (
-        "nothing can be predicted at the start; check the stations' poses and the drawing"
-    )
+    NOT_FINITE = "nothing can be predicted at the start; check the stations' poses and the drawing"
     RUNNING = "not finished"
 
 
@@ -240,15 +238,18 @@ def _try(problem: LeastSquares, state: Any, damping: Array) -> tuple[Any, _Gain]
         accepted, damping * np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2)), damping * 8
     )
     next_damping = np.clip(next_damping, LEAST_DAMPING, MOST_DAMPING)
-    stop = [
-        Stop.NOT_FINITE if n == 0
-        else Stop.CONVERGED if s and d < 1e-2
-        else Stop.STALLED if (not a and d >= MOST_DAMPING)
-        else Stop.RUNNING
-        for n, s, a, d in zip(usable.sum(axis=(1, 2)), small, accepted, damping, strict=True)
-    ]
+    any_usable = np.sum(usable, axis=(1, 2)) > 0
+    stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
     new = problem.take(trial, np.flatnonzero(accepted))
     return new, _Gain(accepted, np.where(accepted, cost_trial, cost), next_damping, stop)
+
+
+def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
+    if not usable:
+        return Stop.NOT_FINITE
+    if small and damping < 1e-2:  # a strongly damped step is small anywhere
+        return Stop.CONVERGED
+    return Stop.STALLED if not accepted and damping >= MOST_DAMPING else Stop.RUNNING
 
 
 def _cost(values: Values, usable: Booleans) -> Array:

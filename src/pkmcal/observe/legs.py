@@ -29,11 +29,12 @@ from pkmcal.observe.predict import (
 from pkmcal.observe.search import SEARCH_SIGMA, sample, search_legs
 
 SEARCH_SAMPLES = 12
-SAMPLES = 48
-"""Points along an edge whose profiles are taken; noise at this density is far below shading."""
+SAMPLES = 192
+"""Points along an edge whose profiles are taken, about one a pixel: faint edges need the average."""
 SEGMENTS = 8
 """Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
-FEWEST_SAMPLES = 3
+FEWEST_SHARE = 1 / 3
+"""Share of a segment's samples that must be clear for its mean profile to count."""
 BLUR = 0.7
 """Pixels of blur assumed where no profile is there to tell: lens 0.6, pixel 0.3."""
 CLEARANCE = 5.0
@@ -171,7 +172,7 @@ def _segment_profiles(
     grey = grey.reshape(k, e, SEGMENTS, n // SEGMENTS, -1)
     weight = clear.reshape(k, e, SEGMENTS, n // SEGMENTS)
     count = weight.sum(axis=-1)
-    full = count >= FEWEST_SAMPLES
+    full = count >= FEWEST_SHARE * weight.shape[-1]
     kept, weight = grey[full], weight[full][..., None]
     mean = np.sum(kept * weight, axis=-2) / count[full][:, None]
     saturated = np.any((kept >= profiles.SATURATED) & weight, axis=-2)

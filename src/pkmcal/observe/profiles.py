@@ -19,7 +19,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 
-INSIDE, OUTSIDE = 3.0, 2.0
+INSIDE, OUTSIDE = 3.0, 3.0
 """Pixels of a profile that the model explains: less is ill-conditioned, more meets the leg's
 other features and neighbours."""
 STEP = 0.5

@@ -31,9 +31,9 @@ SEARCH_DISTANCE = 0.06
 is 10 degrees and 10 cm."""
 TRIES = 800
 RETRIES = 400
-GOOD_SCORE = 0.45
-"""Mean truncated distance above which no leg was recognised. Photographs of the machine give
-0.2-0.3; random pictures or another machine's 0.5 and more."""
+GOOD_SCORE = 0.34
+"""Mean truncated distance above which no leg was recognised. Photographs of the machine give 0.2;
+another configuration, station or order of legs 0.36 to 0.6."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, register
-from pkmcal.identify.gauge import BestFit, generators, projector
+from pkmcal.identify.gauge import BestFit, transformation
+from pkmcal.identify.problem import Estimate
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import LimbEnds, limb_ends
 
@@ -65,11 +66,11 @@ def joint_centres(drawing: Machine, calibrated: Machine, covariance: Array) -> t
     )
 
 
-def free_of_gauge(machine: Machine, covariance: Array) -> Array:
+def free_of_gauge(estimate: Estimate) -> Array:
     """Covariance (P, P) of the parameters about the best fit of all centres to the drawing."""
-    change, _ = projector(machine, machine.values, BestFit())
-    keep = np.eye(len(covariance)) - generators(machine.layout, machine.values) @ change
-    return keep @ covariance @ keep.T
+    n = len(estimate.covariance)
+    keep = transformation(estimate.machine, estimate.state, BestFit())[:n, :n]
+    return keep @ estimate.covariance @ keep.T
 
 
 def laid_over(source: Array, target: Array) -> Array:

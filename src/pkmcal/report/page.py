@@ -61,7 +61,7 @@ def report_views(session: Session, observation: Observation, estimate: Estimate)
     """Everything that the templates show besides the verdict, by its name there."""
     edges, machine = observation.edges, estimate.machine
     camera = residuals.camera_numbers(session)
-    covariance = free_of_gauge(machine, estimate.covariance)
+    covariance = free_of_gauge(estimate)
     centres = joint_centres(session.machine, machine, covariance)
     tool = toolpoint.tool_point(
         session.machine,

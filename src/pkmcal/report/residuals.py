@@ -260,6 +260,6 @@ def _shaded(edges: EdgeSet, estimate: Estimate, shifts: Array) -> list[str]:
             continue
         mean, error = values.mean(), values.std(ddof=1) / np.sqrt(len(values))
         if abs(mean) > max(SHADED, 3 * error):
-            where = f"leg {leg + 1} tube {tube + 1} side {SIDES[side]}"
+            where = f"leg {leg + 1} tube {tube + 1} {SIDES[side]}"
             found.append((abs(mean), f"{where} by {number(mean, 2, signed=True)} px"))
     return [text for _, text in sorted(found, reverse=True)[:4]]

@@ -60,7 +60,7 @@ class Bounds:
         half = np.arccos(np.clip(spread, -1, 1))
         to_ball = self.centre - origin[:, None]
         distance = np.sqrt(np.einsum("ib,ib->b", to_ball, to_ball))
-        cosine = (middle.T @ to_ball) / np.maximum(distance, 1e-12)
+        cosine = np.einsum("ik,ib->kb", middle, to_ball) / np.maximum(distance, 1e-12)
         radius = self.radius + grow
         width = np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1.0))
         # a ball round the origin is met by every ray

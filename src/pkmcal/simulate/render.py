@@ -15,6 +15,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.simulate.casting import Bounds, Scene, look
+from pkmcal.simulate.shapes import turned
 
 TILE = 16
 """Pixels along the side of a bundle of neighbouring rays."""
@@ -107,7 +108,7 @@ def _through_centres(
     rays = view.centre.reshape(3, -1)
     for rows in _chunks(pixels[seeing]):
         d = _seeing(rays[:, rows])
-        found, labels = look(scene, bounds, origin, np.tensordot(rot, d, 1))
+        found, labels = look(scene, bounds, origin, turned(rot, d))
         light[rows], label[rows] = found, labels
     label[blind.ravel()] = -2
     return light.reshape(shape), label.reshape(shape)
@@ -136,7 +137,7 @@ def _over_area(
         centre = view.centre.reshape(3, -1)[:, at[rows]][..., None]
         d = np.where(np.isfinite(d).all(axis=0), d, centre)
         d = d / np.sqrt(np.einsum("i...,i...->...", d, d))
-        d = np.tensordot(rot, d.reshape(3, rows.shape[0], -1), 1)
+        d = turned(rot, d.reshape(3, rows.shape[0], -1))
         light, _ = look(scene, bounds, origin, d)
         out[rows] = light.reshape(*rows.shape, SAMPLES).mean(axis=-1)
     result = np.empty(at.size)

@@ -123,7 +123,8 @@ def _write_texts(
     files = {
         name: "cameras/camera.yaml" if same else f"cameras/{name}.yaml" for name in truth.stations
     }
-    columns = [f"leg{j + 1}" for j, leg in enumerate(drawing.document.legs) if leg.length.actuated]
+    driven = np.flatnonzero(drawing.layout.actuated >= 0)
+    columns = [f"leg{j + 1}" for j in driven]
     texts = {
         "mechanism.yaml": mechanism_text(drawing),
         "session.yaml": yaml_text(_session_document(settings, truth, files)),

@@ -57,6 +57,15 @@ def inner(d: Array, v: Array) -> Array:
     return d[0] * v[0] + d[1] * v[1] + d[2] * v[2]
 
 
+def turned(rot: Array, v: Array) -> Array:
+    """Vectors (3, ...) turned by a matrix (3, 3).
+
+    Not by BLAS: its own threads, for so small a matrix, wait more than they work, and photographs
+    are rendered in threads already.
+    """
+    return np.stack([sum(rot[i, j] * v[j] for j in range(3)) for i in range(3)])
+
+
 def _soft(clearance: Array, width: Array, where: Booleans) -> Array:
     """Hidden part of a lamp whose image at the shape is ``width`` in radius, by clearance (m)."""
     x = np.clip(0.5 - clearance / (2 * width), 0, 1)
@@ -102,7 +111,7 @@ class Cylinder(Shape):
 
     def local(self, points: Array) -> Array:
         """Two coordinates across the axis and one along it."""
-        return _frame_of(self.axis) @ (points - self.start[:, None])
+        return turned(_frame_of(self.axis), points - self.start[:, None])
 
     def balls(self) -> tuple[Array, Array]:
         """A row along the axis, or one ball round a disc."""
@@ -197,7 +206,7 @@ class Box(Shape):
         """The last of the three slabs to be entered, before the first is left."""
         o = self.rot @ (origin - self.centre)
         with np.errstate(divide="ignore", invalid="ignore"):
-            inv = 1 / (self.rot @ d)
+            inv = 1 / turned(self.rot, d)
             near = -o[:, None] * inv - self.half[:, None] * np.abs(inv)
             far = -o[:, None] * inv + self.half[:, None] * np.abs(inv)
         first, last = near.max(axis=0), far.min(axis=0)
@@ -215,7 +224,7 @@ class Box(Shape):
 
     def local(self, points: Array) -> Array:
         """Along the box's axes, from its centre."""
-        return self.rot @ (points - self.centre[:, None])
+        return turned(self.rot, points - self.centre[:, None])
 
     def balls(self) -> tuple[Array, Array]:
         """A row along the longest axis."""
@@ -248,7 +257,7 @@ class Wall(Shape):
 
     def local(self, points: Array) -> Array:
         """Two coordinates in the plane, the third zero."""
-        return _frame_of(self.inward) @ (points - self.point[:, None])
+        return turned(_frame_of(self.inward), points - self.point[:, None])
 
     def balls(self) -> tuple[Array, Array]:
         """Everything."""

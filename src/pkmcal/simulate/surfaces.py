@@ -111,12 +111,12 @@ class Slats(Pattern):
     dark: float
 
     def factor(self, q: Array) -> Array:
-        """A joint is a twentieth of the width."""
+        """A joint is a twelfth of the width, with soft borders: thinner ones would flicker."""
         seam = np.zeros(q.shape[1])
         for axis, size in ((0, self.width), (1, self.height)):
             if np.isfinite(size):
                 gap = np.abs((q[axis] / size) % 1.0 - 0.5)
-                seam = np.maximum(seam, np.clip((gap - 0.475) * 80, 0, 1))
+                seam = np.maximum(seam, np.clip((gap - 0.45) * 35, 0, 1))
         return 1 - (1 - self.dark) * seam
 
 

@@ -1,0 +1,145 @@
+"""Is the result to be used? In words, with reasons, warnings and advice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.identify.problem import Estimate, Measurements
+from pkmcal.observe.edges import Observation
+
+FAR = 5.0
+"""Tolerances by which a value may leave the drawing before a person should look."""
+TOO_NOISY = 4.0
+"""Factor on the edges' stated noise beyond which the model does not explain the photographs."""
+TOO_MANY_LOST = 0.4
+"""Share of edges given up as outliers beyond which the rest may be the outliers."""
+DECIDED = 0.5
+"""Share of a value that the data must decide for it to count as calibrated."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a person should know first.
+
+    usable : whether the result may be loaded into a controller.
+    headline : one sentence. reasons : why not usable. warnings : what to look at. advice : what
+    would make it better.
+    """
+
+    usable: bool
+    headline: str
+    reasons: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+
+
+def judge(measurements: Measurements, observation: Observation, estimate: Estimate) -> Verdict:
+    """The verdict on an estimate of a session."""
+    reasons = tuple(_reasons(measurements, estimate))
+    warnings = tuple(_warnings(measurements, observation, estimate))
+    centres = _centre_sigma(estimate)
+    if reasons:
+        headline = "This calibration should not be used."
+    else:
+        headline = (
+            f"Calibrated: joint centres to {centres * 1e3:.2g} mm"
+            f" and offsets to {_offset_sigma(estimate) * 1e3:.2g} mm (standard deviations)."
+        )
+    return Verdict(not reasons, headline, reasons, warnings, tuple(_advice(estimate)))
+
+
+def _reasons(measurements: Measurements, estimate: Estimate) -> list[str]:
+    out: list[str] = []
+    lost = float(np.mean(estimate.edge_weights < 0.5))
+    if estimate.statistics.noise_scale > TOO_NOISY:
+        out.append(
+            f"The edges disagree with the machine {estimate.statistics.noise_scale:.1f} times more"
+            " than their noise: something that the model leaves out moves them (lens, bending,"
+            " play, photographs under wrong names)."
+        )
+    if lost > TOO_MANY_LOST:
+        out.append(
+            f"{lost:.0%} of the edges do not fit the rest; below {TOO_MANY_LOST:.0%} the majority"
+            " can be trusted to be right."
+        )
+    undecided = _undecided(estimate)
+    if undecided:
+        out.append(
+            f"The data hardly say more than the drawing about {_names(undecided)}: more"
+            " configurations, with legs that point elsewhere, are needed."
+        )
+    bad = np.abs(estimate.joint_residuals) > 6.0
+    if np.mean(bad) > 0.02:
+        leg = int(np.argmax(bad.sum(axis=0))) + 1
+        out.append(
+            f"The readings of joint {leg} and others do not fit the photographs"
+            f" ({int(bad.sum())} of {bad.size} by more than 6 standard deviations)."
+        )
+    return out
+
+
+def _undecided(estimate: Estimate) -> list[str]:
+    """Parameters of free, gauge-free kind that the data do not decide."""
+    table = estimate.machine.parameters
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    moved = sigma > 1e-9  # what defines the frame has no deviation
+    kinematic = [k for k, kind in enumerate(table.kinds) if kind != "radius" and moved[k]]
+    return [table.names[k] for k in kinematic if estimate.data_share[k] < DECIDED]
+
+
+def _warnings(
+    measurements: Measurements, observation: Observation, estimate: Estimate
+) -> list[str]:
+    out: list[str] = []
+    table = estimate.machine.parameters
+    change = np.abs(estimate.machine.values - table.drawing) / table.tolerance
+    far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR]
+    if far:
+        out.append(
+            f"{_names(far)} differ{'s' if len(far) == 1 else ''} from the drawing by more than"
+            f" {FAR:.0f} tolerances (up to {change.max():.0f}): check the drawing and its frame."
+        )
+    seen = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
+    for leg in np.flatnonzero(seen < 0.3 * np.median(seen)):
+        out.append(f"Leg {leg + 1} was seen in few photographs; its values lean on the readings.")
+    unseen = int(np.sum(~estimate.configurations))
+    if unseen:
+        out.append(f"{unseen} configurations had no usable photograph and did not take part.")
+    if estimate.statistics.noise_scale > 1.5:
+        out.append(
+            f"The edges scatter {estimate.statistics.noise_scale:.1f} times more than their"
+            " profiles promise; all standard deviations are enlarged by as much."
+        )
+    return out
+
+
+def _advice(estimate: Estimate) -> list[str]:
+    used = int(np.sum(estimate.configurations))
+    if used < 10:
+        return [
+            f"Only {used} configurations were used. Standard deviations fall with the square root"
+            " of their number; extreme leg lengths help most."
+        ]
+    return []
+
+
+def _centre_sigma(estimate: Estimate) -> float:
+    return _typical_sigma(estimate, "center")
+
+
+def _offset_sigma(estimate: Estimate) -> float:
+    return _typical_sigma(estimate, "offset")
+
+
+def _typical_sigma(estimate: Estimate, kind: str) -> float:
+    sigma = np.sqrt(np.diag(estimate.covariance)[estimate.machine.parameters.of_kind(kind)])
+    free = sigma[sigma > 1e-9]
+    return float(np.sqrt(np.mean(free**2))) if free.size else 0.0
+
+
+def _names(names: list[str], most: int = 3) -> str:
+    if len(names) > most:
+        return f"{', '.join(names[:most])} and {len(names) - most} more"
+    return " and ".join(names)

@@ -1,0 +1,230 @@
+"""The report's views, numbers and overlays, against a case made by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_report_case import OUTWARD, RADIUS, case, edges_of, make_case  # noqa: F401 - a fixture
+
+from pkmcal.geometry.cylinders import contour_point
+from pkmcal.geometry.rigid import apply, perturb, pose_difference
+from pkmcal.observe.predict import legs_in_camera
+from pkmcal.report import parameters, pictures, rejections, residuals, wording
+from pkmcal.report.centres import free_of_gauge, joint_centres
+from pkmcal.report.charts import ticks_between
+from pkmcal.report.page import report_views
+from pkmcal.report.provenance import camera_position_covariance
+from pkmcal.report.scene import enlargement
+from pkmcal.report.toolpoint import pose_covariance, tool_point
+
+# ------------------------------------------------------------------ words and numbers
+
+
+@pytest.mark.parametrize(
+    ("sigma", "places"), [(0.034, 3), (0.0996, 2), (0.0994, 3), (1.2, 1), (34.0, 0), (0.0, 3)]
+)
+def test_sigma_has_two_significant_digits(sigma, places):
+    assert wording.decimals(sigma) == places
+
+
+def test_numbers_have_a_true_minus_and_no_negative_zero():
+    assert wording.number(-1.25, 1) == "−1.2"
+    assert wording.number(-0.0004, 3) == "0.000"
+    assert wording.number(0.5, 1, signed=True) == "+0.5"
+    assert wording.number(float("nan"), 2) == "–"
+    assert wording.percent(0.9999) == "99 %"
+
+
+def test_ticks_are_round_and_inside():
+    assert [t for t, _ in ticks_between(-2.2, 2.2)] == [-2, -1, 0, 1, 2]
+    assert [text for _, text in ticks_between(0, 0.011, 4)] == ["0.000", "0.005", "0.010"]
+
+
+# ------------------------------------------------------------------ parameters
+
+
+def test_table_rows_carry_value_change_and_sigma(case):
+    rows = {r.name: r for g in parameters.parameter_groups(case.session.machine, case.estimate)
+            for r in g.rows}  # fmt: skip
+    row = rows["legs[2].base.center.x"]
+    k = case.session.machine.parameters.index(row.name)
+    after = case.estimate.machine.values[k] * 1e3
+    assert (row.sigma, row.unit, row.drawing) == ("0.034", "mm", "269.300")
+    assert row.calibrated == f"{after:.3f}"
+    assert row.change == f"{after - 269.3:+.3f}".replace("-", "−")
+    assert rows["legs[1].base.center.y"].source == "frame"
+    assert rows["legs[1].base.center.y"].sigma == "–"
+    assert rows["legs[4].tubes[1].radius"].source == "drawing"
+    assert rows["legs[4].platform.center.z"].source == "data"
+
+
+def test_groups_follow_the_legs(case):
+    groups = parameters.parameter_groups(case.session.machine, case.estimate)
+    assert [g.leg for g in groups] == [1, 2, 3, 4, 5, 6]
+    assert sum(len(g.rows) for g in groups) == len(case.session.machine.parameters)
+
+
+def test_what_stays_the_drawings_is_said_in_words(case):
+    covariance = case.estimate.covariance.copy()
+    i, j = (case.session.machine.parameters.index(f"legs[6].{p}")
+            for p in ("platform.center.z", "length.offset"))  # fmt: skip
+    covariance[i, j] = covariance[j, i] = -0.98 * covariance[i, i]
+    estimate = replace(case.estimate, covariance=covariance)
+    groups = parameters.parameter_groups(case.session.machine, estimate)
+    said = parameters.unidentified(groups, estimate)
+    assert said[0].startswith("Tube radius of all legs: the photographs give 20 %")
+    assert said[1].startswith("Leg 6 platform centre z and Leg 6 length offset move together")
+    assert "their sum is known far better" in said[1]
+    assert len(said) == 2
+
+
+# ------------------------------------------------------------------ uncertainty
+
+
+def test_pose_covariance_agrees_with_forward_kinematics(case):
+    machine, state = case.estimate.machine, case.estimate.state
+    got = pose_covariance(
+        machine, case.estimate.covariance, case.session.joints[:1], state.T_base_platform[:1]
+    )[0]
+    sigma = np.sqrt(np.diag(case.estimate.covariance))
+    columns = []
+    for k in range(sigma.size):  # one parameter at a time by its own standard deviation
+        moved = machine.with_values(machine.values + sigma * (np.arange(sigma.size) == k))
+        start = state.T_base_platform[0]
+        found = moved.forward(case.session.joints[:1], start)[0]
+        columns.append(pose_difference(found, start))
+    expected = np.transpose(columns) @ np.array(columns)
+    np.testing.assert_allclose(got, expected, rtol=0.01, atol=1e-3 * np.abs(expected).max())
+
+
+def test_uncertainty_does_not_depend_on_the_frame(case):
+    machine = case.estimate.machine
+    index = machine.layout.base[0].index[:, :3]
+    shift = np.zeros(len(machine.values))
+    shift[index[:, 0]] = 1e-3  # a common shift of the base along x: a frame change
+    moved = replace(case.estimate, covariance=case.estimate.covariance + np.outer(shift, shift))
+    once, twice = free_of_gauge(case.estimate), free_of_gauge(moved)
+    np.testing.assert_allclose(once, twice, atol=1e-6 * once.max())
+
+
+def test_drawing_is_laid_over_before_the_change_is_told(case):
+    session, estimate = case.session, case.estimate
+    turned = np.array([0.01, -0.02, 0.03, 0.1, 0.2, 0.3])
+    drawing, values = session.machine, session.machine.values.copy()
+    index = drawing.layout.base[0].index[:, :3]
+    values[index] = apply(perturb(np.eye(4), turned), values[index])
+    base, platform = joint_centres(drawing, drawing.with_values(values), estimate.covariance)
+    assert np.abs(base.change).max() < 1e-12
+    assert np.abs(platform.change).max() < 1e-12
+    used = np.array([1, 3])
+    centres = joint_centres(drawing, estimate.machine, estimate.covariance)
+    tool = tool_point(drawing, estimate.machine, estimate.covariance, session.joints,
+                      estimate.state.T_base_platform, used, centres)  # fmt: skip
+    assert (tool.position > 1e-5).all()
+    assert (tool.off_position > 1e-4).all()
+    assert enlargement(centres, 0.25) in (10, 20, 50)
+
+
+def test_camera_position_sigma(case):
+    T, sigma = case.estimate.state.T_camera_base[0], np.array([1e-4] * 3 + [2e-4] * 3)
+    rng = np.random.default_rng(0)
+    moved = perturb(T, sigma * rng.normal(size=(20000, 6)))
+    places = -(np.swapaxes(moved[:, :3, :3], 1, 2) @ moved[:, :3, 3:])[..., 0]
+    got = camera_position_covariance(T, np.diag(sigma**2))
+    # 20 000 draws leave 1 % on a standard deviation
+    np.testing.assert_allclose(np.sqrt(np.diag(got)), places.std(axis=0), rtol=0.03)
+
+
+# ------------------------------------------------------------------ edges and pictures
+
+
+def test_outward_shift_is_found_in_pixels(case):
+    edges, estimate = case.observation.edges, case.estimate
+    numbers = residuals.camera_numbers(case.session)
+    got = residuals.outward_shift(edges, estimate, case.session.joints, numbers)
+    np.testing.assert_allclose(got, OUTWARD, atol=2e-3)  # second order in the shift
+
+
+def test_edges_are_drawn_where_the_camera_sees_them(tmp_path):
+    case = make_case(tmp_path, n_poses=1, n_stations=1)
+    estimate, session = case.estimate, case.session
+    T, state = session.stations[0].camera, estimate.state
+    edges = edges_of(
+        estimate.machine, state.T_camera_base, state.T_base_platform, session.joints, 0.0
+    )
+    curves = pictures.edge_curves(session, edges, estimate, np.arange(len(edges)), 0, 0)
+    legs = legs_in_camera(
+        estimate.machine, state.T_camera_base[0], state.T_base_platform[0], session.joints[0]
+    )
+    assert len(edges) > 15
+    for n, curve in enumerate(curves):
+        leg, radius = edges.leg[n], np.array(RADIUS[int(edges.tube[n])])
+        along = np.linspace(*edges.span[n], pictures.SAMPLES)
+        seen = contour_point(legs.a[leg], legs.u[leg], edges.normal[n], radius, along)
+        np.testing.assert_allclose(curve, T.project(seen), atol=1e-6)
+
+
+def test_joints_are_drawn_where_the_camera_sees_them(case):
+    session, estimate = case.session, case.estimate
+    shot = report_views(session, case.observation, estimate)["pictures"][0]
+    s = [station.name for station in session.stations].index(shot.station)
+    k = session.configurations.index(shot.configuration)
+    T_camera_base, pose = estimate.state.T_camera_base[s], estimate.state.T_base_platform[k]
+    base, platform = joint_centres(session.machine, estimate.machine, estimate.covariance)
+    project = session.stations[s].camera.project
+    assert len(shot.spots) == 12
+    for spot in shot.spots:
+        side, T = (base, T_camera_base) if spot.end == "base" else (platform, T_camera_base @ pose)
+        new, old = (
+            project(apply(T, points[spot.leg - 1])) for points in (side.calibrated, side.drawing)
+        )
+        np.testing.assert_allclose(spot.calibrated, new, atol=0.051)  # one decimal is written
+        np.testing.assert_allclose(spot.drawing, old, atol=0.051)
+
+
+def test_straight_curves_are_two_points_and_bent_ones_are_kept():
+    x = np.linspace(0, 100, 13)
+    assert len(pictures.straightened(np.stack([x, 2 * x], -1))) == 2
+    assert len(pictures.straightened(np.stack([x, 1e-3 * x * x], -1))) == 13
+
+
+def test_pictures_stand_for_all_stations_and_show_best_and_worst(case):
+    edges = case.observation.edges
+    white = np.ones((len(edges), 2))
+    white[(edges.station == 1) & (edges.configuration == 3)] = 5
+    white[(edges.station == 2) & (edges.configuration == 4)] = 0.1
+    chosen = pictures.choose(case.session, edges, white, np.ones(5, bool), most=7)
+    assert len(chosen) == 7
+    assert {s for s, _, _ in chosen} == {0, 1, 2}
+    named = {(s, photo.configuration): why for s, photo, why in chosen}
+    assert named[1, 3] == "worst of this station"
+    assert named[2, 4] == "best of this station"
+    assert len(named) == 7
+
+
+def test_rejections_are_grouped_by_reason(case):
+    first, second = rejections.reasons(case.session, case.observation.rejected)
+    assert (first.count, first.text) == (2, "seen over … mm only")
+    assert first.cases[0] == ("front0 / c0", "leg 3 tube 2 right: seen over 3.5 mm only")
+    assert second.cases == (("front1 / c3", "whole photograph"),)
+
+
+def test_a_group_that_stands_out_is_named(case):
+    edges = case.observation.edges
+    white = case.estimate.edge_residuals.copy()
+    white[edges.station == 2] *= 4
+    estimate = replace(case.estimate, edge_residuals=white)
+    shifts = np.zeros(len(edges))
+    remarks = residuals.residual_charts(case.session, edges, estimate, shifts).remarks
+    assert any("station front2" in text for text in remarks)
+    shifts[(edges.leg == 1) & (edges.tube == 0) & (edges.side == 1)] = -0.2
+    (text,) = residuals.residual_charts(case.session, edges, case.estimate, shifts).remarks
+    assert "leg 2 tube 1 left by −0.20 px" in text
+
+
+def test_expected_rms_holds_nineteen_of_twenty():
+    rng = np.random.default_rng(3)
+    for n in (4, 40):
+        low, high = residuals.expected_rms(n)
+        found = np.sqrt(np.mean(rng.normal(size=(20000, n)) ** 2, axis=1))
+        assert np.mean((found > low) & (found < high)) == pytest.approx(0.95, abs=0.01)

@@ -1,0 +1,174 @@
+"""The report's page: its text, that it asks for nothing outside, and that browsers run it."""
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_report_case import Verdict, case, make_case  # noqa: F401 - a fixture
+
+from pkmcal.observe.edges import Rejection
+from pkmcal.report.page import report_html
+
+HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+
+
+@pytest.fixture(scope="module")
+def page(case) -> str:
+    verdict = Verdict(True, "Good to use.", ("fits",), ("a little noisy",), ("more poses",))
+    return report_html(
+        case.session, case.observation, case.estimate, verdict, timings={"observe": 1.5}
+    )
+
+
+class Found(HTMLParser):
+    """Tags, attributes and text of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.text += data
+
+
+# ------------------------------------------------------------------ the page
+
+
+def test_page_tells_verdict_numbers_and_model_error(page):
+    text = Found(page).text
+    for expected in ("Good to use.", "a little noisy", "more poses", "0.90", "15 of 15",
+                     "multiplied by 1.25", "observe", "1.50 s", "three centres: legs 1, 3, 5",
+                     "nothing of what the model leaves out"):  # fmt: skip
+        assert expected in text, expected
+
+
+def test_page_asks_for_nothing_outside(page):
+    assert not re.search(r"https?:|//[a-z]+\.|@import|url\(", page)
+    for tag, attributes in Found(page).tags:
+        assert tag not in ("link", "iframe", "object", "embed", "base")
+        for name in ("src", "href", "xlink:href", "srcset", "action"):
+            assert (attributes.get(name) or "#").startswith(("#", "data:image/jpeg;base64,"))
+    assert "default-src 'none'" in page
+    assert len(page) < 5e6
+
+
+def test_hostile_names_stay_text(tmp_path):
+    case = make_case(tmp_path, n_poses=2, n_stations=2, station=HOSTILE, prefix=HOSTILE)
+    observation = replace(case.observation, rejected=(Rejection(0, 0, 0, 0, 0, HOSTILE),))
+    session = replace(case.session, folder=Path(HOSTILE), warnings=(HOSTILE,))
+    verdict = Verdict(False, HOSTILE, (HOSTILE,), (HOSTILE,), (HOSTILE,))
+    estimate = replace(case.estimate, gauge=HOSTILE)
+    page = report_html(session, observation, estimate, verdict, timings={HOSTILE: 1.0})
+    found = Found(page)
+    assert "<script>alert" not in page
+    assert not [a for tag, a in found.tags if "onerror" in a or tag == "img"]
+    assert sum(tag == "script" for tag, _ in found.tags) == 3
+    assert found.text.count("<script>alert('x')") > 10
+
+
+def test_a_page_without_a_single_edge(case):
+    none = case.observation.edges.select(np.zeros(0, int))
+    estimate = replace(
+        case.estimate,
+        edge_residuals=np.zeros((0, 2)),
+        edge_weights=np.zeros(0),
+        configurations=np.zeros(5, bool),
+    )
+    page = report_html(
+        case.session,
+        replace(case.observation, edges=none),
+        estimate,
+        Verdict(False, "Nothing seen."),
+    )
+    assert "Do not use" in page
+    assert "No photograph has a pose to draw in." in page
+    assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
+
+
+def test_a_photograph_that_is_gone_is_said(tmp_path):
+    case = make_case(tmp_path, n_poses=4, n_stations=2)
+    next(tmp_path.glob("*.png")).unlink()
+    page = report_html(case.session, case.observation, case.estimate, Verdict(True, "Fine."))
+    assert "the file could not be read" in page
+
+
+# ------------------------------------------------------------------ in a browser
+
+PROBE = """<script>
+const seen = [];
+addEventListener("error", (event) => seen.push(event.message));
+addEventListener("unhandledrejection", (event) => seen.push(String(event.reason)));
+addEventListener("securitypolicyviolation", (event) => seen.push("blocked " + event.blockedURI));
+setInterval(() => {
+  const root = document.documentElement;
+  root.dataset.errors = seen.join("; ");
+  root.dataset.overhang = root.scrollWidth - root.clientWidth;
+}, 50);
+</script>"""
+
+
+def browse(page: str, folder: Path, width: int) -> tuple[str, str]:
+    """The page's document after its scripts ran, and what the console said."""
+    if CHROMIUM is None:
+        message = "NO CHROMIUM: the report was not opened in a browser (apt install chromium)"
+        pytest.skip(message)
+    file = folder / "page.html"
+    file.write_text(page.replace("<style>", PROBE + "<style>", 1), encoding="utf-8")
+    done = subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
+         "--no-first-run", f"--user-data-dir={folder / 'profile'}", "--enable-logging=stderr",
+         "--v=0", f"--window-size={width},900", "--virtual-time-budget=20000", "--dump-dom",
+         file.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    return done.stdout, "\n".join(line for line in done.stderr.splitlines() if "CONSOLE" in line)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_page_runs_in_a_browser(page, tmp_path, width):
+    document, console = browse(page, tmp_path, width)
+    root = Found(document).tags[0][1]
+    assert root["data-errors"] == ""
+    assert root["data-overhang"] == "0"
+    assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
+    tags = Found(document).tags
+    assert any(a.get("id") == "plot" and a.get("data-drawn") == "yes" for _, a in tags)
+    assert any(tag == "canvas" for tag, _ in tags)
+    rows = [a for tag, a in tags if tag == "tr" and "data-values" in a]
+    assert len(rows) == 54
+    assert sum(a.get("class") == "shot" for tag, a in tags if tag == "svg") == 12
+
+
+def test_the_browser_test_sees_errors(page, tmp_path):
+    broken = page.replace('"use strict";', 'fetch("https://example.org/x"); missing();', 1)
+    document, console = browse(broken, tmp_path, 800)
+    root = Found(document).tags[0][1]
+    assert "missing is not defined" in root["data-errors"]
+    assert "blocked https://example.org" in root["data-errors"]
+    assert "missing is not defined" in console
+
+
+def test_the_table_sorts_and_a_picture_opens(page, tmp_path):
+    act = """<script>addEventListener("load", () => {
+      document.querySelector('th[data-sort="2"] button').click();
+      document.querySelector(".enlarge").click();
+    });</script></body>"""
+    document, _ = browse(page.replace("</body>", act), tmp_path, 900)
+    changes = [abs(float(v.split()[2])) for v in re.findall(r'data-values="([^"]+)"', document)]
+    assert changes == sorted(changes, reverse=True)
+    dialog = document[document.index('<dialog id="large"') :]
+    assert dialog[: dialog.index(">")].endswith('open=""')
+    assert dialog[: dialog.index("</dialog>")].count("<svg") == 1
