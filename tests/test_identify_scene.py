@@ -53,8 +53,12 @@ class Scene:
         if wrong:
             normal = self._with_wrong(rng, normal, wrong, run)
         edges = EdgeSet(
-            *self.index, normal, tangent_basis(normal, self.middle[run]), self.covariance,
-            self.shift, np.zeros((len(normal), 2)),
+            *self.index,
+            normal,
+            tangent_basis(normal, self.middle[run]),
+            self.covariance,
+            self.shift,
+            np.zeros((len(normal), 2)),
         )
         joints = self.joints[run] + noise * JOINT_NOISE * rng.normal(size=self.joints[run].shape)
         n = len(self.T_camera_base)
@@ -75,7 +79,9 @@ class Scene:
         out = normal.copy()
         for i in np.flatnonzero(rng.random(len(normal)) < share):
             same = (station == station[i]) & (configuration == configuration[i])
-            out[i] = self.normal[run, rng.choice(np.flatnonzero(same & (leg != leg[i])))]
+            others = np.flatnonzero(same & (leg != leg[i]))
+            if others.size:
+                out[i] = self.normal[run, rng.choice(others)]
         return out
 
     def batch(self, rng, **options) -> tuple[Assembled, BatchState]:
@@ -98,8 +104,11 @@ def stations(n: int, distance: float = 0.9) -> np.ndarray:
     angles = 0.3 + np.arange(n) * 2 * np.pi / n
     return np.stack(
         [
-            look_at(distance * np.array([np.cos(a), np.sin(a), 0.25]), np.array([0, 0, 0.2]),
-                    np.array([0, 0, 1.0]))
+            look_at(
+                distance * np.array([np.cos(a), np.sin(a), 0.25]),
+                np.array([0, 0, 0.2]),
+                np.array([0, 0, 1.0]),
+            )
             for a in angles
         ]
     )
@@ -135,15 +144,28 @@ def make_scene(
     covariance[:, 0, 1] = covariance[:, 1, 0] = 0.4 * scale[:, 0] * scale[:, 1]
     shift = np.stack([rng.uniform(-1.2, -0.8, n), rng.uniform(-0.3, 0.3, n)], axis=-1) / FOCAL
     return Scene(
-        machine, theta, stations(n_stations), poses, length - theta[:, None, machine.layout.rod],
-        0.3 * tolerance * rng.normal(size=runs), index, normal, covariance, shift, middle,
+        machine,
+        theta,
+        stations(n_stations),
+        poses,
+        length - theta[:, None, machine.layout.rod],
+        0.3 * tolerance * rng.normal(size=runs),
+        index,
+        normal,
+        covariance,
+        shift,
+        middle,
     )
 
 
 def _index(rng, machine, configurations, n_stations, seen):
     legs = machine.n_legs
     grid = np.meshgrid(
-        np.arange(n_stations), np.arange(configurations), np.arange(legs), [0, 1], [0, 1],
+        np.arange(n_stations),
+        np.arange(configurations),
+        np.arange(legs),
+        [0, 1],
+        [0, 1],
         indexing="ij",
     )
     index = np.stack([g.ravel() for g in grid])

@@ -4,18 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_report_case import OUTWARD, RADIUS, case, edges_of, make_case  # noqa: F401 - a fixture
 
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report import parameters, pictures, rejections, residuals, wording
-from pkmcal.report.centres import free_of_gauge, joint_centres
+from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.report.charts import ticks_between
 from pkmcal.report.page import report_views
 from pkmcal.report.provenance import camera_position_covariance
 from pkmcal.report.scene import enlargement
 from pkmcal.report.toolpoint import pose_covariance, tool_point
+from test_report_case import OUTWARD, RADIUS, Case, edges_of, make_case
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory) -> Case:
+    return make_case(tmp_path_factory.mktemp("session"))
+
 
 # ------------------------------------------------------------------ words and numbers
 
@@ -73,7 +79,7 @@ def test_what_stays_the_drawings_is_said_in_words(case):
     groups = parameters.parameter_groups(case.session.machine, estimate)
     said = parameters.unidentified(groups, estimate)
     assert said[0].startswith("Tube radius of all legs: the photographs give 20 %")
-    assert said[1].startswith("Leg 6 platform centre z and Leg 6 length offset move together")
+    assert said[1].startswith("Leg 6 platform centre z and leg 6 length offset move together")
     assert "their sum is known far better" in said[1]
     assert len(said) == 2
 
@@ -122,7 +128,12 @@ def test_drawing_is_laid_over_before_the_change_is_told(case):
                       estimate.state.T_base_platform, used, centres)  # fmt: skip
     assert (tool.position > 1e-5).all()
     assert (tool.off_position > 1e-4).all()
-    assert enlargement(centres, 0.25) in (10, 20, 50)
+
+
+def test_errors_are_enlarged_by_a_round_factor():
+    assert enlargement(np.full(12, 2e-3), 0.05) == 20
+    assert enlargement(np.full(12, 2e-3), 0.11) == 50
+    assert enlargement(np.full(12, 1.0), 0.1) == 1
 
 
 def test_camera_position_sigma(case):

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.geometry.cylinders import contour_point, edge_normals, tangent_basis
@@ -159,8 +158,3 @@ def make_estimate(machine, poses, T, edges, rng) -> Estimate:
         statistics=Statistics(900.0, 1000.0, 800.0, 960, 60.0, 30, 40.0, 54, 7, "converged", 1.25),
         gauge="three centres: legs 1, 3, 5",
     )
-
-
-@pytest.fixture(scope="module")
-def case(tmp_path_factory) -> Case:
-    return make_case(tmp_path_factory.mktemp("session"))

@@ -9,15 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_report_case import Verdict, case, make_case  # noqa: F401 - a fixture
 
 from pkmcal.observe.edges import Rejection
 from pkmcal.report.page import report_html
+from test_report_case import Case, Verdict, make_case
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory) -> Case:
+    return make_case(tmp_path_factory.mktemp("session"))
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError, ResultError
+from pkmcal.files import listed
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.problem import Estimate, Measurements, State
 from pkmcal.identify.verdict import Verdict, judge
@@ -77,17 +78,28 @@ def calibrate(
     progress : called with the step in words and the share done.
     Raises InputError where the session is at fault, ResultError where nothing can be said.
     """
-    told = progress or (lambda _text, _share: None)
+    from threadpoolctl import threadpool_limits
+
+    # Matrices here are small: threads inside the linear algebra only wait for one another, and
+    # beside our own threads they slow it twentyfold.
+    with threadpool_limits(1, "blas"):
+        return _calibrate(session, method, seed, progress or (lambda _text, _share: None))
+
+
+def _calibrate(
+    session: Session | Path | str, method: str, seed: int, told: Progress
+) -> Calibration:
+    """:func:`calibrate`, step by step."""
     clock = _Clock()
     if not isinstance(session, Session):
         session = load_session(session)
-    _check_observable(session)
+    check_observable(session)
     clock.lap("load")
     told("Reading photographs", 0.0)
-    photographs = _read_photographs(session)
+    photographs = read_photographs(session)
     clock.lap("decode")
     told("Recognising the machine", 0.2)
-    poses = _find_stations(session, photographs, np.random.default_rng(seed))
+    poses = _stations(session, photographs, np.random.default_rng(seed))
     clock.lap("observe")
     observation, estimate, measurements = _take_turns(session, photographs, poses, told, clock)
     told("Judging", 0.95)
@@ -114,7 +126,7 @@ class _Clock:
         self._last = now
 
 
-def _check_observable(session: Session) -> None:
+def check_observable(session: Session) -> None:
     """What the session's form allows but this observation cannot use."""
     for station in session.stations:
         where = f"session.yaml, stations.{station.name}"
@@ -139,13 +151,13 @@ def _check_observable(session: Session) -> None:
         )
 
 
-def _read_photographs(session: Session) -> list[legs.Photographs]:
+def read_photographs(session: Session) -> list[legs.Photographs]:
     """Every station's photographs, decoded and prepared for the search."""
 
     def read(number: int) -> legs.Photographs:
         station = session.stations[number]
         paths = [p.path for p in station.photographs]
-        labels = [_label(session.folder, path) for path in paths]
+        labels = [label_of(session.folder, path) for path in paths]
         images = decode_all(paths, station.camera.image_size, labels)
         rows = np.array([p.configuration for p in station.photographs])
         return legs.photographs_of(number, station.camera, rows, session.joints, images)
@@ -154,34 +166,92 @@ def _read_photographs(session: Session) -> list[legs.Photographs]:
         return list(pool.map(read, range(len(session.stations))))
 
 
-def _label(folder: Path, path: Path) -> str:
+def label_of(folder: Path, path: Path) -> str:
+    """A photograph's name in messages: its path inside the session."""
     return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
 
 
-def _find_stations(
+def platform_poses(session: Session) -> Array:
+    """T_base_platform (K, 4, 4) of all configurations by the drawing, or which one has none."""
+    found = session.machine.forward_result(session.joints)
+    if found.converged.all():
+        return found.T_base_platform
+    bad = [session.configurations[k] for k in np.flatnonzero(~found.converged)]
+    raise InputError(
+        "the drawing's machine cannot take these readings: its legs do not meet the platform",
+        where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
+        found=f"a gap of {float(found.error.max()) * 1e3:.3g} mm",
+        expected="readings at which all legs reach the platform",
+        next_step="Check these readings, the order of their columns, and the drawing's centres",
+    )
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """Where the search for each station's pose ended; rough : the poses it began from."""
+
+    views: tuple[View, ...]
+    rough: tuple[Array, ...]
+    found: tuple[StationPose, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether the machine was recognised in every station's photographs."""
+        return all(pose.good for pose in self.found)
+
+
+def recognise(
+    session: Session,
+    photographs: list[legs.Photographs],
+    poses: Array,
+    rngs: list[np.random.Generator],
+) -> Recognition:
+    """Look for the machine in every station's photographs, nothing raised.
+
+    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one a station.
+    """
+    machine, tubes = session.machine, tubes_of(session.machine)
+    views = tuple(
+        View(machine, p.camera, tubes, p.joints, poses[p.configuration], p.tables)
+        for p in photographs
+    )
+    rough = tuple(_rough(station) for station in session.stations)
+    with ThreadPoolExecutor(WORKERS) as pool:
+        found = tuple(pool.map(find_station, views, rough, rngs))
+    return Recognition(views, rough, found)
+
+
+def why_unrecognised(
+    session: Session,
+    photographs: list[legs.Photographs],
+    recognition: Recognition,
+    rng: np.random.Generator,
+) -> InputError:
+    """The error about the stations that were not recognised; the usual mix-ups are tried."""
+    return unrecognised(
+        [station.name for station in session.stations],
+        list(recognition.views),
+        list(recognition.rough),
+        list(recognition.found),
+        session.joints,
+        [p.configuration for p in photographs],
+        rng,
+    )
+
+
+def _stations(
     session: Session, photographs: list[legs.Photographs], rng: np.random.Generator
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of all stations, or the reason why one is not recognised."""
-    machine = session.machine
-    poses = machine.forward(session.joints)
-    tubes = tubes_of(machine)
-    views = [
-        View(machine, p.camera, tubes, p.joints, poses[p.configuration], p.tables)
-        for p in photographs
-    ]
-    rough = [_rough(station) for station in session.stations]
-    rngs = rng.spawn(len(views) + 1)
-    with ThreadPoolExecutor(WORKERS) as pool:
-        found: list[StationPose] = list(pool.map(find_station, views, rough, rngs[1:]))
-    if all(pose.good for pose in found):
-        return np.stack([pose.T_camera_base for pose in found])
-    names = [station.name for station in session.stations]
-    rows = [p.configuration for p in photographs]
-    raise unrecognised(names, views, rough, found, session.joints, rows, rngs[0])
+    rngs = rng.spawn(len(photographs) + 1)
+    found = recognise(session, photographs, platform_poses(session), rngs[1:])
+    if not found.complete:
+        raise why_unrecognised(session, photographs, found, rngs[0])
+    return np.stack([pose.T_camera_base for pose in found.found])
 
 
 def _rough(station: Station) -> Array:
-    assert station.T_camera_base is not None  # _check_observable came before
+    assert station.T_camera_base is not None  # check_observable came before
     return station.T_camera_base
 
 

@@ -81,7 +81,7 @@ def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Integers) -> 
     """
     u, m = line_through(a, b)
     distance = np.sqrt(dot(m, m))
-    sin = np.where(distance > radius, radius / distance, np.nan)[..., None]
+    sin = np.where(distance > np.abs(radius), radius / distance, np.nan)[..., None]
     m_unit = m / distance[..., None]
     sign = SIDE_SIGNS[side][..., None]
     n = sign * np.sqrt(1 - sin**2) * m_unit - sin * cross(u, m_unit)

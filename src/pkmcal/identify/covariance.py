@@ -31,14 +31,22 @@ from pkmcal.mechanisms import Machine
 RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14
 there with exact derivatives, and real directions are many orders above."""
+NULL = 1e-12
+"""Same, for the scaled rows with drawing and gauge: below it a direction counts as unknown."""
 
 
 class Information(NamedTuple):
-    """The problem at the solution: linear rows, elimination, shared covariance (B, na, na)."""
+    """The problem at the solution.
+
+    linear, reduced : its rows and their elimination. covariance : (B, na, na) of the shared
+    unknowns; a direction that nothing fixes has a huge variance. factor : (B, na, na) whose
+    columns are the known directions, one standard deviation long, and zeros.
+    """
 
     linear: Linear
     reduced: Reduced
     covariance: Array
+    factor: Array
 
 
 def information(problem: Problem, state: BatchState) -> Information:
@@ -57,22 +65,22 @@ def information(problem: Problem, state: BatchState) -> Information:
     scale = np.where(scale > 0, scale, 1.0)
     r = np.linalg.qr(stacked / scale[:, None, :], mode="r")
     _, s, vt = np.linalg.svd(r)
-    # a direction that nothing fixes gets a huge variance instead of a division by zero
-    s = np.maximum(s, 1e-14 * s[:, :1])
-    half = transposed(vt) / s[:, None, :] / scale[:, :, None]
-    return Information(linear, reduced, half @ transposed(half))
+    known = s > NULL * s[:, :1]
+    half = transposed(vt) / np.where(known, s, NULL * s[:, :1])[:, None, :] / scale[:, :, None]
+    factor = np.where(known[:, None, :], half, 0.0)
+    return Information(linear, reduced, half @ transposed(half), factor)
 
 
 def edge_freedom(problem: Problem, info: Information, count: Array) -> Array:
     """Degrees of freedom of the edges' residuals, count - tr(hat), (B,).
 
     count : rows in use, (B,). The hat matrix splits into the own unknowns' part Q Q^T and the
-    shared unknowns' part.
+    shared unknowns' part; directions that nothing fixes have no part in it.
     """
     n = problem.n_edge_rows
     rows, q = info.reduced.rows[:, :, :n], info.reduced.q[:, :, :n]
     own = np.sum(q**2, axis=(1, 2, 3))
-    shared = np.sum((rows @ info.covariance[:, None]) * rows, axis=(1, 2, 3))
+    shared = np.sum((rows @ info.factor[:, None]) ** 2, axis=(1, 2, 3))
     return count - own - shared
 
 
@@ -94,6 +102,9 @@ def machine_covariance(
     spread = transformation(machine, after, gauge) @ spread
     part = shared[: n_free + n_station, : n_free + n_station]
     out = spread @ part @ spread.T
+    # constrained and fixed coordinates are exactly known; the product leaves rounding there
+    known = np.flatnonzero(np.diag(out)[:n_par] < 1e-18 * machine.parameters.tolerance**2)
+    out[known, :], out[:, known] = 0.0, 0.0
     return 0.5 * (out + out.T)
 
 

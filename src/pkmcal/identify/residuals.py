@@ -144,7 +144,7 @@ class Problem:
         by_shared = np.concatenate([shared, self._closure_by_shared(c)], axis=-2)
         by_own = self._by_own(state, c, by_b)
         # padding may lie anywhere, so its derivatives need not be finite though its row is zero
-        usable = np.isfinite(value)
+        usable = np.isfinite(value) & self._rows_in_use(value.shape)
         lost = ~np.isfinite(value + by_shared.sum(axis=-1))
         return Linear(
             np.where(usable, value, 0.0),
@@ -259,6 +259,13 @@ class Problem:
         rows = self._project(n[..., None])[..., 0] + self._shift_column() * shift[..., None]
         unused = np.broadcast_to((self.data.weight == 0)[..., None], rows.shape)
         return np.where(unused, 0.0, rows).reshape(*rows.shape[:2], -1)
+
+    def _rows_in_use(self, shape: tuple[int, ...]) -> Booleans:
+        """Rows that are not padding and not weighted away, (B, K, r)."""
+        edges = np.repeat(self.data.weight > 0, self.data.whiten.shape[-1], axis=-1)
+        used = np.ones(shape, dtype=bool)
+        used[..., : edges.shape[-1]] = edges
+        return used
 
     def _closure_rows(self, c: Closure) -> Array:
         return c.value / self._closure_sigma(c)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pkmcal.arrays import Array
+from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.problem import Estimate, Measurements
 from pkmcal.observe.edges import Observation
 
@@ -39,13 +41,14 @@ def judge(measurements: Measurements, observation: Observation, estimate: Estima
     """The verdict on an estimate of a session."""
     reasons = tuple(_reasons(measurements, estimate))
     warnings = tuple(_warnings(measurements, observation, estimate))
-    centres = _centre_sigma(estimate)
     if reasons:
         headline = "This calibration should not be used."
     else:
+        covariance = free_of_gauge(estimate)
         headline = (
-            f"Calibrated: joint centres to {centres * 1e3:.2g} mm"
-            f" and offsets to {_offset_sigma(estimate) * 1e3:.2g} mm (standard deviations)."
+            f"Calibrated: joint centres to {_centre_sigma(estimate, covariance) * 1e3:.2g} mm"
+            f" and offsets to {_offset_sigma(estimate, covariance) * 1e3:.2g} mm"
+            " (standard deviations)."
         )
     return Verdict(not reasons, headline, reasons, warnings, tuple(_advice(estimate)))
 
@@ -125,18 +128,17 @@ def _advice(estimate: Estimate) -> list[str]:
     return []
 
 
-def _centre_sigma(estimate: Estimate) -> float:
-    return _typical_sigma(estimate, "center")
+def _centre_sigma(estimate: Estimate, covariance: Array) -> float:
+    """Median standard deviation of a joint centre's coordinate, m; no frame is favoured."""
+    drawing = estimate.machine.with_values(estimate.machine.parameters.drawing)
+    bodies = joint_centres(drawing, estimate.machine, covariance)
+    return float(np.median(np.concatenate([body.sigma for body in bodies])))
 
 
-def _offset_sigma(estimate: Estimate) -> float:
-    return _typical_sigma(estimate, "offset")
-
-
-def _typical_sigma(estimate: Estimate, kind: str) -> float:
-    sigma = np.sqrt(np.diag(estimate.covariance)[estimate.machine.parameters.of_kind(kind)])
-    free = sigma[sigma > 1e-9]
-    return float(np.sqrt(np.mean(free**2))) if free.size else 0.0
+def _offset_sigma(estimate: Estimate, covariance: Array) -> float:
+    """Median standard deviation of an offset, m; 0 for a machine without any."""
+    variance = np.diag(covariance)[estimate.machine.parameters.of_kind("offset")]
+    return float(np.sqrt(np.median(variance))) if variance.size else 0.0
 
 
 def _names(names: list[str], most: int = 3) -> str:

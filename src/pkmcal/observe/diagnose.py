@@ -9,7 +9,8 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.observe.stations import StationPose, View, find_station
+from pkmcal.files import listed
+from pkmcal.observe.stations import GOOD_SCORE, StationPose, View, find_station
 
 CLEARLY_BETTER = 0.75
 """A hypothesis must lower the score to this share of the best other one's to be named."""
@@ -30,27 +31,24 @@ def unrecognised(
     configurations : rows of the readings, by station.
     """
     bad = [i for i, pose in enumerate(found) if not pose.good]
+    error = _swapped_stations(names, views, rough, bad, rng)
+    # One recognised station shows that the readings are in order.
+    if error is None and len(bad) == len(found):
+        error = _mixed_columns(views, rough, found, all_joints, configurations, rng)
+    if error is not None:
+        return error
     worst = max(bad, key=lambda i: found[i].score)
-    for text in (
-        _swapped_stations(names, views, rough, found, rng),
-        _mixed_columns(views, rough, found, all_joints, configurations, rng),
-    ):
-        if text is not None:
-            return InputError(
-                f"the machine is not recognised in the photographs of {names[worst]!r}",
-                where="session.yaml, stations",
-                found=text[0],
-                next_step=text[1],
-            )
+    others = [names[i] for i in bad if i != worst]
     return InputError(
-        f"the machine is not recognised in the photographs of {names[worst]!r}",
+        f"the machine is not recognised in the photographs of station {names[worst]}"
+        + (f", nor in those of {listed(others)}" if others else ""),
         where=f"session.yaml, stations.{names[worst]}",
-        found=f"predicted legs lie {found[worst].score:.2f} of the way to nowhere in them",
-        expected="less than 0.34; a good session has 0.2",
+        found=f"a mismatch of {found[worst].score:.2f} between the drawing's legs and the picture",
+        expected=f"less than {GOOD_SCORE:g} (0 is perfect, a good session has 0.2)",
         next_step=(
-            "Check that these photographs show this machine's legs, that the pose is right to"
-            " 10 cm and 10 degrees, that each photograph has its configuration's name, and that"
-            " the drawing is this machine's"
+            "Check that these photographs show this machine's legs, that the station's pose is"
+            " right to 10 cm and 10 degrees, that each photograph bears the name of its"
+            " configuration, and that the drawing is this machine's"
         ),
     )
 
@@ -59,17 +57,18 @@ def _swapped_stations(
     names: list[str],
     views: list[View],
     rough: list[Array],
-    found: list[StationPose],
+    bad: list[int],
     rng: np.random.Generator,
-) -> tuple[str, str] | None:
+) -> InputError | None:
     """Two stations each recognised from the other's pose."""
-    bad = [i for i, pose in enumerate(found) if not pose.good]
     for i, j in combinations(bad, 2):
         if find_station(views[i], rough[j], rng).good and find_station(views[j], rough[i], rng).good:
-            return (
-                f"the photographs of {names[i]!r} fit the pose of {names[j]!r}, and the other way"
-                " round",
-                f"Swap the poses, or the image folders, of {names[i]!r} and {names[j]!r}",
+            return InputError(
+                f"stations {names[i]} and {names[j]} are mixed up",
+                where="session.yaml, stations",
+                found="the photographs of each fit the pose of the other",
+                next_step=f"Exchange the poses of {names[i]} and {names[j]} in session.yaml,"
+                " or their image folders",
             )
     return None
 
@@ -81,12 +80,12 @@ def _mixed_columns(
     all_joints: Array,
     configurations: list[Array],
     rng: np.random.Generator,
-) -> tuple[str, str] | None:
+) -> InputError | None:
     """Readings whose columns stand in another order: turned round, or two of them swapped."""
     count = all_joints.shape[1]
-    i = int(np.argmin([len(v.joints) == 0 for v in views]))
-    orders = [np.roll(np.arange(count), r) for r in range(1, count)]
+    orders = [np.roll(np.arange(count), -r) for r in range(1, count)]
     orders += [_exchanged(count, a, b) for a, b in combinations(range(count), 2)]
+    i = int(np.argmax([len(v.joints) for v in views]))
     scores = [
         find_station(_with_joints(views[i], all_joints[configurations[i]][:, o]), rough[i], rng)
         for o in orders
@@ -94,17 +93,26 @@ def _mixed_columns(
     best = int(np.argmin([s.score for s in scores]))
     if not scores[best].good or scores[best].score > CLEARLY_BETTER * found[i].score:
         return None
-    order = orders[best]
-    if best < count - 1:
-        what = f"everything fits with the readings' columns turned round by {best + 1}"
-        return what, (
-            f"Number the legs alike in the drawing and in joints.csv: column {order[0] + 1} belongs"
-            " to leg 1, and so on round"
+    return _other_order(orders[best], turned=best < count - 1)
+
+
+def _other_order(order: Array, turned: bool) -> InputError:
+    """The error about readings that belong to other legs; order : column of each leg, from 0."""
+    if turned:
+        return InputError(
+            "the legs are numbered differently in the readings and in the drawing",
+            where="joints.csv",
+            found=f"the photographs fit when leg 1 takes the readings of column {order[0] + 1},"
+            f" leg 2 those of column {order[1] + 1}, and so on round",
+            next_step="Give the columns of joints.csv the order of the legs in the drawing",
         )
-    a, b = np.flatnonzero(order != np.arange(count)) + 1
-    return (
-        f"everything fits with the columns of legs {a} and {b} exchanged",
-        f"Exchange the readings of legs {a} and {b} in joints.csv, or the two legs in the drawing",
+    a, b = np.flatnonzero(order != np.arange(len(order))) + 1
+    return InputError(
+        f"the readings of legs {a} and {b} are mixed up",
+        where="joints.csv",
+        found="the photographs fit with these two columns exchanged",
+        next_step=f"Exchange the columns of legs {a} and {b} in joints.csv, or the two legs in"
+        " the drawing",
     )
 
 

@@ -34,7 +34,7 @@ def figure_of(scene: Scene) -> dict[str, Any]:
             _outline(base),
             _outline(platform),
             _vectors(scene.joints),
-            _rings(scene.joints),
+            _rings(scene),
             _centres(base, platform),
         ],
         "layout": _layout(),
@@ -99,16 +99,16 @@ def _vectors(joints: tuple[Joint, ...]) -> dict[str, Any]:
     return _line("Change", "--ink", 6, segments)
 
 
-def _rings(joints: tuple[Joint, ...]) -> dict[str, Any]:
+def _rings(scene: Scene) -> dict[str, Any]:
     """Three rings of every centre's ellipsoid, along its principal planes."""
     angle = np.linspace(0, 2 * np.pi, RING)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     segments: list[Array] = []
-    for joint in joints:
+    for joint in scene.joints:
         values, axes = np.linalg.eigh(joint.spread)
         half = axes * (ELLIPSE * np.sqrt(np.maximum(values, 0)))
         segments += [joint.shown + circle @ half[:, list(p)].T for p in ((0, 1), (0, 2), (1, 2))]
-    return _line(f"{ELLIPSE:g}σ ellipsoids", "--calibrated", 2, segments)
+    return _line(f"{ELLIPSE:g}σ, × {scene.spread_factor:g}", "--calibrated", 2, segments)
 
 
 def _centres(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> dict[str, Any]:
@@ -155,7 +155,10 @@ def _layout() -> dict[str, Any]:
         "scene": {
             "aspectmode": "data",
             "dragmode": "turntable",
-            "camera": {"eye": {"x": 1.45, "y": -1.45, "z": 0.8}},
+            "camera": {
+                "eye": {"x": 1.45, "y": -1.45, "z": 0.8},
+                "center": {"x": 0, "y": 0, "z": -0.14},
+            },
             **{f"{name}axis": {**axis, "title": {"text": f"{name} (mm)"}} for name in "xyz"},
         },
     }

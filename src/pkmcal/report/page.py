@@ -23,7 +23,7 @@ from pkmcal.report import (
     toolpoint,
     wording,
 )
-from pkmcal.report.centres import free_of_gauge, joint_centres
+from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.session import Session
 
 if TYPE_CHECKING:

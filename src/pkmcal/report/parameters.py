@@ -154,14 +154,14 @@ def _kind_text(kind: str, rows: list[Row], all_legs: int) -> str:
 def _pair_text(first: str, second: str, rho: float) -> str:
     what = "difference" if rho > 0 else "sum"
     return (
-        f"{_in_words(first)} and {_in_words(second)} move together (correlation "
+        f"{_in_words(first).capitalize()} and {_in_words(second)} move together (correlation "
         f"{number(rho, 3)}): their {what} is known far better than each alone."
     )
 
 
 def _in_words(name: str) -> str:
     leg, path = split_name(name)
-    return f"Leg {leg} {label(path)}" if leg else label(path)
+    return f"leg {leg} {label(path)}" if leg else label(path)
 
 
 def tight_pairs(covariance: Array) -> list[tuple[int, int, float]]:

@@ -18,7 +18,7 @@ from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.images import decode
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.photographs import Photograph
-from pkmcal.report.centres import Centres
+from pkmcal.identify.centres import Centres
 from pkmcal.report.residuals import KEPT, SIDES, radius_positions, rms
 from pkmcal.report.wording import count, number
 from pkmcal.session import Session

@@ -95,7 +95,7 @@ def settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ...
         ("Session", session.folder.name),
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
         ("Frames", estimate.gauge),
-        ("Noise of a joint reading", f"{session.joint_noise:.3g} (m or rad)"),
+        ("Noise of a joint reading", f"{session.joint_noise:.3g} m or rad"),
         (
             "Drawing's tolerances, 1σ",
             f"centres {tolerance.center * 1e3:g} mm, offsets {tolerance.offset * 1e3:g} mm, "

@@ -218,12 +218,10 @@ def _remarks(
     configurations = [f"configuration {name}" for name in session.configurations]
     legs = [f"leg {j + 1}" for j in range(session.machine.n_legs)]
     out: list[str] = []
-    for names, group in (
-        (legs, edges.leg),
-        (stations, edges.station),
-        (configurations, edges.configuration),
-    ):
+    for names, group in ((legs, edges.leg), (stations, edges.station)):
         out += _outstanding(names, group, estimate)
+    if not out:  # a bad station would name every configuration that it saw
+        out += _outstanding(configurations, edges.configuration, estimate)
     shaded = _shaded(edges, estimate, shifts)
     if shaded:
         out.append(

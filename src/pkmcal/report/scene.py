@@ -12,7 +12,7 @@ from pkmcal.arrays import Array
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.problem import Estimate
-from pkmcal.report.centres import Centres
+from pkmcal.identify.centres import Centres
 from pkmcal.report.charts import WIDTH
 from pkmcal.report.wording import brief, number
 from pkmcal.session import Session
@@ -30,8 +30,8 @@ NEAR = 9.0
 class Joint:
     """One joint centre at home, base frame, m.
 
-    drawing, shown : (3,) by the drawing, and with the error enlarged. spread : (3, 3) covariance
-    enlarged alike. leg : from 1.
+    drawing, shown : (3,) by the drawing, and with the error enlarged. spread : (3, 3) enlarged
+    covariance. leg : from 1.
     """
 
     leg: int
@@ -44,17 +44,15 @@ class Joint:
 
 @dataclass(frozen=True)
 class Scene:
-    """All joint centres, base and platform in turn; ``factor`` enlarges the errors."""
+    """All joint centres, base and platform in turn.
+
+    factor : enlarges the errors. spread_factor : enlarges the ellipses, which would often be
+    hidden by the marks if they were drawn as the errors are.
+    """
 
     factor: float
+    spread_factor: float
     joints: tuple[Joint, ...]
-
-    @property
-    def tiny(self) -> bool:
-        """True where no ellipse reaches out of its mark, some hundredth of the machine."""
-        size = np.ptp(np.array([joint.drawing for joint in self.joints]), axis=0).max()
-        largest = max(float(np.trace(joint.spread)) for joint in self.joints)
-        return ELLIPSE * np.sqrt(largest) < 0.012 * float(size)
 
     def of_side(self, side: str) -> tuple[Joint, ...]:
         """The joints of base or platform, by leg."""
@@ -96,26 +94,27 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
     home = _home(session, estimate)
     placed = {"base": np.eye(4), "platform": home}
     size = float(np.ptp(np.concatenate([c.drawing for c in centres]), axis=0).max()) / 2
-    factor = enlargement(centres, size)
+    change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
+    sigma = np.concatenate([c.sigma for c in centres])
+    factor = enlargement(change, SHARE * size)
+    spread_factor = enlargement(ELLIPSE * sigma, SHARE / 3 * size)
     joints: list[Joint] = []
     for side in centres:
         T = placed[side.side]
         drawing = apply(T, side.drawing)
         shown = drawing + factor * (apply(T, side.calibrated) - drawing)
-        spread = factor**2 * T[:3, :3] @ side.blocks @ T[:3, :3].T
+        spread = spread_factor**2 * T[:3, :3] @ side.blocks @ T[:3, :3].T
         for j in range(len(drawing)):
             tip = _tip(j + 1, side, j)
             joints.append(Joint(j + 1, side.side, drawing[j], shown[j], spread[j], tip))
-    return Scene(factor, tuple(joints))
+    return Scene(factor, spread_factor, tuple(joints))
 
 
-def enlargement(centres: tuple[Centres, ...], size: float) -> float:
-    """1, 2 or 5 times a power of ten, so that large errors span ``SHARE`` of the size (m)."""
-    change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
-    reach = max(np.quantile(change, 0.9), ELLIPSE * max(c.sigma.max() for c in centres), 1e-9)
-    wanted = max(SHARE * size / reach, 1.0)
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return max(m * power for m in (1, 2, 5) if m * power <= wanted * (1 + 1e-9))
+def enlargement(lengths: Array, wanted: float) -> float:
+    """1, 2 or 5 times a power of ten that brings the larger lengths (n,) near the wanted one."""
+    ratio = max(wanted / max(float(np.quantile(lengths, 0.9)), 1e-9), 1.0)
+    power = 10.0 ** math.floor(math.log10(ratio))
+    return max(m * power for m in (1, 2, 5) if m * power <= ratio * (1 + 1e-9))
 
 
 def views(scene: Scene) -> tuple[View, View]:

@@ -10,7 +10,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import closure
-from pkmcal.report.centres import Centres
+from pkmcal.identify.centres import Centres
 
 
 @dataclass(frozen=True)

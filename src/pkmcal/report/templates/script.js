@@ -112,7 +112,3 @@
   };
   load().catch(failed);
 })();
-
-addEventListener("beforeprint", () => {
-  for (const part of document.querySelectorAll("details")) part.open = true;
-});

@@ -1,0 +1,387 @@
+"""The joint estimate: truth recovered, uncertainty that repeats confirm, wrong edges let go."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import apply, pose_difference, register
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.bundle import bundle, solve_batch, start_state
+from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index
+from pkmcal.identify.gauge import apply as in_gauge
+from pkmcal.identify.problem import Measurements
+from pkmcal.identify.solver import Stop
+from pkmcal.mechanisms import load_mechanism
+from test_identify_scene import JOINT_NOISE, guess, make_scene
+
+
+def estimate(scene, measurements, rng, **options):
+    start = start_state(scene.machine, measurements, guess(rng, scene.T_camera_base))
+    return bundle(scene.machine, measurements, start, **options)
+
+
+def registered_error(machine, theta, theta_true):
+    """Largest distance of a joint centre from its true place, frames laid on each other, m."""
+    worst = 0.0
+    for index in centre_index(machine.layout):
+        T = register(theta[index], theta_true[index])
+        worst = max(worst, np.abs(apply(T, theta[index]) - theta_true[index]).max())
+    return worst
+
+
+def without_noise(rng, scene):
+    clean = scene.measurements(rng, noise=0)
+    return replace(clean, edges=replace(clean.edges, covariance=scene.covariance))
+
+
+def known_radii(scene):
+    """The scene with true radii in the drawing and no edge shift: nothing pulls off the truth."""
+    machine = scene.machine
+    radius = machine.parameters.of_kind("radius")
+    drawing = machine.parameters.drawing.copy()
+    drawing[radius] = scene.theta[0, radius]
+    machine = replace(machine, parameters=replace(machine.parameters, drawing=drawing))
+    return replace(scene, machine=machine, edge_shift=np.zeros(1))
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_truth_is_recovered_to_rounding(robust):
+    rng = np.random.default_rng(0)
+    scene = make_scene(rng)
+    scene = replace(scene, edge_shift=np.zeros(1))
+    scene = known_radii(scene)
+    # edges drawn without shift, since the scene's own shift is now zero
+    found = estimate(
+        scene,
+        without_noise(rng, scene),
+        rng,
+        use_drawing=False,
+        robust=robust,
+        scale_noise=False,
+    )
+    truth = in_gauge(scene.machine, scene.state(), ThreeCentres())
+    np.testing.assert_allclose(found.state.theta, truth.theta, atol=1e-11)
+    np.testing.assert_allclose(found.state.T_camera_base, truth.T_camera_base, atol=1e-11)
+    np.testing.assert_allclose(found.state.T_base_platform, truth.T_base_platform, atol=1e-11)
+    assert found.statistics.chi2 < 1e-8
+    assert found.statistics.stopped == Stop.CONVERGED.value
+
+
+def test_uncertainty_is_what_repeats_show():
+    """Two hundred runs: errors divided by their covariance are standard normal, all of them
+    together; so are chi2 and the estimated noise scale."""
+    rng = np.random.default_rng(1)
+    runs = 200
+    scene = make_scene(rng, runs=runs, configurations=8, n_stations=2, seen=0.6)
+    assembled, truth = scene.batch(rng)
+    start = replace(truth, z=0 * truth.z, edge_shift=0 * truth.edge_shift)
+    result = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
+    assert set(result.solution.stop) == {Stop.CONVERGED}
+    found = result.solution.state
+    error = np.concatenate(
+        [
+            found.z - truth.z,
+            pose_difference(found.T_camera_base, truth.T_camera_base).reshape(runs, -1),
+            found.edge_shift - truth.edge_shift,
+        ],
+        axis=1,
+    )
+    n = error.shape[1]
+    whitened = np.linalg.solve(np.linalg.cholesky(result.info.covariance), error[..., None])[..., 0]
+    mean_square = np.sum(whitened**2) / (runs * n)
+    assert mean_square == pytest.approx(1, abs=4 * np.sqrt(2 / (runs * n)))
+    # no direction is told too surely or too modestly: eigenvalues within what chance leaves
+    values = np.linalg.eigvalsh(whitened.T @ whitened / runs)
+    edge = np.sqrt(n / runs)
+    assert values.max() < (1 + edge) ** 2 * 1.15
+    assert values.min() > (1 - edge) ** 2 * 0.7
+    single = error / np.sqrt(np.einsum("bii->bi", result.info.covariance))
+    assert np.mean(np.abs(single) < 1.959964) == pytest.approx(0.95, abs=0.01)
+    dof = assembled.problem.data.weight.sum() * 2 + 8 * 6 + len(assembled.problem.prior) - n - 48
+    assert np.mean(result.solution.cost) / dof == pytest.approx(1, abs=0.02)
+
+
+def test_noise_scale_is_found():
+    """Edges stated three times too sharp: the factor is found, and the covariance holds."""
+    rng = np.random.default_rng(2)
+    scene = make_scene(rng, runs=40, configurations=8, n_stations=2)
+    assembled, truth = scene.batch(rng)
+    data = assembled.problem.data
+    problem = replace(assembled.problem, data=replace(data, whiten=3 * data.whiten))
+    for robust in (False, True):
+        result = solve_batch(problem, truth, robust=robust)
+        n_edges = data.weight.sum() * 2
+        assert result.noise_scale.mean() == pytest.approx(3, rel=0.01)
+        assert result.noise_scale.std() == pytest.approx(3 / np.sqrt(2 * n_edges), rel=0.4)
+        error = (result.solution.state.z - truth.z) ** 2
+        variance = np.einsum("bii->bi", result.info.covariance)[:, : error.shape[1]]
+        assert np.mean(error / variance) == pytest.approx(1, abs=0.15)
+
+
+def test_stated_noise_is_kept_when_asked():
+    rng = np.random.default_rng(3)
+    scene = make_scene(rng)
+    assert (
+        estimate(scene, scene.measurements(rng), rng, scale_noise=False).statistics.noise_scale == 1
+    )
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2])
+def test_wrong_edges_change_nothing_that_matters(share):
+    """Edges replaced by another leg's: the same answer within 1.5 of its standard deviations."""
+    for seed in range(4):
+        scene = make_scene(np.random.default_rng(10 + seed), configurations=20)
+        rng = np.random.default_rng(seed)
+        clean = estimate(scene, scene.measurements(np.random.default_rng(100 + seed)), rng)
+        dirty_data = scene.measurements(np.random.default_rng(100 + seed), wrong=share)
+        dirty = estimate(scene, dirty_data, rng)
+        sigma = np.sqrt(np.diag(dirty.covariance))
+        known = sigma > 1e-9
+        change = (dirty.state.theta - clean.state.theta)[known] / sigma[known]
+        assert np.abs(change).max() < 1.5
+        wrong = np.any(
+            dirty_data.edges.normal
+            != scene.measurements(np.random.default_rng(100 + seed)).edges.normal,
+            axis=1,
+        )
+        far = np.linalg.norm(dirty_data.edges.normal - scene.normal[0], axis=1) > 0.005
+        assert np.all(dirty.edge_weights[wrong & far] < 0.05)
+        assert np.mean(dirty.edge_weights[~wrong] > 0.9) > 0.995
+
+
+def test_robustness_costs_nothing_on_clean_edges():
+    rng = np.random.default_rng(4)
+    scene = make_scene(rng, runs=60, configurations=8, n_stations=2)
+    assembled, truth = scene.batch(rng)
+    plain = solve_batch(assembled.problem, truth, robust=False)
+    robust = solve_batch(assembled.problem, truth, robust=True)
+    nz = truth.z.shape[1]
+    sigma = np.sqrt(np.einsum("bii->bi", plain.info.covariance)[:, :nz])
+    loss = np.mean(((robust.solution.state.z - truth.z) / sigma) ** 2)
+    loss = loss / np.mean(((plain.solution.state.z - truth.z) / sigma) ** 2) - 1
+    assert loss < 0.01
+
+
+def test_starts_far_away_find_the_same_answer():
+    """Parameters 5 mm off, stations 5 degrees and 50 mm off."""
+    rng = np.random.default_rng(5)
+    scene = make_scene(rng, runs=30, configurations=10)
+    assembled, truth = scene.batch(rng)
+    centres = assembled.problem.free.T @ (scene.machine.parameters.drawing * 0 + 1) > 0
+    z = truth.z + rng.uniform(-0.005, 0.005, truth.z.shape) * centres * (
+        np.array(scene.machine.parameters.kinds) != "radius"
+    )
+    stations = np.stack([guess(rng, T, 0.09, 0.05) for T in truth.T_camera_base])
+    start = replace(truth, z=z, T_camera_base=stations)
+    for robust in (False, True):
+        far = solve_batch(assembled.problem, start, robust=robust, scale_noise=False)
+        near = solve_batch(assembled.problem, truth, robust=robust, scale_noise=False)
+        np.testing.assert_allclose(far.solution.cost, near.solution.cost, rtol=1e-3)
+        np.testing.assert_allclose(far.solution.state.z, near.solution.state.z, atol=3e-6)
+
+
+def test_configurations_that_nobody_photographed():
+    """They stay out of the estimate, and their poses come from the readings."""
+    rng = np.random.default_rng(6)
+    scene = make_scene(rng, configurations=10)
+    full = scene.measurements(rng)
+    unseen = np.array([2, 7])
+    part = replace(full, edges=full.edges.select(~np.isin(full.edges.configuration, unseen)))
+    found = estimate(scene, part, rng)
+    assert not found.configurations[unseen].any()
+    assert found.configurations.sum() == 8
+    assert not found.joint_residuals[unseen].any()
+    keep = np.setdiff1d(np.arange(10), unseen)
+    row = np.searchsorted(keep, part.edges.configuration)
+    only = replace(part, joints=part.joints[keep], edges=replace(part.edges, configuration=row))
+    same = estimate(scene, only, rng)
+    # the starts differ, so the robust weights may stop a hair apart
+    np.testing.assert_allclose(found.state.theta, same.state.theta, atol=1e-7)
+    poses = found.machine.forward(part.joints[unseen])
+    np.testing.assert_allclose(found.state.T_base_platform[unseen], poses, atol=1e-9)
+
+
+@pytest.mark.parametrize("edges_left", [0, 1, 4])
+def test_a_station_that_sees_almost_nothing_does_no_harm(edges_left):
+    rng = np.random.default_rng(7)
+    scene = make_scene(rng)
+    full = scene.measurements(rng)
+    keep = full.edges.station != 1
+    without = estimate(scene, replace(full, edges=full.edges.select(keep)), rng)
+    keep = keep.copy()
+    keep[np.flatnonzero(~keep)[:edges_left]] = True
+    found = estimate(scene, replace(full, edges=full.edges.select(keep)), rng)
+    sigma = np.sqrt(np.diag(without.covariance))
+    change = (found.state.theta - without.state.theta)[sigma > 1e-9] / sigma[sigma > 1e-9]
+    assert np.abs(change).max() < (0.3 if edges_left else 1e-3)
+    assert np.isfinite(found.covariance).all()
+    width = np.sqrt(np.einsum("sii->si", found.station_covariance)).max(axis=1)
+    assert width[1] > 1.0  # metres or radians: unknown, and said so
+    assert width[[0, 2]].max() < 0.01
+
+
+def test_result_statistics_add_up():
+    rng = np.random.default_rng(8)
+    scene = make_scene(rng)
+    found = estimate(scene, scene.measurements(rng), rng)
+    s = found.statistics
+    assert s.chi2 == pytest.approx(s.chi2_edges + s.chi2_joints + s.chi2_drawing)
+    assert s.chi2 / s.dof == pytest.approx(1, abs=0.1)
+    weighted = np.sum(found.edge_weights * np.sum(found.edge_residuals**2, axis=1))
+    assert weighted == pytest.approx(s.chi2_edges, rel=1e-6)
+    assert np.sum(found.joint_residuals**2) == pytest.approx(s.chi2_joints)
+    readings = found.machine.inverse(found.state.T_base_platform)
+    measured = scene.measurements(np.random.default_rng(8)).joints
+    assert np.abs(readings - measured).max() < 5 * JOINT_NOISE * 10
+    held = np.diag(found.covariance) == 0
+    assert held.sum() >= 6
+    assert np.all(found.data_share[~held] <= 1)
+    assert np.median(found.data_share) > 0.9
+
+
+def test_fixed_and_tied_parameters():
+    machine = load_mechanism("gough-stewart")
+    names = machine.parameters.names
+    radii = tuple(n for n in names if n.endswith("tubes[1].radius"))
+    table = machine.parameters.with_roles(fixed=("legs[3].length.offset",), tied=(radii,))
+    machine = replace(machine, parameters=table)
+    rng = np.random.default_rng(9)
+    scene = make_scene(rng, machine=machine)
+    found = estimate(scene, scene.measurements(rng), rng)
+    fixed = table.index("legs[3].length.offset")
+    assert found.state.theta[fixed] == table.drawing[fixed]
+    assert found.covariance[fixed].max() == 0
+    tied = [table.index(n) for n in radii]
+    change = found.state.theta[tied] - table.drawing[tied]
+    np.testing.assert_allclose(change, change[0], atol=1e-15)
+    np.testing.assert_allclose(np.diag(found.covariance)[tied], found.covariance[tied[0], tied[1]])
+    truth = in_gauge(machine, scene.state(), ThreeCentres())
+    sigma = np.sqrt(np.diag(found.covariance))
+    known = sigma > 1e-9
+    assert np.abs((found.state.theta - truth.theta)[known] / sigma[known]).max() < 4.5
+
+
+def test_full_rank_of_a_good_session():
+    rng = np.random.default_rng(20)
+    scene = make_scene(rng)
+    assembled = assemble(scene.machine, scene.measurements(rng), ThreeCentres())
+    state = batch_of(scene.machine, assembled, scene.state())
+    found = identifiability(assembled.problem, scene.machine, state)
+    assert found.n_frames == 12
+    # the common scale of radii against the edge shift is soft, but nothing is lost
+    assert found.rank == found.n_parameters - 12
+    assert not found.unidentified
+
+
+def test_what_cannot_be_identified_is_named():
+    """A tube that no edge shows: its radius, and nothing else."""
+    rng = np.random.default_rng(21)
+    scene = make_scene(rng)
+    full = scene.measurements(rng)
+    hidden = (full.edges.leg == 3) & (full.edges.tube == 1)
+    part = replace(full, edges=full.edges.select(~hidden))
+    assembled = assemble(scene.machine, part, ThreeCentres())
+    state = batch_of(scene.machine, assembled, scene.state())
+    found = identifiability(assembled.problem, scene.machine, state)
+    assert [d.names for d in found.unidentified] == [("legs[4].tubes[2].radius",)]
+    result = estimate(scene, part, rng)
+    radius = scene.machine.parameters.index("legs[4].tubes[2].radius")
+    assert result.data_share[radius] == pytest.approx(0, abs=1e-9)
+    assert result.state.theta[radius] == pytest.approx(scene.machine.parameters.drawing[radius])
+
+
+def test_one_configuration_is_singular_and_two_suffice():
+    """Errata, A: one configuration alone leaves directions open."""
+    rng = np.random.default_rng(22)
+    for configurations, complete in ((1, False), (2, True)):
+        scene = make_scene(rng, configurations=configurations, seen=1.0)
+        assembled = assemble(scene.machine, scene.measurements(rng), ThreeCentres())
+        state = batch_of(scene.machine, assembled, scene.state())
+        found = identifiability(assembled.problem, scene.machine, state)
+        assert (not found.unidentified) == complete
+
+
+def test_every_configuration_seen_from_one_station_only():
+    rng = np.random.default_rng(23)
+    scene = make_scene(rng, configurations=24)
+    full = scene.measurements(rng)
+    keep = full.edges.station == full.edges.configuration % 3
+    found = estimate(scene, replace(full, edges=full.edges.select(keep)), rng)
+    truth = in_gauge(scene.machine, scene.state(), ThreeCentres())
+    sigma = np.sqrt(np.diag(found.covariance))
+    known = sigma > 1e-9
+    assert np.abs((found.state.theta - truth.theta)[known] / sigma[known]).max() < 4.5
+    assert found.statistics.chi2 / found.statistics.dof == pytest.approx(1, abs=0.1)
+
+
+def test_two_cameras_have_their_own_edge_shift():
+    rng = np.random.default_rng(24)
+    scene = make_scene(rng, configurations=20, tolerance=0.3)
+    m = scene.measurements(rng)
+    m = replace(m, camera_of_station=np.array([0, 1, 0]))
+    found = estimate(scene, m, rng)
+    assert found.state.edge_shift.shape == (2,)
+    np.testing.assert_allclose(
+        found.state.edge_shift, scene.edge_shift[0], atol=4 * found.edge_shift_sigma.max()
+    )
+
+
+def test_wrong_inputs_are_told():
+    rng = np.random.default_rng(25)
+    scene = make_scene(rng)
+    good = scene.measurements(rng)
+    start = scene.state()
+    with pytest.raises(InputError, match="no edge"):
+        bundle(scene.machine, replace(good, edges=good.edges.select(np.zeros(0, int))), start)
+    with pytest.raises(InputError, match="5 columns"):
+        bundle(scene.machine, replace(good, joints=good.joints[:, :5]), start)
+    with pytest.raises(InputError, match="does not exist"):
+        bundle(scene.machine, replace(good, joints=good.joints[:4]), start)
+
+
+@pytest.mark.parametrize("gauge", [ThreeCentres(), ThreeCentres((1, 3, 5)), BestFit()])
+def test_results_do_not_depend_on_the_gauge(gauge):
+    """Without drawing values the solve itself uses the gauge's rows; distances must not care."""
+    rng = np.random.default_rng(26)
+    scene = make_scene(rng)
+    m = scene.measurements(rng)
+    start = start_state(scene.machine, m, scene.T_camera_base)
+    options = {"use_drawing": False, "robust": False, "scale_noise": False}
+    reference = bundle(scene.machine, m, start, **options)
+    other = bundle(scene.machine, m, start, gauge=gauge, **options)
+    assert registered_error(scene.machine, other.state.theta, reference.state.theta) < 1e-11
+    assert other.statistics.chi2 == pytest.approx(reference.statistics.chi2, rel=1e-9)
+    for index in centre_index(scene.machine.layout):
+        i, j = np.triu_indices(6, 1)
+        for a, b in zip(index[i], index[j], strict=True):
+            assert distance_sigma(other, a, b) == pytest.approx(distance_sigma(reference, a, b))
+
+
+def distance_sigma(found, a, b):
+    """Standard deviation of the distance between two centres: the same in every frame."""
+    e = found.state.theta[a] - found.state.theta[b]
+    e = e / np.linalg.norm(e)
+    c = found.covariance
+    spread = c[np.ix_(a, a)] + c[np.ix_(b, b)] - c[np.ix_(a, b)] - c[np.ix_(b, a)]
+    return np.sqrt(e @ spread @ e)
+
+
+def test_measurements_are_not_changed():
+    rng = np.random.default_rng(27)
+    scene = make_scene(rng)
+    m = scene.measurements(rng)
+    copy = Measurements(
+        replace(m.edges, normal=m.edges.normal.copy()),
+        m.joints.copy(),
+        m.joint_noise,
+        m.n_stations,
+        m.camera_of_station.copy(),
+    )
+    estimate(scene, m, rng)
+    np.testing.assert_array_equal(m.edges.normal, copy.edges.normal)
+    np.testing.assert_array_equal(m.joints, copy.joints)

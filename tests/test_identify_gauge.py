@@ -1,0 +1,203 @@
+"""Gauges: frames change, nothing measurable does, and the covariance follows exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.geometry.rigid import apply as move
+from pkmcal.geometry.rigid import perturb, pose_difference
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.covariance import information, machine_covariance
+from pkmcal.identify.gauge import (
+    BestFit,
+    ThreeCentres,
+    alignment,
+    apply,
+    carried_errors,
+    centre_index,
+    changed_frames,
+    freedoms,
+    generators,
+    station_generators,
+    transformation,
+)
+from pkmcal.mechanisms.limbs import closure
+from test_identify_scene import make_scene
+
+GAUGES = [ThreeCentres(), ThreeCentres((1, 3, 5)), BestFit()]
+
+
+def moved_state(rng, scene, size=0.05):
+    e, f = (perturb(np.eye(4), size * rng.normal(size=6)) for _ in range(2))
+    return changed_frames(scene.machine.layout, scene.state(), e, f)
+
+
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_constraints_hold_and_nothing_measurable_changes(gauge):
+    rng = np.random.default_rng(0)
+    scene = make_scene(rng)
+    machine = scene.machine
+    state = moved_state(rng, scene, 0.2)
+    told = apply(machine, state, gauge)
+    c = gauge.constraints(machine)
+    np.testing.assert_allclose(c @ told.theta, c @ machine.parameters.drawing, atol=1e-14)
+    legs = closure(machine.layout, told.theta, scene.joints[0], told.T_base_platform)
+    np.testing.assert_allclose(legs.value, 0, atol=1e-13)
+    base, _ = centre_index(machine.layout)
+    seen = [move(s.T_camera_base[:, None], s.theta[base]) for s in (state, told)]
+    np.testing.assert_allclose(seen[0], seen[1], atol=1e-13)
+    again = apply(machine, told, gauge)
+    np.testing.assert_allclose(again.theta, told.theta, atol=1e-14)
+
+
+def test_three_centres_as_the_design_says():
+    rng = np.random.default_rng(1)
+    scene = make_scene(rng)
+    base = centre_index(scene.machine.layout)[0]
+    d = scene.machine.parameters.drawing[base]
+    a = apply(scene.machine, moved_state(rng, scene), ThreeCentres()).theta[base]
+    np.testing.assert_allclose(a[0], d[0], atol=1e-14)
+    np.testing.assert_allclose(np.cross(a[2] - a[0], d[2] - d[0]), 0, atol=1e-14)
+    assert (a[2] - a[0]) @ (d[2] - d[0]) > 0
+    normal = np.cross(d[2] - d[0], d[4] - d[0])
+    assert (a[4] - a[0]) @ normal == pytest.approx(0, abs=1e-15)
+
+
+def test_best_fit_is_the_least_squares_fit():
+    """No small motion of either frame brings the centres nearer to the drawing."""
+    rng = np.random.default_rng(2)
+    scene = make_scene(rng)
+    told = apply(scene.machine, moved_state(rng, scene), BestFit())
+    drawing = scene.machine.parameters.drawing
+
+    def cost(e, f):
+        theta = changed_frames(scene.machine.layout, told, e, f).theta
+        return sum(np.sum((theta - drawing)[i] ** 2) for i in centre_index(scene.machine.layout))
+
+    least = cost(np.eye(4), np.eye(4))
+    for _ in range(20):
+        delta = 1e-4 * rng.normal(size=(2, 6))
+        assert cost(*(perturb(np.eye(4), d) for d in delta)) > least
+
+
+def test_generators_against_small_motions():
+    rng = np.random.default_rng(3)
+    scene = make_scene(rng)
+    state = moved_state(rng, scene)
+    y = 1e-6 * rng.normal(size=12)
+    e, f = perturb(np.eye(4), y[:6]), perturb(np.eye(4), y[6:])
+    after = changed_frames(scene.machine.layout, state, e, f)
+    change = generators(scene.machine.layout, state.theta) @ y
+    np.testing.assert_allclose(after.theta - state.theta, change, atol=1e-11)
+    change = station_generators(state.T_camera_base) @ y
+    found = pose_difference(after.T_camera_base, state.T_camera_base)
+    np.testing.assert_allclose(found, change, atol=1e-11)
+
+
+def test_errors_are_carried_by_a_finite_frame_change():
+    rng = np.random.default_rng(4)
+    scene = make_scene(rng)
+    machine, state = scene.machine, scene.state()
+    e, f = (perturb(np.eye(4), 0.4 * rng.normal(size=6)) for _ in range(2))
+    n_par, n_stations = state.theta.size, len(state.T_camera_base)
+    small = 1e-6 * rng.normal(size=n_par + 6 * n_stations)
+    wrong = replace(
+        state,
+        theta=state.theta + small[:n_par],
+        T_camera_base=perturb(state.T_camera_base, small[n_par:].reshape(-1, 6)),
+    )
+    right_after, wrong_after = (changed_frames(machine.layout, s, e, f) for s in (state, wrong))
+    carried = carried_errors(machine.layout, state, e, f) @ small
+    np.testing.assert_allclose(wrong_after.theta - right_after.theta, carried[:n_par], atol=1e-11)
+    found = pose_difference(wrong_after.T_camera_base, right_after.T_camera_base)
+    np.testing.assert_allclose(found.ravel(), carried[n_par:], atol=1e-11)
+
+
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_transformation_is_the_derivative_of_apply(gauge):
+    """Errors told in the gauge, by central differences through the whole of ``apply``."""
+    rng = np.random.default_rng(5)
+    scene = make_scene(rng)
+    machine = scene.machine
+    state = apply(machine, scene.state(), gauge)
+    n_par = state.theta.size
+    s = transformation(machine, state, gauge)
+    for _ in range(5):
+        d = 1e-6 * rng.normal(size=s.shape[1])
+        told = []
+        for sign in (1, -1):
+            wrong = replace(
+                state,
+                theta=state.theta + sign * d[:n_par],
+                T_camera_base=perturb(state.T_camera_base, sign * d[n_par:].reshape(-1, 6)),
+            )
+            told.append(apply(machine, wrong, gauge))
+        numeric = 0.5 * (told[0].theta - told[1].theta)
+        np.testing.assert_allclose(numeric, (s @ d)[:n_par], atol=1e-12)
+        numeric = 0.5 * pose_difference(told[0].T_camera_base, told[1].T_camera_base).ravel()
+        np.testing.assert_allclose(numeric, (s @ d)[n_par:], atol=1e-11)
+    np.testing.assert_allclose(s @ s, s, atol=1e-10)  # told twice is told once
+    np.testing.assert_allclose(gauge.constraints(machine) @ s[:n_par], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("first", GAUGES)
+@pytest.mark.parametrize("second", GAUGES)
+def test_covariance_transformed_equals_covariance_recomputed(first, second):
+    """Solved with one gauge's rows and told in another, or solved with the other's at once."""
+    rng = np.random.default_rng(6)
+    scene = make_scene(rng, configurations=8)
+    machine, m = scene.machine, scene.measurements(np.random.default_rng(7))
+    told = []
+    for rows in (first, second):
+        assembled = assemble(machine, m, rows, use_drawing=False)
+        state = apply(machine, scene.state(), rows)
+        info = information(assembled.problem, batch_of(machine, assembled, state))
+        told.append(
+            machine_covariance(assembled.problem, machine, state, info.covariance[0], second)
+        )
+    scale = np.sqrt(np.diag(told[1])) + 1e-9
+    np.testing.assert_allclose(
+        told[0] / np.outer(scale, scale), told[1] / np.outer(scale, scale), atol=1e-5
+    )
+
+
+def test_end_effector_does_not_depend_on_the_gauge():
+    """Readings to pose, and the pose's change between two sets of readings, in any frames."""
+    rng = np.random.default_rng(8)
+    scene = make_scene(rng)
+    poses = []
+    for gauge in GAUGES:
+        told = apply(scene.machine, scene.state(), gauge)
+        machine = scene.machine.with_values(told.theta)
+        T = machine.forward(scene.joints[0], told.T_base_platform)
+        b = machine.platform_centers()
+        points = move(T[:, None], b)
+        poses.append(np.linalg.norm(points[1:] - points[:-1], axis=-1))
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-12)
+    np.testing.assert_allclose(poses[0], poses[2], atol=1e-12)
+
+
+def test_fixed_parameters_take_frames_away():
+    machine = make_scene(np.random.default_rng(9)).machine
+    assert freedoms(machine).shape == (12, 12)
+    for fixed, left in (
+        (("legs[1].base.center.x",), 11),
+        (tuple(f"legs[2].platform.center.{a}" for a in "xyz"), 9),
+        (tuple(f"legs[{j}].base.center.{a}" for j in (1, 3, 5) for a in "xyz"), 6),
+    ):
+        held = replace(machine, parameters=machine.parameters.with_roles(fixed=fixed))
+        basis = freedoms(held)
+        assert basis.shape == (12, left)
+        moved = generators(held.layout, held.parameters.drawing) @ basis
+        rows = [held.parameters.index(name) for name in fixed]
+        np.testing.assert_allclose(moved[rows], 0, atol=1e-12)
+
+
+def test_alignment_of_a_state_already_in_the_gauge_is_nothing():
+    scene = make_scene(np.random.default_rng(10))
+    state = apply(scene.machine, scene.state(), ThreeCentres())
+    for transform in alignment(scene.machine, state, ThreeCentres()):
+        np.testing.assert_allclose(transform, np.eye(4), atol=1e-13)

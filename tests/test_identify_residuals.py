@@ -1,0 +1,197 @@
+"""The joint residuals: exact Jacobians, signs, whitening, edges that cannot be predicted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.geometry.cylinders import tangent_basis
+from pkmcal.geometry.rigid import perturb, pose
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.gauge import ThreeCentres
+from pkmcal.identify.paper_a import Settings, joint_problem, simulate, study_machine
+from pkmcal.identify.residuals import BatchState
+from pkmcal.mechanisms import load_mechanism
+from test_identify_scene import FOCAL, make_scene
+
+
+def derivatives(problem, state, shared, own, h=1e-4):
+    """Sixth-order central differences along a direction; exact to about 1e-10 of the value."""
+    weights = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+    total = 0.0
+    for k, w in weights.items():
+        up = problem.residuals(problem.moved(state, k * h * shared, k * h * own))
+        down = problem.residuals(problem.moved(state, -k * h * shared, -k * h * own))
+        flat = np.concatenate([(up.value - down.value).ravel(), (up[1] - down[1]).ravel()])
+        total = total + w * flat
+    return total / h
+
+
+def check(problem, state, rng, directions=4):
+    linear = problem.linearize(state)
+    assert np.isfinite(problem.residuals(state).value).all()
+    for _ in range(directions):
+        # one hundredth: radii are centimetres, so a unit step would leave the model's domain
+        shared = 0.01 * rng.normal(size=(state.z.shape[0], problem.n_shared))
+        own = 0.01 * rng.normal(size=linear.by_own.shape[:2] + linear.by_own.shape[-1:])
+        exact = np.concatenate(
+            [
+                (
+                    (linear.by_shared @ shared[:, None, :, None])[..., 0]
+                    + (linear.by_own @ own[..., None])[..., 0]
+                ).ravel(),
+                (shared @ linear.shared_by.T).ravel(),
+            ]
+        )
+        numeric = derivatives(problem, state, shared, own)
+        scale = np.abs(exact).max()
+        np.testing.assert_allclose(exact, numeric, atol=2e-8 * scale)
+
+
+def test_jacobian_at_the_nominal_machine():
+    rng = np.random.default_rng(0)
+    assembled, truth = make_scene(rng, configurations=4, tolerance=0.0).batch(rng)
+    check(assembled.problem, truth, rng)
+
+
+def test_jacobian_at_random_points():
+    rng = np.random.default_rng(1)
+    assembled, truth = make_scene(rng, runs=3, configurations=4, tolerance=3.0).batch(rng)
+    step = 0.02 * rng.normal(size=(3, 4, 6))
+    moved = replace(
+        truth,
+        T_base_platform=perturb(truth.T_base_platform, step),
+        edge_shift=rng.normal(size=(3, 1)),
+    )
+    check(assembled.problem, moved, rng)
+
+
+def test_jacobian_near_a_singular_pose_and_beside_a_leg():
+    """The platform turned by 85 degrees, a camera 3 mm beside a leg's surface."""
+    rng = np.random.default_rng(2)
+    assembled, truth = make_scene(rng, configurations=3, n_stations=1).batch(rng)
+    turned = perturb(truth.T_base_platform, np.array([0, 0, np.radians(85), 0, 0, 0]))
+    check(assembled.problem, replace(truth, T_base_platform=turned), rng)
+    problem = assembled.problem
+    ends = problem._closure(truth).ends
+    a, b = ends.a[0, 0, 0], ends.b[0, 0, 0]
+    u = (b - a) / np.linalg.norm(b - a)
+    aside = np.cross(u, [0, 0, 1.0])
+    beside = 0.5 * (a + b) + 0.017 * aside / np.linalg.norm(aside)
+    rot = truth.T_camera_base[0, 0, :3, :3]
+    near = replace(truth, T_camera_base=pose(rot, -rot @ beside)[None, None])
+    linear = problem.linearize(near)
+    assert np.isfinite(problem.residuals(near).value).all()
+    # curvature grows with 1 / gap, so the differences' step has to shrink
+    shared = 1e-5 * rng.normal(size=(1, problem.n_shared))
+    exact = (linear.by_shared @ shared[:, None, :, None]).ravel()
+    numeric = derivatives(problem, near, shared, np.zeros((1, 3, 6)), h=1e-2)[: exact.size]
+    np.testing.assert_allclose(exact, numeric, atol=1e-6 * np.abs(exact).max())
+
+
+def test_jacobian_with_fixed_and_tied_parameters():
+    machine = load_mechanism("gough-stewart")
+    table = machine.parameters.with_roles(
+        fixed=("legs[1].base.center.z", "legs[2].length.offset"),
+        tied=(
+            ("legs[1].tubes[1].radius", "legs[2].tubes[1].radius", "legs[3].tubes[1].radius"),
+            # two parameters of one leg, so that their derivatives add up in one row
+            ("legs[4].base.center.x", "legs[4].platform.center.x"),
+        ),
+    )
+    machine = replace(machine, parameters=table)
+    rng = np.random.default_rng(3)
+    assembled, truth = make_scene(rng, configurations=4, machine=machine).batch(rng)
+    check(assembled.problem, truth, rng)
+
+
+def test_jacobian_of_edges_that_are_whitened_in_pairs():
+    rng = np.random.default_rng(4)
+    machine = study_machine()
+    settings = Settings(poses=3)
+    truth = simulate(machine, settings, 2, rng)
+    problem = joint_problem(machine, settings, truth)
+    z = (truth.theta - problem.drawing) @ np.linalg.pinv(problem.free).T
+    T = np.broadcast_to(truth.T_camera_base, (2, 3, 4, 4))
+    check(problem, BatchState(z, T, truth.T_base_platform, np.zeros((2, 1))), rng)
+
+
+def test_true_values_leave_no_residual():
+    rng = np.random.default_rng(5)
+    scene = make_scene(rng)
+    scene = replace(scene, edge_shift=np.zeros(1))
+    machine = scene.machine
+    assembled = assemble(machine, scene.measurements(rng, noise=0), ThreeCentres())
+    values = assembled.problem.residuals(batch_of(machine, assembled, scene.state()))
+    assert np.abs(values.value).max() < 1e-9
+
+
+def test_whitening_makes_the_noise_standard():
+    """Residuals at the truth are the noise itself: unit covariance, [0] by [1] uncorrelated."""
+    rng = np.random.default_rng(6)
+    assembled, truth = make_scene(rng, runs=40).batch(rng)
+    rows = assembled.problem.block_residuals(truth)[:, assembled.row, assembled.place]
+    rows = rows.reshape(-1, 2)
+    bound = 5 / np.sqrt(len(rows))
+    np.testing.assert_allclose(rows.T @ rows / len(rows), np.eye(2), atol=2 * bound)
+    assert np.abs(rows.mean(axis=0)).max() < bound
+
+
+def test_sign_of_the_edge_shift():
+    """Image points moved outward by 0.4 px are found as +0.4: outward is away from the leg."""
+    rng = np.random.default_rng(7)
+    scene = make_scene(rng, configurations=15, tolerance=0.0)
+    normal = scene.normal[0]
+    basis = tangent_basis(normal, scene.middle[0])
+    shift = np.einsum("nij,ni->nj", basis, (moved_outward(normal, scene.middle[0], 1e-3) - normal))
+    clean = scene.measurements(rng, noise=0)
+    shifted = moved_outward(normal, scene.middle[0], 0.4)
+    edges = replace(
+        clean.edges,
+        normal=shifted,
+        basis=tangent_basis(shifted, scene.middle[0]),
+        shift=shift / 1e-3,
+    )
+    measurements = replace(clean, edges=edges)
+    start = start_state(scene.machine, measurements, scene.T_camera_base)
+    found = bundle(scene.machine, measurements, start, robust=False, scale_noise=False)
+    assert found.state.edge_shift[0] == pytest.approx(0.4, abs=0.02)
+    assert found.state.edge_shift[0] / found.edge_shift_sigma[0] > 10
+
+
+def moved_outward(normal, middle, pixels):
+    """Normals refitted to two image points of each edge, moved away from the leg's axis."""
+    on_edge = middle - np.sum(middle * normal, axis=-1, keepdims=True) * normal
+    across = np.cross(normal, on_edge)
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    rays = np.stack([on_edge + s * 0.1 * across for s in (-1, 1)])
+    image = rays[..., :2] / rays[..., 2:]
+    line = normal[:, :2] / np.linalg.norm(normal[:, :2], axis=-1, keepdims=True)
+    # the leg lies where n.p < 0, so its outside is along the normal's image part
+    image = image + pixels / FOCAL * line
+    rays = np.concatenate([image, np.ones((*image.shape[:-1], 1))], axis=-1)
+    n = np.cross(rays[0], rays[1])
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    return n * np.sign(np.sum(n * normal, axis=-1, keepdims=True))
+
+
+def test_an_edge_that_cannot_be_predicted_counts_for_nothing():
+    """A station inside a leg of the drawing: its edges are NaN, all else is solved."""
+    rng = np.random.default_rng(8)
+    scene = make_scene(rng, configurations=6)
+    measurements = scene.measurements(rng)
+    assembled = assemble(scene.machine, measurements, ThreeCentres())
+    state = batch_of(scene.machine, assembled, scene.state())
+    ends = assembled.problem._closure(state).ends
+    inside = 0.5 * (ends.a[0, 0, 0] + ends.b[0, 0, 0])
+    T = state.T_camera_base.copy()
+    T[0, 2, :3, 3] = -T[0, 2, :3, :3] @ inside
+    linear = assembled.problem.linearize(replace(state, T_camera_base=T))
+    assert not linear.usable.all()
+    assert linear.usable.mean() > 0.5
+    for part in (linear.value, linear.by_shared, linear.by_own):
+        assert np.isfinite(part).all()
+        assert not part[~linear.usable].any()

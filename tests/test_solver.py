@@ -1,0 +1,187 @@
+"""The batched solver against dense algebra, and its ways of stopping."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.identify.bundle import solve_batch
+from pkmcal.identify.registration import Dense, minimise_dense
+from pkmcal.identify.solver import (
+    Linear,
+    Stop,
+    damped_step,
+    eliminate,
+    minimise,
+    reduced_normal,
+)
+from test_identify_scene import guess, make_scene
+
+
+def random_linear(rng, runs=3, k=4, r=9, na=5, d=3, c=4) -> Linear:
+    return Linear(
+        rng.normal(size=(runs, k, r)),
+        rng.normal(size=(runs, k, r, na)),
+        rng.normal(size=(runs, k, r, d)),
+        np.ones((runs, k, r), dtype=bool),
+        rng.normal(size=(runs, c)),
+        rng.normal(size=(c, na)),
+    )
+
+
+def dense(linear: Linear, run: int) -> tuple[np.ndarray, np.ndarray]:
+    """The whole Jacobian and residual of a run, own unknowns after the shared ones."""
+    _, k, r, na = linear.by_shared.shape
+    d, c = linear.by_own.shape[-1], linear.shared_value.shape[1]
+    jac = np.zeros((k * r + c, na + k * d))
+    jac[: k * r, :na] = linear.by_shared[run].reshape(-1, na)
+    for j in range(k):
+        jac[j * r : (j + 1) * r, na + j * d : na + (j + 1) * d] = linear.by_own[run, j]
+    jac[k * r :, :na] = linear.shared_by
+    return jac, np.concatenate([linear.value[run].ravel(), linear.shared_value[run]])
+
+
+def test_undamped_step_equals_dense_least_squares():
+    linear = random_linear(np.random.default_rng(0))
+    shared, own = damped_step(linear, np.zeros(3))
+    for run in range(3):
+        jac, value = dense(linear, run)
+        step = -np.linalg.lstsq(jac, value, rcond=None)[0]
+        np.testing.assert_allclose(
+            np.concatenate([shared[run], own[run].ravel()]), step, atol=1e-11
+        )
+
+
+def test_damped_step_equals_dense_marquardt():
+    """Each run has its own damping; shared unknowns are damped in the reduced problem."""
+    linear = random_linear(np.random.default_rng(1))
+    damping = np.array([0.0, 1e-3, 10.0])
+    shared, own = damped_step(linear, damping)
+    for run in range(3):
+        jac, value = dense(linear, run)
+        na = linear.by_shared.shape[-1]
+        norms = np.linalg.norm(jac[:, na:], axis=0)
+        damped = np.zeros((len(norms), jac.shape[1]))
+        damped[:, na:] = np.sqrt(damping[run]) * np.diag(norms)
+        full = np.concatenate([jac, damped])
+        q, _ = np.linalg.qr(full[:, na:])
+        reduced = full[:, :na] - q @ (q.T @ full[:, :na])
+        scale = np.sqrt(damping[run]) * np.diag(np.linalg.norm(reduced, axis=0))
+        full = np.concatenate([full, np.pad(scale, ((0, 0), (0, jac.shape[1] - na)))])
+        right = np.concatenate([value, np.zeros(len(full) - len(value))])
+        step = -np.linalg.lstsq(full, right, rcond=None)[0]
+        np.testing.assert_allclose(
+            np.concatenate([shared[run], own[run].ravel()]), step, atol=1e-10
+        )
+
+
+def test_reduced_normal_is_the_schur_complement():
+    linear = random_linear(np.random.default_rng(2))
+    reduced = eliminate(linear, np.zeros(3))
+    normal = reduced_normal(linear, reduced)
+    for run in range(3):
+        jac, value = dense(linear, run)
+        full, na = jac.T @ jac, 5
+        schur = full[:na, :na] - full[:na, na:] @ np.linalg.solve(full[na:, na:], full[na:, :na])
+        np.testing.assert_allclose(normal[run], schur, atol=1e-11)
+        g = jac.T @ value
+        g = g[:na] - full[:na, na:] @ np.linalg.solve(full[na:, na:], g[na:])
+        np.testing.assert_allclose(reduced.gradient[run], g, atol=1e-11)
+
+
+def test_runs_of_a_batch_do_not_touch_each_other():
+    """A run solved in a batch, among easier and harder ones, gives what it gives alone."""
+    rng = np.random.default_rng(3)
+    assembled, truth = make_scene(rng, runs=4, configurations=6).batch(rng)
+    station = np.stack(
+        [guess(rng, t, 0.01 * 4**i, 0.01) for i, t in enumerate(truth.T_camera_base)]
+    )
+    start = replace(truth, z=0 * truth.z, T_camera_base=station)
+    together = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
+    assert len(set(together.steps.tolist())) > 1
+    for run in range(4):
+        only = np.array([run])
+        alone = solve_batch(
+            assembled.problem.select(only),
+            assembled.problem.take(start, only),
+            robust=False,
+            scale_noise=False,
+        )
+        assert alone.steps[0] == together.steps[run]
+        np.testing.assert_allclose(
+            alone.solution.state.z[0], together.solution.state.z[run], atol=1e-11
+        )
+
+
+def test_typical_number_of_steps():
+    rng = np.random.default_rng(4)
+    assembled, truth = make_scene(rng, runs=20, configurations=8).batch(rng)
+    start = replace(truth, z=0 * truth.z)
+    found = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
+    assert set(found.solution.stop) == {Stop.CONVERGED}
+    assert found.steps.max() <= 10
+
+
+def rosenbrock(x, runs):
+    value = np.stack([10 * (x[:, 1] - x[:, 0] ** 2), 1 - x[:, 0]], axis=1)
+    jac = np.zeros((len(x), 2, 2))
+    jac[:, 0, 0], jac[:, 0, 1], jac[:, 1, 0] = -20 * x[:, 0], 10, -1
+    return value, jac
+
+
+def test_a_curved_valley_is_followed():
+    found = minimise_dense(rosenbrock, np.array([[-1.2, 1.0], [3.0, -4.0], [1.0, 1.0]]))
+    assert set(found.stop) == {Stop.CONVERGED}
+    np.testing.assert_allclose(found.state, 1, atol=1e-7)
+
+
+def test_a_minimum_with_residual_left():
+    """x^2 + 0.1 and x - 1 meet nowhere; the sum of squares is least at 2x(x^2 + 0.1) = 1 - x."""
+
+    def rows(x, runs):
+        value = np.concatenate([x**2 + 0.1, x - 1], axis=1)
+        return value, np.stack([2 * x, np.ones_like(x)], axis=1)
+
+    found = minimise_dense(rows, np.array([[5.0], [-3.0]]))
+    x = found.state
+    assert set(found.stop) == {Stop.CONVERGED}
+    np.testing.assert_allclose(2 * x * (x**2 + 0.1), 1 - x, atol=1e-6)
+
+
+def test_step_limit_is_told():
+    found = minimise_dense(rosenbrock, np.array([[-1.2, 1.0]]))
+    assert found.steps[0] > 3
+    limited = minimise(Dense(rosenbrock, np.arange(1)), np.array([[-1.2, 1.0]]), max_steps=2)
+    assert limited.stop == (Stop.STEPS,)
+    assert "step limit" in limited.stop[0].value
+
+
+def test_nothing_predictable_is_told():
+    """No pose is a number, so no row can be predicted."""
+    rng = np.random.default_rng(5)
+    assembled, truth = make_scene(rng).batch(rng)
+    broken = replace(truth, T_base_platform=truth.T_base_platform * np.nan)
+    found = minimise(assembled.problem, broken)
+    assert found.stop == (Stop.NOT_FINITE,)
+
+
+def test_an_uphill_jacobian_stalls():
+    def rows(x, runs):
+        value, jac = rosenbrock(x, runs)
+        return value, -jac
+
+    found = minimise_dense(rows, np.array([[-1.2, 1.0]]))
+    assert found.stop == (Stop.STALLED,)
+    np.testing.assert_array_equal(found.state, [[-1.2, 1.0]])
+
+
+@pytest.mark.parametrize("column", [0, 3])
+def test_a_parameter_without_data_stays_where_it_was(column):
+    linear = random_linear(np.random.default_rng(6))
+    linear.by_shared[..., column] = 0
+    linear.shared_by[..., column] = 0
+    shared, _ = damped_step(linear, np.full(3, 1e-9))
+    np.testing.assert_array_equal(shared[:, column], 0)
+    assert np.isfinite(shared).all()
