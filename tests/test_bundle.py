@@ -9,9 +9,9 @@ import pytest
 
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, pose_difference, register
-from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, solve_batch, start_state
-from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.assembly import assemble, batch_of, state_of
+from pkmcal.identify.bundle import bundle, solve_batch, start_state, what_data_tell
+from pkmcal.identify.covariance import identifiability, machine_covariance
 from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.problem import Measurements
@@ -83,16 +83,24 @@ def test_uncertainty_is_what_repeats_show():
     result = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
     assert set(result.solution.stop) == {Stop.CONVERGED}
     found = result.solution.state
-    error = np.concatenate(
-        [
-            found.z - truth.z,
-            pose_difference(found.T_camera_base, truth.T_camera_base).reshape(runs, -1),
-            found.edge_shift - truth.edge_shift,
-        ],
-        axis=1,
-    )
-    n = error.shape[1]
-    whitened = np.linalg.solve(np.linalg.cholesky(result.info.covariance), error[..., None])[..., 0]
+    whitened, single = [], []
+    for run in range(runs):
+        before = state_of(assembled, result.problem.take(found, np.array([run])), scene.state(run))
+        shared = result.info.covariance[run]
+        c = machine_covariance(assembled.problem, scene.machine, before, shared, ThreeCentres())
+        told = [in_gauge(scene.machine, s, ThreeCentres()) for s in (before, scene.state(run))]
+        stations = pose_difference(told[0].T_camera_base, told[1].T_camera_base)
+        error = np.concatenate([told[0].theta - told[1].theta, stations.ravel()])
+        known = np.diag(c) > 0
+        error, c = error[known], c[np.ix_(known, known)]
+        scale = np.sqrt(np.diag(c))
+        values, vectors = np.linalg.eigh(c / np.outer(scale, scale))
+        keep = values > 1e-9  # the frames' second leg holds two combinations of three numbers
+        whitened.append((vectors.T @ (error / scale))[keep] / np.sqrt(values[keep]))
+        single.append(error / scale)
+    whitened = np.array(whitened)
+    n = whitened.shape[1]
+    assert n == 54 + 12 - 12
     mean_square = np.sum(whitened**2) / (runs * n)
     assert mean_square == pytest.approx(1, abs=4 * np.sqrt(2 / (runs * n)))
     # no direction is told too surely or too modestly: eigenvalues within what chance leaves
@@ -100,8 +108,8 @@ def test_uncertainty_is_what_repeats_show():
     edge = np.sqrt(n / runs)
     assert values.max() < (1 + edge) ** 2 * 1.15
     assert values.min() > (1 - edge) ** 2 * 0.7
-    single = error / np.sqrt(np.einsum("bii->bi", result.info.covariance))
     assert np.mean(np.abs(single) < 1.959964) == pytest.approx(0.95, abs=0.01)
+    n = truth.z.shape[1] + 12 + 1
     dof = assembled.problem.data.weight.sum() * 2 + 8 * 6 + len(assembled.problem.prior) - n - 48
     assert np.mean(result.solution.cost) / dof == pytest.approx(1, abs=0.02)
 
@@ -291,6 +299,7 @@ def test_what_cannot_be_identified_is_named():
     assert [d.names for d in found.unidentified] == [("legs[4].tubes[2].radius",)]
     result = estimate(scene, part, rng)
     radius = scene.machine.parameters.index("legs[4].tubes[2].radius")
+    assert what_data_tell(part, result).unidentified[0].names == ("legs[4].tubes[2].radius",)
     assert result.data_share[radius] == pytest.approx(0, abs=1e-9)
     assert result.state.theta[radius] == pytest.approx(scene.machine.parameters.drawing[radius])
 

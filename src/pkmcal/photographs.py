@@ -157,8 +157,8 @@ def _none_found(folder: Path, wildcard: str, pattern: str, where: str) -> InputE
     found = f"no folder {place}"
     if place.is_dir():
         entries = sorted(entry.name for entry in place.iterdir())
-        count = f"{len(entries)} other entries, such as {entries[0]}" if entries else "nothing"
-        found = f"{count} in {place}"
+        others = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
+        found = f"{others} {entries[0]} in {place}" if entries else f"nothing in {place}"
     return InputError(
         "there is no photograph under this pattern",
         where=where,

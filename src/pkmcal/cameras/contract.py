@@ -21,7 +21,6 @@ from pydantic import Field
 from pkmcal.arrays import Array, Booleans
 from pkmcal.files import Schema
 
-
 PositivePair = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
 PositiveSize = tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
 

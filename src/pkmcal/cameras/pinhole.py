@@ -8,11 +8,13 @@ from typing import Annotated, Any, ClassVar, Literal, final
 import numpy as np
 from pydantic import Field
 
+from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
 from pkmcal.files import Schema
-from pkmcal.arrays import Array, Booleans
 
 _NEWTON_STEPS = 20
+_TABLE = 513
+"""Radii of the table that Newton starts from: its steps are a thousandth of the picture."""
 
 
 def distort(xy: Array, k: Array) -> tuple[Array, Array, Array]:
@@ -54,7 +56,7 @@ def undistort(target: Array, k: Array) -> Array:
     """Newton's inverse of :func:`distort`, (..., 2); NaN where it has none in the field."""
     if not np.any(k):
         return np.array(target, dtype=float)
-    xy = np.array(target, dtype=float)
+    xy = _undistort_radially(target, k)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for _ in range(_NEWTON_STEPS):
             value, slope, _ = distort(xy, k)
@@ -70,24 +72,55 @@ def undistort(target: Array, k: Array) -> Array:
             xy = xy - step / det[..., None]
             if np.nanmax(np.abs(error), initial=0.0) < 1e-14:
                 break
-        good = np.max(np.abs(distort(xy, k)[0] - target), axis=-1) < 1e-11
-        good &= _monotonic(np.sum(xy * xy, axis=-1), k)
+        value, slope, _ = distort(xy, k)
+        good = (np.max(np.abs(value - target), axis=-1) < 1e-11) & _unfolded(xy, slope, k)
     return np.where(good[..., None], xy, np.nan)
 
 
-def _monotonic(r2: Array, k: Array) -> Booleans:
-    """True where the radial polynomial still grows: beyond, the model folds the image back."""
+def _unfolded(xy: Array, by_xy: Array, k: Array) -> Booleans:
+    """True before the place where the lens model folds the image back.
+
+    xy : (..., 2) undistorted; by_xy : (..., 2, 2) derivative of :func:`distort` there. The radial
+    polynomial tells the sheets apart; the tangential terms move the fold, where the derivative is
+    singular, a little nearer on one side.
+    """
+    det = by_xy[..., 0, 0] * by_xy[..., 1, 1] - by_xy[..., 0, 1] * by_xy[..., 1, 0]
+    return (det > 0) & (np.sum(xy * xy, axis=-1) < _fold(k))
+
+
+def _undistort_radially(target: Array, k: Array) -> Array:
+    """A start for Newton, (..., 2): the inverse of the radial terms alone, from a table.
+
+    Newton from the target itself leaps over the fold of a strong lens, and finds nothing.
+    """
+    distance = np.sqrt(np.sum(np.square(target, dtype=float), axis=-1))
+    farthest, fold = float(np.nanmax(distance, initial=0.0)), np.sqrt(_fold(k))
+    last = farthest
+    while last < fold and last * _radial(last**2, k) < farthest:
+        last *= 2
+    radius = np.linspace(0.0, min(last, fold), _TABLE)
+    found = np.interp(distance, radius * _radial(radius**2, k), radius)
+    scale = np.where(distance > 0, found / np.where(distance > 0, distance, 1.0), 1.0)
+    return target * scale[..., None]
+
+
+def _radial(r2: Any, k: Array) -> Any:
+    return 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+
+
+def _fold(k: Array) -> float:
+    """Square of the radius where the radial polynomial stops growing; inf where it never does."""
     k1, k2, k3 = k[0], k[1], k[4]
     if k1 >= 0 and k2 >= 0 and k3 >= 0:
-        return np.ones(np.shape(r2), dtype=bool)
+        return np.inf
     # first zero of d(r radial)/dr = 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 with s = r^2
     roots = np.roots(np.trim_zeros([7 * k3, 5 * k2, 3 * k1, 1.0], "f"))
     real = roots[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)].real
-    return r2 < (real.min() if real.size else np.inf)
+    return float(real.min()) if real.size else np.inf
 
 
 class PinholeSchema(CameraSchema):
-    """``model: pinhole``; ``distortion`` is OpenCV's k1 k2 p1 p2 k3, shorter or absent for zeros."""
+    """``model: pinhole``; ``distortion`` is OpenCV's k1 k2 p1 p2 k3, or fewer, or absent."""
 
     model: Literal["pinhole"]
     distortion: Annotated[tuple[float, ...], Field(max_length=5)] = ()
@@ -106,16 +139,13 @@ class Pinhole(Camera):
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold."""
-        xy, good = self._normalised(points)
-        distorted = distort(xy, self.parameters[4:])[0]
-        return np.where(good[..., None], self.parameters[:2] * distorted, np.nan) + (
-            self.parameters[2:4]
-        )
+        _, good, distorted, _, _ = self._imaged(points)
+        focal, center = self.parameters[:2], self.parameters[2:4]
+        return np.where(good[..., None], focal * distorted + center, np.nan)
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
-        xy, good = self._normalised(points)
-        distorted, by_xy, by_k = distort(xy, self.parameters[4:])
+        xy, good, distorted, by_xy, by_k = self._imaged(points)
         focal = self.parameters[:2, None]
         z = np.where(good, points[..., 2], 1.0)
         dxy = np.zeros((*points.shape[:-1], 2, 3))
@@ -139,14 +169,16 @@ class Pinhole(Camera):
 
     def in_field(self, points: Array) -> Booleans:
         """In front of the camera, and before the lens polynomial folds back; (...)."""
-        return self._normalised(points)[1]
+        return self._imaged(points)[1]
 
-    def _normalised(self, points: Array) -> tuple[Array, Booleans]:
-        """x/z and y/z (..., 2), and where they are valid (...)."""
+    def _imaged(self, points: Array) -> tuple[Array, Booleans, Array, Array, Array]:
+        """x/z and y/z (..., 2), where they have an image (...), and :func:`distort` of them."""
         z = points[..., 2]
         front = z > 1e-9
         xy = points[..., :2] / np.where(front, z, 1.0)[..., None]
-        return xy, front & _monotonic(np.sum(xy * xy, axis=-1), self.parameters[4:])
+        distorted, by_xy, by_k = distort(xy, self.parameters[4:])
+        good = front & _unfolded(xy, by_xy, self.parameters[4:])
+        return xy, good, distorted, by_xy, by_k
 
     @classmethod
     def from_document(cls, document: PinholeSchema) -> Pinhole:

@@ -1,5 +1,6 @@
 """Files in and out: YAML with line numbers, schemas, CSV tables, outputs whole or not at all."""
 
+from pkmcal.files.json_files import json_text, plain, read_json
 from pkmcal.files.tables import Table, csv_text, read_csv
 from pkmcal.files.text import closest, listed, read_text, shown, wanted_file
 from pkmcal.files.validation import Schema, field_path, validate
@@ -15,9 +16,12 @@ __all__ = [
     "closest",
     "csv_text",
     "field_path",
+    "json_text",
     "listed",
     "parse_yaml",
+    "plain",
     "read_csv",
+    "read_json",
     "read_text",
     "read_yaml",
     "shown",

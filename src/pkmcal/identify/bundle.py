@@ -7,6 +7,7 @@ readings and the drawing, each divided by its standard deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,9 +16,11 @@ from pkmcal.errors import ResultError
 from pkmcal.identify import robust as robust_weights
 from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
+    Identifiability,
     Information,
     data_share,
-    edge_freedom,
+    edge_fit,
+    identifiability,
     information,
     machine_covariance,
 )
@@ -37,7 +40,7 @@ ROUNDS = 4
 class BatchResult:
     """The joint estimate of B runs.
 
-    problem : with the weights in use, noise scale included. solution : states and stops.
+    problem : with the weights in use, noise scale included. solution : states, cost, stops.
     weight : (B, K, G) robust weights 0..1. noise_scale : (B,). steps : (B,).
     info : rows and covariance at the solution.
     """
@@ -58,60 +61,59 @@ def solve_batch(
     present = np.broadcast_to(
         problem.blocks.present.astype(float), (n_runs, *problem.blocks.present.shape)
     )
-    state, weight = start, present
-    steps: Integers = np.zeros(n_runs, dtype=int)
-    scale = np.ones(n_runs)
+    fit = _Fit(problem, start, present, np.ones(n_runs), np.zeros(n_runs, dtype=int), ())
     if robust:
         found = robust_weights.anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
-        state, weight, steps = found.state, found.weight, steps + found.steps
-        scale = found.scale if scale_noise else scale
-    repeat = robust or scale_noise
-    damping = RESTART_DAMPING if robust else FIRST_DAMPING
-    result = _solve_weighted(problem, state, weight, scale, steps, damping)
-    for _ in range(ROUNDS if repeat else 0):
-        scale = _noise_scale(result) if scale_noise else result.noise_scale
+        scale = found.scale if scale_noise else fit.scale
+        fit = fit._replace(state=found.state, weight=found.weight, scale=scale, steps=found.steps)
+    fit = _solved(problem, fit, RESTART_DAMPING if robust else FIRST_DAMPING)
+    for _ in range(ROUNDS if robust or scale_noise else 0):
+        scale = _noise_scale(fit) if scale_noise else fit.scale
+        weight = fit.weight
         if robust:
-            d = robust_weights.norms(problem, result.solution.state)
-            weight = robust_weights.final_weights(d, scale)
-        change = np.abs(scale / result.noise_scale - 1).max()
-        if max(change, 0.1 * np.abs(weight - result.weight).max()) < 1e-3:
+            weight = robust_weights.final_weights(robust_weights.norms(problem, fit.state), scale)
+        change = np.abs(scale / fit.scale - 1).max()
+        if max(change, 0.1 * np.abs(weight - fit.weight).max()) < 1e-3:
             break
-        state, steps = result.solution.state, result.steps
-        result = _solve_weighted(problem, state, weight, scale, steps, RESTART_DAMPING)
-    return result
+        fit = _solved(problem, fit._replace(weight=weight, scale=scale), RESTART_DAMPING)
+    info = information(fit.problem, fit.state)
+    solution = Solution(fit.state, info.cost(), fit.steps, fit.stop)
+    return BatchResult(fit.problem, solution, fit.weight, fit.scale, fit.steps, info)
 
 
-def _solve_weighted(
-    problem: Problem,
-    state: BatchState,
-    weight: Array,
-    scale: Array,
-    steps: Integers,
-    damping: float,
-) -> BatchResult:
-    """The problem solved with fixed weights (B, K, G) and noise scales (B,)."""
-    used = problem.weighted(weight / scale[:, None, None] ** 2)
-    solution = minimise(used, state, damping=damping)
-    info = information(used, solution.state)
-    return BatchResult(used, solution, weight, scale, steps + solution.steps, info)
+class _Fit(NamedTuple):
+    """A solve with fixed weights (B, K, G) and noise scales (B,), counted steps (B,)."""
+
+    problem: Problem
+    state: BatchState
+    weight: Array
+    scale: Array
+    steps: Integers
+    stop: tuple[Stop, ...]
 
 
-def _noise_scale(result: BatchResult) -> Array:
+def _solved(problem: Problem, fit: _Fit, damping: float) -> _Fit:
+    """The problem solved with the fit's weights, from its state."""
+    used = problem.weighted(fit.weight / fit.scale[:, None, None] ** 2)
+    found = minimise(used, fit.state, damping=damping)
+    steps = fit.steps + found.steps
+    return fit._replace(problem=used, state=found.state, steps=steps, stop=found.stop)
+
+
+def _noise_scale(fit: _Fit) -> Array:
     """Factor on the edges' stated noise that makes their chi2 equal its degrees of freedom, (B,).
 
     The variance component of the edges' group with redundancies as weights; kept as it is
     where fewer than five degrees of freedom remain to judge it.
     """
-    n = result.problem.n_edge_rows
-    chi2 = np.sum(result.info.linear.value[:, :, :n] ** 2, axis=(1, 2))
-    freedom = edge_freedom(result.problem, result.info, _edge_count(result))
-    new = result.noise_scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
-    return np.where(freedom > 5, np.maximum(new, LEAST_SCALE), result.noise_scale)
+    chi2, freedom = edge_fit(fit.problem, fit.state, edge_count(fit.problem, fit.weight))
+    new = fit.scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
+    return np.where(freedom > 5, np.maximum(new, LEAST_SCALE), fit.scale)
 
 
-def _edge_count(result: BatchResult) -> Array:
+def edge_count(problem: Problem, weight: Array) -> Array:
     """Residuals of edges in use, each counted by its robust weight, (B,)."""
-    return np.sum(result.weight, axis=(1, 2)) * result.problem.data.whiten.shape[-1]
+    return np.sum(weight, axis=(1, 2)) * problem.data.whiten.shape[-1]
 
 
 def bundle(
@@ -153,6 +155,21 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
     poses = machine.forward_result(measurements.joints).T_base_platform
     n_cameras = int(np.max(measurements.camera_of_station)) + 1
     return State(machine.values, np.asarray(T_camera_base_guess), poses, np.zeros(n_cameras))
+
+
+def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiability:
+    """Which combinations of parameters the data fix, at the estimate and with its edge weights.
+
+    For words such as "these two values cannot be told apart": names and weights of what is
+    unidentified, and of what the drawing knows better than the data.
+    """
+    machine = estimate.machine
+    assembled = assemble(machine, measurements, ThreeCentres())
+    weight = assembled.problem.data.weight.copy()
+    weight[0, assembled.row, assembled.place] = estimate.edge_weights
+    weight = weight / estimate.statistics.noise_scale**2
+    state = batch_of(machine, assembled, estimate.state)
+    return identifiability(assembled.problem.weighted(weight), machine, state)
 
 
 def _estimate(
@@ -220,7 +237,7 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     chi2_edges = float(np.sum(linear.value[0, :, :n] ** 2))
     chi2_joints = float(np.sum(linear.value[0, :, n:] ** 2))
     chi2_drawing = float(np.sum(linear.shared_value[0, kinds != "gauge"] ** 2))
-    n_edges = float(_edge_count(result)[0])
+    n_edges = float(edge_count(problem, result.weight)[0])
     n_joints = linear.value[0, :, n:].size
     n_drawing = int(np.sum(kinds != "gauge"))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))

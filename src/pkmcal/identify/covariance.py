@@ -25,7 +25,7 @@ from pkmcal.identify.gauge import (
 )
 from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import BatchState, Problem
-from pkmcal.identify.solver import Linear, Reduced, eliminate, transposed
+from pkmcal.identify.solver import Linear, Reduced, eliminate, reduced_normal, transposed
 from pkmcal.mechanisms import Machine
 
 RANK_TOLERANCE = 1e-9
@@ -33,20 +33,25 @@ RANK_TOLERANCE = 1e-9
 there with exact derivatives, and real directions are many orders above."""
 NULL = 1e-12
 """Same, for the scaled rows with drawing and gauge: below it a direction counts as unknown."""
+UNKNOWN = 1e-13
+"""Same, for eigenvalues of the scaled normal matrix, which hold half of the digits."""
 
 
 class Information(NamedTuple):
     """The problem at the solution.
 
     linear, reduced : its rows and their elimination. covariance : (B, na, na) of the shared
-    unknowns; a direction that nothing fixes has a huge variance. factor : (B, na, na) whose
-    columns are the known directions, one standard deviation long, and zeros.
+    unknowns; a direction that nothing fixes has a huge variance.
     """
 
     linear: Linear
     reduced: Reduced
     covariance: Array
-    factor: Array
+
+    def cost(self) -> Array:
+        """Sum of squares of all residuals, (B,)."""
+        own = np.sum(self.linear.value**2, axis=(1, 2))
+        return own + np.sum(self.linear.shared_value**2, axis=1)
 
 
 def information(problem: Problem, state: BatchState) -> Information:
@@ -65,23 +70,29 @@ def information(problem: Problem, state: BatchState) -> Information:
     scale = np.where(scale > 0, scale, 1.0)
     r = np.linalg.qr(stacked / scale[:, None, :], mode="r")
     _, s, vt = np.linalg.svd(r)
-    known = s > NULL * s[:, :1]
-    half = transposed(vt) / np.where(known, s, NULL * s[:, :1])[:, None, :] / scale[:, :, None]
-    factor = np.where(known[:, None, :], half, 0.0)
-    return Information(linear, reduced, half @ transposed(half), factor)
+    half = transposed(vt) / np.maximum(s, NULL * s[:, :1])[:, None, :] / scale[:, :, None]
+    return Information(linear, reduced, half @ transposed(half))
 
 
-def edge_freedom(problem: Problem, info: Information, count: Array) -> Array:
-    """Degrees of freedom of the edges' residuals, count - tr(hat), (B,).
+def edge_fit(problem: Problem, state: BatchState, count: Array) -> tuple[Array, Array]:
+    """The edges' chi2 and its degrees of freedom, count - tr(hat), (B,) each.
 
     count : rows in use, (B,). The hat matrix splits into the own unknowns' part Q Q^T and the
-    shared unknowns' part; directions that nothing fixes have no part in it.
+    shared unknowns' part tr(N^-1 N_edges); directions that nothing fixes have no part in it.
     """
+    linear = problem.linearize(state)
+    reduced = eliminate(linear, np.zeros(len(count)))
     n = problem.n_edge_rows
-    rows, q = info.reduced.rows[:, :, :n], info.reduced.q[:, :, :n]
-    own = np.sum(q**2, axis=(1, 2, 3))
-    shared = np.sum((rows @ info.factor[:, None]) ** 2, axis=(1, 2, 3))
-    return count - own - shared
+    own = np.sum(reduced.q[:, :, :n] ** 2, axis=(1, 2, 3))
+    rows = reduced.rows[:, :, :n].reshape(len(count), -1, reduced.rows.shape[-1])
+    normal = reduced_normal(linear, reduced)
+    scale = np.sqrt(np.einsum("bii->bi", normal))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(normal / (scale[:, :, None] * scale[:, None, :]))
+    known = values > UNKNOWN * values[:, -1:]
+    rows = rows / scale[:, None, :] @ vectors
+    shared = np.sum(rows**2 * np.where(known, 1 / np.abs(values), 0.0)[:, None], axis=(1, 2))
+    return np.sum(linear.value[:, :, :n] ** 2, axis=(1, 2)), count - own - shared
 
 
 def machine_covariance(

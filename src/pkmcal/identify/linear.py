@@ -52,6 +52,8 @@ def weighted(n: Array, radius: Array, weight: Array) -> tuple[Array, Array]:
 
     n : (..., n, 3). radius, weight : (..., n). NaN where A is not fixed.
     """
+    # what is not known of a leg leaves it not fixed
+    n, weight = (np.where(np.isfinite(x), x, 0.0) for x in (n, weight))
     rows = n * weight[..., None]
     normal = np.swapaxes(rows, -1, -2) @ n
     values, vectors = np.linalg.eigh(normal)

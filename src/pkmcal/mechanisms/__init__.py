@@ -43,7 +43,12 @@ def load_mechanism(source: Path | str, label: str | None = None) -> Machine:
             found=str(source),
             expected=guess or f"a mechanism file, or {listed(sorted(built_in))}",
         )
-    return machine_from_document(validate(read_yaml(path, label), MechanismDocument))
+    document = read_yaml(path, label)
+    checked = validate(document, MechanismDocument)
+    try:
+        return machine_from_document(checked)
+    except InputError as error:  # a name under fixed or tied that is no parameter's
+        raise error.located(document.label) from None
 
 
 def mechanism_text(machine: Machine) -> str:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.geometry.rigid import perturb, pose, rotation
-from pkmcal.mechanisms.limbs import LimbLayout, closure
 from pkmcal.arrays import Array, Booleans
+from pkmcal.mechanisms.limbs import LimbLayout, closure, limb_ends, rod_lengths
 
 MAX_STEPS = 60
 CONVERGED = 1e-12
@@ -45,7 +45,7 @@ def inverse(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     driven = layout.actuated >= 0
     zeros = np.zeros((*poses.shape[:-2], int(driven.sum())))
     at_zero = closure(layout, theta, zeros, poses)
-    return (-at_zero.value / at_zero.by_reading)[..., driven] if driven.any() else zeros
+    return -at_zero.value[..., driven] / at_zero.by_reading[..., driven]
 
 
 def forward(layout: LimbLayout, theta: Array, readings: Array, start: Array) -> ForwardResult:
@@ -99,6 +99,8 @@ def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:
     radius = np.sqrt(np.mean(np.sum(spread**2, axis=-1), axis=-1))
     scale = np.concatenate([np.repeat(1 / radius[..., None], 3, -1), np.ones((*radius.shape, 3))], -1)
     jac = (by_pose * scale[..., None, :]) @ layout.motion
+    if layout.n_legs < jac.shape[-1]:  # with fewer rods than freedoms it can always move
+        return np.zeros(jac.shape[:-2])
     return np.linalg.svd(jac, compute_uv=False)[..., -1]
 
 
@@ -106,12 +108,9 @@ def home_candidates(layout: LimbLayout, theta: Array, readings: Array) -> Array:
     """Starts for a machine whose file names no home pose: the platform unturned, its joints'
     mean above (and below) the base joints' mean, at the height that the rods reach; (k, 4, 4).
     """
-    zero = np.zeros_like(readings)
-    ends = closure(layout, theta, zero, np.eye(4)).ends
+    ends = limb_ends(layout, theta, np.zeros_like(readings), np.eye(4))
     shift = ends.a.mean(axis=-2) - ends.b.mean(axis=-2)
-    length = np.abs(closure(layout, theta, readings, np.eye(4)).value
-                    - closure(layout, theta, readings, np.eye(4)).distance)
-    reach = float(length.mean())
+    reach = float(np.abs(rod_lengths(layout, theta, readings)).mean())
     flat = float(np.linalg.norm((ends.b + shift - ends.a)[..., :2], axis=-1).mean())
     height = np.sqrt(max(reach**2 - flat**2, (0.3 * reach) ** 2))
     starts = [pose(np.eye(3), shift + np.array([0.0, 0.0, s * height])) for s in (1, -1)]
@@ -132,7 +131,7 @@ def assembly_modes(
     A multi-start search: every mode returned is one; that none is missing is not proven.
     """
     home = home_candidates(layout, theta, readings)[0]
-    reach = float(np.abs(home[2, 3]) + 1e-9)
+    reach = float(np.abs(rod_lengths(layout, theta, readings)).mean())
     turns = rng.normal(size=(starts, 3)) * 1.2
     shifts = rng.normal(size=(starts, 3)) * reach
     delta = np.concatenate([turns, shifts], axis=-1) @ layout.motion @ layout.motion.T

@@ -156,6 +156,11 @@ def leg_readings(layout: LimbLayout, readings: Array) -> Array:
     return np.where(layout.actuated >= 0, readings[..., np.maximum(layout.actuated, 0)], 0.0)
 
 
+def rod_lengths(layout: LimbLayout, theta: Array, readings: Array) -> Array:
+    """Length of every rod (..., L), m: reading + offset, or the constant; [B] eq. 4."""
+    return theta[..., layout.rod] + leg_readings(layout, readings)
+
+
 def _gather(
     layout: LimbLayout, groups: tuple[CarrierGroup, ...], points: list[CarriedPoint]
 ) -> tuple[CarriedPoint, Integers]:
@@ -187,9 +192,8 @@ def closure(layout: LimbLayout, theta: Array, readings: Array, poses: Array) -> 
     d = ends.b - ends.a
     distance = np.sqrt(dot(d, d))
     u = d / distance[..., None]
-    length = theta[..., layout.rod] + leg_readings(layout, readings)
     return Closure(
-        value=distance - length,
+        value=distance - rod_lengths(layout, theta, readings),
         u=u,
         distance=distance,
         by_pose=(u[..., None, :] @ ends.b_by_pose)[..., 0, :],

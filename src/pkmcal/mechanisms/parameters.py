@@ -12,8 +12,8 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from pkmcal.errors import InputError
 from pkmcal.arrays import Array, Integers
+from pkmcal.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ class ParameterTable:
         owner = np.arange(len(self))
         for group in self.tied:
             members = [self.index(name) for name in group]
-            owner[members] = owner[members].min()
+            joined = np.isin(owner, owner[members])  # a name in two ties makes one of them
+            owner[joined] = owner[members].min()
         held = {owner[self.index(name)] for name in self.fixed}
         columns = [k for k in np.unique(owner) if k not in held]
         return (owner[:, None] == np.array(columns, dtype=int)[None, :]).astype(float)

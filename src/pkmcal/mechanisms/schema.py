@@ -67,6 +67,8 @@ class Home(Schema):
 def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     if len(legs) < 2:
         raise ValueError("a parallel machine has at least two legs")
+    if not any(leg.length.actuated for leg in legs):
+        raise ValueError("a machine has at least one leg with actuated: true")
     return legs
 
 
@@ -79,4 +81,4 @@ class MechanismDocument(Schema):
     tolerance: Tolerance = Tolerance()
     home: Home | None = None
     fixed: tuple[str, ...] = ()
-    tied: tuple[tuple[str, ...], ...] = ()
+    tied: tuple[Annotated[tuple[str, ...], Field(min_length=2)], ...] = ()

@@ -62,7 +62,8 @@ def _swapped_stations(
 ) -> InputError | None:
     """Two stations each recognised from the other's pose."""
     for i, j in combinations(bad, 2):
-        if find_station(views[i], rough[j], rng).good and find_station(views[j], rough[i], rng).good:
+        exchanged = (find_station(views[a], rough[b], rng) for a, b in ((i, j), (j, i)))
+        if all(pose.good for pose in exchanged):
             return InputError(
                 f"stations {names[i]} and {names[j]} are mixed up",
                 where="session.yaml, stations",

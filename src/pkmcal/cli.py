@@ -1,0 +1,148 @@
+"""The command line. What a command does stands in :mod:`pkmcal.commands`; here, what all share.
+
+Exit codes: 0 done; 1 ran, but the result should not be used; 2 the input is wrong; 70 a defect of
+pkmcal; 130 interrupted. No mistake of a user's ends in a traceback.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Annotated, cast
+
+import typer
+
+from pkmcal import __version__
+from pkmcal.commands import COMMANDS
+from pkmcal.commands.console import print_error
+from pkmcal.errors import InputError, PkmcalError
+
+DEFECT = 70
+"""sysexits.h's EX_SOFTWARE: an internal error, which is nothing that a user did."""
+INTERRUPTED = 130
+"""What shells give a program that was ended by Ctrl-C."""
+DEBUG = "PKMCAL_DEBUG"
+
+_UsageError = cast("type[Exception]", typer.BadParameter.__bases__[0])
+"""The base of all complaints about options; typer gives it no public name."""
+
+app = typer.Typer(
+    name="pkmcal",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Begin with: pkmcal demo. With your own machine: pkmcal new my-machine.",
+)
+for _name, _command in COMMANDS.items():
+    app.command(_name)(_command)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"pkmcal {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _top(
+    version: Annotated[  # noqa: ARG001 - typer calls _show_version with it
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Show the version, and exit."
+        ),
+    ] = False,
+) -> None:
+    """Calibrate parallel machines from photographs of their own legs."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal that lacks a sign shows ? for it; that is no reason to fail.
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+    try:
+        code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return _reader_left()
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except Exception as error:  # noqa: BLE001 - the last resort, which tells defects from mistakes
+        return _failed(error, words)
+    if code == INTERRUPTED:  # typer turns Ctrl-C into this code
+        return _failed(KeyboardInterrupt(), words)
+    return code if isinstance(code, int) else 0
+
+
+def _failed(error: BaseException, words: list[str]) -> int:
+    """Tell an error in words, or as JSON where that was asked for; returns the exit code."""
+    if os.environ.get(DEBUG):
+        traceback.print_exception(error, file=sys.stderr)
+    told, code = _in_words(error, words)
+    if "--json" in words:
+        typer.echo(json.dumps({**told.as_dict(), "exit_code": code}, ensure_ascii=False))
+    else:
+        print_error(str(told))
+    return code
+
+
+def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]:
+    """Any error as one of ours, and its exit code."""
+    if isinstance(error, PkmcalError):
+        return error, error.exit_code
+    if isinstance(error, _UsageError):
+        return _misused(error, words), InputError.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        return PkmcalError("interrupted; what was not finished was not written"), INTERRUPTED
+    if isinstance(error, MemoryError):
+        return _too_large(), InputError.exit_code
+    if isinstance(error, OSError):
+        return _refused(error), InputError.exit_code
+    return _defect(error), DEFECT
+
+
+def _misused(error: Exception, words: list[str]) -> InputError:
+    """A wrong option or argument."""
+    message = getattr(error, "format_message", error.__str__)()
+    command = words[0] + " " if words and words[0] in COMMANDS else ""
+    return InputError(
+        " ".join(message.split()).rstrip("."),
+        next_step=f"See pkmcal {command}--help",
+    )
+
+
+def _too_large() -> InputError:
+    return InputError(
+        "there is not enough memory",
+        next_step="Close other programs, or use fewer or smaller photographs",
+    )
+
+
+def _refused(error: OSError) -> InputError:
+    """The operating system would not: no space, no permission, a disk taken away."""
+    reason = (error.strerror or str(error) or type(error).__name__).lower()
+    return InputError(
+        f"the operating system refused: {reason}",
+        where=str(error.filename) if error.filename else None,
+        next_step="Make room, change the permissions, or name another folder",
+    )
+
+
+def _defect(error: BaseException) -> PkmcalError:
+    return PkmcalError(
+        f"this is a defect of pkmcal, not of your session: {type(error).__name__}: {error}",
+        next_step=f"Set {DEBUG}=1, run the command again, and report what it then prints",
+    )
+
+
+def _reader_left() -> int:
+    """The reader of a pipe, such as head, has gone: nobody is left to tell anything."""
+    # Python would complain at exit, when it flushes what is left.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0

@@ -1,0 +1,103 @@
+"""A calibration against the truth of its simulated session; read only when all else is done."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.identify.gauge import ThreeCentres, apply
+from pkmcal.identify.problem import State
+from pkmcal.mechanisms import Machine
+from pkmcal.report.centres import joint_centres
+from pkmcal.report.toolpoint import tool_point
+from pkmcal.simulate import Truth, load_truth
+
+if TYPE_CHECKING:
+    from pkmcal.calibration import Calibration
+
+WITHIN = 2.0
+"""Standard deviations within which 95 % of the values should lie."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of a machine against the true one, frames laid over each other: m and rad.
+
+    centre : mean distance of the joint centres. offset : root mean square. position,
+    orientation : mean error of the platform's pose at the session's readings.
+    """
+
+    centre: float
+    offset: float
+    position: float
+    orientation: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Errors before and after; count : values with a standard deviation, within : of them,
+    those nearer to the truth than two of theirs.
+    """
+
+    drawing: Errors
+    calibrated: Errors
+    count: int
+    within: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything under its name."""
+        return asdict(self)
+
+
+def compare(calibration: Calibration, session_folder: Path) -> Comparison:
+    """Compare with ``truth.json`` in the session's folder."""
+    drawing = calibration.session.machine
+    truth = load_truth(session_folder, drawing)
+    off = _in_sigmas(calibration, truth)
+    return Comparison(
+        drawing=_errors(drawing, truth),
+        calibrated=_errors(calibration.machine, truth),
+        count=off.size,
+        within=int(np.sum(off < WITHIN)),
+    )
+
+
+def _errors(machine: Machine, truth: Truth) -> Errors:
+    table = machine.parameters
+    nothing = np.zeros((len(table), len(table)))
+    centres = joint_centres(machine, truth.machine, nothing)
+    every = np.arange(len(truth.joints))
+    tool = tool_point(
+        machine, truth.machine, nothing, truth.joints, truth.T_base_platform, every, centres
+    )
+    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres])
+    offsets = table.of_kind("offset")
+    return Errors(
+        centre=float(change.mean()),
+        offset=_rms((machine.values - truth.machine.values)[offsets]),
+        position=float(np.nanmean(tool.off_position)),
+        orientation=float(np.nanmean(tool.off_orientation)),
+    )
+
+
+def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
+    """Distances of the values from the truth in standard deviations, in the result's frames."""
+    estimate = calibration.estimate
+    true = State(
+        theta=truth.machine.values,
+        T_camera_base=truth.T_camera_base,
+        T_base_platform=truth.T_base_platform,
+        edge_shift=np.zeros_like(estimate.state.edge_shift),
+    )
+    told = apply(calibration.session.machine, true, ThreeCentres())
+    sigma = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
+    known = sigma > 1e-9  # what defines the frames has no deviation
+    return np.abs(estimate.machine.values - told.theta)[known] / sigma[known]
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0

@@ -1,0 +1,156 @@
+"""``pkmcal demo``: a simulated session, calibrated, and compared with its truth."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from math import degrees
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pkmcal.commands import console
+from pkmcal.commands.calibrate import exit_code, summary, tell
+from pkmcal.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pkmcal.calibration import Calibration
+    from pkmcal.commands.comparison import Comparison
+
+SESSION, CALIBRATION = "session", "calibration"
+FAST_SIZE = (480, 360)
+FAST_CONFIGURATIONS = 4
+SIMULATING = 0.85
+"""Share of the time that rendering takes."""
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="DIR", help="Output folder.")
+    ] = Path("pkmcal-demo"),
+    no_open: Annotated[
+        bool, typer.Option("--no-open", help="Do not open the report in a browser.")
+    ] = False,
+    fast: Annotated[bool, typer.Option("--fast", help="Fewer and smaller photographs.")] = False,
+    as_json: console.Json = False,
+) -> int:
+    """Simulate, calibrate, compare with the truth, open the report."""
+    from pkmcal.commands.comparison import compare
+    from pkmcal.results import check_output, save
+
+    session, result = out / SESSION, out / CALIBRATION
+    _make_room(out)
+    check_output(result)
+    with console.progress() as told:
+        _simulate(session, fast, told)
+        calibration = _calibrate(session, told)
+        told("Writing the report", 0.98)
+        save(calibration, result)
+    # Only now, with everything written, is the truth looked at.
+    comparison = compare(calibration, session)
+    if as_json:
+        whole = summary(calibration, result)
+        console.print_json({**whole, "session": session, "comparison": comparison.as_dict()})
+        return exit_code(calibration)
+    terminal = console.out()
+    photographs = sum(len(station.photographs) for station in calibration.session.stations)
+    terminal.print(
+        f"A {calibration.machine.name} platform, not quite as drawn, in {photographs} simulated"
+        f" photographs: {console.escaped(str(session))}\n"
+    )
+    tell(terminal, calibration, result)
+    _tell_comparison(terminal, comparison)
+    if not no_open and _can_show():
+        import webbrowser
+
+        webbrowser.open((result / "report.html").resolve().as_uri())
+    return exit_code(calibration)
+
+
+def _make_room(out: Path) -> None:
+    """Remove an earlier demonstration; anything else in the folder is somebody's."""
+    if not out.is_dir() or not any(out.iterdir()):
+        return
+    entries = sorted(entry.name for entry in out.iterdir())
+    if not (out / SESSION / "truth.json").is_file() or set(entries) - {SESSION, CALIBRATION}:
+        raise InputError(
+            "the folder for the demonstration holds something else",
+            where=str(out),
+            found=", ".join(entries[:3]),
+            expected="a new or empty folder, or an earlier demonstration to replace",
+            next_step="Name another folder with -o",
+        )
+    for name in entries:
+        shutil.rmtree(out / name)
+
+
+def _simulate(session: Path, fast: bool, told: console.Progress) -> None:
+    from dataclasses import replace
+
+    from pkmcal.commands.simulate import camera_of_size
+    from pkmcal.mechanisms import load_mechanism
+    from pkmcal.simulate import simulate_session
+    from pkmcal.simulate.demo import MECHANISM, SEED, SETTINGS, demo_camera
+
+    settings = replace(SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else SETTINGS
+    camera = camera_of_size(FAST_SIZE) if fast else demo_camera()
+    simulate_session(
+        session,
+        load_mechanism(MECHANISM),
+        camera,
+        settings,
+        seed=SEED,
+        progress=console.counted(told, upto=SIMULATING),
+    )
+
+
+def _calibrate(session: Path, told: console.Progress) -> Calibration:
+    from pkmcal.calibration import calibrate
+
+    rest = 0.97 - SIMULATING
+    return calibrate(
+        session, progress=lambda text, share: told(text, SIMULATING + rest * share)
+    )
+
+
+def _tell_comparison(out: Console, found: Comparison) -> None:
+    """Errors before and after, and whether the standard deviations were honest."""
+    before, after = found.drawing, found.calibrated
+    table = console.plain_table(show_header=True, header_style="dim")
+    for heading in ("Against the truth", "Drawing", "Calibrated", ""):
+        table.add_column(heading, justify="left" if heading[:1] in ("A", "") else "right")
+    for what, old, new, unit in (
+        ("joint centres", before.centre * 1e3, after.centre * 1e3, " mm"),
+        ("joint offsets", before.offset * 1e3, after.offset * 1e3, " mm"),
+        ("platform's position", before.position * 1e3, after.position * 1e3, " mm"),
+        ("platform's orientation", degrees(before.orientation), degrees(after.orientation), "°"),
+    ):
+        times = f"{old / new:.0f} times nearer" if new > 0 else ""
+        table.add_row(what, f"{old:.2f}{unit}", f"[bold]{new:.3f}{unit}[/]", times)
+    out.print()
+    out.print(table)
+    out.print()
+    share = found.within / found.count
+    console.print_points(
+        out,
+        [
+            (
+                "[cyan]→[/]",
+                f"{found.within} of {found.count} values ({share:.0%}) lie within two of their"
+                " standard deviations of the truth; 95 % should.",
+            )
+        ],
+    )
+
+
+def _can_show() -> bool:
+    """Whether there is a person with a browser in front of a screen."""
+    if os.environ.get("CI") or not sys.stdout.isatty():
+        return False
+    if sys.platform.startswith("linux"):
+        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return True

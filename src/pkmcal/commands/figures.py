@@ -1,0 +1,72 @@
+"""The report's headline figures for the terminal, and the same as numbers for programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pkmcal.report.centres import Centres, free_of_gauge, joint_centres
+from pkmcal.report.headline import Headline, headlines
+from pkmcal.report.toolpoint import ToolPoint, tool_point
+
+if TYPE_CHECKING:
+    from pkmcal.calibration import Calibration
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Joint centres and poses of the configurations with their uncertainties, free of frames."""
+
+    calibration: Calibration
+    centres: tuple[Centres, ...]
+    tool: ToolPoint
+
+    def headlines(self) -> tuple[Headline, ...]:
+        """As in the report."""
+        c = self.calibration
+        return headlines(c.session, c.observation, c.estimate, self.centres, self.tool)
+
+    def as_dict(self) -> dict[str, Any]:
+        """In m and rad; means over joint centres and configurations, sigma of one coordinate."""
+        estimate = self.calibration.estimate
+        statistics, table = estimate.statistics, estimate.machine.parameters
+        offsets = np.sqrt(np.diag(estimate.covariance)[table.of_kind("offset")])
+        sigma = np.concatenate([side.sigma for side in self.centres])
+        change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in self.centres])
+        return {
+            "joint_centre_sigma": float(np.median(sigma)),
+            "joint_offset_sigma": float(np.median(offsets)) if offsets.size else None,
+            "joint_centre_change": float(change.mean()),
+            "platform_position_sigma": _mean(self.tool.position),
+            "platform_orientation_sigma": _mean(self.tool.orientation),
+            "platform_position_change": _mean(self.tool.off_position),
+            "platform_orientation_change": _mean(self.tool.off_orientation),
+            "edges": len(self.calibration.observation.edges),
+            "rejected": len(self.calibration.observation.rejected),
+            "chi2_per_freedom": statistics.chi2 / statistics.dof if statistics.dof > 0 else None,
+            "edge_noise_scale": statistics.noise_scale,
+        }
+
+
+def figures_of(calibration: Calibration) -> Figures:
+    """The figures of a calibration."""
+    session, estimate = calibration.session, calibration.estimate
+    covariance = free_of_gauge(estimate)
+    centres = joint_centres(session.machine, estimate.machine, covariance)
+    tool = tool_point(
+        session.machine,
+        estimate.machine,
+        covariance,
+        session.joints,
+        estimate.state.T_base_platform,
+        np.flatnonzero(estimate.configurations),
+        centres,
+    )
+    return Figures(calibration, centres, tool)
+
+
+def _mean(values: np.ndarray[Any, Any]) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if values.size else None

@@ -1,0 +1,127 @@
+"""``pkmcal simulate``: a session with known truth."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pkmcal.commands import console
+from pkmcal.errors import InputError
+
+if TYPE_CHECKING:
+    from pkmcal.cameras import Camera
+
+SMALLEST, LARGEST = 64, 8192
+"""Pixels along a side: below, no leg is wide enough to have edges; above, no memory is enough."""
+
+
+def simulate(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new or empty folder.")],
+    mechanism: Annotated[
+        str, typer.Option(metavar="NAME|FILE", help="A built-in machine, or a mechanism file.")
+    ] = "gough-stewart",
+    camera: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A camera file, instead of --size.")
+    ] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of a photograph.")] = "800x600",
+    stations: Annotated[int, typer.Option(metavar="N", min=1, max=100, help="Places of the camera.")] = 3,
+    configurations: Annotated[
+        int, typer.Option(metavar="N", min=2, max=1000, help="Photographs from each place.")
+    ] = 15,
+    shared: Annotated[
+        bool, typer.Option("--shared", help="The same configurations from all places.")
+    ] = False,
+    tolerance: Annotated[
+        float,
+        typer.Option(metavar="X", min=0, help="True values' deviation, in tolerances."),
+    ] = 1.0,
+    joint_noise: Annotated[
+        float, typer.Option(metavar="M", help="Noise of a reading, m or rad.")
+    ] = 3e-6,
+    noise: Annotated[
+        float, typer.Option(metavar="GREY", min=0, help="Noise of a pixel, grey levels.")
+    ] = 0.9,
+    blur: Annotated[
+        float, typer.Option(metavar="PX", min=0, help="Blur of the lens, pixels.")
+    ] = 0.6,
+    seed: console.Seed = 0,
+    as_json: console.Json = False,
+) -> int:
+    """Simulate a session with photographs and known truth."""
+    from pkmcal.cameras import load_camera
+    from pkmcal.mechanisms import load_mechanism
+    from pkmcal.simulate import Sensor, Settings, simulate_session
+
+    if not 0 < joint_noise < 1:
+        raise InputError(
+            "a reading's noise cannot be this", where="--joint-noise", found=f"{joint_noise:g}",
+            expected="more than 0 and less than 1, such as 3e-6",
+        )  # fmt: skip
+    eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
+    machine = load_mechanism(mechanism, label=None)
+    settings = Settings(
+        stations=stations,
+        configurations=configurations,
+        shared=shared,
+        tolerance=tolerance,
+        joint_noise=joint_noise,
+        sensor=Sensor(blur=blur, read_noise=noise),
+    )
+    with console.progress() as told:
+        truth = simulate_session(
+            folder, machine, eye, settings, seed=seed, progress=console.counted(told)
+        )
+    count = len(truth.photographs)
+    if as_json:
+        console.print_json(
+            {"folder": str(folder), "photographs": count, "stations": truth.stations, "seed": seed}
+        )
+        return 0
+    out = console.out()
+    console.print_points(
+        out,
+        [
+            (
+                console.MARKS["good"],
+                f"{count} photographs of {machine.name} from {stations} places in {folder}; the"
+                " truth is in its truth.json, which no calibration reads.",
+            )
+        ],
+    )
+    out.print(f"\nNext: pkmcal calibrate {shlex.quote(str(folder))}", markup=False)
+    return 0
+
+
+def parsed_size(text: str) -> tuple[int, int]:
+    """(width, height) of a text such as 800x600."""
+    match = re.fullmatch(r"(\d{1,6})[x×](\d{1,6})", text.strip())
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
+    if min(size) < SMALLEST or max(size) > LARGEST:
+        raise InputError(
+            "no size of a photograph",
+            where="--size",
+            found=text,
+            expected=f"width x height, each {SMALLEST} to {LARGEST}, such as 800x600",
+        )
+    return size
+
+
+def camera_of_size(size: tuple[int, int]) -> Camera:
+    """The demonstration's camera with the same lens and another number of pixels."""
+    from pkmcal.cameras import camera_models
+    from pkmcal.simulate.demo import demo_camera
+
+    camera = demo_camera()
+    width, height = camera.image_size
+    scale = size[0] / width
+    parameters = camera.parameters.copy()
+    parameters[:2] *= scale
+    middle = ((width - 1) / 2, (height - 1) / 2)
+    for axis in (0, 1):
+        off = (parameters[2 + axis] - middle[axis]) * scale
+        parameters[2 + axis] = (size[axis] - 1) / 2 + off
+    return camera_models()[camera.model](size, parameters)

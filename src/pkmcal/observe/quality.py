@@ -1,0 +1,103 @@
+"""What photographs are like where it counts: on the legs, once the machine was recognised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.mechanisms import Machine
+from pkmcal.observe.legs import CLEARANCE, SEARCH_SAMPLES, Photographs
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.observe.profiles import SATURATED
+from pkmcal.observe.search import sample, search_legs
+
+BLACK = 8
+"""Grey level up to which a sample is taken as black: shading and edges drown in the noise."""
+ACROSS = np.array([0.25, 0.6, 1.0])
+"""Depths inside an edge, in half widths of the leg, at which its grey levels are looked at."""
+REACH, PITCH = 8.0, 0.5
+"""Pixels to each side of an edge, and between samples, of the profiles that tell the blur."""
+FLANK = 6.0
+"""Pixels from the steepest place within which a blurred edge has its whole contrast."""
+CONTRAST = 30.0
+"""Grey levels that an edge needs to tell the blur in spite of noise."""
+SHARPEST = 25.0
+"""Percentile of the edges' widths that is the lens's: shading makes the others wider."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """By photograph (K,) of one station.
+
+    legs : (K, L) True where a leg was found; all False where the machine was not recognised.
+    saturated, black : share of the legs' pixels that are so; of all pixels where there are no
+    legs. blur : standard deviation of the sharper edges, px; NaN where no edge tells.
+    """
+
+    legs: Booleans
+    saturated: Array
+    black: Array
+    blur: Array
+
+
+def quality(
+    photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
+) -> Quality:
+    """Quality on the legs; poses : T_base_platform (K, 4, 4) of the photographs."""
+    tubes = tubes_of(machine)
+    legs = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
+    points = edge_points(machine, photographs.camera, legs, tubes, SEARCH_SAMPLES)
+    clear = unobstructed(machine, photographs.camera, legs, tubes, points, CLEARANCE)
+    places = search_legs(photographs.images, tubes, points, clear)
+    edge = places.outward(points, clear, tubes)[..., None]
+    half_width = (points.gain * machine.values[tubes.radius][:, None])[..., None]
+
+    def look(outward: Array) -> Array:
+        pixel = points.pixel[..., None, :] + outward[..., None] * points.outward[..., None, :]
+        return sample(photographs.images, pixel, cubic=False)
+
+    inside = look(edge - ACROSS * half_width)
+    across = look(edge + np.arange(-REACH, REACH + PITCH / 2, PITCH)).astype(float)
+    found = clear & places.clear[:, tubes.leg][..., None]
+    return Quality(
+        legs=places.clear,
+        saturated=_share(inside >= SATURATED, clear),
+        black=_share(inside <= BLACK, clear),
+        blur=np.array([_blur(a[f]) for a, f in zip(across, found, strict=True)]),
+    )
+
+
+def unrecognised_quality(images: list[Integers], n_legs: int) -> Quality:
+    """Quality of photographs in which the machine was not found: of the whole pictures."""
+    count = len(images)
+    return Quality(
+        legs=np.zeros((count, n_legs), dtype=bool),
+        saturated=np.array([float(np.mean(image >= SATURATED)) for image in images]),
+        black=np.array([float(np.mean(image <= BLACK)) for image in images]),
+        blur=np.full(count, np.nan),
+    )
+
+
+def _share(is_so: Booleans, clear: Booleans) -> Array:
+    """Share of the samples (K, E, n, depths) that are so, of those at clear edge points, (K,)."""
+    count = np.maximum(clear.sum(axis=(1, 2)), 1) * is_so.shape[-1]
+    return np.sum(is_so & clear[..., None], axis=(1, 2, 3)) / count
+
+
+def _blur(profiles: Array) -> float:
+    """Blur s (px) of profiles (N, n): a step of contrast C has the slope C / (s sqrt(2 pi))."""
+    flank = round(FLANK / PITCH)
+    slope = np.abs(profiles[:, 2:] - profiles[:, :-2]) / (2 * PITCH)
+    # Near the middle, so that most of the contrast around it lies in the profile.
+    near = slope[:, flank // 2 : -(flank // 2)]
+    steepest = near.argmax(axis=1) + flank // 2
+    around = steepest[:, None] + 1 + np.arange(-flank, flank + 1)
+    around = np.clip(around, 0, profiles.shape[1] - 1)
+    contrast = np.ptp(np.take_along_axis(profiles, around, axis=1), axis=1)
+    use = contrast > CONTRAST
+    if not use.any():
+        return float("nan")
+    width = contrast[use] / near.max(axis=1)[use] / np.sqrt(2 * np.pi)
+    return float(np.percentile(width, SHARPEST))

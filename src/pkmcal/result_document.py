@@ -1,0 +1,201 @@
+"""The content of calibration.json: everything that a calibration found, as plain data.
+
+SI units, in the frames that ``gauge`` names; without dates, so that the same session gives the
+same file but for its timings.
+"""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pkmcal import __version__
+from pkmcal.arrays import Array
+from pkmcal.files import plain
+from pkmcal.geometry.rigid import inverse, skew
+
+if TYPE_CHECKING:
+    from pkmcal.calibration import Calibration
+    from pkmcal.report.parameters import Group
+
+FORMAT = 1
+PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
+CONVENTIONS = (
+    "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = reading + offset. Legs,"
+    " tubes and sides count from 1. sigma is a standard deviation: of sampling, not of what the"
+    " model leaves out. Rotations of a pose are perturbed from the left, about the axes of its"
+    " outer frame."
+)
+EDGE_COLUMNS = ("station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt")
+"""Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations."""
+
+
+def document_of(calibration: Calibration) -> dict[str, Any]:
+    """The content of calibration.json, plain data without NaN."""
+    session, estimate = calibration.session, calibration.estimate
+    document = {
+        "pkmcal_calibration": FORMAT,
+        "conventions": CONVENTIONS,
+        "verdict": asdict(calibration.verdict),
+        "method": calibration.method,
+        "seed": calibration.seed,
+        "gauge": estimate.gauge,
+        "parameters": _parameters(calibration),
+        "covariance": estimate.covariance,
+        "not_identified": _not_identified(calibration),
+        "stations": _stations(calibration),
+        "cameras": _cameras(calibration),
+        "configurations": _configurations(calibration),
+        "statistics": asdict(estimate.statistics),
+        "residuals": _residuals(calibration),
+        "rejected": _rejected(calibration),
+        "mechanism": estimate.machine.to_document(),
+        "session": {"folder": session.folder.resolve().name, **session.document},
+        "warnings": session.warnings,
+        "versions": versions(),
+        "timings": {name: round(value, 3) for name, value in calibration.timings.items()},
+    }
+    return plain(document)
+
+
+def versions() -> dict[str, str]:
+    """Versions of pkmcal, Python and the packages that numbers depend on."""
+    found = {"pkmcal": __version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _parameters(calibration: Calibration) -> list[dict[str, Any]]:
+    """One entry a parameter; decided_by : data, drawing, frame (of the result) or fixed."""
+    estimate = calibration.estimate
+    source = {row.name: row.source for group in _groups(calibration) for row in group.rows}
+    table = estimate.machine.parameters
+    sigma = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
+    return [
+        {
+            "name": name,
+            "unit": table.units[k],
+            "drawing": calibration.session.machine.values[k],
+            "value": estimate.machine.values[k],
+            "sigma": sigma[k],
+            "data_share": estimate.data_share[k],
+            "decided_by": source[name],
+        }
+        for k, name in enumerate(table.names)
+    ]
+
+
+def _groups(calibration: Calibration) -> tuple[Group, ...]:
+    from pkmcal.report.parameters import parameter_groups
+
+    return parameter_groups(calibration.session.machine, calibration.estimate)
+
+
+def _not_identified(calibration: Calibration) -> list[str]:
+    """The report's sentences about what the data could not decide."""
+    from pkmcal.report.parameters import unidentified
+
+    return list(unidentified(_groups(calibration), calibration.estimate))
+
+
+def _stations(calibration: Calibration) -> list[dict[str, Any]]:
+    estimate = calibration.estimate
+    out: list[dict[str, Any]] = []
+    for s, station in enumerate(calibration.session.stations):
+        T_camera_base = estimate.state.T_camera_base[s]
+        covariance = base_camera_covariance(T_camera_base, estimate.station_covariance[s])
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        out.append(
+            {
+                "name": station.name,
+                "camera": station.camera_file,
+                "T_base_camera": inverse(T_camera_base),
+                "sigma_rotation": sigma[:3],
+                "sigma_translation": sigma[3:],
+                "photographs": len(station.photographs),
+            }
+        )
+    return out
+
+
+def base_camera_covariance(T_camera_base: Array, covariance: Array) -> Array:
+    """Covariance (6, 6) of (omega, tau) of T_base_camera from that of T_camera_base, m and rad.
+
+    With R, t of T_camera_base: omega' = -R^T omega, tau' = -R^T ([t]x omega + tau).
+    """
+    rot_t, t = T_camera_base[:3, :3].T, T_camera_base[:3, 3]
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = jacobian[3:, 3:] = -rot_t
+    jacobian[3:, :3] = -rot_t @ skew(t)
+    return jacobian @ covariance @ jacobian.T
+
+
+def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
+    """Each camera file once, with its edge shift, px outward."""
+    estimate, numbers = calibration.estimate, calibration.measurements.camera_of_station.tolist()
+    stations = calibration.session.stations
+    files = {c: station.camera_file for c, station in zip(numbers, stations, strict=True)}
+    return [
+        {
+            "file": files[c],
+            "edge_shift": estimate.state.edge_shift[c],
+            "sigma": estimate.edge_shift_sigma[c],
+        }
+        for c in sorted(files)
+    ]
+
+
+def _configurations(calibration: Calibration) -> list[dict[str, Any]]:
+    """Poses of all configurations; those not used have theirs from the readings alone."""
+    session, estimate = calibration.session, calibration.estimate
+    return [
+        {
+            "name": name,
+            "used": bool(estimate.configurations[k]),
+            "joints": session.joints[k],
+            "joint_residuals": np.round(estimate.joint_residuals[k], 4),
+            "T_base_platform": estimate.state.T_base_platform[k],
+        }
+        for k, name in enumerate(session.configurations)
+    ]
+
+
+def _residuals(calibration: Calibration) -> dict[str, Any]:
+    """One row an edge, whitened."""
+    edges, estimate = calibration.observation.edges, calibration.estimate
+    whole = [edges.station, edges.configuration, edges.leg, edges.tube, edges.side]
+    reals = np.column_stack([estimate.edge_weights, estimate.edge_residuals])
+    numbers = np.column_stack(whole) + 1
+    rows = [
+        [*place, *values]
+        for place, values in zip(numbers.tolist(), np.round(reals, 3).tolist(), strict=True)
+    ]
+    return {"columns": EDGE_COLUMNS, "edges": rows}
+
+
+def _rejected(calibration: Calibration) -> list[dict[str, Any]]:
+    """What was left out, by reason; leg, tube and side from 1, 0 where all of them are meant."""
+    session = calibration.session
+    groups: dict[str, list[list[Any]]] = {}
+    for item in calibration.observation.rejected:
+        groups.setdefault(item.reason, []).append(
+            [
+                session.stations[item.station].name,
+                session.configurations[item.configuration],
+                item.leg + 1,
+                item.tube + 1,
+                item.side + 1,
+            ]
+        )
+    return [
+        {"reason": reason, "count": len(cases), "cases": cases}
+        for reason, cases in sorted(groups.items(), key=lambda group: -len(group[1]))
+    ]

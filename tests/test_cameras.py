@@ -1,0 +1,442 @@
+"""One conformance test for every camera model, and the camera files.
+
+A new model is found by itself; it needs example cameras in `EXAMPLES`, and in `OPENCV` the same
+mathematics from cv2, where cv2 has it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+from pkmcal.cameras import camera_models, load_camera
+from pkmcal.cameras.files import save_camera
+from pkmcal.errors import InputError
+
+
+class Example(NamedTuple):
+    """A camera and what is known of its field.
+
+    fields : of its file, without model. imaged : least share of the picture that rays meet.
+    outside : points of the camera frame that it cannot see, inside : ones that it can.
+    """
+
+    fields: dict
+    imaged: float = 1.0
+    outside: tuple = ()
+    inside: tuple = ((0.0, 0.0, 1.0), (0.2, -0.1, 1.0))
+
+
+BEHIND = ((0.0, 0.0, -1.0), (0.1, -0.2, -1.0), (0.3, 0.1, 0.0), (0.0, 0.0, 0.0), (np.nan, 0, 1))
+
+
+def pinhole(*distortion, imaged=1.0, outside=(), inside=()):
+    size = {"image_size": (1024, 768), "focal": (500.0, 510.0), "center": (515.5, 380.5)}
+    fields = {**size, "distortion": distortion}
+    return Example(fields, imaged, BEHIND + outside, Example({}).inside + inside)
+
+
+# k1 alone folds where 1 + 3 k1 r^2 = 0: at 0.8607 for -0.45
+FOLD = float(np.sqrt(1 / 1.35))
+
+EXAMPLES = {
+    "pinhole": {
+        "no lens": pinhole(),
+        "usual": pinhole(-0.2, 0.08, 1e-3, -2e-3),
+        "strong barrel": pinhole(-0.38, 0.17, 2e-3, -1e-3, -0.03, imaged=0.85),
+        "pincushion": pinhole(0.35, 0.2, -3e-3, 2e-3, 0.1),
+        "tangential": pinhole(-0.05, 0.0, 0.02, -0.03, imaged=0.98),
+        "folding": pinhole(
+            -0.45,
+            imaged=0.3,
+            outside=((0.0, FOLD + 1e-6, 1.0), (0.0, 3.0, 1.0), (2.0, -2.0, 1.0)),
+            inside=((0.0, FOLD - 1e-6, 1.0),),
+        ),
+        # Newton's method from the distorted point leaps over the folds of these two
+        "barrel that turns": pinhole(-0.462, -0.132, 4e-3, 0.0, 0.16, imaged=0.5),
+        "pincushion that turns": pinhole(0.417, -0.253, -2e-3, -4e-3, -0.043, imaged=0.75),
+    },
+}
+
+
+def opencv_pinhole_project(fields, points):
+    matrix, distortion = opencv_matrix(fields)
+    zero = np.zeros(3)
+    return cv2.projectPoints(points, zero, zero, matrix, distortion)[0].reshape(-1, 2)
+
+
+def opencv_pinhole_undistort(fields, pixels):
+    matrix, distortion = opencv_matrix(fields)
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-13)
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4; in 5 the short name takes criteria
+        found = cv2.undistortPointsIter(pixels, matrix, distortion, None, None, until)
+    else:
+        found = cv2.undistortPoints(pixels, matrix, distortion, criteria=until)
+    return found.reshape(-1, 2)
+
+
+def opencv_matrix(fields):
+    (fx, fy), (cx, cy) = fields["focal"], fields["center"]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    return matrix, np.array([*fields["distortion"], 0, 0, 0, 0, 0])[:5].astype(float)
+
+
+OPENCV = {"pinhole": (opencv_pinhole_project, opencv_pinhole_undistort)}
+
+ALL = [(model, name) for model, examples in EXAMPLES.items() for name in examples]
+
+
+def made(model, name):
+    example, kind = EXAMPLES[model][name], camera_models()[model]
+    return example, kind.from_document(kind.schema(model=model, **example.fields))
+
+
+@pytest.fixture(params=ALL, ids=": ".join)
+def case(request):
+    return made(*request.param)
+
+
+def test_every_model_has_examples():
+    missing = sorted(set(camera_models()) - set(EXAMPLES))
+    assert not missing, f"add example cameras to EXAMPLES in tests/test_cameras.py for {missing}"
+
+
+def picture_pixels(camera, count=60):
+    """A grid over the whole picture, its border included."""
+    width, height = camera.image_size
+    x, y = np.meshgrid(np.linspace(0, width - 1, count), np.linspace(0, height - 1, count))
+    return np.stack([x, y], axis=-1)
+
+
+def seen_points(camera, seed, count=400):
+    """Points of the camera frame whose image lies in the picture, at all depths."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(40 * count, 3)) * np.exp(rng.normal(size=(40 * count, 1)))
+    seen = camera.in_field(points) & camera.in_image(camera.project(points))
+    return points[seen][:count]
+
+
+def near_border(camera, share):
+    """Rays a ``share`` of the way from the middle of the field to its end, in 24 directions."""
+    angle = np.arange(24) * (np.pi / 12) + 0.1
+    side = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+    forward = np.array([0.0, 0.0, 1.0])
+
+    def ray(theta):
+        return np.cos(theta)[:, None] * forward + np.sin(theta)[:, None] * side
+
+    low, high = np.zeros(24), np.full(24, np.pi)
+    for _ in range(50):
+        middle = (low + high) / 2
+        held = camera.in_field(ray(middle)) & camera.in_image(camera.project(ray(middle)))
+        low, high = np.where(held, middle, low), np.where(held, high, middle)
+    return ray(share * low)
+
+
+def test_round_trips(case):
+    """Pixel to ray to pixel: 1e-9 px, a thousand times the rounding of a pixel coordinate."""
+    example, camera = case
+    pixels = picture_pixels(camera)
+    rays = camera.ray(pixels)
+    imaged = np.isfinite(rays).all(axis=-1)
+    assert imaged.mean() >= example.imaged
+    assert camera.in_field(rays[imaged]).all()
+    np.testing.assert_allclose(np.linalg.norm(rays[imaged], axis=-1), 1, atol=1e-14)
+    np.testing.assert_allclose(camera.project(rays[imaged]), pixels[imaged], atol=1e-9, rtol=0)
+
+
+def test_points_come_back_as_their_directions(case):
+    """No imaged point is lost or found in another place, whatever its depth."""
+    _, camera = case
+    points = seen_points(camera, 0)
+    assert len(points) > 100
+    pixels = camera.project(points)
+    np.testing.assert_allclose(camera.project(7.0 * points), pixels, atol=1e-9, rtol=0)
+    direction = points / np.linalg.norm(points, axis=-1, keepdims=True)
+    off = np.linalg.norm(camera.ray(pixels) - direction, axis=-1)
+    # near a fold, a pixel's rounding of 1e-13 turns the ray by its root
+    assert off.max() < 1e-6
+    assert np.median(off) < 1e-14
+
+
+def test_shapes_follow_the_input(case):
+    _, camera = case
+    n = len(camera.parameter_names)
+    assert camera.parameters.shape == (n,)
+    for lead in ((), (3,), (2, 0), (2, 3)):
+        points = np.broadcast_to([0.05, 0.02, 1.0], (*lead, 3))
+        pixels = camera.project(points)
+        assert pixels.shape == (*lead, 2)
+        assert camera.in_field(points).shape == camera.in_image(pixels).shape == lead
+        assert [j.shape for j in camera.project_jacobians(points)] == [
+            (*lead, 2, 3),
+            (*lead, 2, n),
+        ]
+        assert camera.ray(pixels).shape == (*lead, 3)
+        assert [j.shape for j in camera.ray_jacobians(pixels)] == [(*lead, 3, 2), (*lead, 3, n)]
+
+
+# Weights of a first derivative, exact to the sixth order: a step h leaves h^6 / 140 of the seventh
+# derivative, and 1e-16 / h by rounding.
+STENCIL = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
+
+
+def differences(function, x, steps):
+    """Central differences of function(x) (..., m) by x (..., n), steps (..., n).
+
+    Another way than the code's own chain rule; complex steps are no way where a model compares.
+    """
+    columns = []
+    for k in range(x.shape[-1]):
+        by = np.zeros(x.shape)
+        by[..., k] = steps[..., k]
+        total = sum(w * (function(x + i * by) - function(x - i * by)) for i, w in STENCIL)
+        columns.append(total / steps[..., k, None])
+    return np.stack(columns, axis=-1)
+
+
+def agrees(found, oracle, tolerance):
+    """Equal to a share of the largest entry of each matrix."""
+    assert np.isfinite(found).all()
+    scale = np.abs(oracle).max(axis=(-1, -2), keepdims=True)
+    assert np.max(np.abs(found - oracle) / scale) < tolerance
+
+
+class Place(NamedTuple):
+    """Where derivatives are tested: towards the border of picture or field, the fold among them,
+    the inverse's higher derivatives grow, so steps shrink, and rounding takes more of the oracle.
+    """
+
+    share: tuple[float, float]
+    step: float
+    tolerance: float
+
+
+PLACES = {
+    "nominal": Place((0.0, 0.1), 1.0, 1e-9),
+    "random": Place((0.1, 0.9), 0.05, 1e-8),
+    "border": Place((0.99, 0.99), 0.002, 1e-8),
+}
+
+
+@pytest.fixture(params=PLACES)
+def place(request):
+    return PLACES[request.param]
+
+
+def rays_at(camera, place):
+    rng = np.random.default_rng(1)
+    return near_border(camera, rng.uniform(*place.share, 24)) * rng.uniform(0.5, 2, (24, 1))
+
+
+def by_parameters_of(method, camera, at, place):
+    """Differences of a camera's method at given points by the camera's parameters."""
+    steps = place.step * 1e-3 * np.maximum(1.0, np.abs(camera.parameters))
+
+    def of(rows):
+        return np.stack([getattr(replace(camera, parameters=p), method)(at) for p in rows])
+
+    columns = []
+    for by in np.diag(steps):
+        up, down = (of([camera.parameters + sign * i * by for i, _ in STENCIL]) for sign in (1, -1))
+        columns.append(np.tensordot([w for _, w in STENCIL], up - down, 1) / by.sum())
+    return np.stack(columns, axis=-1)
+
+
+def test_derivatives_of_project(case, place):
+    _, camera = case
+    points = rays_at(camera, place)
+    by_point, by_parameters = camera.project_jacobians(points)
+    steps = place.step * 1e-3 * np.linalg.norm(points, axis=-1, keepdims=True) * np.ones(3)
+    agrees(by_point, differences(camera.project, points, steps), place.tolerance)
+    found = by_parameters_of("project", camera, points, place)
+    agrees(by_parameters, found, place.tolerance)
+
+
+def test_derivatives_of_ray(case, place):
+    _, camera = case
+    pixels = camera.project(rays_at(camera, place))
+    by_pixel, by_parameters = camera.ray_jacobians(pixels)
+    steps = np.full(pixels.shape, 0.3 * place.step)
+    agrees(by_pixel, differences(camera.ray, pixels, steps), place.tolerance)
+    found = by_parameters_of("ray", camera, pixels, place)
+    agrees(by_parameters, found, place.tolerance)
+
+
+def test_derivatives_of_ray_undo_those_of_project(case, place):
+    """What differences cannot resolve near a fold: one map's derivatives against the other's."""
+    _, camera = case
+    rays = rays_at(camera, place)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    pixels = camera.project(rays)
+    forth, back = camera.project_jacobians(rays), camera.ray_jacobians(pixels)
+    # rounding of the ray, 1e-16, times the second derivative near the fold
+    np.testing.assert_allclose(forth[0] @ back[0], np.eye(2) * np.ones((24, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(forth[0] @ back[1] + forth[1], 0, atol=1e-6)
+    for turn in back:
+        np.testing.assert_allclose(rays[:, None] @ turn, 0, atol=1e-12 * np.abs(turn).max())
+
+
+@pytest.mark.parametrize(("model", "name"), [pair for pair in ALL if pair[0] in OPENCV])
+def test_opencv_agrees(model, name):
+    example, camera = made(model, name)
+    project, undistort = OPENCV[model]
+    points = np.concatenate([seen_points(camera, 2), near_border(camera, 0.9)])
+    pixels = camera.project(points)
+    np.testing.assert_allclose(project(example.fields, points), pixels, atol=1e-9, rtol=0)
+    # cv2's fixed-point iteration only converges in the middle of a strong lens
+    middle = near_border(camera, 0.4)
+    found = undistort(example.fields, camera.project(middle))
+    np.testing.assert_allclose(found, middle[:, :2] / middle[:, 2:], atol=1e-10)
+    ray = camera.ray(camera.project(middle))
+    np.testing.assert_allclose(found, ray[:, :2] / ray[:, 2:], atol=1e-10)
+
+
+def test_the_field_ends_where_the_model_does(case):
+    example, camera = case
+    for points, expected in ((example.inside, True), (example.outside, False)):
+        array = np.array(points, dtype=float).reshape(-1, 3)
+        np.testing.assert_array_equal(camera.in_field(array), expected)
+        pixels = camera.project(array)
+        np.testing.assert_array_equal(np.isfinite(pixels).all(axis=-1), expected)
+        for jacobian in camera.project_jacobians(array):
+            np.testing.assert_array_equal(np.isfinite(jacobian).all(axis=(-1, -2)), expected)
+        assert not camera.in_image(pixels)[~np.isfinite(pixels).all(axis=-1)].any()
+
+
+def test_before_its_end_the_field_does_not_fold(case):
+    """Throughout the field the picture keeps its orientation; a mirror image would be a fold."""
+    _, camera = case
+    points = np.random.default_rng(3).normal(size=(4000, 3))
+    points = points[camera.in_field(points)]
+    rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
+    by_point = camera.project_jacobians(rays)[0]
+    turn = np.linalg.det(np.concatenate([by_point, rays[:, None, :]], axis=1))
+    assert np.all(turn > 0)
+
+
+def test_pixels_that_no_ray_meets():
+    _, camera = made("pinhole", "folding")
+    corner = camera.ray(np.array([[0.0, 0.0], [np.nan, 5.0]]))
+    assert np.isnan(corner).all()
+    assert np.isnan(camera.ray_jacobians(np.array([0.0, 0.0]))[0]).all()
+
+
+def test_in_image_and_its_margin(case):
+    _, camera = case
+    width, height = camera.image_size
+    pixels = np.array([[0, 0], [width - 1, height - 1], [-0.01, 5], [5, height - 0.99]])
+    assert camera.in_image(pixels).tolist() == [True, True, False, False]
+    edge = np.array([[4.0, 4.0], [3.99, 4.0], [width - 5.0, 10.0], [width - 4.99, 10.0]])
+    assert camera.in_image(edge, margin=4.0).tolist() == [True, False, True, False]
+
+
+# Camera files
+
+
+def test_a_saved_camera_is_the_same(case, tmp_path):
+    _, camera = case
+    save_camera(camera, tmp_path / "a.yaml")
+    again = load_camera(tmp_path / "a.yaml")
+    assert type(again) is type(camera)
+    assert again.image_size == camera.image_size
+    np.testing.assert_array_equal(again.parameters, camera.parameters)
+
+
+GOOD = """\
+model: pinhole
+image_size: [640, 480]
+focal: [600, 601.5]
+center: [319.5, 239.5]
+distortion: [-0.2, 0.1]
+"""
+
+
+def test_the_parameters_of_a_file_stand_in_their_order(tmp_path):
+    (tmp_path / "a.yaml").write_text(GOOD)
+    camera = load_camera(tmp_path / "a.yaml")
+    assert camera.image_size == (640, 480)
+    named = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
+    assert named == {
+        "focal.x": 600, "focal.y": 601.5, "center.x": 319.5, "center.y": 239.5,
+        "k1": -0.2, "k2": 0.1, "p1": 0, "p2": 0, "k3": 0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("line", "instead", "sentence"),
+    [
+        (
+            "model: pinhole",
+            "model: pinhol",
+            "a.yaml, line 1, model: no such camera model; found pinhol, expected pinhole.",
+        ),
+        (
+            "model: pinhole\n",
+            "",
+            "a.yaml, model: the camera's model is missing; expected MODELS.",
+        ),
+        (
+            "model: pinhole",
+            "model: 5",
+            "a.yaml, line 1, model: no such camera model; found 5, expected MODELS.",
+        ),
+        (
+            "focal: [600, 601.5]",
+            "focal: [600, -601.5]",
+            "a.yaml, line 3, focal[2]: this value cannot be used; found -601.5, "
+            "expected a number above 0.",
+        ),
+        (
+            "center: [319.5, 239.5]\n",
+            "",
+            "a.yaml, center: this is missing; expected [cx, cy] in pixels, pixel centres at "
+            "integers.",
+        ),
+        (
+            "distortion: [-0.2, 0.1]",
+            "distortion: [1, 2, 3, 4, 5, 6, 7, 8]",
+            "a.yaml, line 5, distortion: this has too many entries; "
+            "found [1, 2, 3, 4, 5, 6, 7, 8], expected at most 5.",
+        ),
+        (
+            "[640, 480]",
+            "[640.5, 480]",
+            "a.yaml, line 2, image_size[1]: this value cannot be used; found 640.5, "
+            "expected a whole number.",
+        ),
+        (
+            "[640, 480]",
+            "640x480",
+            "a.yaml, line 2, image_size: this value cannot be used; found '640x480', "
+            "expected a list, such as [1, 2, 3].",
+        ),
+        (
+            "[640, 480]",
+            "[640]",
+            "a.yaml, line 2, image_size: this has too few entries; found [640], "
+            "expected [width, height] in pixels.",
+        ),
+        (
+            "center:",
+            "centre:",
+            "a.yaml, line 4, centre: this key is not known; found centre, expected center "
+            "(known here: center, distortion, focal, image_size, model).",
+        ),
+        (
+            "239.5",
+            ".nan",
+            "a.yaml, line 4, center[2]: this is not a finite number; found nan, expected a number.",
+        ),
+    ],
+)
+def test_faults_of_camera_files(tmp_path, line, instead, sentence):
+    assert line in GOOD
+    (tmp_path / "a.yaml").write_text(GOOD.replace(line, instead, 1))
+    with pytest.raises(InputError) as caught:
+        load_camera(tmp_path / "a.yaml")
+    assert str(caught.value) == sentence.replace("MODELS", " or ".join(sorted(camera_models())))

@@ -1,0 +1,333 @@
+"""Makes the pictures of README and docs/ from a simulated session, with Chromium.
+
+    python tools/pictures.py [names...] [--out docs/pictures] [--work build/pictures]
+
+Without names, all of them. The sessions are kept in the work folder and made once. Figures that
+the documentation quotes are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import pkmcal
+from pkmcal.arrays import Array
+from pkmcal.calibration import (
+    Calibration,
+    platform_poses,
+    read_photographs,
+    recognise,
+)
+from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
+from pkmcal.identify.problem import Measurements
+from pkmcal.observe import legs
+from pkmcal.report import charts, page
+from pkmcal.results import save
+from pkmcal.session import Session, load_session
+from pkmcal.simulate import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
+from pkmcal.simulate.demo import MECHANISM, SEED, SETTINGS, demo_camera
+
+sys.path.insert(0, str(Path(__file__).parent))
+import drawings
+
+HERE = Path(__file__).resolve().parents[1]
+LARGEST = 200_000
+"""Bytes of a picture."""
+REPEATS, EDGE_REPEATS = 12, 60
+"""Sessions simulated with photographs, and with edges only."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A page to be photographed: HTML and its size in pixels."""
+
+    html: str
+    width: int
+    height: int
+
+
+class Case:
+    """The demonstration's session with its truth and its calibration."""
+
+    def __init__(self, work: Path) -> None:
+        self.work = work
+
+    @cached_property
+    def folder(self) -> Path:
+        """The session's folder."""
+        return simulated(self.work / "demo", SEED)
+
+    @cached_property
+    def session(self) -> Session:
+        """The session as a user would load it."""
+        return load_session(self.folder)
+
+    @cached_property
+    def truth(self) -> Truth:
+        """What the simulation drew."""
+        return load_truth(self.folder, self.session.machine)
+
+    @cached_property
+    def photographs(self) -> list[legs.Photographs]:
+        """Decoded photographs by station."""
+        return read_photographs(self.session)
+
+    @cached_property
+    def result(self) -> Calibration:
+        """The calibration."""
+        return pkmcal.calibrate(self.session)
+
+    @cached_property
+    def looks(self) -> list[Array]:
+        """Stations by hand and as recognised, T_camera_base (S, 4, 4) each."""
+        poses = platform_poses(self.session)
+        rngs = np.random.default_rng(0).spawn(len(self.photographs) + 1)
+        found = recognise(self.session, self.photographs, poses, rngs[1:])
+        return [np.stack(found.rough), np.stack([f.T_camera_base for f in found.found])]
+
+
+def simulated(folder: Path, seed: int) -> Path:
+    """A session like the demonstration's, made where it is not there yet."""
+    if not folder.exists():
+        machine = pkmcal.load_mechanism(MECHANISM)
+        simulate_session(folder, machine, demo_camera(), SETTINGS, seed=seed)
+    return folder
+
+
+def whole_page(body: str, width: int, height: int, more_style: str = "") -> Shot:
+    """A white page in the report's style; ``body`` may use its drawing macros as ``draw``."""
+    style = (Path(page.__file__).parent / "templates" / "style.css").read_text(encoding="utf-8")
+    extra = (
+        "html, body { margin: 0; background: #fff; overflow: hidden; }"
+        "body { font-family: 'Liberation Sans', Arial, sans-serif; color: #1a1e24; }"
+    )
+    html = f"<!doctype html><meta charset=utf-8><style>{style}{extra}{more_style}</style>{body}"
+    return Shot(html, width, height)
+
+
+def result(case: Case) -> Shot:
+    """README's first picture: a photograph with fitted edges beside the geometry's change."""
+    views = page.report_views(case.session, case.result.observation, case.result.estimate)
+    shots = {(p.station, p.configuration): p for p in views["pictures"]}
+    shot = shots.get(("station2", "0011")) or next(iter(shots.values()))
+    template = page._environment().from_string(
+        '{% import "charts.html.j2" as draw with context %}'
+        '<div class="grid"><div>{{ draw.picture(shot) }}<p>A photograph, the edges fitted in it,'
+        " and the joints of the calibrated machine (rings) and of the drawing (crosses)</p></div>"
+        '<div class="right">{{ draw.view(view) }}<p>The machine from above, mm: joints by'
+        ' <b class="d">the drawing</b> and <b class="c">as calibrated</b>, their'
+        " differences {{ '{:g}'.format(scene.factor) }} times enlarged</p></div></div>"
+    )
+    body = template.render(shot=shot, view=views["views"][0], scene=views["scene"])
+    style = (
+        ".grid { display: grid; grid-template-columns: 640px 500px; gap: 22px; padding: 8px; }"
+        ".grid p { font-size: 15px; line-height: 1.35; margin: 8px 4px 0; color: #58626d; }"
+        ".right svg { max-width: none; height: 480px; } .shot { border-radius: 8px; }"
+        ".d { color: #0068a8; } .c { color: #c2480c; }"
+    )
+    return whole_page(body, 1180, 545, style)
+
+
+def report(case: Case) -> Shot:
+    """The top of the report."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out"
+        save(case.result, out)
+        html = (out / "report.html").read_text(encoding="utf-8")
+    return Shot(html, 1180, 900)
+
+
+def frames(case: Case) -> Shot:
+    """The machine with its frames and cameras."""
+    return whole_page(drawings.frames(case.truth), 860, 520)
+
+
+def edge_planes(_case: Case) -> Shot:
+    """Across a leg: the two planes through its edges and the camera's centre."""
+    return whole_page(drawings.edge_planes(), 780, 380)
+
+
+def looks(case: Case) -> Shot:
+    """One photograph, and the edges predicted in it after each look."""
+    return whole_page(drawings.looks(case), 1160, 400)
+
+
+def profile(case: Case) -> Shot:
+    """Two profiles across edges with their model, and the strongest gradient."""
+    places = drawings.measured_places(case)
+    return whole_page(drawings.two_profiles(places), 880, 330)
+
+
+def positions(case: Case) -> Shot:
+    """Errors of edge positions: by the model, and by the strongest gradient."""
+    places = drawings.measured_places(case)
+    for name, values in (("model", places.model_error), ("gradient", places.gradient_error)):
+        for tube in (0, 1):
+            mine = values[places.tube == tube]
+            tell(
+                f"position by {name}, tube {tube + 1}: median {np.median(mine):+.3f} px,"
+                f" rms {np.sqrt(np.mean(mine**2)):.3f} px, n {mine.size}"
+            )
+    return whole_page(drawings.position_errors(places), 880, 330)
+
+
+def residuals(case: Case) -> Shot:
+    """The report's histogram of the edges' residuals, and the boxes by leg."""
+    views = page.report_views(case.session, case.result.observation, case.result.estimate)
+    template = page._environment().from_string(
+        '{% import "charts.html.j2" as draw with context %}<div class="two">'
+        "<div>{{ draw.bars(r.histogram) }}</div><div>{{ draw.rows(r.by_leg) }}</div></div>"
+    )
+    style = ".two { display: grid; grid-template-columns: 1fr 1fr; gap: 20px; padding: 10px; }"
+    return whole_page(template.render(r=views["residuals"]), 900, 275, style)
+
+
+def repeats(case: Case) -> Shot:
+    """Errors over standard deviations: repeated sessions with edges only, and with photographs."""
+    edges = np.concatenate([_edge_scores(case, k) for k in range(EDGE_REPEATS)])
+    groups: dict[str, list[Array]] = {}
+    for k in range(REPEATS):
+        for name, values in _photograph_scores(case, 100 + k).items():
+            groups.setdefault(name, []).append(values)
+    photographs = {name: np.concatenate(values) for name, values in groups.items()}
+    tell(f"edges only: error / sigma of centres {rms(edges):.2f}, n {edges.size}")
+    for name, values in photographs.items():
+        tell(f"photographs: error / sigma of {name} {rms(values):.2f}, n {values.size}")
+    return whole_page(drawings.repeats(edges, photographs["centres"]), 880, 330)
+
+
+def _edge_scores(case: Case, seed: int) -> Array:
+    """Errors of joint centres over their standard deviations, edges with exactly known noise."""
+    truth, rng = case.truth, np.random.default_rng(seed)
+    edges, joints = simulate_edges(
+        truth.machine,
+        truth.T_camera_base,
+        demo_camera(),
+        truth.T_base_platform,
+        EdgeNoise(),
+        rng,
+        photographs=truth.photographs,
+    )
+    cameras = np.zeros(len(truth.stations), dtype=int)
+    measured = Measurements(edges, joints, 3e-6, len(cameras), cameras)
+    drawing = case.session.machine
+    start = start_state(drawing, measured, truth.T_camera_base)
+    estimate = bundle(drawing, measured, start, use_drawing=False, scale_noise=False)
+    centres = joint_centres(truth.machine, estimate.machine, free_of_gauge(estimate))
+    return np.concatenate([normalised(body) for body in centres])
+
+
+def _photograph_scores(case: Case, seed: int) -> dict[str, Array]:
+    """Errors over standard deviations by kind of parameter, from rendered photographs."""
+    folder = simulated(case.work / f"repeat{seed}", seed)
+    estimate = pkmcal.calibrate(folder).estimate
+    truth = load_truth(folder, case.session.machine)
+    covariance = free_of_gauge(estimate)
+    centres = joint_centres(truth.machine, estimate.machine, covariance)
+    error = estimate.machine.values - truth.machine.values
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    out = {"centres": np.concatenate([normalised(body) for body in centres])}
+    for kind in ("offset", "radius"):
+        at = estimate.machine.parameters.of_kind(kind)
+        out[kind] = error[at] / sigma[at]
+    return out
+
+
+def normalised(body: Centres) -> Array:
+    """Errors of a body's centres over their standard deviations, (3L,)."""
+    variance = np.einsum("iaa->ia", body.blocks)
+    return (body.change / np.sqrt(variance)).ravel()
+
+
+def accuracy(case: Case) -> None:
+    """Errors against the truth, as README quotes them, for 6 and 15 configurations a station."""
+    for name, count in (("demo", 6), ("larger", 15)):
+        found = case.result if count == 6 else pkmcal.calibrate(_larger(case.work / name, count))
+        truth = load_truth(found.session.folder, found.session.machine)
+        tell(f"{count} configurations a station: {found.verdict.headline}")
+        for what, machine in (("drawing", found.session.machine), ("calibrated", found.machine)):
+            centre, offset, shift, turn = drawings.against_truth(truth.machine, machine)
+            tell(
+                f"  {what}: centres {centre * 1e3:.3f} mm a coordinate, offsets"
+                f" {offset * 1e3:.3f} mm, platform {shift * 1e3:.3f} mm and"
+                f" {np.rad2deg(turn):.4f} degrees at poses not photographed"
+            )
+
+
+def _larger(folder: Path, count: int) -> Path:
+    from dataclasses import replace
+
+    if not folder.exists():
+        machine = pkmcal.load_mechanism(MECHANISM)
+        settings = replace(SETTINGS, configurations=count)
+        simulate_session(folder, machine, demo_camera(), settings, seed=SEED)
+    return folder
+
+
+def rms(values: Array) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def tell(words: str) -> None:
+    """A line for people."""
+    sys.stdout.write(words + "\n")
+
+
+def photograph(shot: Shot, path: Path) -> None:
+    """The page as a PNG file, small."""
+    browser = next(
+        filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+    )
+    if browser is None:
+        sys.exit("Chromium is needed: apt-get install chromium")
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "page.html", Path(folder) / "page.png"
+        source.write_text(shot.html, encoding="utf-8")
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        command += [f"--window-size={shot.width},{shot.height}", f"--screenshot={target}"]
+        subprocess.run([*command, source.as_uri()], check=True, capture_output=True, timeout=120)
+        image = cv2.imread(str(target))
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    size = path.stat().st_size
+    tell(f"{path}: {shot.width}x{shot.height}, {size / 1e3:.0f} kB")
+    if size > LARGEST:
+        sys.exit(f"{path} is larger than {LARGEST / 1e3:.0f} kB")
+
+
+PICTURES: dict[str, Callable[[Case], Shot]] = {
+    f.__name__.replace("_", "-"): f
+    for f in (result, report, frames, edge_planes, looks, profile, positions, residuals, repeats)
+}
+
+
+def main() -> None:
+    """Make the pictures that were asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("names", nargs="*", help=f"{', '.join(PICTURES)} or accuracy; all if none")
+    parser.add_argument("--out", type=Path, default=HERE / "docs" / "pictures")
+    parser.add_argument("--work", type=Path, default=HERE / "build" / "pictures")
+    args = parser.parse_args()
+    case = Case(args.work)
+    args.out.mkdir(parents=True, exist_ok=True)
+    for name in args.names or [*PICTURES, "accuracy"]:
+        if name == "accuracy":
+            accuracy(case)
+        else:
+            photograph(PICTURES[name](case), args.out / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()
