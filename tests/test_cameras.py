@@ -40,6 +40,14 @@ def pinhole(*distortion, imaged=1.0, outside=(), inside=()):
     return Example(fields, imaged, BEHIND + outside, Example({}).inside + inside)
 
 
+def wide(*distortion, imaged=1.0, behind=(0.0, 0.0, -1.0), beyond=(0.5, 0.1, 1.0), **fields):
+    """A model that may reach beyond 90 degrees: ``beyond`` is seen, ``behind`` is not."""
+    size = {"image_size": (1024, 768), "center": (515.5, 380.5)}
+    outside = (behind, (0.0, 0.0, -1.0), (0.0, 0.0, 0.0), (np.nan, 0, 1))
+    inside = (*Example({}).inside, beyond)
+    return Example({**size, **fields, "distortion": distortion}, imaged, outside, inside)
+
+
 # k1 alone folds where 1 + 3 k1 r^2 = 0: at 0.8607 for -0.45
 FOLD = float(np.sqrt(1 / 1.35))
 
@@ -59,6 +67,31 @@ EXAMPLES = {
         # Newton's method from the distorted point leaps over the folds of these two
         "barrel that turns": pinhole(-0.462, -0.132, 4e-3, 0.0, 0.16, imaged=0.5),
         "pincushion that turns": pinhole(0.417, -0.253, -2e-3, -4e-3, -0.043, imaged=0.75),
+    },
+    "fisheye": {
+        "equidistant": wide(focal=(450.0, 452.0), beyond=(0.0, 1.0, -1.0)),
+        "usual": wide(-0.03, 0.01, -4e-3, 3e-4, focal=(480.0, 481.0), beyond=(0.1, 1.0, -0.2)),
+        # stops growing where 1 + 3 k1 t^2 = 0: at 46.8 degrees for -0.5
+        "ends before 90 degrees": wide(
+            -0.5, focal=(600.0, 600.0), behind=(1.07, 0.0, 1.0), beyond=(1.06, 0.0, 1.0), imaged=0.4
+        ),
+    },
+    "unified": {
+        "parabolic mirror": wide(xi=1.0, focal=(220.0, 221.0), beyond=(1.0, 0.5, -1.0)),
+        "hyperbolic mirror": wide(
+            xi=0.8, focal=(240.0, 239.0), beyond=(1.0, 0.5, -0.5), behind=(0.1, 0.2, -0.9)
+        ),
+        "wide lens": wide(
+            *(-0.1, 0.02, 1e-3, -8e-4),
+            xi=1.7,
+            focal=(420.0, 424.0),
+            beyond=(1.0, 1.0, -0.3),
+            behind=(0.3, 0.3, -0.7),
+            imaged=0.3,
+        ),
+        "no mirror": wide(
+            -0.2, 0.08, 1e-3, -2e-3, xi=0.0, focal=(500.0, 510.0), behind=(1.0, 0.0, 0.0)
+        ),
     },
 }
 

@@ -7,9 +7,9 @@ import pytest
 
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
+from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report import parameters, pictures, rejections, residuals, wording
-from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.report.charts import ticks_between
 from pkmcal.report.page import report_views
 from pkmcal.report.provenance import camera_position_covariance

@@ -105,11 +105,9 @@ class Plot:
             dot(self.at(*p), colour, radius) for p in zip(x.tolist(), y.tolist(), strict=True)
         ]
 
-    def upright(self, x: float, words: str, colour: str, row: int, dash: str = "") -> None:
-        """A vertical line with its name beside it; ``row`` counts names from the top."""
+    def upright(self, x: float, colour: str, dash: str = "") -> None:
+        """A vertical line over the frame's height."""
         self.parts.append(line([self.at(x, self.y[0]), self.at(x, self.y[1])], colour, 2, dash))
-        place = self.at(x, self.y[1])
-        self.parts.append(text((place[0] + 6, place[1] + 16 + 17 * row), words, colour))
 
     def histogram(self, values: Array, borders: Array, colour: str, opacity: float = 0.55) -> None:
         """Bars of the values' density; what lies beyond the borders is left out."""

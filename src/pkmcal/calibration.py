@@ -11,7 +11,9 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -19,7 +21,10 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import listed
 from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.problem import Estimate, Measurements, State
+from pkmcal.identify.paper_methods import Method as PaperMethod
+from pkmcal.identify.paper_methods import by_paper
+from pkmcal.identify.problem import Estimate, Measurements
+from pkmcal.identify.start import better_start
 from pkmcal.identify.verdict import Verdict, judge
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
@@ -36,6 +41,8 @@ tenth, the third changes nothing that matters."""
 WORKERS = 2
 FEWEST_EDGES = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
+
+Method = Literal["bundle"] | PaperMethod
 
 Progress = Callable[[str, float], None]
 """Called with a sentence about the present step and the share that is done, 0 to 1."""
@@ -66,7 +73,7 @@ class Calibration:
 def calibrate(
     session: Session | Path | str,
     *,
-    method: str = "bundle",
+    method: Method = "bundle",
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -87,7 +94,7 @@ def calibrate(
 
 
 def _calibrate(
-    session: Session | Path | str, method: str, seed: int, told: Progress
+    session: Session | Path | str, method: Method, seed: int, told: Progress
 ) -> Calibration:
     """:func:`calibrate`, step by step."""
     clock = _Clock()
@@ -104,8 +111,9 @@ def _calibrate(
     observation, estimate, measurements = _take_turns(session, photographs, poses, told, clock)
     told("Judging", 0.95)
     if method != "bundle":
-        estimate = _by_method(method, session, measurements, estimate)
-    verdict = judge(measurements, observation, estimate)
+        told("Repeating the paper's method", 0.9)
+        estimate = by_paper(method, session.machine, measurements, estimate, seed)
+    verdict = judge(observation, estimate, method)
     clock.lap("identify")
     return Calibration(
         session, observation, measurements, estimate, verdict, method, seed, clock.laps
@@ -251,8 +259,8 @@ def _stations(
 
 
 def _rough(station: Station) -> Array:
-    assert station.T_camera_base is not None  # check_observable came before
-    return station.T_camera_base
+    """The station's pose by hand; :func:`check_observable` has seen that there is one."""
+    return np.eye(4) if station.T_camera_base is None else station.T_camera_base
 
 
 def _take_turns(
@@ -267,9 +275,7 @@ def _take_turns(
     poses = session.machine.forward(session.joints)
     looks = _each(
         photographs,
-        lambda p: legs.search(
-            p, session.machine, T_camera_base[p.station], poses[p.configuration]
-        ),
+        lambda p: legs.search(p, session.machine, T_camera_base[p.station], poses[p.configuration]),
     )
     measurements = _measurements(session, _edges(looks))
     clock.lap("observe")
@@ -279,17 +285,19 @@ def _take_turns(
     blur: list[float | None] = [None] * len(photographs)
     for turn in range(ROUNDS):
         told("Measuring edges and identifying", 0.45 + 0.5 * turn / ROUNDS)
-        looks = _each(photographs, lambda p: _measure(p, estimate, blur[p.station]))
+        looks = _each(photographs, partial(_measure, estimate=estimate, blur=blur))
         blur = [look.blur for look in looks]
         measurements = _measurements(session, _edges(looks))
         clock.lap("observe")
-        estimate = bundle(session.machine, measurements, estimate.state)
+        known = estimate.state
+        start = better_start(session.machine, measurements, known) if turn == 0 else known
+        estimate = bundle(session.machine, measurements, start)
         clock.lap("identify")
     return _observation(looks, estimate), estimate, measurements
 
 
 def _measure(
-    photographs: legs.Photographs, estimate: Estimate, blur: float | None
+    photographs: legs.Photographs, estimate: Estimate, blur: list[float | None]
 ) -> legs.StationEdges:
     state = estimate.state
     return legs.measure(
@@ -297,7 +305,7 @@ def _measure(
         estimate.machine,
         state.T_camera_base[photographs.station],
         state.T_base_platform[photographs.configuration],
-        blur,
+        blur[photographs.station],
     )
 
 
@@ -337,24 +345,25 @@ def _observation(looks: list[legs.StationEdges], estimate: Estimate) -> Observat
     edges = concatenate([look.edges for look in looks])
     first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
     given_up = [
-        Rejection(*(int(getattr(edges, name)[k]) for name in _PLACE), _OUTLIER)
+        Rejection(
+            int(edges.station[k]),
+            int(edges.configuration[k]),
+            int(edges.leg[k]),
+            int(edges.tube[k]),
+            int(edges.side[k]),
+            _OUTLIER,
+        )
         for k in np.flatnonzero(estimate.edge_weights < 0.5)
     ]
     return Observation(
         edges=edges,
         rejected=tuple(r for look in looks for r in look.rejected) + tuple(given_up),
         points=np.concatenate([look.points for look in looks]),
-        point_edge=np.concatenate([look.point_edge + k for look, k in zip(looks, first, strict=True)]),
+        point_edge=np.concatenate(
+            [look.point_edge + k for look, k in zip(looks, first, strict=True)]
+        ),
         T_camera_base=estimate.state.T_camera_base,
     )
 
 
-_PLACE = ("station", "configuration", "leg", "tube", "side")
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
-
-
-def _by_method(
-    method: str, session: Session, measurements: Measurements, estimate: Estimate
-) -> Estimate:
-    """The papers' own methods on the same edges, for comparison."""
-    raise NotImplementedError

@@ -261,9 +261,7 @@ def _observed(
         return _Seen(_unlooked(session, photographs))
     rngs = rng.spawn(len(whole) + 1)
     found = recognise(session, whole, poses, rngs[1:])
-    stations = tuple(
-        _station(session, p, found, poses) for p in whole
-    )
+    stations = tuple(_station(session, p, found, poses) for p in whole)
     if found.complete:
         return _Seen(stations)
     return _Seen(stations, (_wrong(why_unrecognised(session, whole, found, rngs[0])),))
@@ -293,9 +291,7 @@ def _station(
     if not pose.good:
         what = unrecognised_quality(photographs.images, machine.n_legs)
         return replace(_summary(station, what, recognised=False), mismatch=pose.score)
-    what = quality(
-        photographs, machine, pose.T_camera_base, poses[photographs.configuration]
-    )
+    what = quality(photographs, machine, pose.T_camera_base, poses[photographs.configuration])
     T_base_camera, by_hand = inverse(pose.T_camera_base), inverse(rough)
     change = pose_difference(T_base_camera, by_hand)
     return replace(
@@ -349,7 +345,7 @@ def _station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
             f"Only {station.legs:.1f} of {n_legs} legs are found in a photograph on average."
             " Move the camera back or aside, so that it sees the legs one beside the other."
         )
-    return [Finding(Level.DOUBTFUL, f"Station {station.name}: {t}", station.name) for t in texts]
+    return [Finding(Level.DOUBTFUL, f"{station.name}: {t}", station.name) for t in texts]
 
 
 def _joint(session: Session, column: int) -> JointCheck:

@@ -6,6 +6,7 @@ pkmcal; 130 interrupted. No mistake of a user's ends in a traceback.
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
@@ -49,7 +50,7 @@ def _show_version(wanted: bool) -> None:
 
 @app.callback()
 def _top(
-    version: Annotated[  # noqa: ARG001 - typer calls _show_version with it
+    version: Annotated[
         bool,
         typer.Option(
             "--version", callback=_show_version, is_eager=True, help="Show the version, and exit."
@@ -64,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that lacks a sign shows ? for it; that is no reason to fail.
-        if hasattr(stream, "reconfigure"):
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
         code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
@@ -109,12 +110,10 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
 
 def _misused(error: Exception, words: list[str]) -> InputError:
     """A wrong option or argument."""
-    message = getattr(error, "format_message", error.__str__)()
+    message = " ".join(getattr(error, "format_message", error.__str__)().split())
+    message = message.replace(". Did you mean", ", did you mean").rstrip("?.")
     command = words[0] + " " if words and words[0] in COMMANDS else ""
-    return InputError(
-        " ".join(message.split()).rstrip("."),
-        next_step=f"See pkmcal {command}--help",
-    )
+    return InputError(message, next_step=f"See pkmcal {command}--help")
 
 
 def _too_large() -> InputError:

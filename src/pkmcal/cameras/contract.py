@@ -16,13 +16,17 @@ from functools import cache
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.files import Schema
 
 PositivePair = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
 PositiveSize = tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
+
+LEAST_FOCAL = 0.05
+"""Share of the image's width below which a focal length is none in pixels: a fisheye lens with all
+of its 180 degrees in the picture has a third, a mirror a fifth."""
 
 
 class CameraSchema(Schema):
@@ -31,6 +35,18 @@ class CameraSchema(Schema):
     image_size: PositiveSize = Field(description="[width, height] in pixels")
     focal: PositivePair = Field(description="[fx, fy] in pixels")
     center: tuple[float, float] = Field(description="[cx, cy] in pixels, pixel centres at integers")
+
+    @field_validator("focal")
+    @classmethod
+    def _in_pixels(cls, focal: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
+        """No lens or mirror sees so much that its focal length is a twentieth of the width."""
+        width = info.data.get("image_size", (0, 0))[0]
+        if min(focal) < LEAST_FOCAL * width:
+            raise ValueError(
+                f"the focal length {list(focal)} looks like millimetres; it is wanted in pixels, "
+                "which is millimetres divided by the size of a pixel in mm"
+            )
+        return focal
 
 
 @dataclass(frozen=True)
@@ -72,7 +88,7 @@ class Camera(ABC):
         by_point, by_parameters = self.project_jacobians(rays)
         # on the tangent plane: J d = e with ray . d = 0, a 3x3 system
         system = np.concatenate([by_point, rays[..., None, :]], axis=-2)
-        bad = ~np.isfinite(system).all(axis=(-1, -2))
+        bad: Booleans = ~np.all(np.isfinite(system), axis=(-1, -2))
         system = np.where(bad[..., None, None], np.eye(3), system)
         inverse = np.linalg.inv(system)[..., :, :2]
         inverse = np.where(bad[..., None, None], np.nan, inverse)

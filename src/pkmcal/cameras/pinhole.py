@@ -73,11 +73,11 @@ def undistort(target: Array, k: Array) -> Array:
             if np.nanmax(np.abs(error), initial=0.0) < 1e-14:
                 break
         value, slope, _ = distort(xy, k)
-        good = (np.max(np.abs(value - target), axis=-1) < 1e-11) & _unfolded(xy, slope, k)
+        good = (np.max(np.abs(value - target), axis=-1) < 1e-11) & unfolded(xy, slope, k)
     return np.where(good[..., None], xy, np.nan)
 
 
-def _unfolded(xy: Array, by_xy: Array, k: Array) -> Booleans:
+def unfolded(xy: Array, by_xy: Array, k: Array) -> Booleans:
     """True before the place where the lens model folds the image back.
 
     xy : (..., 2) undistorted; by_xy : (..., 2, 2) derivative of :func:`distort` there. The radial
@@ -177,7 +177,7 @@ class Pinhole(Camera):
         front = z > 1e-9
         xy = points[..., :2] / np.where(front, z, 1.0)[..., None]
         distorted, by_xy, by_k = distort(xy, self.parameters[4:])
-        good = front & _unfolded(xy, by_xy, self.parameters[4:])
+        good = front & unfolded(xy, by_xy, self.parameters[4:])
         return xy, good, distorted, by_xy, by_k
 
     @classmethod

@@ -26,7 +26,7 @@ class Method(StrEnum):
 
 WHAT = {
     "report.html": "open it in a browser",
-    "mechanism.yaml": "the calibrated machine, loads as any mechanism",
+    "mechanism.yaml": "the calibrated machine",
     "calibration.json": "everything, with covariances",
 }
 
@@ -43,7 +43,9 @@ def calibrate(
     ] = Method.BUNDLE,
     seed: console.Seed = 0,
     as_json: console.Json = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing if it is well.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Say nothing if it is well.")
+    ] = False,
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""
     from pkmcal.calibration import calibrate as run
@@ -97,11 +99,11 @@ def tell(out: Console, calibration: Calibration, folder: Path) -> None:
     console.print_points(out, [(mark, verdict.headline)])
     console.print_points(out, [("  [red]•[/]", reason) for reason in verdict.reasons])
     out.print()
-    table = console.plain_table()
-    for headline in figures_of(calibration).headlines():
-        values = ", ".join(_joined(*value) for value in headline.values)
-        table.add_row(headline.question, f"[bold]{values}[/]")
-    out.print(table)
+    cards = figures_of(calibration).headlines()
+    widest = max(len(card.question) for card in cards)
+    for card in cards:
+        values = ", ".join(_joined(*value) for value in card.values)
+        out.print(f"  {card.question:{widest}}  [bold]{values}[/]", soft_wrap=True)
     notes = [*calibration.session.warnings, *verdict.warnings]
     points = [(console.MARKS["doubtful"], note) for note in notes]
     points += [("[cyan]→[/]", advice) for advice in verdict.advice]

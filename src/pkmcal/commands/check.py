@@ -22,6 +22,14 @@ LAST_WORDS = {
     1: "It can be calibrated, but the marked points will cost accuracy.",
     2: "It cannot be calibrated yet.",
 }
+STATION_LEGEND = """\
+   Mismatch: of drawing and pictures, 0 perfect, below 0.34 recognised.
+   Moved: from the pose by hand to the one found. Legs: found in a photograph.
+   White, black: of the legs' pixels. Blur: of the sharpest edges."""
+KINEMATICS = (
+    "The drawing's machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
+    " singular, 1 far). These lengths allow {0.assemblies} assemblies; the one at home is taken."
+)
 
 
 def check(
@@ -45,24 +53,23 @@ def tell(out: Console, found: SessionCheck) -> None:
     """Tables of what was looked at, then what is wrong, then what to do."""
     if found.machine:
         photographs = sum(station.photographs for station in found.stations)
-        out.print(
-            f"[bold]{console.escaped(found.folder)}[/]: {console.escaped(found.machine)},"
-            f" {found.n_legs} legs, {found.configurations} configurations,"
-            f" {photographs} photographs\n"
+        title = (
+            f"{found.folder}: {found.machine}, {found.n_legs} legs,"
+            f" {found.configurations} configurations, {photographs} photographs"
         )
+        console.print_points(out, [("", title)])
+        out.print()
         out.print(_stations(found))
+        out.print(STATION_LEGEND, style="dim")
         out.print()
         out.print(_joints(found.joints))
         out.print()
+    points: list[tuple[str, str]] = []
     if math.isfinite(found.singularity):
-        out.print(
-            f"The drawing's machine closes at all readings. Distance to a singular pose:"
-            f" {found.singularity:.2f} (1 is far, 0 singular). Assemblies at these lengths:"
-            f" {found.assemblies}; the one at home is taken.\n"
-        )
-    marks = {"wrong": "wrong", "doubtful": "doubtful", "note": "note"}
-    console.print_points(out, [(console.MARKS[marks[f.level]], f.text) for f in found.findings])
-    if found.findings:
+        points.append((console.MARKS["good"], KINEMATICS.format(found)))
+    points += [(console.MARKS[f.level], f.text) for f in found.findings]
+    console.print_points(out, points)
+    if points:
         out.print()
     words = LAST_WORDS[found.exit_code].format(shlex.quote(found.folder))
     mark = console.MARKS[("good", "doubtful", "wrong")[found.exit_code]]
@@ -70,11 +77,9 @@ def tell(out: Console, found: SessionCheck) -> None:
 
 
 def _stations(found: SessionCheck) -> Table:
-    table = console.plain_table(show_header=True, header_style="dim")
-    table.add_column("")
-    table.add_column("Station", overflow="fold")
-    for heading in ("Photos", "Mismatch", "Moved", "Legs", "White", "Black", "Blur"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = console.plain_table(
+        "", "Station", "Photos", "Mismatch", "Moved", "Legs", "White", "Black", "Blur"
+    )
     for station in found.stations:
         table.add_row(*_station(station, found))
     return table
@@ -100,15 +105,13 @@ def _station(station: StationCheck, found: SessionCheck) -> list[str]:
 
 
 def _joints(joints: tuple[JointCheck, ...]) -> Table:
-    table = console.plain_table(show_header=True, header_style="dim")
-    table.add_column("")
-    table.add_column("Joint", overflow="fold")
-    for heading in ("Lowest", "Highest", "Of its range", "Near the ends"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = console.plain_table("", "Joint", "Lowest", "Highest", "Of its range", "Near the ends")
+    from pkmcal.check import LITTLE_USED
+
     for joint in joints:
         known = math.isfinite(joint.used)
         table.add_row(
-            console.MARKS["good" if not known or joint.used >= 0.5 else "doubtful"],
+            console.MARKS["good" if not known or joint.used >= LITTLE_USED else "note"],
             console.escaped(joint.name),
             f"{joint.low:.4f}",
             f"{joint.high:.4f}",

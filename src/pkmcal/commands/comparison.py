@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.identify.centres import joint_centres
 from pkmcal.identify.gauge import ThreeCentres, apply
 from pkmcal.identify.problem import State
 from pkmcal.mechanisms import Machine
-from pkmcal.report.centres import joint_centres
 from pkmcal.report.toolpoint import tool_point
 from pkmcal.simulate import Truth, load_truth
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,7 +19,12 @@ Progress = Callable[[str, float], None]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Of all random draws.")]
 
-MARKS = {"good": "[green]✓[/]", "doubtful": "[yellow]![/]", "wrong": "[red]✗[/]"}
+MARKS = {
+    "good": "[green]✓[/]",
+    "note": "[cyan]·[/]",
+    "doubtful": "[yellow]![/]",
+    "wrong": "[red]✗[/]",
+}
 
 
 def out() -> Console:
@@ -38,10 +44,10 @@ def err() -> Console:
 def print_error(sentence: str) -> None:
     """One error to stderr: wrapped and coloured on a terminal, one line elsewhere."""
     console = err()
-    if not console.is_terminal:
+    if console.is_terminal:
+        print_points(console, [("[bold red]Error:[/]", sentence)])
+    else:
         sys.stderr.write(f"Error: {sentence}\n")
-        return
-    console.print(_hanging("Error:", "bold red", sentence))
 
 
 def print_json(data: Mapping[str, Any]) -> None:
@@ -52,28 +58,39 @@ def print_json(data: Mapping[str, Any]) -> None:
 
 
 def print_points(console: Console, points: Iterable[tuple[str, str]]) -> None:
-    """Sentences with a mark before each: (mark in markup, text)."""
+    """Sentences that wrap beside the mark before each: (mark in markup, text)."""
+    from rich.text import Text
+
     for mark, text in points:
-        console.print(_hanging(mark, "", text))
+        before = Text.from_markup(f"{mark} " if mark else "")
+        # Paths and numbers stay whole; a word that is wider than the terminal runs over.
+        lines = textwrap.wrap(
+            text,
+            max(console.width - before.cell_len, 20),
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        rest = ("\n" + " " * before.cell_len).join(lines)
+        console.print(before + Text(rest), soft_wrap=True)
 
 
 def print_files(console: Console, files: Iterable[tuple[str, str]]) -> None:
-    """Paths, each with what it is; on one line each where they fit."""
-    table = plain_table()
-    table.add_column(overflow="fold")
-    table.add_column(style="dim")
+    """Paths, each with what it is."""
+    files = list(files)
+    widest = max(len(path) for path, _ in files)
     for path, what in files:
-        table.add_row(escaped(path), what)
-    console.print(table)
+        console.print(f"  {escaped(path):{widest}}  [dim]{what}[/]", soft_wrap=True)
 
 
-def plain_table(**options: Any) -> Table:
-    """A table without lines, indented by two."""
+def plain_table(*headings: str) -> Table:
+    """A table without lines; columns but the first two, a mark and a name, are numbers."""
     from rich.table import Table
 
-    settings: dict[str, Any] = {"box": None, "pad_edge": False, "show_header": False}
-    settings |= {"padding": (0, 2, 0, 2 if not options.get("title") else 0)}
-    return Table(**{**settings, **options})
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", show_header=bool(headings))
+    for place, heading in enumerate(headings):
+        left = place < 2
+        table.add_column(heading, justify="left" if left else "right", no_wrap=not left)
+    return table
 
 
 def escaped(text: str) -> str:
@@ -90,7 +107,8 @@ def progress(quiet: bool = False) -> Generator[Progress]:
     if quiet or not console.is_terminal:
         yield lambda _text, _share: None
         return
-    from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
 
     columns = (BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Bar(*columns, console=console, transient=True) as bar:
@@ -101,12 +119,3 @@ def progress(quiet: bool = False) -> Generator[Progress]:
 def counted(told: Progress, upto: float = 1.0) -> Callable[[int, int], None]:
     """A callback of photographs done and in all, told as a share of `upto`."""
     return lambda done, total: told(f"Photograph {done} of {total}", upto * done / total)
-
-
-def _hanging(mark: str, style: str, text: str) -> Table:
-    """A mark, and text that wraps beside it."""
-    table = plain_table(padding=(0, 1, 0, 0))
-    table.add_column(style=style, no_wrap=True)
-    table.add_column(overflow="fold")
-    table.add_row(mark, escaped(text))
-    return table

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pkmcal.calibration import Calibration
     from pkmcal.commands.comparison import Comparison
 
+HERE = Path("pkmcal-demo")
 SESSION, CALIBRATION = "session", "calibration"
 FAST_SIZE = (480, 360)
 FAST_CONFIGURATIONS = 4
@@ -29,9 +30,7 @@ SIMULATING = 0.85
 
 
 def demo(
-    out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="DIR", help="Output folder.")
-    ] = Path("pkmcal-demo"),
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Output folder.")] = HERE,
     no_open: Annotated[
         bool, typer.Option("--no-open", help="Do not open the report in a browser.")
     ] = False,
@@ -58,10 +57,9 @@ def demo(
         return exit_code(calibration)
     terminal = console.out()
     photographs = sum(len(station.photographs) for station in calibration.session.stations)
-    terminal.print(
-        f"A {calibration.machine.name} platform, not quite as drawn, in {photographs} simulated"
-        f" photographs: {console.escaped(str(session))}\n"
-    )
+    title = f"A {calibration.machine.name}, not built quite as drawn, in {photographs} simulated"
+    console.print_points(terminal, [("", f"{title} photographs: {session}")])
+    terminal.print()
     tell(terminal, calibration, result)
     _tell_comparison(terminal, comparison)
     if not no_open and _can_show():
@@ -112,17 +110,13 @@ def _calibrate(session: Path, told: console.Progress) -> Calibration:
     from pkmcal.calibration import calibrate
 
     rest = 0.97 - SIMULATING
-    return calibrate(
-        session, progress=lambda text, share: told(text, SIMULATING + rest * share)
-    )
+    return calibrate(session, progress=lambda text, share: told(text, SIMULATING + rest * share))
 
 
 def _tell_comparison(out: Console, found: Comparison) -> None:
     """Errors before and after, and whether the standard deviations were honest."""
     before, after = found.drawing, found.calibrated
-    table = console.plain_table(show_header=True, header_style="dim")
-    for heading in ("Against the truth", "Drawing", "Calibrated", ""):
-        table.add_column(heading, justify="left" if heading[:1] in ("A", "") else "right")
+    table = console.plain_table("", "Against the truth", "Drawing", "Calibrated", "")
     for what, old, new, unit in (
         ("joint centres", before.centre * 1e3, after.centre * 1e3, " mm"),
         ("joint offsets", before.offset * 1e3, after.offset * 1e3, " mm"),
@@ -130,7 +124,7 @@ def _tell_comparison(out: Console, found: Comparison) -> None:
         ("platform's orientation", degrees(before.orientation), degrees(after.orientation), "°"),
     ):
         times = f"{old / new:.0f} times nearer" if new > 0 else ""
-        table.add_row(what, f"{old:.2f}{unit}", f"[bold]{new:.3f}{unit}[/]", times)
+        table.add_row("", what, f"{old:.2f}{unit}", f"[bold]{new:.3f}{unit}[/]", times)
     out.print()
     out.print(table)
     out.print()

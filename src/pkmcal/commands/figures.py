@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.report.centres import Centres, free_of_gauge, joint_centres
+from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.report.headline import Headline, headlines
 from pkmcal.report.toolpoint import ToolPoint, tool_point
 

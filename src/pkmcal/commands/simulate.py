@@ -28,7 +28,9 @@ def simulate(
         Path | None, typer.Option(metavar="FILE", help="A camera file, instead of --size.")
     ] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of a photograph.")] = "800x600",
-    stations: Annotated[int, typer.Option(metavar="N", min=1, max=100, help="Places of the camera.")] = 3,
+    stations: Annotated[
+        int, typer.Option(metavar="N", min=1, max=100, help="Places of the camera.")
+    ] = 3,
     configurations: Annotated[
         int, typer.Option(metavar="N", min=2, max=1000, help="Photographs from each place.")
     ] = 15,

@@ -38,9 +38,10 @@ def json_text(value: Any) -> str:
 
 def _text(value: Any, indent: str) -> str:
     line = _line(value)
-    if not isinstance(value, dict | list) or _is_row(value) or (
-        len(line) <= _WIDEST and not any(isinstance(item, dict | list) for item in _items(value))
-    ):
+    if not isinstance(value, dict | list) or _is_row(value):
+        return line
+    nested = any(isinstance(item, dict | list) for item in _items(value))
+    if len(line) <= _WIDEST and not nested:
         return line
     inner = indent + " "
     parts = [_text(item, inner) for item in _items(value)]

@@ -30,9 +30,10 @@ from pkmcal.identify.residuals import BatchState, Problem
 from pkmcal.identify.solver import FIRST_DAMPING, RESTART_DAMPING, Solution, Stop, minimise
 from pkmcal.mechanisms import Machine
 
-LEAST_SCALE = 0.05
-"""Noise is not believed to be twenty times smaller than stated: noise-free simulations would
-otherwise weigh edges infinitely against readings."""
+LEAST_SCALE = 1.0
+"""The stated noise is never believed to be too large. What moves several edges alike (shading,
+lens) is partly taken up by the parameters, so residuals come out smaller than errors are: scaling
+down by them would promise too much."""
 ROUNDS = 4
 
 
@@ -131,8 +132,8 @@ def bundle(
     start : every unknown's first value, see :func:`start_state`.
     use_drawing : take the drawing's values as measurements with their tolerances; radii
         and edge shifts keep theirs in any case.
-    robust : let go of edges that do not fit. scale_noise : estimate a common factor on the
-        edges' stated noise; otherwise it is taken as it is.
+    robust : let go of edges that do not fit. scale_noise : where the residuals
+        ask for it, enlarge the edges' stated noise by a common factor.
     gauge : frames of the result, three centres by default.
     Raises ResultError where the search cannot start or ends without an answer.
     """

@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
-from pkmcal.identify.problem import Estimate, Measurements
+from pkmcal.identify.problem import Estimate
 from pkmcal.observe.edges import Observation
 
 FAR = 5.0
@@ -37,10 +37,14 @@ class Verdict:
     advice: tuple[str, ...] = ()
 
 
-def judge(measurements: Measurements, observation: Observation, estimate: Estimate) -> Verdict:
-    """The verdict on an estimate of a session."""
-    reasons = tuple(_reasons(measurements, estimate))
-    warnings = tuple(_warnings(measurements, observation, estimate))
+def judge(
+    observation: Observation,
+    estimate: Estimate,
+    method: str = "bundle",
+) -> Verdict:
+    """The verdict on an estimate of a session by a method."""
+    reasons = tuple(_reasons(estimate, method))
+    warnings = tuple(_warnings(observation, estimate))
     if reasons:
         headline = "This calibration should not be used."
     else:
@@ -53,10 +57,16 @@ def judge(measurements: Measurements, observation: Observation, estimate: Estima
     return Verdict(not reasons, headline, reasons, warnings, tuple(_advice(estimate)))
 
 
-def _reasons(measurements: Measurements, estimate: Estimate) -> list[str]:
+def _reasons(estimate: Estimate, method: str) -> list[str]:
     out: list[str] = []
     lost = float(np.mean(estimate.edge_weights < 0.5))
-    if estimate.statistics.noise_scale > TOO_NOISY:
+    if estimate.statistics.noise_scale > TOO_NOISY and method != "bundle":
+        out.append(
+            f"The {method} method leaves the edges {estimate.statistics.noise_scale:.0f} times"
+            " further off than their noise; it is here for comparison. Use the joint method,"
+            " bundle, which is the default."
+        )
+    elif estimate.statistics.noise_scale > TOO_NOISY:
         out.append(
             f"The edges disagree with the machine {estimate.statistics.noise_scale:.1f} times more"
             " than their noise: something that the model leaves out moves them (lens, bending,"
@@ -92,9 +102,7 @@ def _undecided(estimate: Estimate) -> list[str]:
     return [table.names[k] for k in kinematic if estimate.data_share[k] < DECIDED]
 
 
-def _warnings(
-    measurements: Measurements, observation: Observation, estimate: Estimate
-) -> list[str]:
+def _warnings(observation: Observation, estimate: Estimate) -> list[str]:
     out: list[str] = []
     table = estimate.machine.parameters
     change = np.abs(estimate.machine.values - table.drawing) / table.tolerance
@@ -105,8 +113,10 @@ def _warnings(
             f" {FAR:.0f} tolerances (up to {change.max():.0f}): check the drawing and its frame."
         )
     seen = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
-    for leg in np.flatnonzero(seen < 0.3 * np.median(seen)):
-        out.append(f"Leg {leg + 1} was seen in few photographs; its values lean on the readings.")
+    out.extend(
+        f"Leg {leg + 1} was seen in few photographs; its values lean on the readings."
+        for leg in np.flatnonzero(seen < 0.3 * np.median(seen))
+    )
     unseen = int(np.sum(~estimate.configurations))
     if unseen:
         out.append(f"{unseen} configurations had no usable photograph and did not take part.")

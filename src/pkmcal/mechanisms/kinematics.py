@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.geometry.rigid import perturb, pose, rotation
 from pkmcal.arrays import Array, Booleans
+from pkmcal.geometry.rigid import perturb, pose, rotation
 from pkmcal.mechanisms.limbs import LimbLayout, closure, limb_ends, rod_lengths
 
 MAX_STEPS = 60
@@ -84,7 +84,7 @@ def _damped_solve(jac: Array, value: Array, damping: Array) -> Array:
     normal = np.swapaxes(jac, -1, -2) @ jac
     scale = np.einsum("...ii->...i", normal) + 1e-300
     normal = normal + damping[..., None, None] * scale[..., None] * np.eye(jac.shape[-1])
-    gradient = (np.swapaxes(jac, -1, -2) @ value[..., None])
+    gradient = np.swapaxes(jac, -1, -2) @ value[..., None]
     return np.linalg.solve(normal, gradient)[..., 0]
 
 
@@ -97,7 +97,8 @@ def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:
     centres = np.concatenate([theta[..., g.index[:, :3]] for g in layout.platform], axis=-2)
     spread = centres - centres.mean(axis=-2, keepdims=True)
     radius = np.sqrt(np.mean(np.sum(spread**2, axis=-1), axis=-1))
-    scale = np.concatenate([np.repeat(1 / radius[..., None], 3, -1), np.ones((*radius.shape, 3))], -1)
+    radius = np.where(radius > 0, radius, 1.0)[..., None]  # legs that meet in a point turn nothing
+    scale = np.concatenate([np.repeat(1 / radius, 3, -1), np.ones((*radius.shape[:-1], 3))], -1)
     jac = (by_pose * scale[..., None, :]) @ layout.motion
     if layout.n_legs < jac.shape[-1]:  # with fewer rods than freedoms it can always move
         return np.zeros(jac.shape[:-2])

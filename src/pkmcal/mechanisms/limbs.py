@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import CarriedPoint, base_carriers, platform_carriers
 from pkmcal.mechanisms.schema import MechanismDocument
-from pkmcal.arrays import Array, Integers
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,9 @@ def limb_ends(layout: LimbLayout, theta: Array, readings: Array, poses: Array) -
     """
     q = leg_readings(layout, readings)
     a, a_index = _gather(
-        layout, layout.base, [g.carrier.point(theta[..., g.index], q[..., g.legs]) for g in layout.base]
+        layout,
+        layout.base,
+        [g.carrier.point(theta[..., g.index], q[..., g.legs]) for g in layout.base],
     )
     b, b_index = _gather(
         layout,
@@ -147,7 +149,14 @@ def limb_ends(layout: LimbLayout, theta: Array, readings: Array, poses: Array) -
         [g.carrier.point(theta[..., g.index], poses[..., None, :, :]) for g in layout.platform],
     )
     return LimbEnds(
-        a.value, b.value, a_index, b_index, a.by_parameters, b.by_parameters, a.by_motion, b.by_motion
+        a.value,
+        b.value,
+        a_index,
+        b_index,
+        a.by_parameters,
+        b.by_parameters,
+        a.by_motion,
+        b.by_motion,
     )
 
 

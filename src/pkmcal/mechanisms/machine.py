@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from pkmcal.arrays import Array
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import kinematics
 from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
 from pkmcal.mechanisms.limbs import LimbLayout, layout_of
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.mechanisms.rods import CONSTANT, OFFSET
+from pkmcal.mechanisms.rods import CONSTANT, OFFSET, ActuatedLength
 from pkmcal.mechanisms.schema import MechanismDocument
-from pkmcal.arrays import Array
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,12 @@ class Machine:
 
         ``range`` bounds the leg's length, so the drawing's offset is taken off.
         """
-        legs = [leg for leg in self.document.legs if leg.length.actuated]
+        lengths = [leg.length for leg in self.document.legs]
         return np.array(
             [
-                np.subtract(leg.length.range or (np.nan, np.nan), leg.length.offset)
-                for leg in legs
+                np.subtract(length.range or (np.nan, np.nan), length.offset)
+                for length in lengths
+                if isinstance(length, ActuatedLength)
             ]
         ).reshape(-1, 2)
 
@@ -125,9 +126,7 @@ class Machine:
             )
         return found.T_base_platform
 
-    def forward_result(
-        self, joints: Array, start: Array | None = None
-    ) -> kinematics.ForwardResult:
+    def forward_result(self, joints: Array, start: Array | None = None) -> kinematics.ForwardResult:
         """As :meth:`forward`, with convergence and nearness to singularity, nothing raised."""
         readings = _checked(joints, (self.n_joints,), "joints")
         begin = self.home() if start is None else _checked(start, (4, 4), "start")

@@ -28,7 +28,7 @@ class ConstantLength(Schema):
     """``length: {actuated: false, constant: 0.48}``: a rod of one length, metres."""
 
     actuated: Literal[False]
-    constant: Annotated[float, Field(gt=0)]
+    constant: Annotated[float, Field(gt=0, description="the rod's length in metres")]
 
 
 OFFSET = ParameterKind("offset", "m", "offset")

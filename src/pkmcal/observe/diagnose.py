@@ -7,13 +7,15 @@ from itertools import combinations
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import listed
 from pkmcal.observe.stations import GOOD_SCORE, StationPose, View, find_station
 
 CLEARLY_BETTER = 0.75
 """A hypothesis must lower the score to this share of the best other one's to be named."""
+WELL = 0.26
+"""Score below which a station is recognised beyond doubt: two legs mixed up still give 0.29."""
 
 
 def unrecognised(
@@ -22,7 +24,7 @@ def unrecognised(
     rough: list[Array],
     found: list[StationPose],
     all_joints: Array,
-    configurations: list[Array],
+    configurations: list[Integers],
     rng: np.random.Generator,
 ) -> InputError:
     """The error about stations in whose photographs no leg was recognised.
@@ -32,15 +34,16 @@ def unrecognised(
     """
     bad = [i for i, pose in enumerate(found) if not pose.good]
     error = _swapped_stations(names, views, rough, bad, rng)
-    # One recognised station shows that the readings are in order.
-    if error is None and len(bad) == len(found):
-        error = _mixed_columns(views, rough, found, all_joints, configurations, rng)
+    worst = max(bad, key=lambda i: found[i].score)
+    # One well recognised station shows that the readings are in order.
+    if error is None and min(pose.score for pose in found) > WELL:
+        rows = configurations[worst]
+        error = _mixed_columns(views[worst], rough[worst], found[worst], all_joints[rows], rng)
     if error is not None:
         return error
-    worst = max(bad, key=lambda i: found[i].score)
     others = [names[i] for i in bad if i != worst]
     return InputError(
-        f"the machine is not recognised in the photographs of station {names[worst]}"
+        f"the machine is not recognised in the photographs of {names[worst]}"
         + (f", nor in those of {listed(others)}" if others else ""),
         where=f"session.yaml, stations.{names[worst]}",
         found=f"a mismatch of {found[worst].score:.2f} between the drawing's legs and the picture",
@@ -75,24 +78,18 @@ def _swapped_stations(
 
 
 def _mixed_columns(
-    views: list[View],
-    rough: list[Array],
-    found: list[StationPose],
-    all_joints: Array,
-    configurations: list[Array],
-    rng: np.random.Generator,
+    view: View, rough: Array, found: StationPose, joints: Array, rng: np.random.Generator
 ) -> InputError | None:
-    """Readings whose columns stand in another order: turned round, or two of them swapped."""
-    count = all_joints.shape[1]
+    """Readings whose columns stand in another order: turned round, or two of them swapped.
+
+    joints : (K, m) the readings of the view's photographs.
+    """
+    count = joints.shape[1]
     orders = [np.roll(np.arange(count), -r) for r in range(1, count)]
     orders += [_exchanged(count, a, b) for a, b in combinations(range(count), 2)]
-    i = int(np.argmax([len(v.joints) for v in views]))
-    scores = [
-        find_station(_with_joints(views[i], all_joints[configurations[i]][:, o]), rough[i], rng)
-        for o in orders
-    ]
+    scores = [find_station(_with_joints(view, joints[:, o]), rough, rng) for o in orders]
     best = int(np.argmin([s.score for s in scores]))
-    if not scores[best].good or scores[best].score > CLEARLY_BETTER * found[i].score:
+    if not scores[best].good or scores[best].score > CLEARLY_BETTER * found.score:
         return None
     return _other_order(orders[best], turned=best < count - 1)
 
@@ -117,7 +114,7 @@ def _other_order(order: Array, turned: bool) -> InputError:
     )
 
 
-def _exchanged(count: int, a: int, b: int) -> Array:
+def _exchanged(count: int, a: int, b: int) -> Integers:
     order = np.arange(count)
     order[[a, b]] = order[[b, a]]
     return order

@@ -10,6 +10,7 @@ not say where the machine is.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,9 @@ class DistanceTables:
     tables: Array
     scale: float
 
-    def look(self, direction: Integers, pixel: Array, photograph: Integers) -> tuple[Array, Booleans]:
+    def look(
+        self, direction: Integers, pixel: Array, photograph: Integers
+    ) -> tuple[Array, Booleans]:
         """Distances (reduced px) at full-size pixels (..., 2), and which lie in the photograph.
 
         direction, photograph : (...) table numbers. Nearest table entry; callers that need a
@@ -61,7 +64,8 @@ class DistanceTables:
         fx, fy = (place[..., i] - corner[..., i] for i in (0, 1))
         x, y = corner[..., 0], corner[..., 1]
         at = self.tables
-        upper = (1 - fx) * at[photograph, direction, y, x] + fx * at[photograph, direction, y, x + 1]
+        upper = (1 - fx) * at[photograph, direction, y, x]
+        upper = upper + fx * at[photograph, direction, y, x + 1]
         lower = (1 - fx) * at[photograph, direction, y + 1, x]
         lower = lower + fx * at[photograph, direction, y + 1, x + 1]
         return (1 - fy) * upper + fy * lower, inside
@@ -85,7 +89,7 @@ def distance_tables(images: list[Integers]) -> DistanceTables:
     return DistanceTables(np.stack([_tables_of(image, still) for image in small]), scale)
 
 
-def _tables_of(image: Integers, still: Array | None) -> Array:
+def _tables_of(image: Any, still: Array | None) -> Array:
     """Distance tables (DIRECTIONS, h, w) of one reduced photograph."""
     import cv2
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,9 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         raise _broken(label, "a PNG file that ends early")
     if data[:2] == b"\xff\xd8" and JPEG_END not in data[-64:]:
         raise _broken(label, "a JPEG file that ends early")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data else None
+    # a turned picture would no longer be its camera's: flags that ask for turning are ignored
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if image is None:
         raise _broken(label, "no readable image")
     if (image.shape[1], image.shape[0]) != tuple(image_size):

@@ -30,7 +30,7 @@ from pkmcal.observe.search import SEARCH_SIGMA, sample, search_legs
 
 SEARCH_SAMPLES = 12
 SAMPLES = 192
-"""Points along an edge whose profiles are taken, about one a pixel: faint edges need the average."""
+"""Points along an edge whose profiles are taken, about one a pixel: faint edges need it."""
 SEGMENTS = 8
 """Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
 FEWEST_SHARE = 1 / 3
@@ -99,7 +99,7 @@ def search(
     rejected = [
         Rejection(photographs.station, int(photographs.configuration[k]), int(leg), -1, -1, why)
         for k, leg in zip(*np.nonzero(~places.clear), strict=True)
-        for why in [_search_reason(places.share[k, leg])]
+        for why in [_search_reason(float(places.share[k, leg]))]
         if leg in tubes.leg
     ]
     nowhere = np.zeros((0, 2)), np.zeros(0, dtype=int)
@@ -129,16 +129,15 @@ def measure(
     grey = sample(photographs.images, pixel)
     middles = np.arange(SEGMENTS) * (SAMPLES // SEGMENTS) + SAMPLES // SEGMENTS // 2
     places = _at_samples(points, middles)
-    full, across = _segment_profiles(grey, clear, places.gain * machine.values[tubes.radius][:, None])
+    half_width = places.gain * machine.values[tubes.radius][:, None]
+    full, across = _segment_profiles(grey, clear, half_width)
     if blur is None:
         blur = profiles.estimate_blur(across) if full.any() else BLUR
     at = profiles.locate(across, blur)
     position, sigma, found = np.zeros(full.shape), np.ones(full.shape), full.copy()
     position[full], sigma[full], found[full] = at.position, at.sigma, at.found
     fits = fit_edges(places, position, sigma, found)
-    edges = edge_set(
-        places, fits, tubes, photographs.station, photographs.configuration, fits.good
-    )
+    edges = edge_set(places, fits, tubes, photographs.station, photographs.configuration, fits.good)
     rejected = _rejections(photographs, tubes, full, found, fits)
     k, e, s = np.nonzero(fits.used & fits.good[..., None])
     xy = places.pixel[k, e, s] + position[k, e, s, None] * places.outward[k, e, s]
@@ -183,9 +182,7 @@ def _segment_profiles(
 def _at_samples(points: EdgePoints, samples: Integers) -> EdgePoints:
     """The same edges at some of their samples only."""
     per_sample = {
-        f.name: getattr(points, f.name)[:, :, samples]
-        for f in fields(points)
-        if f.name != "normal"
+        f.name: getattr(points, f.name)[:, :, samples] for f in fields(points) if f.name != "normal"
     }
     return replace(points, **per_sample)
 

@@ -53,11 +53,13 @@ def fit_edges(
     rows = np.where(found[..., None], np.nan_to_num(points.by_normal() @ basis), 0.0)
     value = np.where(found, position, 0.0)
     base = np.where(found, 1 / (sigma**2 + FLOOR**2), 0.0)
+    turn, normal = _weighted(rows, value, base)
+    off2 = _squared_misfit(rows, value, turn, base)
     weight = base
     for _ in range(rounds):
-        turn, normal = _weighted(rows, value, weight)
-        off2 = (value - (rows @ turn[..., None])[..., 0]) ** 2 * base
         weight = base / (1 + off2 / 4.0)  # Cauchy, two sigmas
+        turn, normal = _weighted(rows, value, weight)
+        off2 = _squared_misfit(rows, value, turn, base)
     used = found & (off2 < 9.0)
     count = used.sum(axis=-1)
     spread2 = np.sum(weight * off2, axis=-1) / np.maximum(np.sum(weight, axis=-1), 1e-30)
@@ -73,6 +75,10 @@ def fit_edges(
 def _middle_ray(points: EdgePoints) -> Array:
     ray = points.point[..., points.point.shape[-2] // 2, :]
     return ray / np.sqrt(dot(ray, ray))[..., None]
+
+
+def _squared_misfit(rows: Array, value: Array, turn: Array, base: Array) -> Array:
+    return (value - (rows @ turn[..., None])[..., 0]) ** 2 * base
 
 
 def _weighted(rows: Array, value: Array, weight: Array) -> tuple[Array, Array]:

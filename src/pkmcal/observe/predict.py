@@ -56,7 +56,7 @@ def tubes_of(machine: Machine) -> TubeList:
 
 @dataclass(frozen=True)
 class LegsInCamera:
-    """Axes of the legs as a station sees them: a, b (K, L, 3) ends and u (K, L, 3), camera frame."""
+    """Leg axes as a station sees them: ends a, b and directions u, (..., L, 3), camera frame."""
 
     a: Array
     b: Array
@@ -127,9 +127,7 @@ def edge_points(
     )
 
 
-def plane_normals(
-    a: Array, u: Array, radius: Array, tubes: TubeList
-) -> tuple[Array, Booleans]:
+def plane_normals(a: Array, u: Array, radius: Array, tubes: TubeList) -> tuple[Array, Booleans]:
     """Edge planes (..., E, 3) of axes given per edge, and where the leg can be seen at all."""
     m = cross(a, u)
     distance = np.sqrt(dot(m, m))

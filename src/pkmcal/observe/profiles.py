@@ -53,7 +53,8 @@ FAINT = 0.25
 @dataclass(frozen=True)
 class ProfileEdges:
     """Edge positions in profiles: position (...) px outward from the predicted edge, its
-    standard deviation sigma (...) px from grey-level noise, and found (...)."""
+    standard deviation sigma (...) px from grey-level noise, and found (...).
+    """
 
     position: Array
     sigma: Array
@@ -67,7 +68,7 @@ def profile_offsets() -> Array:
 
 @lru_cache(maxsize=512)
 def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
-    """Places x (px outward of the edge) and the model's five brightnesses there, blurred, (n, 5)."""
+    """Places x (px outward of the edge), (n,), and the five brightnesses there, blurred, (n, 5)."""
     pitch = 0.05
     place = np.arange(-INSIDE - 8, OUTSIDE + 8, pitch)
     inside = (place < 0).astype(float)

@@ -57,17 +57,19 @@ class LegPlaces:
 
 
 def sample(images: list[Integers], pixel: Array, cubic: bool = True) -> Array:
-    """Grey levels of K images at pixels (K, ..., 2), (K, ...); any order of points."""
+    """Grey levels of K images at pixels (K, E, ..., 2): (K, E, ...), interpolated."""
     import cv2
 
     kind = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
-    flat = np.nan_to_num(pixel.reshape(len(images), -1, pixel.shape[-3], 2), nan=-9.0)
-    flat = np.ascontiguousarray(flat.reshape(len(images), -1, pixel.shape[-2], 2), np.float32)
-    out = [
-        cv2.remap(image, at[..., 0], at[..., 1], kind, borderMode=cv2.BORDER_REPLICATE)
-        for image, at in zip(images, flat, strict=True)
-    ]
-    return np.stack(out).reshape(pixel.shape[:-1])
+    # one row an edge: cv2.remap takes at most 32767 rows and columns
+    flat = np.nan_to_num(pixel.reshape(*pixel.shape[:2], -1, 2), nan=-9.0).astype(np.float32)
+    out = np.empty(flat.shape[:3], dtype=np.float32)
+    for image, at, grey in zip(images, flat, out, strict=True):
+        x, y = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
+        # floats, because cv2 rounds what it interpolates in bytes to whole grey levels
+        levels = image.astype(np.float32)
+        cv2.remap(levels, x, y, kind, dst=grey, borderMode=cv2.BORDER_REPLICATE)
+    return out.reshape(pixel.shape[:-1])
 
 
 def search_legs(
@@ -84,7 +86,7 @@ def search_legs(
     legs = range(tubes.leg.max() + 1)
     place = place_on_leg(points.along, clear, tubes)
     scores = np.zeros((len(images), tubes.leg.max() + 1, len(TILTS), len(steps)), np.float32)
-    k, e, n = np.indices(clear.shape, sparse=True)
+    k, e, n = np.ogrid[: clear.shape[0], : clear.shape[1], : clear.shape[2]]
     for i, tilt in enumerate(TILTS):
         at = sign[:, None, None] * (steps + tilt * place[..., None])
         column = np.rint(at - offsets[0]).astype(np.intp)
@@ -109,7 +111,7 @@ def gradient_strength(
     offsets = np.arange(-np.ceil(reach), np.ceil(reach) + 1)
     wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]])
     pixel = points.pixel[..., None, :] + wide[:, None] * points.outward[..., None, :]
-    grey = sample(images, pixel, cubic=False).astype(np.float32)
+    grey = sample(images, pixel, cubic=False)
     slope = np.abs(grey[..., 2:] - grey[..., :-2]) / 2
     return slope / (slope + GRADIENT_HALF), offsets
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Integers
+from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.observe.edges import Observation
-from pkmcal.identify.centres import Centres
 from pkmcal.report.residuals import KEPT
 from pkmcal.report.toolpoint import ToolPoint
 from pkmcal.report.wording import brief, count, number

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.observe.edges import Observation
 from pkmcal.report import (
@@ -23,7 +24,6 @@ from pkmcal.report import (
     toolpoint,
     wording,
 )
-from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.session import Session
 
 if TYPE_CHECKING:

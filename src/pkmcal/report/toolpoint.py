@@ -8,9 +8,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, pose_difference
+from pkmcal.identify.centres import Centres
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import closure
-from pkmcal.identify.centres import Centres
 
 
 @dataclass(frozen=True)

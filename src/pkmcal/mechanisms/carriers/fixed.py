@@ -6,13 +6,13 @@ from typing import ClassVar, Literal, final
 
 import numpy as np
 
+from pkmcal.arrays import Array
 from pkmcal.files import Schema
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
     CarriedPoint,
     ParameterKind,
 )
-from pkmcal.arrays import Array
 
 
 class FixedDocument(Schema):

@@ -6,11 +6,11 @@ from typing import ClassVar, Literal, final
 
 import numpy as np
 
-from pkmcal.geometry.rigid import skew
+from pkmcal.arrays import Array
 from pkmcal.files import Schema
+from pkmcal.geometry.rigid import skew
 from pkmcal.mechanisms.carriers.contract import CarriedPoint, PlatformCarrier
 from pkmcal.mechanisms.carriers.fixed import CENTER
-from pkmcal.arrays import Array
 
 
 class RigidDocument(Schema):

@@ -1,0 +1,34 @@
+"""Where the joint estimate starts: the better of what is known and the papers' own solution."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.errors import PkmcalError
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.four_step import four_step
+from pkmcal.identify.gauge import ThreeCentres
+from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.robust import norms
+from pkmcal.mechanisms import Machine
+
+
+def better_start(machine: Machine, measurements: Measurements, known: State) -> State:
+    """``known``, or [A]'s four steps on the edges where these explain the edges better.
+
+    The four steps need no first guess, so they find the way back when the drawing or an earlier
+    estimate has gone astray. Judged by the median misfit, which wrong edges do not move.
+    """
+    try:
+        steps = four_step(machine, measurements, T_camera_base_guess=known.T_camera_base)
+    except PkmcalError:  # too few legs, directions or configurations for the four steps
+        return known
+    return min(known, steps, key=lambda state: misfit(machine, measurements, state))
+
+
+def misfit(machine: Machine, measurements: Measurements, state: State) -> float:
+    """Median Mahalanobis distance of the edges from their prediction; infinite where none is."""
+    assembled = assemble(machine, measurements, ThreeCentres())
+    distance = norms(assembled.problem, batch_of(machine, assembled, state))
+    found = distance[np.isfinite(distance)]
+    return float(np.median(found)) if found.size else np.inf

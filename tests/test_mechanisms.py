@@ -1,0 +1,441 @@
+"""Mechanism files, the catalogue, carriers and the parameter table."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pkmcal.errors import InputError
+from pkmcal.files import parse_yaml, validate
+from pkmcal.geometry.rigid import perturb
+from pkmcal.mechanisms import (
+    MechanismDocument,
+    catalogue,
+    load_mechanism,
+    machine_from_document,
+    mechanism_text,
+)
+from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.limbs import MOTIONS
+
+
+@pytest.fixture(params=sorted(catalogue()), scope="module")
+def machine(request):
+    return load_mechanism(request.param)
+
+
+def read(text):
+    return machine_from_document(validate(parse_yaml(text, Path("m.yaml")), MechanismDocument))
+
+
+# The catalogue
+
+
+def test_catalogue_machines_carry_their_files_name(machine):
+    assert machine.name in catalogue()
+    assert load_mechanism(catalogue()[machine.name]).name == machine.name
+
+
+def test_catalogue_machines_can_be_assembled(machine):
+    """Home closes at readings in range, far from a singular pose."""
+    home = machine.home()
+    readings = machine.inverse(home)
+    found = machine.forward_result(readings)
+    assert found.converged
+    assert found.singularity > 0.1
+    np.testing.assert_allclose(found.T_base_platform, home, atol=1e-11)
+    low, high = machine.joint_ranges.T
+    assert not ((readings < low) | (readings > high)).any()
+
+
+def test_catalogue_tubes_are_as_long_as_the_legs(machine):
+    """A leg that an edge is looked for on is there over the whole range of its length."""
+    for leg in machine.document.legs:
+        for tube in leg.tubes:
+            assert tube.radius < 0.1
+            if leg.length.actuated and leg.length.range:
+                assert tube.start < leg.length.range[0]
+
+
+# Files there and back
+
+
+def test_a_written_mechanism_is_the_same(machine, tmp_path):
+    text = mechanism_text(machine)
+    (tmp_path / "m.yaml").write_text(text)
+    again = load_mechanism(tmp_path / "m.yaml")
+    assert again.document == machine.document
+    assert again.parameters.names == machine.parameters.names
+    np.testing.assert_array_equal(again.values, machine.values)
+    assert mechanism_text(again) == text
+
+
+def test_calibrated_values_come_back_to_the_last_bit(machine, tmp_path):
+    rng = np.random.default_rng(0)
+    changed = machine.with_values(machine.values + 1e-3 * rng.normal(size=len(machine.values)) ** 2)
+    (tmp_path / "m.yaml").write_text(mechanism_text(changed))
+    again = load_mechanism(tmp_path / "m.yaml")
+    np.testing.assert_array_equal(again.values, changed.values)
+    np.testing.assert_array_equal(machine.values, machine.parameters.drawing)
+
+
+def at_path(document, name):
+    """What stands in a file's fields at a parameter's name, by the rule of docs/files.md."""
+    node = document
+    for key, number in re.findall(r"([a-z]+)|\[(\d+)\]", name):
+        if number:
+            node = node[int(number) - 1]
+        elif isinstance(node, list):
+            node = node["xyz".index(key)]
+        else:
+            node = node[key]
+    return node
+
+
+def test_parameter_names_are_paths_in_the_file(machine):
+    """Each value at its own place, seen by giving every parameter another value."""
+    unlike = machine.values + 1e-3 * np.arange(1, len(machine.values) + 1)
+    names = machine.parameters.names
+    assert len(set(names)) == len(names)
+    for values in (machine.values, unlike):
+        document = machine.with_values(values).to_document()
+        assert [at_path(document, name) for name in names] == values.tolist()
+
+
+def test_every_number_of_the_drawing_is_a_parameter():
+    """A hexapod's file holds 6 (3 + 3 + 1) kinematic numbers and two radii a leg."""
+    machine = load_mechanism("gough-stewart")
+    table = machine.parameters
+    assert len(table) == 6 * (3 + 3 + 1 + 2)
+    assert [len(table.of_kind(kind)) for kind in ("center", "offset", "radius")] == [36, 6, 12]
+    assert set(table.units) == {"m"}
+    assert table.names[:3] == tuple(f"legs[1].base.center.{axis}" for axis in "xyz")
+    tolerances = [table.tolerance[table.of_kind(k)] for k in ("center", "offset", "radius")]
+    assert [t.tolist() for t in tolerances] == [[0.002] * 36, [0.002] * 6, [0.0001] * 12]
+
+
+# A small machine with everything in it
+
+SMALL = """\
+name: small
+motion: planar
+legs:
+  - base: {joint: spherical, center: [0.0, 0.1, 0.2]}
+    platform: {joint: universal, center: [0.3, 0.4, 0.5]}
+    length: {actuated: true, offset: 0.05, range: [0.2, 0.6]}
+    tubes: [{radius: 0.01, from: 0.02, to: 0.2}, {radius: 0.008, from: 0.2, to: 0.4}]
+  - base: {joint: universal, center: [1.0, 1.1, 1.2]}
+    platform: {joint: spherical, center: [1.3, 1.4, 1.5]}
+    length: {actuated: false, constant: 0.7}
+  - base: {joint: universal, center: [2.0, 2.1, 2.2]}
+    platform: {joint: spherical, center: [2.3, 2.4, 2.5]}
+    length: {actuated: true}
+    tubes: [{radius: 0.006, from: 0.0, to: 0.1}]
+"""
+
+
+def test_what_a_machine_tells():
+    machine = read(SMALL)
+    assert (machine.n_legs, machine.n_joints) == (3, 2)
+    np.testing.assert_array_equal(
+        machine.base_centers(), [[0, 0.1, 0.2], [1, 1.1, 1.2], [2, 2.1, 2.2]]
+    )
+    np.testing.assert_array_equal(
+        machine.platform_centers(), [[0.3, 0.4, 0.5], [1.3, 1.4, 1.5], [2.3, 2.4, 2.5]]
+    )
+    assert [r.tolist() for r in machine.radii()] == [[0.01, 0.008], [], [0.006]]
+    # a range is of the leg's length, a reading is without the offset
+    np.testing.assert_allclose(machine.joint_ranges, [[0.15, 0.55], [np.nan, np.nan]])
+    assert [n for n in machine.parameters.names if "length" in n] == [
+        "legs[1].length.offset",
+        "legs[2].length.constant",
+        "legs[3].length.offset",
+    ]
+
+
+def test_a_missing_tolerance_has_its_documented_value():
+    table = read(SMALL).parameters
+    assert dict(zip(table.kinds, table.tolerance.tolist(), strict=True)) == {
+        "center": 0.002,
+        "offset": 0.002,
+        "radius": 0.0001,
+    }
+
+
+# Fixed and tied parameters
+
+NAMES = ("legs[1].length.offset", "legs[3].length.offset", "legs[2].length.constant")
+
+
+def roles(fixed=(), tied=()):
+    return read(SMALL).parameters.with_roles(fixed, tied)
+
+
+def together(matrix, table):
+    """Which of NAMES move with which, as the free matrix has it; None where held."""
+    rows = matrix[[table.index(name) for name in NAMES]]
+    return [int(np.argmax(row)) if row.any() else None for row in rows]
+
+
+def test_without_roles_every_parameter_is_free():
+    table = roles()
+    np.testing.assert_array_equal(table.free_matrix(), np.eye(len(table)))
+
+
+def test_fixed_parameters_have_no_column():
+    table = roles(fixed=NAMES[:2])
+    matrix = table.free_matrix()
+    assert matrix.shape == (len(table), len(table) - 2)
+    assert not matrix[[table.index(n) for n in NAMES[:2]]].any()
+    np.testing.assert_array_equal(matrix.sum(axis=0), 1)
+
+
+def test_tied_parameters_change_by_the_same_amount():
+    table = roles(tied=(NAMES[:2],))
+    matrix = table.free_matrix()
+    assert matrix.shape == (len(table), len(table) - 1)
+    values = table.drawing + matrix @ np.arange(1.0, matrix.shape[1] + 1)
+    moved = values - table.drawing
+    a, b, c = (moved[table.index(name)] for name in NAMES)
+    assert a == pytest.approx(b)
+    assert a != pytest.approx(c)
+    assert np.linalg.matrix_rank(matrix) == matrix.shape[1]
+
+
+@pytest.mark.parametrize(
+    "tied",
+    [
+        (NAMES,),
+        ((NAMES[0], NAMES[1]), (NAMES[1], NAMES[2])),
+        ((NAMES[1], NAMES[2]), (NAMES[0], NAMES[1])),
+        ((NAMES[2], NAMES[0]), (NAMES[1], NAMES[2])),
+    ],
+)
+def test_ties_that_share_a_name_are_one_tie(tied):
+    table = roles(tied=tied)
+    matrix = table.free_matrix()
+    assert matrix.shape[1] == len(table) - 2
+    assert len(set(together(matrix, table))) == 1
+
+
+def test_a_tie_to_a_fixed_parameter_is_fixed():
+    table = roles(fixed=NAMES[1:2], tied=(NAMES[:2],))
+    first, second, third = together(table.free_matrix(), table)
+    assert first is second is None
+    assert third is not None
+
+
+def test_roles_in_a_file():
+    text = SMALL + f"fixed: ['{NAMES[2]}']\ntied: [['{NAMES[0]}', '{NAMES[1]}']]\n"
+    table = read(text).parameters
+    first, second, third = together(table.free_matrix(), table)
+    assert first == second
+    assert third is None
+
+
+def test_an_unknown_name_is_told_with_the_nearest():
+    with pytest.raises(InputError) as caught:
+        roles(fixed=("legs[1].length.ofset",))
+    assert str(caught.value) == (
+        "there is no parameter 'legs[1].length.ofset'; expected a name such as "
+        "'legs[1].length.offset'. Write the parameter as its path in the mechanism file, legs "
+        "from 1."
+    )
+
+
+# Carriers: one conformance test for every kind
+
+CARRIERS = sorted(
+    {("base", c) for c in base_carriers().values()}
+    | {("platform", c) for c in platform_carriers().values()},
+    key=lambda pair: (pair[0], pair[1].__name__),
+)
+
+
+@pytest.mark.parametrize(("side", "carrier"), CARRIERS)
+def test_carriers_have_exact_derivatives(side, carrier):
+    """Sixth-order differences with steps of 1e-3: 1e-13 by rounding of lengths about a metre."""
+    rng = np.random.default_rng(0)
+    parameters = rng.normal(size=(5, len(carrier.parameters)))
+    motion = rng.normal(size=(4, 1)) if side == "base" else perturb(np.eye(4), rng.normal(size=6))
+    at = carrier.point(parameters, motion)
+    lead = at.value.shape[:-1]
+    assert at.by_parameters.shape == (*lead, 3, len(carrier.parameters))
+
+    def differences(of, step=1e-3):
+        weights = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
+        return sum(w * (of(i * step).value - of(-i * step).value) for i, w in weights) / step
+
+    for k, by in enumerate(np.eye(parameters.shape[1])):
+        oracle = differences(lambda d, by=by: carrier.point(parameters + d * by, motion))
+        np.testing.assert_allclose(at.by_parameters[..., k], oracle, atol=1e-11)
+    if side == "base":
+        oracle = differences(lambda d: carrier.point(parameters, motion + d))
+        np.testing.assert_allclose(at.by_motion, oracle, atol=1e-11)
+        return
+    for k, by in enumerate(np.eye(6)):
+        oracle = differences(lambda d, by=by: carrier.point(parameters, perturb(motion, d * by)))
+        np.testing.assert_allclose(at.by_motion[..., k], oracle, atol=1e-11)
+
+
+@pytest.mark.parametrize(("side", "carrier"), CARRIERS)
+def test_carriers_broadcast(side, carrier):
+    """Legs last, configurations and machines before them; a batch equals its members."""
+    rng = np.random.default_rng(1)
+    parameters = rng.normal(size=(2, 1, 3, len(carrier.parameters)))
+    tail = () if side == "base" else (4, 4)
+    motion = (
+        rng.normal(size=(4, 3))
+        if side == "base"
+        else np.stack([perturb(np.eye(4), d) for d in rng.normal(size=(4, 6))])[:, None]
+    )
+    batch = carrier.point(parameters, motion)
+    assert batch.value.shape == (2, 4, 3, 3)
+    spread = np.broadcast_to(motion, (4, 3, *tail))
+    for r, k, leg in np.ndindex(2, 4, 3):
+        one = carrier.point(parameters[r, 0, leg], np.asarray(spread[k, leg]))
+        for got, single in zip(batch, one, strict=True):
+            full = np.broadcast_to(got, (2, 4, 3, *got.shape[3:]))
+            np.testing.assert_allclose(full[r, k, leg], single, atol=1e-15)
+
+
+# Faults of files
+
+
+@pytest.mark.parametrize(
+    ("text", "instead", "sentence"),
+    [
+        (
+            "from: 0.02, to: 0.2}",
+            "from: 0.02, to: 0.01}",
+            "m.yaml, line 7, legs[1].tubes[1]: tube's 'to' should be greater than its 'from'.",
+        ),
+        (
+            "radius: 0.008",
+            "radius: -0.008",
+            "m.yaml, line 7, legs[1].tubes[2].radius: this value cannot be used; found -0.008, "
+            "expected a number above 0.",
+        ),
+        (
+            "[0.2, 0.6]",
+            "[0.6, 0.2]",
+            "m.yaml, line 6, legs[1].length.range: should be two increasing positive lengths "
+            "[min, max].",
+        ),
+        (
+            "motion: planar\n",
+            "motion: planar\nmotion: spatial\n",
+            "m.yaml, line 3, motion: the key motion stands twice, on lines 2 and 3. Remove one "
+            "of the two.",
+        ),
+        (
+            "name: small\nmotion: planar",
+            "nam: small\nmotoin: planar",
+            "m.yaml, line 1, nam: this key is not known; found nam, expected name (known here: "
+            "fixed, home, legs, motion, name, tied, tolerance). Then look at line 2, motoin.",
+        ),
+        (
+            "[0.0, 0.1, 0.2]",
+            "[0.0, .nan, 0.2]",
+            "m.yaml, line 4, legs[1].base.center[2]: this is not a finite number; found nan, "
+            "expected a number.",
+        ),
+        (
+            "[0.0, 0.1, 0.2]",
+            "[0.0, 0.1]",
+            "m.yaml, line 4, legs[1].base.center: this has too few entries; found [0.0, 0.1], "
+            "expected 3 entries.",
+        ),
+        (
+            "constant: 0.7",
+            "constant: 0",
+            "m.yaml, line 10, legs[2].length.constant: this value cannot be used; found 0, "
+            "expected a number above 0.",
+        ),
+        (
+            "actuated: true, offset",
+            "actuated: false, offset",
+            "m.yaml, line 6, legs[1].length.constant: this is missing; expected the rod's length "
+            "in metres. Then look at line 6, legs[1].length.offset and line 6, "
+            "legs[1].length.range.",
+        ),
+        (
+            "motion: planar",
+            "motion: planar\ntied: [['legs[1].length.offset']]",
+            "m.yaml, line 3, tied[1]: this has too few entries; found ['legs[1].length.offset'], "
+            "expected at least 2.",
+        ),
+        (
+            "motion: planar",
+            "motion: planar\nfixed: ['legs[3].base.centre.z']",
+            "m.yaml: there is no parameter 'legs[3].base.centre.z'; expected a name such as "
+            "'legs[3].base.center.z'. Write the parameter as its path in the mechanism file, "
+            "legs from 1.",
+        ),
+        (
+            "name: small\n",
+            "name: small\ntolerance: {center: 0.0}\n",
+            "m.yaml, line 2, tolerance.center: this value cannot be used; found 0.0, "
+            "expected a number above 0.",
+        ),
+    ],
+)
+def test_faults_of_mechanism_files(tmp_path, text, instead, sentence):
+    assert text in SMALL
+    (tmp_path / "m.yaml").write_text(SMALL.replace(text, instead, 1))
+    assert refused(tmp_path / "m.yaml") == sentence
+
+
+def refused(source):
+    with pytest.raises(InputError) as caught:
+        load_mechanism(source)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "instead", "place", "known"),
+    [
+        ("joint: spherical", "joint: ball", "m.yaml, line 4, legs[1].base", base_carriers()),
+        (
+            "joint: universal",
+            "joint: ball",
+            "m.yaml, line 5, legs[1].platform",
+            platform_carriers(),
+        ),
+        ("motion: planar", "motion: flat", "m.yaml, line 2, motion", MOTIONS),
+    ],
+)
+def test_kinds_that_are_not_known_are_told_with_those_that_are(
+    tmp_path, text, instead, place, known
+):
+    (tmp_path / "m.yaml").write_text(SMALL.replace(text, instead, 1))
+    message = refused(tmp_path / "m.yaml")
+    assert message.startswith(place)
+    assert instead.split()[-1] in message
+    assert all(name in message for name in known)
+
+
+def test_a_machine_has_two_legs_and_one_that_is_driven(tmp_path):
+    top, *legs = SMALL.split("  - ")
+    for few, reason in (
+        (legs[:1], "a parallel machine has at least two legs"),
+        ([legs[1]] * 2, "a machine has at least one leg with actuated: true"),
+    ):
+        (tmp_path / "m.yaml").write_text("  - ".join([top, *few]))
+        assert refused(tmp_path / "m.yaml") == f"m.yaml, line 3, legs: {reason}."
+
+
+def test_sources_that_are_not_there(tmp_path):
+    assert refused("gough-stuart") == (
+        "no built-in machine and no file has this name; found gough-stuart, expected gough-stewart."
+    )
+    message = refused("nothing like it")
+    assert all(name in message for name in catalogue())
+    (tmp_path / "machine.yaml").write_text(SMALL)
+    assert refused(tmp_path / "machin.yaml") == (
+        f"machin.yaml: the file does not exist; expected a file {tmp_path / 'machin.yaml'} "
+        "(there is machine.yaml)."
+    )
