@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.errors import InputError, ResultError
+from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.files import listed
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.paper_methods import Method as PaperMethod
@@ -181,7 +181,16 @@ def label_of(folder: Path, path: Path) -> str:
 
 def platform_poses(session: Session) -> Array:
     """T_base_platform (K, 4, 4) of all configurations by the drawing, or which one has none."""
-    found = session.machine.forward_result(session.joints)
+    try:
+        found = session.machine.forward_result(session.joints)
+    except GeometryError as error:  # the drawing is the user's: it is at fault
+        raise InputError(
+            error.what,
+            where=session.document["mechanism"],
+            found=error.found,
+            expected=error.expected,
+            next_step=error.next_step,
+        ) from None
     if found.converged.all():
         return found.T_base_platform
     bad = [session.configurations[k] for k in np.flatnonzero(~found.converged)]

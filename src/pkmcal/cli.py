@@ -11,13 +11,13 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, cast
 
 import typer
 
 from pkmcal import __version__
-from pkmcal.commands import COMMANDS
+from pkmcal.commands import calibrate, check, demo, new, simulate
 from pkmcal.commands.console import print_error
 from pkmcal.errors import InputError, PkmcalError
 
@@ -29,6 +29,15 @@ DEBUG = "PKMCAL_DEBUG"
 
 _UsageError = cast("type[Exception]", typer.BadParameter.__bases__[0])
 """The base of all complaints about options; typer gives it no public name."""
+
+COMMANDS: dict[str, Callable[..., int]] = {
+    "demo": demo.demo,
+    "new": new.new,
+    "check": check.check,
+    "calibrate": calibrate.calibrate,
+    "simulate": simulate.simulate,
+}
+"""In the order of the help: the order in which a newcomer needs them."""
 
 app = typer.Typer(
     name="pkmcal",
@@ -70,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
         sys.stdout.flush()
-    except BrokenPipeError:
+    except (BrokenPipeError, SystemExit):  # typer and Rich leave by the latter
         return _reader_left()
     except KeyboardInterrupt:
         code = INTERRUPTED

@@ -63,6 +63,7 @@ def refine(image: Integers, start: Array, axes: Array, window: Window) -> Corner
     widened = np.maximum(1.0, LEAST_RADIUS / np.maximum(window.reach * scale, 1e-6))
     offsets, grey, inside = _pixels(image, start, axes, window.reach * widened)
     weight = _weights(offsets, axes, window, widened) * inside
+    offsets, grey, weight = _packed(offsets, grey, weight)
     first = _first(grey, weight, axes)
     p, residual = _fit(grey, weight, offsets, first, window.saddle)
     return _judged(start, p, residual, grey, weight, scale, window.saddle, offsets)
@@ -91,6 +92,14 @@ def _weights(offsets: Array, axes: Array, window: Window, widened: Array) -> Arr
     reach, margin = window.reach * widened[:, None], window.margin * widened[:, None]
     taper = np.clip((reach - along) / (0.2 * reach), 0, 1)
     return taper * (across < margin) * (np.abs(offsets).max(axis=-1) <= MOST_RADIUS)
+
+
+def _packed(offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Only the pixels that count, each corner's to the left, as wide as the largest window."""
+    most = max(int(np.count_nonzero(weight, axis=1).max()), 1)
+    order = np.argsort(weight == 0, axis=1, kind="stable")[:, :most]
+    rows = np.arange(len(order))[:, None]
+    return offsets[rows, order], grey[rows, order], weight[rows, order]
 
 
 def _first(grey: Array, weight: Array, axes: Array) -> Array:

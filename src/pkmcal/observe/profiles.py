@@ -76,8 +76,9 @@ def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
     depth = np.clip(-place, 0.0, 2 * half_width)
     root = np.sqrt(depth * (2 * half_width - depth))
     columns = [inside, depth, root, 1 - inside, np.maximum(place, 0.0)]
-    reach = np.arange(-5 * blur, 5 * blur + pitch, pitch)
-    kernel = np.exp(-0.5 * ((reach - reach.mean()) / blur) ** 2)
+    # an odd count: np.convolve centres an even one half a pitch aside, and the edge with it
+    half = int(np.ceil(5 * blur / pitch))
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) * pitch / blur) ** 2)
     smooth = [np.convolve(c, kernel / kernel.sum(), mode="same") for c in columns]
     return place, np.stack(smooth, axis=1)
 

@@ -96,8 +96,9 @@ def _blur(profiles: Array) -> float:
     around = steepest[:, None] + 1 + np.arange(-flank, flank + 1)
     around = np.clip(around, 0, profiles.shape[1] - 1)
     contrast = np.ptp(np.take_along_axis(profiles, around, axis=1), axis=1)
-    use = contrast > CONTRAST
+    steep = near.max(axis=1)
+    use = (contrast > CONTRAST) & (steep > 0)
     if not use.any():
         return float("nan")
-    width = contrast[use] / near.max(axis=1)[use] / np.sqrt(2 * np.pi)
+    width = contrast[use] / steep[use] / np.sqrt(2 * np.pi)
     return float(np.percentile(width, SHARPEST))

@@ -1,0 +1,181 @@
+"""Photographs that do not show the board that was described: which board they show instead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Integers
+from pkmcal.errors import InputError
+from pkmcal.files import Document, listed
+from pkmcal.observe.board_finders import (
+    LEAST_CORNERS,
+    charuco_detector,
+    detect_markers,
+    find,
+    find_chessboard,
+)
+from pkmcal.observe.boards import Board, Detection, board_from_document, chessboard, dictionaries
+from pkmcal.observe.images import decode
+
+LOOKED_AT = 3
+"""Photographs that are examined more closely; one good one is enough."""
+NEIGHBOURS = 2
+"""Counts each way by which a description of a chessboard is tried wrong."""
+MOST_SQUARES = 16
+
+
+def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board) -> None:
+    """Raise `InputError` where some or all photographs show another board than `board`."""
+    missed = [f for f, d in zip(files, found, strict=True) if not d.found]
+    shown = [f for f, d in zip(files, found, strict=True) if d.found]
+    size = found[0].image_size
+    other: str | None = None
+    for path in shown[:LOOKED_AT]:
+        # One photograph alone may show something beside the board that looks like more of it.
+        other = _larger(decode(path, size, path.name), board)
+        if other is None:
+            break
+    if other is not None:
+        raise _another(shown[0], other, board)
+    for path in missed[:LOOKED_AT]:
+        other = other_board(decode(path, size, path.name), board)
+        if other is not None and not shown:
+            raise _another(path, other, board)
+        if other is not None:
+            raise InputError(
+                "photographs of two boards are mixed",
+                where=path.name,
+                found=other,
+                expected=f"{board.described}, as in {listed([f.name for f in shown], 3)}",
+                next_step="Calibrate with the photographs of one board",
+            )
+    if not shown:
+        raise InputError(
+            "the board is in none of the photographs",
+            where=listed([path.name for path in files], 3),
+            found=found[0].reason,
+            expected=board.described,
+            next_step="Check the board file, the light and the focus; a chessboard's white border"
+            " must be seen as well",
+        )
+
+
+def _another(path: Path, other: str, board: Board) -> InputError:
+    return InputError(
+        "the photographs show another board than the one described",
+        where=path.name,
+        found=other,
+        expected=f"{board.described}, as the board file says",
+        next_step="Write what the board has into the board file",
+    )
+
+
+def other_board(image: Integers, board: Board) -> str | None:
+    """The board that a photograph shows in place of `board`, in words; None for none."""
+    if board.type == "chessboard":
+        found = _other_chessboard(image, board.counts)
+        return found or _other_markers(image, "")
+    name = board.document["dictionary"]
+    if board.type == "charuco":
+        best = _other_charuco(image, board)
+        if best:
+            return best
+    return _other_markers(image, name) or _other_chessboard(image, (0, 0))
+
+
+def _larger(image: Integers, board: Board) -> str | None:
+    """More of the board than described, in a photograph in which the described one was found."""
+    if board.type == "chessboard":
+        columns, rows = board.counts
+        for counts in ((columns + 1, rows), (columns, rows + 1), (columns + 1, rows + 1)):
+            if _all_corners(image, counts):
+                return _chess(counts)
+        return None
+    ids, _ = detect_markers(image, board.document["dictionary"])
+    if board.type == "aruco_grid":
+        ids = ids - board.document.get("first_id", 0)
+        count = board.counts[0] * board.counts[1]
+    else:
+        squares = board.document["squares"]
+        count = squares[0] * squares[1] // 2
+    beyond = ids[(ids < 0) | (ids >= count)]
+    if len(beyond) < 2:
+        return None
+    if board.type == "charuco":
+        return _other_charuco(image, board)
+    return f"markers {listed([str(i) for i in sorted(beyond.tolist())], 4)} beyond its {count}"
+
+
+def _other_chessboard(image: Integers, counts: tuple[int, int]) -> str | None:
+    """The counts near the described ones that fit; with (0, 0), of the usual ones."""
+    if counts == (0, 0):
+        candidates = [(9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (6, 5), (11, 8), (10, 7), (6, 4)]
+    else:
+        span = range(-NEIGHBOURS, NEIGHBOURS + 1)
+        candidates = [(counts[0] + a, counts[1] + b) for a, b in product(span, span)]
+    # The largest first: a smaller grid is found inside a larger one.
+    for candidate in sorted(candidates, key=lambda c: -c[0] * c[1]):
+        if min(candidate) < 3 or candidate in (counts, counts[::-1]):
+            continue
+        if _all_corners(image, candidate):
+            return _chess(candidate)
+    return None
+
+
+def _all_corners(image: Integers, counts: tuple[int, int]) -> bool:
+    """True where a chessboard of these counts is there, every corner of it looking like one."""
+    if find_chessboard(image, counts, quick=True) is None:
+        return False
+    return len(find(image, chessboard(counts, 1.0), "").ids) == counts[0] * counts[1]
+
+
+def _chess(counts: tuple[int, int]) -> str:
+    return "a chessboard of {}x{} inner corners".format(*counts)
+
+
+def _other_charuco(image: Integers, board: Board) -> str | None:
+    """The counts of squares, or the older pattern, with which most corners are found."""
+    ids, _ = detect_markers(image, board.document["dictionary"])
+    if len(ids) < 2:
+        return None
+    mine, _ = _score(image, board.document)
+    best: tuple[int, float, dict[str, Any]] = (mine, 0.0, {})
+    for columns, rows in product(range(3, MOST_SQUARES), repeat=2):
+        if columns * rows // 2 <= ids.max():
+            continue
+        for legacy in (False, True) if rows % 2 == 0 else (False,):
+            data = {**board.document, "squares": [columns, rows], "legacy": legacy}
+            count, share = _score(image, data)
+            if (count, share) > best[:2] and count > 1.2 * mine:
+                best = (count, share, data)
+    if best[0] < LEAST_CORNERS or not best[2]:
+        return None
+    data = best[2]
+    changed = bool(data["legacy"]) != bool(board.document.get("legacy", False))
+    pattern = f" with legacy: {str(data['legacy']).lower()}" if changed else ""
+    return "a ChArUco board of {}x{} squares".format(*data["squares"]) + pattern
+
+
+def _score(image: Integers, data: dict[str, Any]) -> tuple[int, float]:
+    """Corners of a ChArUco board that look like corners, and their share of the board's."""
+    corners, ids, _, _ = charuco_detector(data).detectBoard(image)
+    if corners is None or ids is None or len(ids) < LEAST_CORNERS:
+        return 0, 0.0
+    board = board_from_document(Document(Path(), "", data, {}))
+    return (count := len(find(image, board, "").ids)), count / len(board.points)
+
+
+def _other_markers(image: Integers, mine: str) -> str | None:
+    """The dictionary whose markers the photograph shows; the smallest that has them all."""
+    counts = {name: len(detect_markers(image, name)[0]) for name in dictionaries()}
+    best = max(counts.values(), default=0)
+    if best < 4 or counts.get(mine, 0) > 0.7 * best:
+        return None
+    names = [name for name in counts if counts[name] >= 0.9 * best]
+    names.sort(key=lambda name: (int(np.prod([int(n) for n in name.split("_")[2:] if n.isdigit()] or [9999])), name))
+    return f"{best} markers of {names[0]}"

@@ -1,0 +1,75 @@
+"""Shared by the tests of commands: one demonstration, rendered once, and the command line."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pkmcal.cli import main
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one command left: exit code and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self):
+        """The one object on stdout."""
+        return json.loads(self.out, parse_constant=pytest.fail)
+
+
+def run(*words) -> Run:
+    """One command through the real entry point, in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = main([str(word) for word in words])
+    return Run(code, out.getvalue(), err.getvalue())
+
+
+@dataclass(frozen=True)
+class Demo:
+    """A finished demonstration: its folders, and what it printed. Nobody writes into them."""
+
+    folder: Path
+    run: Run
+
+    @property
+    def session(self) -> Path:
+        return self.folder / "session"
+
+    @property
+    def calibration(self) -> Path:
+        return self.folder / "calibration"
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory) -> Demo:
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    return Demo(folder, run("demo", "-o", folder, "--fast", "--no-open", "--json"))
+
+
+@pytest.fixture(scope="session")
+def calibrated(demo):
+    """The demonstration's session, calibrated from Python."""
+    from pkmcal.calibration import calibrate
+
+    return calibrate(demo.session)
+
+
+@pytest.fixture
+def session(demo, tmp_path) -> Path:
+    """A copy of the demonstration's session, to spoil; without its truth."""
+    folder = tmp_path / "session"
+    shutil.copytree(demo.session, folder)
+    (folder / "truth.json").unlink()
+    return folder

@@ -1,0 +1,292 @@
+"""What people get wrong with a session: each mistake answered by one sentence to act on.
+
+Every mistake goes through ``pkmcal calibrate``, and most through ``pkmcal check``, which must say
+the same.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from conftest import run
+
+
+def replaced(session, name, old, new, count=-1):
+    path = session / name
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
+def rows(session, change):
+    """joints.csv with its rows (lists of cells, the header first) changed in place."""
+    path = session / "joints.csv"
+    table = [line.split(",") for line in path.read_text().splitlines()]
+    change(table)
+    path.write_text("\n".join(",".join(cells) for cells in table) + "\n")
+
+
+def stations(session, change):
+    """session.yaml with its stations changed in place."""
+    path = session / "session.yaml"
+    document = yaml.safe_load(path.read_text())
+    change(document["stations"])
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+
+
+def photographs(session, station):
+    return sorted((session / "images" / station).iterdir())
+
+
+def refused(session, *said):
+    """The sentence of both commands, which holds all of `said`; nothing was written."""
+    done = run("calibrate", session)
+    assert (done.code, done.out) == (2, "")
+    sentence = done.err.removeprefix("Error: ").rstrip("\n")
+    assert "\n" not in sentence
+    for words in said:
+        assert words in sentence
+    assert not (session / "calibration").exists()
+    found = run("check", session, "--json")
+    assert found.code == 2
+    assert sentence in [finding["text"] for finding in found.json["findings"]]
+    return sentence
+
+
+# files
+
+
+def test_no_such_folder(tmp_path):
+    said = refused(tmp_path / "none")
+    assert said == f"{tmp_path / 'none'}: there is no such session folder."
+
+
+def test_an_empty_folder(tmp_path):
+    said = refused(tmp_path)
+    assert said == (
+        f"{tmp_path}: the folder holds no session.yaml."
+        " Name the session's folder; pkmcal new DIR makes one to fill in."
+    )
+
+
+def test_a_file_in_the_place_of_the_folder(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    refused(tmp_path / "notes.txt", "there is no such session folder")
+
+
+def test_a_missing_file(session):
+    (session / "joints.csv").unlink()
+    refused(session, "session.yaml, line ", "joints.file: there is no such file; found joints.csv")
+
+
+def test_an_unknown_key(session):
+    replaced(session, "session.yaml", "observe: legs", "obsserve: legs", 1)
+    refused(session, "session.yaml, line ", "obsserve", "observe")
+
+
+# readings
+
+
+def test_wrong_columns(session):
+    rows(session, lambda table: [cells.pop() for cells in table])
+    refused(
+        session,
+        "joints.csv, line 1: another number of joint columns than the machine has actuated legs;"
+        " found 5 (leg1, leg2, leg3, leg4, leg5), expected 6.",
+    )
+
+
+def test_columns_in_another_order(session):
+    rows(session, lambda table: [cells.insert(1, cells.pop()) for cells in table])
+    refused(session, "the columns are not in the order of the machine's legs", "Sort the columns")
+
+
+def test_a_configuration_twice(session):
+    rows(session, lambda table: table.append(table[1]))
+    refused(session, "joints.csv, line 14: the configuration 0000 stands twice, on lines 2 and 14.")
+
+
+def test_an_unknown_configuration(session):
+    shutil.move(photographs(session, "station1")[0], session / "images" / "station1" / "0099.png")
+    refused(session, "0099.png is of a configuration without joint readings", "configuration 0099")
+
+
+def test_a_reading_that_is_no_number(session):
+    def spoil(table):
+        table[3][2] = "NaN"
+
+    rows(session, spoil)
+    refused(session, "joints.csv, line 4, column leg2: this is not a finite number; found 'NaN'")
+
+
+def test_readings_in_millimetres(session):
+    def spoil(table):
+        for cells in table[1:]:
+            cells[1:] = [f"{1e3 * float(cell):.3f}" for cell in cells[1:]]
+
+    rows(session, spoil)
+    refused(
+        session,
+        "joints.csv, line 2, column leg1: the readings look like millimetres",
+        "expected metres, between 0.345 and 0.485. Divide them by 1000.",
+    )
+
+
+def test_only_one_configuration(session):
+    for station in ("station1", "station2", "station3"):
+        for path in photographs(session, station):
+            shutil.move(path, path.with_name("0000.png"))
+    rows(session, lambda table: table.__delitem__(slice(2, None)))
+    refused(
+        session,
+        "joints.csv: there is only one configuration; found 0000, expected two at least;"
+        " one cannot tell a joint's place from its offset.",
+    )
+
+
+def test_all_configurations_alike(session):
+    def spoil(table):
+        for cells in table[2:]:
+            cells[1:] = table[1][1:]
+
+    rows(session, spoil)
+    refused(
+        session, "joints.csv: all configurations are alike: no joint moves by more than its noise"
+    )
+
+
+def test_legs_numbered_differently(session):
+    def turn(table):
+        for cells in table[1:]:
+            cells.append(cells.pop(1))
+
+    rows(session, turn)
+    said = refused(session)
+    assert said == (
+        "joints.csv: the legs are numbered differently in the readings and in the drawing; found"
+        " the photographs fit when leg 1 takes the readings of column 6, leg 2 those of column 1,"
+        " and so on round. Give the columns of joints.csv the order of the legs in the drawing."
+    )
+
+
+def test_two_legs_mixed_up(session):
+    def swap(table):
+        for cells in table[1:]:
+            cells[1], cells[4] = cells[4], cells[1]
+
+    rows(session, swap)
+    said = refused(session)
+    assert said == (
+        "joints.csv: the readings of legs 1 and 4 are mixed up; found the photographs fit with"
+        " these two columns exchanged. Exchange the columns of legs 1 and 4 in joints.csv, or the"
+        " two legs in the drawing."
+    )
+
+
+# photographs
+
+
+def test_an_image_of_another_size(session):
+    path = photographs(session, "station2")[1]
+    assert cv2.imwrite(str(path), np.zeros((300, 400), np.uint8))
+    refused(
+        session,
+        f"images/station2/{path.name}: the photograph has another size than its camera;"
+        " found 400x300, expected 480x360 (cameras/camera.yaml).",
+    )
+
+
+def test_a_photograph_cut_short(session):
+    path = photographs(session, "station2")[1]
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    said = refused(session)
+    assert said == (
+        f"images/station2/{path.name}: the photograph cannot be decoded; found a PNG file that"
+        " ends early, expected a whole PNG or JPEG file. Copy it again from the camera, or remove"
+        " it: an absent photograph is allowed."
+    )
+
+
+def test_photographs_of_something_else(session):
+    rng = np.random.default_rng(1)
+    for path in photographs(session, "station2"):
+        cloud = cv2.GaussianBlur(rng.normal(size=(360, 480)), (0, 0), 9)
+        picture = 255 * (cloud - cloud.min()) / np.ptp(cloud)
+        assert cv2.imwrite(str(path), picture.astype(np.uint8))
+    refused(
+        session,
+        "session.yaml, stations.station2: the machine is not recognised in the photographs of"
+        " station2; found a mismatch of ",
+        "Check that these photographs show this machine's legs, that the station's pose is right"
+        " to 10 cm and 10 degrees, that each photograph bears the name of its configuration, and"
+        " that the drawing is this machine's.",
+    )
+
+
+def test_two_stations_swapped(session):
+    def swap(found):
+        first, second = found["station1"], found["station2"]
+        first["pose"], second["pose"] = second["pose"], first["pose"]
+
+    stations(session, swap)
+    said = refused(session)
+    assert said == (
+        "session.yaml, stations: stations station1 and station2 are mixed up; found the"
+        " photographs of each fit the pose of the other. Exchange the poses of station1 and"
+        " station2 in session.yaml, or their image folders."
+    )
+
+
+# outputs
+
+
+def unwritten(session, out, *said):
+    before = sorted(path for path in session.rglob("*"))
+    done = run("calibrate", session, "-o", out)
+    assert (done.code, done.out) == (2, "")
+    for words in said:
+        assert words in done.err
+    assert sorted(path for path in session.rglob("*")) == before
+
+
+def test_output_inside_a_file(session):
+    out = session / "joints.csv" / "out"
+    unwritten(session, out, f"{out}: outputs cannot go here; found", "joints.csv is a file")
+
+
+def test_output_is_a_file(session):
+    unwritten(session, session / "joints.csv", "outputs cannot go here; found")
+
+
+def test_output_folder_of_the_kernels(session):
+    if not os.path.isdir("/proc/self"):  # noqa: PTH112
+        pytest.skip("no folder here that even an administrator cannot write to")
+    unwritten(
+        session, "/proc/self/out", "/proc/self/out: cannot be written", "Choose another folder"
+    )
+
+
+def test_no_work_is_spent_before_the_output_is_known_to_be_writable(session, monkeypatch):
+    def worked(*_, **__):
+        pytest.fail("calibrated before looking at the output folder")
+
+    monkeypatch.setattr("pkmcal.calibration.calibrate", worked)
+    unwritten(session, session / "joints.csv", "outputs cannot go here")
+
+
+def test_a_disk_that_fills_up_leaves_nothing(session, monkeypatch):
+    def full(_self, _text, **_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    done = run("calibrate", session)
+    assert done.code == 2
+    assert "cannot be written (No space left on device)" in done.err
+    assert not (session / "calibration").exists()
+    assert not list(session.glob(".*"))

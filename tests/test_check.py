@@ -1,0 +1,180 @@
+"""What the check finds in photographs and configurations, and how it judges it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.check import (
+    JointCheck,
+    Level,
+    StationCheck,
+    _joint_findings,
+    _kinematics,
+    _station_findings,
+    check_session,
+)
+from pkmcal.session import load_session
+
+GOOD = StationCheck("front", 15, True, 0.2, 0.04, 0.08, 5.5, 0.05, 0.01, 0.8)
+
+
+def changed(session, change, station="*"):
+    """All photographs of a station (or of all), changed by a function of the picture."""
+    for path in sorted((session / "images").glob(f"{station}/*.png")):
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert cv2.imwrite(str(path), np.clip(change(picture), 0, 255).astype(np.uint8))
+
+
+def texts(found, level):
+    return [finding.text for finding in found.findings if finding.level is level]
+
+
+# whole sessions
+
+
+def test_a_good_session(session):
+    found = check_session(session)
+    assert found.exit_code == 0
+    assert texts(found, Level.WRONG) == texts(found, Level.DOUBTFUL) == []
+    assert (found.n_legs, found.configurations) == (6, 12)
+    assert found.singularity > 0.5
+    assert found.assemblies >= 2
+    for station in found.stations:
+        assert station.recognised
+        assert station.mismatch < 0.3
+        # the simulation's poses by hand are 5 cm and 5 degrees off
+        assert 0.03 < station.moved < 0.07
+        assert np.deg2rad(3) < station.turned < np.deg2rad(7)
+        assert station.legs > 4.5
+        assert 0.5 < station.blur < 1.2
+        assert station.saturated < 0.1
+        assert station.black < 0.1
+    assert all(0.6 < joint.used < 1 for joint in found.joints)
+
+
+def test_progress_is_told_in_order(session):
+    told = []
+    check_session(session, progress=lambda text, share: told.append((share, text)))
+    assert told == sorted(told)
+    assert told[-1][1] == "Recognising the machine"
+
+
+def test_blurred_photographs(session):
+    changed(session, lambda picture: cv2.GaussianBlur(picture, (0, 0), 1.8), "station1")
+    found = check_session(session)
+    assert found.exit_code == 1
+    (text,) = texts(found, Level.DOUBTFUL)
+    assert text.startswith("station1: The edges are blurred over 1.")
+    assert found.stations[0].blur > 1.7
+    assert found.stations[1].blur < 1.2
+
+
+def test_overexposed_photographs(session):
+    changed(session, lambda picture: picture * 2.5, "station2")
+    found = check_session(session)
+    assert any(
+        text.startswith("station2: ") and "are overexposed: edges vanish in white" in text
+        for text in texts(found, Level.DOUBTFUL)
+    )
+
+
+def test_black_photographs_of_nothing(session):
+    changed(session, lambda picture: picture * 0, "station3")
+    found = check_session(session)
+    assert found.exit_code == 2
+    assert "station3: 100% of the pictures are black" in texts(found, Level.DOUBTFUL)[0]
+    assert "not recognised in the photographs of station3" in texts(found, Level.WRONG)[0]
+    assert [station.recognised for station in found.stations] == [True, True, False]
+
+
+def test_all_broken_photographs_are_named(session):
+    broken = sorted((session / "images" / "station1").iterdir())[:2]
+    names = [f"images/station1/{path.name}: the photograph cannot be decoded" for path in broken]
+    for path in broken:
+        path.write_bytes(path.read_bytes()[:-300])
+    found = check_session(session)
+    assert found.exit_code == 2
+    assert [text.partition(";")[0] for text in texts(found, Level.WRONG)] == names
+    assert found.stations[0].recognised  # by its other photographs
+
+
+def test_a_station_whose_photographs_are_all_broken(session):
+    for path in (session / "images" / "station1").iterdir():
+        path.write_bytes(path.read_bytes()[:-300])
+    found = check_session(session)
+    assert len(texts(found, Level.WRONG)) == 4
+    assert not any(station.recognised for station in found.stations)
+
+
+def test_what_cannot_be_observed_is_told(session):
+    text = (session / "session.yaml").read_text()
+    start, end = text.index("    pose:"), text.index("  station2:")
+    (session / "session.yaml").write_text(text[:start] + text[end:])
+    found = check_session(session)
+    assert found.exit_code == 2
+    assert "station1: the station has no rough pose" in texts(found, Level.WRONG)[0]
+
+
+@pytest.mark.parametrize(
+    ("x", "where", "said"),
+    [
+        ("0.55", "joints.csv, configuration ", "its legs do not meet the platform"),
+        ("1.27", "mechanism.yaml: ", "cannot be assembled with its legs at mid-range"),
+    ],
+)
+def test_readings_that_the_drawing_cannot_take(session, x, where, said):
+    path = session / "mechanism.yaml"
+    path.write_text(path.read_text().replace("[0.2693, 0.02,", f"[{x}, 0.02,"))
+    found = check_session(session)
+    assert found.exit_code == 2
+    text = texts(found, Level.WRONG)[0]
+    assert text.startswith(where)
+    assert said in text
+    assert run("calibrate", session).err == f"Error: {text}\n"
+
+
+# single judgements
+
+
+@pytest.mark.parametrize(
+    ("station", "said"),
+    [
+        (GOOD, None),
+        (replace(GOOD, saturated=0.3), "30% of the legs are overexposed"),
+        (replace(GOOD, saturated=0.3, recognised=False), "30% of the pictures are overexposed"),
+        (replace(GOOD, black=0.6), "60% of the legs are black"),
+        (replace(GOOD, blur=1.9), "blurred over 1.9 px"),
+        (replace(GOOD, blur=float("nan")), None),
+        (replace(GOOD, legs=2.5), "Only 2.5 of 6 legs"),
+    ],
+)
+def test_a_stations_findings(station, said):
+    found = _station_findings(station, 6)
+    assert (said is None and not found) or (len(found) == 1 and said in found[0].text)
+
+
+def test_crowded_and_few_configurations(demo):
+    session = load_session(demo.session)
+    joints = (
+        JointCheck("leg1", 0.4, 0.41, 0.07, (0, 0)),
+        JointCheck("leg2", 0.35, 0.48, 0.9, (3, 3)),
+    )
+    found = _joint_findings(replace(session, configurations=("a", "b")), joints)
+    assert [finding.level for finding in found] == [Level.NOTE] * 2
+    assert found[0].text.startswith("leg1 used little of the range (down to 7%)")
+    assert found[1].text.startswith("There are only 2 configurations")
+
+
+def test_nearly_singular_configurations_are_named(demo, monkeypatch):
+    session = load_session(demo.session)
+    singularity = session.machine.forward_result(session.joints).singularity
+    weakest = session.configurations[int(np.argmin(singularity))]
+    monkeypatch.setattr("pkmcal.check.NEAR_SINGULAR", singularity.min() + 1e-9)
+    (finding,) = _kinematics(session, np.random.default_rng(0)).findings
+    assert finding.level is Level.DOUBTFUL
+    assert finding.text.startswith(f"Near a singular pose in configuration {weakest}: ")

@@ -1,0 +1,388 @@
+"""The commands as a person types them, and what they promise to programs."""
+
+from __future__ import annotations
+
+import errno
+import json
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pkmcal
+from conftest import run
+from pkmcal.cameras import load_camera
+from pkmcal.cli import main
+from pkmcal.files import read_csv
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.results import load
+from pkmcal.starter import TO_FILL, template_files
+
+COMMANDS = ("demo", "new", "check", "calibrate", "simulate")
+
+
+def python(*words, **options):
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
+
+
+# the entry point
+
+
+def test_the_installed_command_is_main():
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    place = project["scripts"]["pkmcal"]
+    assert EntryPoint("pkmcal", place, "console_scripts").load() is main
+
+
+def test_as_a_module():
+    done = python("-m", "pkmcal", "--version")
+    assert (done.returncode, done.stdout) == (0, f"pkmcal {pkmcal.__version__}\n")
+
+
+def test_help_imports_nothing_heavy():
+    heavy = ("numpy", "scipy", "cv2", "pydantic", "yaml", "rich.progress")
+    code = f"import sys, pkmcal.cli; print([m for m in {heavy} if m in sys.modules])"
+    assert python("-c", code).stdout == "[]\n"
+
+
+def test_no_arguments_show_the_help():
+    done = run()
+    assert done == run("--help")
+    assert done.code == 0
+    assert all(f"\n  {command} " in done.out for command in COMMANDS)
+    assert "..." not in done.out.partition("Commands:")[2]  # no description is cut off
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_and_json(command):
+    done = run(command, "--help")
+    assert done.code == 0
+    assert "--json" in done.out
+    assert max(map(len, done.out.splitlines())) <= 80
+
+
+def test_a_reader_that_leaves_is_no_error():
+    code = (
+        "import sys, os; from pkmcal.cli import main; r, w = os.pipe(); os.dup2(w, 1);"
+        " os.close(w); os.close(r); sys.exit(main(['--help']))"
+    )
+    done = python("-c", code)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+# demo
+
+
+def test_demo(demo):
+    result = demo.run.json
+    assert demo.run.code == result["exit_code"] == 0
+    assert demo.run.err == ""
+    before, after = result["comparison"]["drawing"], result["comparison"]["calibrated"]
+    assert after["centre"] < before["centre"] / 3
+    assert after["position"] < before["position"] / 2
+    assert after["orientation"] < before["orientation"] / 2
+    # 44 values, correlated: 95 % expected within two deviations, 80 % is far off
+    assert result["comparison"]["within"] > 0.8 * result["comparison"]["count"]
+    assert load(demo.calibration).verdict.usable
+
+
+def test_demo_finds_the_same_without_the_truth(demo, session):
+    assert not (session / "truth.json").exists()
+    assert run("calibrate", session, "--quiet").code == 0
+    again, first = load(session / "calibration"), load(demo.calibration)
+    assert np.array_equal(again.machine.values, first.machine.values)
+
+
+def test_demo_in_words(demo, tmp_path, monkeypatch, calibrated):
+    monkeypatch.setattr("pkmcal.commands.demo._simulate", lambda *_: None)
+    monkeypatch.setattr("pkmcal.commands.demo._calibrate", lambda *_: calibrated)
+    monkeypatch.setattr("pkmcal.commands.demo.SESSION", str(demo.session))
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr("pkmcal.commands.demo._can_show", lambda: True)
+    done = run("demo", "-o", tmp_path / "out")
+    assert done.code == 0
+    assert "times nearer" in done.out
+    assert "within two of their standard deviations" in " ".join(done.out.split())
+    assert opened == [(tmp_path / "out" / "calibration" / "report.html").as_uri()]
+    assert run("demo", "-o", tmp_path / "other", "--no-open").code == 0
+    assert len(opened) == 1
+
+
+@pytest.mark.parametrize(
+    ("variables", "shown"),
+    [({"DISPLAY": ":0"}, True), ({"DISPLAY": ":0", "CI": "1"}, False), ({}, False)],
+)
+def test_a_browser_opens_for_people_only(variables, shown, monkeypatch):
+    from pkmcal.commands.demo import _can_show
+
+    for name in ("CI", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    assert _can_show() is shown
+
+
+def test_demo_replaces_only_a_demo(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    done = run("demo", "-o", tmp_path, "--fast")
+    assert done.code == 2
+    assert "the folder for the demonstration holds something else; found thesis.tex" in done.err
+    assert (tmp_path / "thesis.tex").exists()
+
+
+def test_an_earlier_demo_is_removed(tmp_path):
+    from pkmcal.commands.demo import _make_room
+
+    (tmp_path / "session").mkdir()
+    (tmp_path / "session" / "truth.json").touch()
+    (tmp_path / "calibration").mkdir()
+    _make_room(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+# new
+
+
+def test_new_then_check_says_what_is_missing(tmp_path):
+    done = run("new", tmp_path / "mine")
+    assert done.code == 0
+    assert all(name in done.out for name in template_files())
+    assert "pkmcal check" in done.out
+    found = run("check", tmp_path / "mine")
+    said = " ".join(found.out.split())
+    assert found.code == 2
+    assert "there is no photograph under this pattern; found only README.txt in" in said
+    for name, what in TO_FILL.items():
+        assert f"{name} is still the example of pkmcal new: {what}" in said
+
+
+def test_new_files_load(tmp_path):
+    folder = tmp_path / "mine"
+    done = run("new", folder, "--json")
+    assert sorted(done.json["files"]) == sorted(template_files())
+    machine = load_mechanism(folder / "mechanism.yaml")
+    assert machine.n_legs == 6
+    assert load_camera(folder / "cameras" / "front.yaml").image_size == (1024, 768)
+    readings = read_csv(folder / "joints.csv")
+    assert machine.forward_result(readings.values).converged.all()
+    for name in ("session.yaml", "mechanism.yaml", "cameras/front.yaml"):
+        assert (folder / name).read_text().startswith("# ")
+
+
+def test_new_in_a_folder_that_is_not_empty(demo):
+    done = run("new", demo.session)
+    assert done.code == 2
+    assert "the folder for the new session is not empty" in done.err
+
+
+# check
+
+
+def test_check_of_a_good_session(session):
+    done = run("check", session)
+    assert done.code == 0
+    assert "Nothing is wrong. Next: pkmcal calibrate" in done.out
+    rows = [line for line in done.out.splitlines() if " station" in line]
+    assert len(rows) == 3
+    assert all(row.startswith("✓") for row in rows)
+    assert max(map(len, done.out.splitlines())) <= 80 + len(str(session))
+
+
+def test_check_as_json(session):
+    found = run("check", session, "--json").json
+    assert found["exit_code"] == 0
+    names = [station["name"] for station in found["stations"]]
+    assert names == ["station1", "station2", "station3"]
+    assert all(station["recognised"] for station in found["stations"])
+    assert len(found["joints"]) == 6
+
+
+# calibrate
+
+
+def test_calibrate(session):
+    done = run("calibrate", session)
+    assert (done.code, done.err) == (0, "")
+    assert done.out.startswith("✓ Calibrated: joint centres to")
+    assert "How well is the platform's pose known?" in done.out
+    folder = session / "calibration"
+    assert {path.name for path in folder.iterdir()} == {
+        "mechanism.yaml",
+        "calibration.json",
+        "report.html",
+    }
+    machine = load_mechanism(folder / "mechanism.yaml")
+    assert np.array_equal(machine.values, load(folder).machine.values)
+
+
+def test_calibrate_again_replaces_the_result(session, tmp_path):
+    out = tmp_path / "result"
+    assert run("calibrate", session, "-o", out, "--quiet").code == 0
+    done = run("calibrate", session, "-o", out, "--seed", 5, "--quiet")
+    assert (done.code, done.out, done.err) == (0, "", "")
+    assert load(out).seed == 5
+
+
+def test_calibrate_as_json_in_a_process_of_its_own(session, tmp_path):
+    out = tmp_path / "result"
+    done = python("-m", "pkmcal", "calibrate", session, "-o", out, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    result = json.loads(done.stdout)
+    assert result["verdict"]["usable"] is True
+    assert result["files"]["report.html"] == str(out / "report.html")
+    assert 0 < result["figures"]["joint_centre_sigma"] < 1e-3
+
+
+@pytest.mark.parametrize("method", ["four-step", "linear"])
+def test_calibrate_by_the_papers_methods(session, method):
+    done = run("calibrate", session, "--method", method, "--json")
+    assert done.code in (0, 1)  # with four configurations a station they may well be too weak
+    assert load(session / "calibration").method == method
+
+
+def test_an_unusable_result_is_told_and_written(session):
+    text = (session / "session.yaml").read_text()
+    (session / "session.yaml").write_text(text[: text.index("  station2:")])
+    done = run("calibrate", session)
+    assert done.code == 1
+    assert "This calibration should not be used" in done.out
+    assert "Written all the same" in done.out
+    assert not load(session / "calibration").verdict.usable
+    assert "# NOT TO BE USED: " in (session / "calibration" / "mechanism.yaml").read_text()
+    quiet = run("calibrate", session, "--quiet")
+    assert (quiet.code, quiet.out) == (1, "")
+    assert quiet.err.startswith("Error: This calibration should not be used")
+
+
+def test_an_output_folder_with_other_things_is_left_alone(session):
+    drawing = (session / "mechanism.yaml").read_bytes()
+    done = run("calibrate", session, "-o", session)
+    assert done.code == 2
+    assert "the output folder holds something other than a calibration" in done.err
+    assert (session / "mechanism.yaml").read_bytes() == drawing
+
+
+# simulate
+
+
+def small(folder, *more):
+    words = ("--stations", 1, "--configurations", 2, "--size", "128x96", *more)
+    return run("simulate", folder, *words)
+
+
+def test_simulate(tmp_path):
+    done = small(tmp_path / "a", "--json")
+    assert done.json["photographs"] == 2
+    assert "pkmcal calibrate" in small(tmp_path / "b").out
+    small(tmp_path / "c", "--seed", 1)
+    texts = [(tmp_path / name / "truth.json").read_text() for name in "abc"]
+    assert texts[0] == texts[1] != texts[2]
+    session = pkmcal.load_session(tmp_path / "a")
+    assert session.stations[0].camera.image_size == (128, 96)
+
+
+def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
+    words = ("--mechanism", demo.session / "mechanism.yaml", "--stations", 1)
+    camera = demo.session / "cameras" / "camera.yaml"
+    done = run("simulate", tmp_path / "s", *words, "--configurations", 2, "--camera", camera)
+    assert done.code == 0
+    assert (tmp_path / "s" / "cameras" / "camera.yaml").read_bytes() == camera.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--size", "3x4", "no size of a photograph; found 3x4, expected width x height"),
+        ("--size", "large", "found large, expected width x height"),
+        ("--joint-noise", "0", "a reading's noise cannot be this; found 0, expected more than 0"),
+        ("--joint-noise", "nan", "found nan"),
+        ("--mechanism", "gough-stuart", "found gough-stuart, expected gough-stewart"),
+        ("--mechanism", "mine.yaml", "mine.yaml: the file does not exist"),
+        ("--camera", "eye.yaml", "eye.yaml: the file does not exist"),
+        ("--stations", "0", "'--stations'"),
+    ],
+)
+def test_simulate_refuses(tmp_path, option, value, said):
+    done = run("simulate", tmp_path / "s", option, value)
+    assert done.code == 2
+    assert said in done.err
+    assert not (tmp_path / "s").exists()
+
+
+# what goes wrong
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["chek"], "No such command 'chek', did you mean 'check'. See pkmcal --help."),
+        (["check"], "Missing argument 'SESSION'. See pkmcal check --help."),
+        (["check", "a", "b"], "unexpected extra argument"),
+        (["calibrate", "s", "--sed", "1"], "No such option: --sed"),
+        (["calibrate", "s", "--seed", "many"], "'--seed'"),
+        (["calibrate", "s", "--method", "best"], "'bundle', 'four-step', 'linear'"),
+    ],
+)
+def test_usage_errors(words, said):
+    done = run(*words)
+    assert (done.code, done.out) == (2, "")
+    assert said in done.err
+    assert done.err.startswith("Error: ")
+    assert run(*words, "--json").json["exit_code"] == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (MemoryError(), 2, "there is not enough memory. Close other programs"),
+        (OSError(errno.ENOSPC, "No space left on device", "x.png"), 2,
+         "x.png: the operating system refused: no space left on device. Make room"),
+        (PermissionError(errno.EACCES, "Permission denied", "s"), 2, "s: the operating system"),
+        (KeyboardInterrupt(), 130, "interrupted; what was not finished was not written"),
+        (ZeroDivisionError("by zero"), 70,
+         "this is a defect of pkmcal, not of your session: ZeroDivisionError: by zero."
+         " Set PKMCAL_DEBUG=1, run the command again, and report what it then prints."),
+    ],
+)  # fmt: skip
+def test_no_traceback_whatever_happens(error, code, said, tmp_path, monkeypatch):
+    def fail(_folder):
+        raise error
+
+    monkeypatch.setattr("pkmcal.starter.write_session", fail)
+    monkeypatch.delenv("PKMCAL_DEBUG", raising=False)
+    done = run("new", tmp_path)
+    assert (done.code, done.out) == (code, "")
+    assert said in done.err
+    assert "Traceback" not in done.err
+    assert run("new", tmp_path, "--json").json["exit_code"] == code
+    monkeypatch.setenv("PKMCAL_DEBUG", "1")
+    if code == 70:
+        assert "Traceback" in run("new", tmp_path).err
+
+
+def test_errors_as_json(tmp_path):
+    done = run("calibrate", tmp_path / "none", "--json")
+    assert (done.code, done.err) == (2, "")
+    assert done.json["what"] == "there is no such session folder"
+    assert done.json["where"] == str(tmp_path / "none")
+    assert done.json["message"].endswith("there is no such session folder.")
+
+
+def test_an_error_on_a_terminal_is_wrapped(monkeypatch, capsys):
+    from pkmcal.commands.console import print_error
+
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "40")
+    print_error("joints.csv, line 4: a sentence that is longer than forty columns are wide.")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) > 1
+    assert "\x1b[1;31mError:" in lines[0]
+    assert all(line.startswith("       ") for line in lines[1:])

@@ -1,0 +1,225 @@
+"""What a calibration leaves on disk, and that it comes back the same or is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from pkmcal import results
+from pkmcal.errors import InputError
+from pkmcal.files import json_text
+from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.result_document import base_camera_covariance, document_of
+from pkmcal.results import check_output, load, save
+
+
+@pytest.fixture
+def folder(demo, tmp_path):
+    """A copy of the demonstration's result."""
+    shutil.copytree(demo.calibration, tmp_path / "result")
+    return tmp_path / "result"
+
+
+def everything(folder):
+    text = (folder / "calibration.json").read_text()
+    return json.loads(text, parse_constant=pytest.fail)
+
+
+def rewritten(folder, change):
+    data = everything(folder)
+    change(data)
+    (folder / "calibration.json").write_text(json.dumps(data))
+    with pytest.raises(InputError) as caught:
+        load(folder)
+    return str(caught.value)
+
+
+# save and load
+
+
+def test_it_comes_back(calibrated, tmp_path):
+    save(calibrated, tmp_path / "out")
+    saved, estimate = load(tmp_path / "out"), calibrated.estimate
+    assert np.array_equal(saved.machine.values, estimate.machine.values)
+    assert np.array_equal(saved.drawing, calibrated.session.machine.values)
+    assert np.array_equal(saved.covariance, estimate.covariance)
+    assert np.array_equal(saved.sigma, np.sqrt(np.diag(estimate.covariance)))
+    assert np.array_equal(saved.data_share, estimate.data_share, equal_nan=True)
+    assert np.array_equal(saved.T_base_platform, estimate.state.T_base_platform)
+    assert np.array_equal(saved.joints, calibrated.session.joints)
+    assert np.array_equal(saved.used, estimate.configurations)
+    assert saved.verdict == calibrated.verdict
+    assert (saved.gauge, saved.method, saved.seed) == (estimate.gauge, "bundle", 0)
+    found = np.stack([station.T_base_camera for station in saved.stations])
+    assert np.array_equal(found, inverse(estimate.state.T_camera_base))
+    assert load(tmp_path / "out" / "calibration.json").path == saved.path
+
+
+def test_the_file_holds_everything(folder, calibrated):
+    data = everything(folder)
+    names = [row["name"] for row in data["parameters"]]
+    assert names == list(calibrated.machine.parameters.names)
+    assert {row["decided_by"] for row in data["parameters"]} <= {
+        "data",
+        "drawing",
+        "frame",
+        "fixed",
+    }
+    assert {row["unit"] for row in data["parameters"]} == {"m"}
+    assert len(data["residuals"]["edges"]) == len(calibrated.observation.edges)
+    assert len(data["residuals"]["edges"][0]) == len(data["residuals"]["columns"])
+    assert sum(group["count"] for group in data["rejected"]) == len(calibrated.observation.rejected)
+    assert data["cameras"][0]["file"] == "cameras/camera.yaml"
+    assert {"pkmcal", "python", "numpy", "opencv-contrib-python-headless"} <= set(data["versions"])
+    assert set(data["timings"]) == {"load", "decode", "observe", "identify"}
+    assert data["session"]["joints"]["columns"] == [f"leg{n}" for n in range(1, 7)]
+    assert "not of what the model leaves out" in data["conventions"]
+
+
+def test_numbers_that_are_none_become_null(calibrated):
+    document = document_of(calibrated)
+    document["statistics"]["chi2"] = float("nan")
+    document["covariance"] = np.array([np.inf, 1.0])
+    data = json.loads(json_text(document), parse_constant=pytest.fail)
+    assert data["statistics"]["chi2"] is None
+    assert data["covariance"] == [None, 1.0]
+
+
+def test_the_mechanism_file_says_what_it_is(folder, calibrated):
+    path = folder / "mechanism.yaml"
+    comment = [line for line in path.read_text().splitlines() if line.startswith("#")]
+    assert re.match(
+        r"# Calibrated by pkmcal \S+ from the session session \(method bundle", comment[0]
+    )
+    assert comment[1] == f"# {calibrated.verdict.headline}"
+    assert np.array_equal(load_mechanism(path).values, calibrated.machine.values)
+
+
+def test_twice_the_same_but_for_the_timings(folder, calibrated, tmp_path):
+    save(calibrated, tmp_path / "again")
+    one, two = everything(folder), everything(tmp_path / "again")
+    assert one.pop("timings") != two.pop("timings")
+    assert one == two
+    texts = [(place / "mechanism.yaml").read_text() for place in (folder, tmp_path / "again")]
+    assert texts[0] == texts[1]
+
+
+# whole or not at all
+
+
+def test_a_failed_save_leaves_the_old_result(folder, calibrated, monkeypatch):
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def fail(_calibration):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(results, "document_of", fail)
+    with pytest.raises(OSError, match="No space"):
+        save(calibrated, folder)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "mechanism.yaml", ".git"])
+def test_foreign_files_are_not_overwritten(tmp_path, name):
+    (tmp_path / name).touch()
+    with pytest.raises(InputError, match="something other than a calibration") as caught:
+        check_output(tmp_path)
+    assert name in str(caught.value)
+
+
+def test_new_and_empty_folders_and_results_are_fine(tmp_path, folder):
+    check_output(tmp_path / "new" / "deep")
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "empty").mkdir()
+    check_output(tmp_path / "empty")
+    check_output(folder)
+
+
+# a file that was changed
+
+
+def test_nothing_there(tmp_path):
+    with pytest.raises(InputError, match="there is no calibration here"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "not valid JSON"),
+        ('{"a": NaN}', "not valid JSON; found NaN"),
+        ("[]", "the top of the file is not an object"),
+        ('{"a": 1}', "this is not a calibration; expected 1"),
+        ('{"pkmcal_calibration": 9}', "of a version that is known; found 9, expected 1"),
+        ('{"pkmcal_calibration": 1}', "verdict"),
+        ("[" * 20_000, "not"),
+    ],
+)
+def test_other_files(tmp_path, text, said):
+    (tmp_path / "calibration.json").write_text(text)
+    with pytest.raises(InputError) as caught:
+        load(tmp_path)
+    assert said in str(caught.value)
+
+
+def test_a_changed_value(folder):
+    said = rewritten(folder, lambda data: data["parameters"][4].update(value=0.1))
+    assert "parameters[5].value: the calibration does not agree with itself" in said
+    assert "Calibrate again" in said
+
+
+def test_a_changed_name(folder):
+    said = rewritten(folder, lambda data: data["parameters"].pop())
+    assert "expected the names of the mechanism's parameters" in said
+
+
+def test_a_changed_covariance(folder):
+    said = rewritten(folder, lambda data: data["covariance"].pop())
+    assert "the covariance has another size than the list of parameters" in said
+
+
+def test_a_covariance_that_is_none(folder):
+    def turn(data):
+        data["covariance"][7][8] += 1e-6
+
+    assert "not symmetric, or negative" in rewritten(folder, turn)
+
+
+def test_a_pose_that_is_none(folder):
+    def mirror(data):
+        data["stations"][1]["T_base_camera"][0] = [-1.0, 0.0, 0.0, 0.0]
+
+    assert "stations[2].T_base_camera" in rewritten(folder, mirror)
+
+
+def test_a_missing_field(folder):
+    assert "gauge" in rewritten(folder, lambda data: data.pop("gauge"))
+
+
+def test_fields_of_a_newer_version_do_not_matter(folder):
+    data = everything(folder)
+    data["novelty"] = 1
+    data["stations"][0]["novelty"] = 1
+    (folder / "calibration.json").write_text(json.dumps(data))
+    assert load(folder).document["novelty"] == 1
+
+
+# the cameras' covariance
+
+
+def test_covariance_of_the_inverse_pose():
+    rng = np.random.default_rng(3)
+    T = pose(rotation(np.array([0.4, -0.9, 1.3])), np.array([0.2, -0.5, 1.1]))
+    # numeric derivative of the inverse's six numbers by those of the pose
+    step = 1e-6
+    columns = [pose_difference(inverse(perturb(T, step * e)), inverse(T)) / step for e in np.eye(6)]
+    jacobian = np.stack(columns, axis=-1)
+    root = rng.normal(size=(6, 6))
+    covariance = root @ root.T
+    found = base_camera_covariance(T, covariance)
+    assert np.allclose(found, jacobian @ covariance @ jacobian.T, rtol=1e-4, atol=1e-4)
