@@ -79,7 +79,7 @@ def test_uncertainty_is_what_repeats_show():
     runs = 200
     scene = make_scene(rng, runs=runs, configurations=8, n_stations=2, seen=0.6)
     assembled, truth = scene.batch(rng)
-    start = replace(truth, z=0 * truth.z, edge_shift=0 * truth.edge_shift)
+    start = replace(truth, z=0 * truth.z, optics=0 * truth.optics)
     result = solve_batch(assembled.problem, start, robust=False, scale_noise=False)
     assert set(result.solution.stop) == {Stop.CONVERGED}
     found = result.solution.state

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -64,6 +65,18 @@ def test_every_command_has_help_and_json(command):
     assert done.code == 0
     assert "--json" in done.out
     assert max(map(len, done.out.splitlines())) <= 80
+
+
+def test_the_documentation_tells_of_all_commands_and_options():
+    text = (Path(__file__).parents[1] / "docs" / "commands.md").read_text()
+    options = {
+        option
+        for command in ("", *COMMANDS)
+        for option in re.findall(r"--[a-z-]+", run(*command.split(), "--help").out)
+    }
+    assert set(re.findall(r"(?<![\w-])--[a-z-]+", text)) <= options
+    assert options - {"--out", "--version"} <= set(re.findall(r"--[a-z-]+", text))
+    assert re.findall(r"^## pkmcal (\w+)", text, re.MULTILINE) == list(COMMANDS)
 
 
 def test_a_reader_that_leaves_is_no_error():

@@ -64,7 +64,7 @@ def test_jacobian_at_random_points():
     moved = replace(
         truth,
         T_base_platform=perturb(truth.T_base_platform, step),
-        edge_shift=rng.normal(size=(3, 1)),
+        optics=rng.normal(size=(3, 1, 1)),
     )
     check(assembled.problem, moved, rng)
 
@@ -116,7 +116,7 @@ def test_jacobian_of_edges_that_are_whitened_in_pairs():
     problem = joint_problem(machine, settings, truth)
     z = (truth.theta - problem.drawing) @ np.linalg.pinv(problem.free).T
     T = np.broadcast_to(truth.T_camera_base, (2, 3, 4, 4))
-    check(problem, BatchState(z, T, truth.T_base_platform, np.zeros((2, 1))), rng)
+    check(problem, BatchState(z, T, truth.T_base_platform, np.zeros((2, 1, 1))), rng)
 
 
 def test_true_values_leave_no_residual():

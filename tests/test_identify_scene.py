@@ -92,11 +92,11 @@ class Scene:
         basis[:, assembled.row, assembled.place, 0] = tangent_basis(normal, self.middle)
         old = assembled.problem.data
         joints = self.joints + JOINT_NOISE * rng.normal(size=self.joints.shape)
-        data = Data(basis, old.whiten, old.shift, joints, old.weight)
+        data = Data(basis, old.whiten, old.optics, joints, old.weight)
         problem = replace(assembled.problem, data=data)
         z = (self.theta - self.machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
         stations = np.broadcast_to(self.T_camera_base, (len(z), *self.T_camera_base.shape))
-        truth = BatchState(z, stations, self.poses, self.edge_shift[:, None])
+        truth = BatchState(z, stations, self.poses, self.edge_shift[:, None, None])
         return replace(assembled, problem=problem), truth
 
 

@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from plots import CALIBRATED, DRAWING, GOOD, INK, MUTED, Plot, arrow_heads, dot, line, svg, text
 from scipy.interpolate import CubicSpline
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.cylinders import edge_normals
-from pkmcal.geometry.rigid import apply, inverse, look_at, pose_difference
-from pkmcal.identify.centres import joint_centres
+from pkmcal.geometry.rigid import apply, inverse, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import limb_ends
 from pkmcal.observe import legs, profiles
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.search import sample
 from pkmcal.simulate import Truth
-from pkmcal.simulate.configurations import draw_configurations
-from plots import CALIBRATED, DRAWING, GOOD, INK, MUTED, Plot, arrow_heads, dot, line, svg, text
 
 if TYPE_CHECKING:
     from pictures import Case
 
 LEGS = ("#c77f00", "#2a94cc", "#008f68", "#bd5f95", "#0a62a6", "#c8500a")
+Box = tuple[int, int, int, int]
+"""Left, top, width, height, px."""
 REACH = 1.4
 """Pixels about the true edge in which the strongest gradient is looked for."""
 
@@ -73,7 +73,8 @@ def frames(truth: Truth) -> str:
     parts.append(text((middle[0], middle[1] + 20), "T_camera_base", MUTED, "middle"))
     parts += axes(np.eye(4), "base", 0.12, (-10, 20), "middle")
     parts += axes(T, "platform", 0.1, (12, -24), "start")
-    parts += [*_camera(T_base_camera, on_paper), *axes(T_base_camera, "camera", 0.1, (-12, 0), "end")]
+    parts += _camera(T_base_camera, on_paper)
+    parts += axes(T_base_camera, "camera", 0.1, (-12, 0), "end")
     return svg(720, 450, *parts)
 
 
@@ -103,7 +104,7 @@ def edge_planes() -> str:
 
     parts = [arrow_heads(CALIBRATED, DRAWING, INK, MUTED)]
     o, axis = at(np.zeros(3)), at(centre)
-    parts.append(f'<circle cx="{axis[0]}" cy="{axis[1]}" r="{radius * scale}" fill="#eef1f4" stroke="{INK}"/>')
+    parts.append(dot(axis, INK, radius * scale, "#eef1f4"))
     parts.append(line([o, axis], MUTED, 1.2, "5 4"))
     for side, colour in ((0, CALIBRATED), (1, DRAWING)):
         touch = centre + radius * n[side]
@@ -114,7 +115,8 @@ def edge_planes() -> str:
         parts.append(line([at(foot), at(foot + 0.75 * n[side])], colour, 2.4, head=True))
         parts.append(dot(at(touch), colour, 3.5))
         place = at(1.25 * n[side])
-        parts.append(text((place[0] - 8, place[1] + 5), f"n{'₀₁'[side]}", colour, "middle", font_size=16))
+        place = (place[0] - 8, place[1] + 5)
+        parts.append(text(place, f"n{'₀₁'[side]}", colour, "middle", font_size=16))
     middle = at(centre / 2)
     parts += [
         dot(o, INK, 4), dot(axis, INK, 4),
@@ -150,7 +152,8 @@ def looks(case: Case) -> str:
     ]  # fmt: skip
     crops = [(150, 80, 480, 410), (215, 150, 152, 130), (215, 150, 152, 130)]
     parts: list[str] = []
-    for panel, ((machine, T, pose, colour, title), crop) in enumerate(zip(views, crops, strict=True)):
+    for panel, (view, crop) in enumerate(zip(views, crops, strict=True)):
+        machine, T, pose, colour, title = view
         lines = edge_lines(machine, photographs, T, pose, k)
         frame = (10 + panel * 385, 34, 370, 316)
         parts.append(_panel(image, crop, frame, lines, colour, title, panel))
@@ -169,10 +172,9 @@ def edge_lines(
 
 
 def _panel(
-    image: Integers, crop: tuple[int, int, int, int], frame: tuple[int, int, int, int],
-    lines: Array, colour: str, title: str, number: int,
-) -> str:  # fmt: skip
-    """A part of a photograph (x, y, width, height) in a frame, with edges over it."""
+    image: Integers, crop: Box, frame: Box, lines: Array, colour: str, title: str, number: int
+) -> str:
+    """A part of a photograph in a frame, with edges over it."""
     x, y, w, h = crop
     left, top, width, height = frame
     # brighter, so that dark sides of legs can be told from the wall
@@ -180,18 +182,15 @@ def _panel(
     packed = cv2.imencode(".png", shown)[1]
     data = base64.b64encode(packed.tobytes()).decode("ascii")
     zoom = width / w
-    drawn = [
-        line((np.array([left, top]) + (e[np.isfinite(e).all(axis=1)] - (x, y) + 0.5) * zoom).tolist(),
-             colour, 1.6)
-        for e in lines
-        if np.isfinite(e).all(axis=1).sum() > 1
-    ]  # fmt: skip
-    clip = f'<clipPath id="c{number}"><rect x="{left}" y="{top}" width="{width}" height="{height}"/></clipPath>'
+    seen = [edge[np.isfinite(edge).all(axis=1)] for edge in lines]
+    placed = [(left, top) + (edge - (x, y) + 0.5) * zoom for edge in seen if len(edge) > 1]
+    drawn = "".join(line(points.tolist(), colour, 1.6) for points in placed)
+    rectangle = f'<rect x="{left}" y="{top}" width="{width}" height="{height}"/>'
     return (
-        f"<defs>{clip}</defs>"
+        f'<defs><clipPath id="c{number}">{rectangle}</clipPath></defs>'
         f'<g clip-path="url(#c{number})"><image x="{left}" y="{top}" width="{width}"'
         f' height="{h * zoom:.1f}" preserveAspectRatio="none" href="data:image/png;base64,{data}"/>'
-        f"{''.join(drawn)}</g>" + text((left, top - 10), title, INK, font_size=15)
+        f"{drawn}</g>" + text((left, top - 10), title, INK, font_size=15)
     )
 
 
@@ -233,7 +232,8 @@ def measured_places(case: Case) -> Places:
         good = at.found & (across.cut == 0)
         tube = tubes.tube[np.nonzero(full)[1]]
         steep = strongest_gradient(across.grey)
-        columns = (across.grey, across.half_width, np.full(len(good), blur), tube, at.position, steep)
+        blurs = np.full(len(good), blur)
+        columns = (across.grey, across.half_width, blurs, tube, at.position, steep)
         found.append(tuple(c[good] for c in columns))
     return Places(*(np.concatenate(c) for c in zip(*found, strict=True)))
 
@@ -294,7 +294,8 @@ def position_errors(places: Places) -> str:
     borders = np.arange(-1.45, 1.46, 0.1)
     plots: list[Plot] = []
     for tube, title in ((0, "Cylinders (tube 1)"), (1, "Rods (tube 2)")):
-        plot = Plot((-1.5, 1.5), (0, 5.2), ("error of a position, px outward", "density"), (430, 320), title)
+        label = "error of a position, px outward"
+        plot = Plot((-1.5, 1.5), (0, 5.2), (label, "density"), (430, 320), title)
         mine = places.tube == tube
         plot.histogram(places.gradient_error[mine], borders, DRAWING)
         plot.histogram(places.model_error[mine], borders, CALIBRATED)
@@ -323,27 +324,5 @@ def repeats(edges: Array, photographs: Array) -> str:
 
 
 def _beside(*plots: Plot) -> str:
-    return f'<div style="display: flex; gap: 10px; padding: 5px">{"".join(p.svg() for p in plots)}</div>'
-
-
-# ------------------------------------------------------------------ accuracy
-
-
-def against_truth(truth: Machine, machine: Machine) -> tuple[float, float, float, float]:
-    """Errors of a machine: a centre's coordinate and an offset (rms, m), and the platform's
-    place and turn (means, m and rad) at 200 poses of the truth, frames laid over each other.
-    """
-    nothing = np.zeros((len(truth.values),) * 2)
-    base, platform = joint_centres(machine, truth, nothing)
-    centre = np.concatenate([base.change, platform.change])
-    offset = (machine.values - truth.values)[truth.parameters.of_kind("offset")]
-    poses, joints = draw_configurations(truth, 200, 0.0, np.random.default_rng(1))
-    e, f = base.T_calibrated_drawing, platform.T_calibrated_drawing
-    found = machine.forward(joints, inverse(e) @ poses @ f)
-    off = pose_difference(e @ found @ inverse(f), poses)
-    return (
-        float(np.sqrt(np.mean(centre**2))),
-        float(np.sqrt(np.mean(offset**2))),
-        float(np.linalg.norm(off[:, 3:], axis=1).mean()),
-        float(np.linalg.norm(off[:, :3], axis=1).mean()),
-    )
+    drawn = "".join(plot.svg() for plot in plots)
+    return f'<div style="display: flex; gap: 10px; padding: 5px">{drawn}</div>'

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -23,17 +23,14 @@ import numpy as np
 
 import pkmcal
 from pkmcal.arrays import Array
-from pkmcal.calibration import (
-    Calibration,
-    platform_poses,
-    read_photographs,
-    recognise,
-)
+from pkmcal.calibration import Calibration
+from pkmcal.commands.comparison import compare
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.problem import Measurements
 from pkmcal.observe import legs
-from pkmcal.report import charts, page
+from pkmcal.recognition import platform_poses, read_photographs, recognise
+from pkmcal.report import page
 from pkmcal.results import save
 from pkmcal.session import Session, load_session
 from pkmcal.simulate import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
@@ -254,22 +251,18 @@ def normalised(body: Centres) -> Array:
 
 def accuracy(case: Case) -> None:
     """Errors against the truth, as README quotes them, for 6 and 15 configurations a station."""
-    for name, count in (("demo", 6), ("larger", 15)):
-        found = case.result if count == 6 else pkmcal.calibrate(_larger(case.work / name, count))
-        truth = load_truth(found.session.folder, found.session.machine)
-        tell(f"{count} configurations a station: {found.verdict.headline}")
-        for what, machine in (("drawing", found.session.machine), ("calibrated", found.machine)):
-            centre, offset, shift, turn = drawings.against_truth(truth.machine, machine)
+    for folder, count in ((case.folder, 6), (_larger(case.work / "larger", 15), 15)):
+        found = pkmcal.calibrate(folder)
+        tell(f"{count} configurations a station, {sum(found.timings.values()):.1f} s")
+        compared = compare(found, folder)
+        for what, e in (("drawing", compared.drawing), ("calibrated", compared.calibrated)):
             tell(
-                f"  {what}: centres {centre * 1e3:.3f} mm a coordinate, offsets"
-                f" {offset * 1e3:.3f} mm, platform {shift * 1e3:.3f} mm and"
-                f" {np.rad2deg(turn):.4f} degrees at poses not photographed"
+                f"  {what}: centres {e.centre * 1e3:.3f} mm, offsets {e.offset * 1e3:.3f} mm,"
+                f" platform {e.position * 1e3:.3f} mm, {np.rad2deg(e.orientation):.4f} degrees"
             )
 
 
 def _larger(folder: Path, count: int) -> Path:
-    from dataclasses import replace
-
     if not folder.exists():
         machine = pkmcal.load_mechanism(MECHANISM)
         settings = replace(SETTINGS, configurations=count)

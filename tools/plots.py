@@ -27,7 +27,11 @@ def text(at: Point, words: str, colour: str = INK, anchor: str = "start", **more
 
 
 def line(
-    points: Iterable[Sequence[float]], colour: str, width: float = 1.5, dash: str = "", head: bool = False
+    points: Iterable[Sequence[float]],
+    colour: str,
+    width: float = 1.5,
+    dash: str = "",
+    head: bool = False,
 ) -> str:
     """A polyline; ``head`` puts an arrow at its end."""
     path = "M" + "L".join(f"{p[0]:.2f},{p[1]:.2f}" for p in points)

@@ -10,16 +10,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.errors import GeometryError, InputError, ResultError
-from pkmcal.files import listed
+from pkmcal.errors import ResultError
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.paper_methods import Method as PaperMethod
 from pkmcal.identify.paper_methods import by_paper
@@ -28,17 +27,14 @@ from pkmcal.identify.start import better_start
 from pkmcal.identify.verdict import Verdict, judge
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
-from pkmcal.observe.diagnose import unrecognised
 from pkmcal.observe.edges import EdgeSet, Observation, Rejection, concatenate
-from pkmcal.observe.images import decode_all
-from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import StationPose, View, find_station
-from pkmcal.session import Session, Station, load_session
+from pkmcal.recognition import WORKERS, check_observable, found_stations, read_photographs
+from pkmcal.refinement import CameraRefinement, refinement_of
+from pkmcal.session import Session, load_session
 
 ROUNDS = 3
 """Looks at the edges, each from the estimate before: the first corrects a pixel, the second a
 tenth, the third changes nothing that matters."""
-WORKERS = 2
 FEWEST_EDGES = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
 
@@ -60,6 +56,7 @@ class Calibration:
     measurements: Measurements
     estimate: Estimate
     verdict: Verdict
+    cameras: CameraRefinement
     method: str
     seed: int
     timings: dict[str, float] = field(default_factory=dict)
@@ -75,6 +72,7 @@ def calibrate(
     *,
     method: Method = "bundle",
     seed: int = 0,
+    refine_camera: bool = False,
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate the machine of a session; nothing is written.
@@ -82,6 +80,8 @@ def calibrate(
     session : a loaded session, or its folder.
     method : ``bundle`` (joint maximum likelihood), ``four-step`` ([A]) or ``linear`` ([B]).
     seed : of the random search for the stations' poses.
+    refine_camera : estimate the cameras' intrinsics with the machine, from their calibration's
+        covariance on.
     progress : called with the step in words and the share done.
     Raises InputError where the session is at fault, ResultError where nothing can be said.
     """
@@ -90,33 +90,44 @@ def calibrate(
     # Matrices here are small: threads inside the linear algebra only wait for one another, and
     # beside our own threads they slow it twentyfold.
     with threadpool_limits(1, "blas"):
-        return _calibrate(session, method, seed, progress or (lambda _text, _share: None))
+        told = progress or (lambda _text, _share: None)
+        return _calibrate(session, method, seed, refine_camera, told)
 
 
 def _calibrate(
-    session: Session | Path | str, method: Method, seed: int, told: Progress
+    session: Session | Path | str, method: Method, seed: int, refine_camera: bool, told: Progress
 ) -> Calibration:
     """:func:`calibrate`, step by step."""
     clock = _Clock()
     if not isinstance(session, Session):
         session = load_session(session)
     check_observable(session)
+    cameras = refinement_of(session, refine_camera)
     clock.lap("load")
     told("Reading photographs", 0.0)
     photographs = read_photographs(session)
     clock.lap("decode")
     told("Recognising the machine", 0.2)
-    poses = _stations(session, photographs, np.random.default_rng(seed))
+    poses = found_stations(session, photographs, np.random.default_rng(seed))
     clock.lap("observe")
-    observation, estimate, measurements = _take_turns(session, photographs, poses, told, clock)
-    told("Judging", 0.95)
+    turns = _take_turns(session, photographs, poses, cameras, told, clock)
+    estimate = turns.estimate
     if method != "bundle":
         told("Repeating the paper's method", 0.9)
-        estimate = by_paper(method, session.machine, measurements, estimate, seed)
-    verdict = judge(observation, estimate, method)
+        estimate = by_paper(method, session.machine, turns.measurements, estimate, seed)
+    told("Judging", 0.95)
+    verdict = judge(turns.observation, estimate, method)
     clock.lap("identify")
     return Calibration(
-        session, observation, measurements, estimate, verdict, method, seed, clock.laps
+        session=session,
+        observation=turns.observation,
+        measurements=turns.measurements,
+        estimate=estimate,
+        verdict=verdict,
+        cameras=turns.cameras,
+        method=method,
+        seed=seed,
+        timings=clock.laps,
     )
 
 
@@ -134,179 +145,56 @@ class _Clock:
         self._last = now
 
 
-def check_observable(session: Session) -> None:
-    """What the session's form allows but this observation cannot use."""
-    for station in session.stations:
-        where = f"session.yaml, stations.{station.name}"
-        if station.observe != "legs":
-            raise InputError(
-                "boards are not observed yet", where=where, found=f"observe: {station.observe}",
-                expected="observe: legs",
-            )  # fmt: skip
-        if station.T_camera_base is None:
-            raise InputError(
-                "the station has no rough pose",
-                where=where,
-                expected="pose: {position: [x, y, z], look_at: [x, y, z], up: [0, 0, 1]}",
-                next_step="Measure by hand where the camera stands; 10 cm and 10 degrees will do",
-            )
-    if not any(leg.tubes for leg in session.machine.document.legs):
-        raise InputError(
-            "no leg of the drawing has visible cylinders",
-            where="mechanism.yaml, legs",
-            expected="tubes: [{radius: 0.014, from: 0.05, to: 0.25}] on the legs",
-            next_step="Measure the legs' radii with calipers",
-        )
+class _Turns(NamedTuple):
+    """What the last turn left."""
 
-
-def read_photographs(session: Session) -> list[legs.Photographs]:
-    """Every station's photographs, decoded and prepared for the search."""
-
-    def read(number: int) -> legs.Photographs:
-        station = session.stations[number]
-        paths = [p.path for p in station.photographs]
-        labels = [label_of(session.folder, path) for path in paths]
-        images = decode_all(paths, station.camera.image_size, labels)
-        rows = np.array([p.configuration for p in station.photographs])
-        return legs.photographs_of(number, station.camera, rows, session.joints, images)
-
-    with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(read, range(len(session.stations))))
-
-
-def label_of(folder: Path, path: Path) -> str:
-    """A photograph's name in messages: its path inside the session."""
-    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
-
-
-def platform_poses(session: Session) -> Array:
-    """T_base_platform (K, 4, 4) of all configurations by the drawing, or which one has none."""
-    try:
-        found = session.machine.forward_result(session.joints)
-    except GeometryError as error:  # the drawing is the user's: it is at fault
-        raise InputError(
-            error.what,
-            where=session.document["mechanism"],
-            found=error.found,
-            expected=error.expected,
-            next_step=error.next_step,
-        ) from None
-    if found.converged.all():
-        return found.T_base_platform
-    bad = [session.configurations[k] for k in np.flatnonzero(~found.converged)]
-    raise InputError(
-        "the drawing's machine cannot take these readings: its legs do not meet the platform",
-        where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
-        found=f"a gap of {float(found.error.max()) * 1e3:.3g} mm",
-        expected="readings at which all legs reach the platform",
-        next_step="Check these readings, the order of their columns, and the drawing's centres",
-    )
-
-
-@dataclass(frozen=True)
-class Recognition:
-    """Where the search for each station's pose ended; rough : the poses it began from."""
-
-    views: tuple[View, ...]
-    rough: tuple[Array, ...]
-    found: tuple[StationPose, ...]
-
-    @property
-    def complete(self) -> bool:
-        """Whether the machine was recognised in every station's photographs."""
-        return all(pose.good for pose in self.found)
-
-
-def recognise(
-    session: Session,
-    photographs: list[legs.Photographs],
-    poses: Array,
-    rngs: list[np.random.Generator],
-) -> Recognition:
-    """Look for the machine in every station's photographs, nothing raised.
-
-    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one a station.
-    """
-    machine, tubes = session.machine, tubes_of(session.machine)
-    views = tuple(
-        View(machine, p.camera, tubes, p.joints, poses[p.configuration], p.tables)
-        for p in photographs
-    )
-    rough = tuple(_rough(station) for station in session.stations)
-    with ThreadPoolExecutor(WORKERS) as pool:
-        found = tuple(pool.map(find_station, views, rough, rngs))
-    return Recognition(views, rough, found)
-
-
-def why_unrecognised(
-    session: Session,
-    photographs: list[legs.Photographs],
-    recognition: Recognition,
-    rng: np.random.Generator,
-) -> InputError:
-    """The error about the stations that were not recognised; the usual mix-ups are tried."""
-    return unrecognised(
-        [station.name for station in session.stations],
-        list(recognition.views),
-        list(recognition.rough),
-        list(recognition.found),
-        session.joints,
-        [p.configuration for p in photographs],
-        rng,
-    )
-
-
-def _stations(
-    session: Session, photographs: list[legs.Photographs], rng: np.random.Generator
-) -> Array:
-    """Poses T_camera_base (S, 4, 4) of all stations, or the reason why one is not recognised."""
-    rngs = rng.spawn(len(photographs) + 1)
-    found = recognise(session, photographs, platform_poses(session), rngs[1:])
-    if not found.complete:
-        raise why_unrecognised(session, photographs, found, rngs[0])
-    return np.stack([pose.T_camera_base for pose in found.found])
-
-
-def _rough(station: Station) -> Array:
-    """The station's pose by hand; :func:`check_observable` has seen that there is one."""
-    return np.eye(4) if station.T_camera_base is None else station.T_camera_base
+    observation: Observation
+    measurements: Measurements
+    estimate: Estimate
+    cameras: CameraRefinement
 
 
 def _take_turns(
     session: Session,
     photographs: list[legs.Photographs],
     T_camera_base: Array,
+    cameras: CameraRefinement,
     told: Progress,
     clock: _Clock,
-) -> tuple[Observation, Estimate, Measurements]:
+) -> _Turns:
     """Observation and identification in turns, the search narrowing."""
     told("Finding the legs", 0.35)
-    poses = session.machine.forward(session.joints)
+    machine, poses = session.machine, session.machine.forward(session.joints)
     looks = _each(
         photographs,
-        lambda p: legs.search(p, session.machine, T_camera_base[p.station], poses[p.configuration]),
+        lambda p: legs.search(p, machine, T_camera_base[p.station], poses[p.configuration]),
     )
-    measurements = _measurements(session, _edges(looks))
+    measurements = _measurements(session, _edges(looks), None)
     clock.lap("observe")
-    state = start_state(session.machine, measurements, T_camera_base)
-    estimate = bundle(session.machine, measurements, state)
+    estimate = bundle(machine, measurements, start_state(machine, measurements, T_camera_base))
     clock.lap("identify")
     blur: list[float | None] = [None] * len(photographs)
     for turn in range(ROUNDS):
         told("Measuring edges and identifying", 0.45 + 0.5 * turn / ROUNDS)
-        looks = _each(photographs, partial(_measure, estimate=estimate, blur=blur))
+        cameras = cameras.moved(estimate)
+        photographs = [
+            replace(p, camera=cameras.camera(session.stations[p.station].camera_file))
+            for p in photographs
+        ]
+        look = partial(_measure, estimate=estimate, blur=blur, refine=cameras.active)
+        looks = _each(photographs, look)
         blur = [look.blur for look in looks]
-        measurements = _measurements(session, _edges(looks))
+        measurements = _measurements(session, _edges(looks), cameras)
         clock.lap("observe")
-        known = estimate.state
-        start = better_start(session.machine, measurements, known) if turn == 0 else known
-        estimate = bundle(session.machine, measurements, start)
+        known = replace(estimate.state, intrinsics=np.zeros_like(cameras.at))
+        start = better_start(machine, measurements, known) if turn == 0 else known
+        estimate = bundle(machine, measurements, start)
         clock.lap("identify")
-    return _observation(looks, estimate), estimate, measurements
+    return _Turns(_observation(looks, estimate), measurements, estimate, cameras)
 
 
 def _measure(
-    photographs: legs.Photographs, estimate: Estimate, blur: list[float | None]
+    photographs: legs.Photographs, estimate: Estimate, blur: list[float | None], refine: bool
 ) -> legs.StationEdges:
     state = estimate.state
     return legs.measure(
@@ -315,6 +203,7 @@ def _measure(
         state.T_camera_base[photographs.station],
         state.T_base_platform[photographs.configuration],
         blur[photographs.station],
+        refine_camera=refine,
     )
 
 
@@ -337,16 +226,22 @@ def _edges(looks: list[legs.StationEdges]) -> EdgeSet:
     return edges
 
 
-def _measurements(session: Session, edges: EdgeSet) -> Measurements:
+def _measurements(
+    session: Session, edges: EdgeSet, cameras: CameraRefinement | None
+) -> Measurements:
+    """cameras : None at the first look, which is too coarse to refine any."""
     files = [station.camera_file for station in session.stations]
     numbers = {name: k for k, name in enumerate(dict.fromkeys(files))}
-    return Measurements(
+    measurements = Measurements(
         edges=edges,
         joints=session.joints,
         joint_noise=session.joint_noise,
         n_stations=len(files),
         camera_of_station=np.array([numbers[name] for name in files]),
     )
+    if cameras is None:
+        return measurements
+    return replace(measurements, intrinsics_factor=cameras.factor, intrinsics_at=cameras.at)
 
 
 def _observation(looks: list[legs.StationEdges], estimate: Estimate) -> Observation:

@@ -15,15 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.calibration import (
-    Progress,
-    Recognition,
-    check_observable,
-    label_of,
-    platform_poses,
-    recognise,
-    why_unrecognised,
-)
+from pkmcal.calibration import Progress
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import listed, plain
 from pkmcal.geometry.rigid import inverse, pose_difference
@@ -31,6 +23,14 @@ from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.observe import legs
 from pkmcal.observe.images import decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
+from pkmcal.recognition import (
+    Recognition,
+    check_observable,
+    label_of,
+    platform_poses,
+    recognise,
+    why_unrecognised,
+)
 from pkmcal.session import Session, Station, load_session
 from pkmcal.starter import untouched_files
 

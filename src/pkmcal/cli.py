@@ -108,7 +108,7 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
         return error, error.exit_code
     if isinstance(error, _UsageError):
         return _misused(error, words), InputError.exit_code
-    if isinstance(error, KeyboardInterrupt):
+    if isinstance(error, KeyboardInterrupt | typer.Abort):
         return PkmcalError("interrupted; what was not finished was not written"), INTERRUPTED
     if isinstance(error, MemoryError):
         return _too_large(), InputError.exit_code

@@ -148,9 +148,22 @@ def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
             "file": files[c],
             "edge_shift": estimate.state.edge_shift[c],
             "sigma": estimate.edge_shift_sigma[c],
+            **_refined(calibration, files[c]),
         }
         for c in sorted(files)
     ]
+
+
+def _refined(calibration: Calibration, file: str) -> dict[str, Any]:
+    """The intrinsics where they were refined with the machine, with their deviations."""
+    if not calibration.cameras.active:
+        return {}
+    camera = calibration.cameras.result(calibration.estimate, file)
+    return {
+        "parameters": list(camera.parameter_names),
+        "values": camera.parameters,
+        "deviations": np.sqrt(np.diag(camera.covariance)),
+    }
 
 
 def _configurations(calibration: Calibration) -> list[dict[str, Any]]:

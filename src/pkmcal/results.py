@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 MECHANISM, EVERYTHING, REPORT = "mechanism.yaml", "calibration.json", "report.html"
 FILES = (REPORT, MECHANISM, EVERYTHING)
+CAMERA_FILE = re.compile(r"camera-.+\.yaml")
+"""Cameras as refined with the machine, where that was asked for."""
 EXACT = 1e-9
 """Relative difference below which two numbers of a file are the same: rounding leaves 1e-15, a
 change by hand a millionth."""
@@ -52,7 +55,7 @@ def check_output(folder: Path | str) -> None:
     if not folder.is_dir():
         return
     entries = sorted(entry.name for entry in folder.iterdir())
-    foreign = [name for name in entries if name not in FILES]
+    foreign = [name for name in entries if name not in FILES and not CAMERA_FILE.fullmatch(name)]
     # A mechanism.yaml without the rest is somebody's drawing.
     if foreign or (entries and EVERYTHING not in entries):
         raise InputError(
@@ -81,9 +84,24 @@ def save(calibration: Calibration, folder: Path | str) -> None:
         EVERYTHING: json_text(document_of(calibration)),
         REPORT: report,
     }
+    texts |= _refined_cameras(calibration)
     with staged_folder(folder) as stage:
         for name, text in texts.items():
+            (stage / name).parent.mkdir(parents=True, exist_ok=True)
             (stage / name).write_text(text, encoding="utf-8", newline="\n")
+
+
+def _refined_cameras(calibration: Calibration) -> dict[str, str]:
+    """Camera files as refined with the machine, by their place in the folder."""
+    from pkmcal.cameras.files import camera_text
+
+    cameras = calibration.cameras
+    if not cameras.active:
+        return {}
+    return {
+        f"camera-{Path(file).stem}.yaml": camera_text(cameras.result(calibration.estimate, file))
+        for file in cameras.files
+    }
 
 
 def calibrated_mechanism_text(calibration: Calibration) -> str:

@@ -32,6 +32,9 @@ of its 180 degrees in the picture has a third, a mirror a fifth."""
 class CameraSchema(Schema):
     """The fields that every camera file has; a model's own schema adds to them."""
 
+    covariance: tuple[tuple[float, ...], ...] | None = Field(
+        default=None, description="the parameters' covariance, one row a parameter"
+    )
     image_size: PositiveSize = Field(description="[width, height] in pixels")
     focal: PositivePair = Field(description="[fx, fy] in pixels")
     center: tuple[float, float] = Field(description="[cx, cy] in pixels, pixel centres at integers")
@@ -53,6 +56,7 @@ class CameraSchema(Schema):
 class Camera(ABC):
     """Intrinsics of one central camera.
 
+    covariance : (n, n) of the parameters by the camera's calibration, where it is known.
     image_size : (width, height) in pixels.
     parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and
         center, none for the rest. Pixel centres are at integers, as in OpenCV.
@@ -64,6 +68,7 @@ class Camera(ABC):
 
     image_size: tuple[int, int]
     parameters: Array
+    covariance: Array | None = None
 
     @abstractmethod
     def project(self, points: Array) -> Array:

@@ -24,6 +24,8 @@ FULL, NONE = 4.0, 6.5
 LEAST_NOISE = 1e-4
 """px; keeps noise-free data finite."""
 ROUNDS = 12
+STEPS = 20
+"""Most steps of a round; a long valley, such as that of xi and f, is followed over several."""
 SETTLED = 1e-3
 """Change of the corners' weights and relative change of tau that end the rounds."""
 
@@ -162,16 +164,16 @@ class Fit:
 
 
 def fit_camera(
-    camera: Camera, free: Integers, views: Views, T_camera_board: Array, weight: Array | None = None
+    camera: Camera, free: Integers, views: Views, T_camera_board: Array, rounds: int = ROUNDS
 ) -> Fit:
     """Fit intrinsics and poses from a start; weights and noise alternate with the search."""
     seen = views.seen
-    weight = seen.astype(float) if weight is None else weight * seen
+    weight = seen.astype(float)
     state = State(camera.parameters, T_camera_board[None])
     tau, cut, converged = 1.0, 4.0, True
-    for turn in range(ROUNDS):
+    for _ in range(rounds):
         problem = _problem(camera, free, views, weight, tau)
-        found = minimise(problem, state, max_steps=60 if turn == 0 else 30)
+        found = minimise(problem, state, max_steps=STEPS)
         state, converged = found.state, "converged" in found.stop[0].value
         off = _off(camera, state, views)
         dof = max(2 * weight.sum() - 6 * len(seen) - len(free), 1.0)
@@ -201,12 +203,14 @@ def refit(fit: Fit, views: Views, kept: Integers) -> Fit:
     )  # fmt: skip
 
 
-def fit_poses(camera: Camera, views: Views, T_camera_board: Array, scale: Array) -> tuple[Array, Array]:
+def fit_poses(
+    camera: Camera, views: Views, T_camera_board: Array, scale: Array
+) -> tuple[Array, Array]:
     """Poses (V, 4, 4) alone, each view on its own, and their costs (V,). scale : (V, N)."""
     problem = Problem(
         camera, np.zeros(0, dtype=int), views.points, views.pixels[:, None], scale[:, None]
     )
-    found = minimise(problem, State(camera.parameters, T_camera_board[:, None]), max_steps=40)
+    found = minimise(problem, State(camera.parameters, T_camera_board[:, None]), max_steps=STEPS)
     return found.state.T_camera_board[:, 0], found.cost
 
 
@@ -259,9 +263,7 @@ def noise_beyond(off: Array, sigma: Array, weight: Array, dof: float) -> float:
     return float(high)
 
 
-def _problem(
-    camera: Camera, free: Integers, views: Views, weight: Array, tau: float
-) -> Problem:
+def _problem(camera: Camera, free: Integers, views: Views, weight: Array, tau: float) -> Problem:
     scale = np.where(views.seen, np.sqrt(weight / (views.sigma**2 + tau**2)), 0.0)
     return Problem(camera, free, views.points, views.pixels[None], scale[None])
 

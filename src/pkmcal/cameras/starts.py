@@ -21,7 +21,8 @@ FOCALS = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
 TRIES = 16
 XIS = (0.0, 0.5, 1.0, 1.5, 2.2)
 KEPT = 3
-"""Best tries that are refined."""
+"""Best tries that are refined, over so many rounds of weights: it is a start only."""
+ROUNDS = 3
 
 
 def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers:
@@ -43,7 +44,7 @@ def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> Fit | No
     best: Fit | None = None
     for _, camera, poses in scored[:KEPT]:
         settled = settled_poses(camera, views, poses)
-        fit = fit_camera(camera, positions(camera, ()), views, settled)
+        fit = fit_camera(camera, positions(camera, ()), views, settled, ROUNDS)
         if best is None or _median(fit) < _median(best):
             best = fit
     return best

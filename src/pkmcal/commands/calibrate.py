@@ -42,6 +42,10 @@ def calibrate(
         typer.Option(metavar="NAME", help="bundle, or the papers' own: four-step, linear."),
     ] = Method.BUNDLE,
     seed: console.Seed = 0,
+    refine_camera: Annotated[
+        bool,
+        typer.Option("--refine-camera", help="Estimate the cameras' intrinsics as well."),
+    ] = False,
     as_json: console.Json = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Say nothing if it is well.")
@@ -56,7 +60,9 @@ def calibrate(
     folder = out or loaded.folder / "calibration"
     check_output(folder)
     with console.progress(quiet) as told:
-        calibration = run(loaded, method=method.value, seed=seed, progress=told)
+        calibration = run(
+            loaded, method=method.value, seed=seed, refine_camera=refine_camera, progress=told
+        )
         told("Writing the report", 0.97)
         save(calibration, folder)
     if as_json:

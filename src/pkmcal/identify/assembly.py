@@ -21,7 +21,7 @@ class Assembled:
 
     seen : (K,) configurations with at least one edge; only they are in the problem.
     row, place : (N,) of each edge: its configuration among the seen ones, its block there.
-    priors : names of the kinds of the prior rows, (c,): drawing, shift or gauge.
+    priors : names of the kinds of the prior rows, (c,): drawing, camera or gauge.
     """
 
     problem: Problem
@@ -47,15 +47,24 @@ def assemble(
     shape = (int(seen.sum()), int(place.max()) + 1)
     n_cameras = int(measurements.camera_of_station.max()) + 1
     prior, target, kinds = prior_rows(
-        machine, gauge, measurements.n_stations, n_cameras, use_drawing, radius_prior
+        machine,
+        gauge,
+        measurements.n_stations,
+        n_cameras,
+        use_drawing,
+        radius_prior,
+        intrinsics=measurements.intrinsics_factor.shape[-1],
     )
+    if measurements.intrinsics_at.size:
+        camera = np.array([kind == "camera" for kind in kinds])
+        target[camera] = np.pad(-measurements.intrinsics_at, ((0, 0), (1, 0))).ravel()
     blocks = _blocks(machine, measurements, row, place, shape)
     problem = Problem(
         layout=machine.layout,
         drawing=machine.parameters.drawing,
         free=machine.parameters.free_matrix(),
         blocks=blocks,
-        data=_data(edges, measurements.joints[seen], blocks, row, place),
+        data=_data(measurements, seen, blocks, row, place),
         joint_noise=measurements.joint_noise,
         n_stations=measurements.n_stations,
         n_cameras=n_cameras,
@@ -127,15 +136,23 @@ def _blocks(
     )
 
 
-def _data(edges: EdgeSet, joints: Array, blocks: Blocks, row: Integers, place: Integers) -> Data:
-    shape = blocks.leg.shape
+def _data(
+    measurements: Measurements, seen: Booleans, blocks: Blocks, row: Integers, place: Integers
+) -> Data:
+    edges, shape = measurements.edges, blocks.leg.shape
+    factor = measurements.intrinsics_factor
     basis = np.zeros((1, *shape, 1, 3, 2))
     whiten = np.zeros((1, *shape, 2, 2))
-    shift = np.zeros((1, *shape, 2))
+    optics = np.zeros((1, *shape, 2, 1 + factor.shape[-1]))
     basis[0, row, place, 0] = edges.basis
     whiten[0, row, place] = np.linalg.inv(np.linalg.cholesky(edges.covariance))
-    shift[0, row, place] = edges.shift
-    return Data(basis, whiten, shift, joints[None], blocks.present[None].astype(float))
+    optics[0, row, place, :, 0] = edges.shift
+    if factor.shape[-1]:
+        # the measured normals move with the intrinsics; residuals are predicted less measured
+        camera = measurements.camera_of_station[edges.station]
+        optics[0, row, place, :, 1:] = -edges.by_intrinsics @ factor[camera]
+    joints = measurements.joints[None, seen]
+    return Data(basis, whiten, optics, joints, blocks.present[None].astype(float))
 
 
 def prior_rows(
@@ -145,23 +162,26 @@ def prior_rows(
     n_cameras: int,
     use_drawing: bool,
     radius_prior: bool = True,
+    intrinsics: int = 0,
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
     Without the drawing the frames are free, so the gauge's constraints stand in as rows: they
-    can be met exactly, hence fix the frames and pull on nothing else.
+    can be met exactly, hence fix the frames and pull on nothing else. ``intrinsics`` unknowns a
+    camera stand in units of their prior.
     """
     table, free = machine.parameters, machine.parameters.free_matrix()
     nz = free.shape[1]
-    na = nz + 6 * n_stations + n_cameras
+    na = nz + 6 * n_stations + n_cameras * (1 + intrinsics)
     first = np.argmax(free, axis=0)
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
     held = (radius & radius_prior) | (~radius & use_drawing)
     drawing = np.zeros((int(held.sum()), na))
     drawing[np.arange(len(drawing)), np.flatnonzero(held)] = 1 / table.tolerance[first[held]]
-    shift = np.zeros((n_cameras, na))
-    shift[:, na - n_cameras :] = np.eye(n_cameras) / SHIFT_SIGMA
-    rows, kinds = [drawing, shift], ["drawing"] * len(drawing) + ["shift"] * n_cameras
+    optics = np.zeros((n_cameras * (1 + intrinsics), na))
+    sigma = np.tile([SHIFT_SIGMA] + [1.0] * intrinsics, n_cameras)
+    optics[:, nz + 6 * n_stations :] = np.diag(1 / sigma)
+    rows, kinds = [drawing, optics], ["drawing"] * len(drawing) + ["camera"] * len(optics)
     if not use_drawing and freedoms(machine).shape[1]:
         c = gauge.constraints(machine) @ free / float(np.mean(table.tolerance[first[~radius]]))
         rows.append(np.concatenate([c, np.zeros((len(c), na - nz))], axis=1))
@@ -174,11 +194,15 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
     """A state as a batch of one, free parameters only."""
     free = machine.parameters.free_matrix()
     z = np.linalg.lstsq(free, state.theta - machine.parameters.drawing, rcond=None)[0]
+    width = assembled.problem.n_optics - 1
+    known = state.intrinsics if state.intrinsics.shape[-1] == width else np.zeros((0, width))
+    intrinsics = np.zeros((len(state.edge_shift), width))
+    intrinsics[: len(known)] = known
     return BatchState(
         z[None],
         state.T_camera_base[None],
         state.T_base_platform[assembled.seen][None],
-        state.edge_shift[None],
+        np.concatenate([state.edge_shift[:, None], intrinsics], axis=1)[None],
     )
 
 
@@ -187,5 +211,9 @@ def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
     poses = start.T_base_platform.copy()
     poses[assembled.seen] = batch.T_base_platform[0]
     return State(
-        assembled.problem.theta(batch)[0], batch.T_camera_base[0], poses, batch.edge_shift[0]
+        assembled.problem.theta(batch)[0],
+        batch.T_camera_base[0],
+        poses,
+        batch.optics[0, :, 0],
+        batch.optics[0, :, 1:],
     )

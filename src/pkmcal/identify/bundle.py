@@ -191,12 +191,14 @@ def _estimate(
     stations = np.arange(6 * problem.n_stations).reshape(-1, 6) + n_par
     rows = problem.block_residuals(found)[0] / result.noise_scale[0]
     covariance = full[:n_par, :n_par]
+    optics = _optics_covariance(result)
+    factor = measurements.intrinsics_factor
     return Estimate(
         machine=identified,
         state=_with_unseen_poses(identified, measurements, assembled, state),
         covariance=covariance,
         station_covariance=full[stations[:, :, None], stations[:, None, :]],
-        edge_shift_sigma=np.sqrt(np.diag(result.info.covariance[0])[-problem.n_cameras :]),
+        edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
         edge_residuals=rows[assembled.row, assembled.place],
         edge_weights=result.weight[0, assembled.row, assembled.place],
         joint_residuals=_joint_residuals(result, assembled, measurements),
@@ -204,7 +206,15 @@ def _estimate(
         configurations=assembled.seen,
         statistics=_statistics(result, assembled),
         gauge=gauge.name,
+        intrinsics_covariance=factor @ optics[:, 1:, 1:] @ np.swapaxes(factor, -1, -2),
     )
+
+
+def _optics_covariance(result: BatchResult) -> Array:
+    """Covariance (C, w, w) of each camera's own unknowns."""
+    c, w = result.problem.n_cameras, result.problem.n_optics
+    own = result.info.covariance[0][-c * w :, -c * w :].reshape(c, w, c, w)
+    return np.einsum("iaib->iab", own)
 
 
 def _with_unseen_poses(

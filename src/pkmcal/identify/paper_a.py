@@ -192,7 +192,7 @@ def joint_problem(machine: Machine, settings: Settings, truth: Truth) -> Problem
     basis, whiten = as_edges(
         truth.axis, settings.noise.sigma(), np.broadcast_to(radius, truth.axis.shape[:-1])
     )
-    data = Data(basis, whiten, np.zeros((1, *shape, 4)), truth.joints, np.ones((1, *shape)))
+    data = Data(basis, whiten, np.zeros((1, *shape, 4, 1)), truth.joints, np.ones((1, *shape)))
     prior, target, _ = prior_rows(machine, ThreeCentres(), 3, 1, use_drawing=False)
     return Problem(
         layout=machine.layout,
@@ -249,7 +249,7 @@ def joint(machine: Machine, problem: Problem, truth: Truth, start_error: Array) 
     guess = perturb(truth.T_camera_base, np.array([0.03, -0.02, 0.03, 0.01, -0.01, 0.02]))
     z = (theta - machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
     n = len(theta)
-    start = BatchState(z, np.broadcast_to(guess, (n, 3, 4, 4)), poses, np.zeros((n, 1)))
+    start = BatchState(z, np.broadcast_to(guess, (n, 3, 4, 4)), poses, np.zeros((n, 1, 1)))
     return solve_batch(problem, start, robust=False, scale_noise=False)
 
 
@@ -258,7 +258,7 @@ def bound(machine: Machine, problem: Problem, truth: Truth) -> Array:
     z = (truth.theta - machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
     n = len(z)
     T = np.broadcast_to(truth.T_camera_base, (n, 3, 4, 4))
-    info = information(problem, BatchState(z, T, truth.T_base_platform, np.zeros((n, 1))))
+    info = information(problem, BatchState(z, T, truth.T_base_platform, np.zeros((n, 1, 1))))
     nz = problem.free.shape[1]
     change = projector(machine, truth.theta, ThreeCentres())
     spread = problem.free - generators(machine.layout, truth.theta) @ change @ problem.free

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
@@ -15,7 +17,10 @@ class Measurements:
 
     edges : silhouette edges. joints : (K, m) readings, m or rad. joint_noise : their
     standard deviation. n_stations : S. camera_of_station : (S,) number of the camera (file)
-    that each station uses: one edge shift is estimated for each camera.
+    that each station uses: one edge shift is estimated for each camera. intrinsics_factor :
+    (C, n, r) square roots F of the cameras' intrinsics' covariances F F^T, where these are to be
+    refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
+    those units from the calibration's values.
     """
 
     edges: EdgeSet
@@ -23,6 +28,8 @@ class Measurements:
     joint_noise: float
     n_stations: int
     camera_of_station: Integers
+    intrinsics_factor: Array = field(default_factory=lambda: np.zeros((1, 0, 0)))
+    intrinsics_at: Array = field(default_factory=lambda: np.zeros((1, 0)))
 
 
 @dataclass(frozen=True)
@@ -30,13 +37,15 @@ class State:
     """One value of every unknown.
 
     theta : (P,) machine parameters. T_camera_base : (S, 4, 4). T_base_platform : (K, 4, 4).
-    edge_shift : (C,) px outward, per camera.
+    edge_shift : (C,) px outward, per camera. intrinsics : (C, r) change of each camera's from
+    ``Measurements.intrinsics_at``, in the same units; r = 0 where they are held.
     """
 
     theta: Array
     T_camera_base: Array
     T_base_platform: Array
     edge_shift: Array
+    intrinsics: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)
@@ -70,7 +79,8 @@ class Estimate:
     machine : with the identified values. state : all unknowns.
     covariance : (P, P) of the machine's parameters in that gauge; zero rows where fixed.
     station_covariance : (S, 6, 6) of (omega, tau), left perturbation of T_camera_base.
-    edge_shift_sigma : (C,) px.
+    edge_shift_sigma : (C,) px. intrinsics_covariance : (C, n, n) of the cameras' intrinsics
+    after refinement; n = 0 where they were held.
     edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1.
     joint_residuals : (K, m) in standard deviations.
     data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
@@ -91,3 +101,4 @@ class Estimate:
     configurations: Booleans
     statistics: Statistics
     gauge: str
+    intrinsics_covariance: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))

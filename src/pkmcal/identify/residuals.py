@@ -57,13 +57,15 @@ class Blocks:
 class Data:
     """Numbers measured in each run; leading axis B, or 1 where all runs share them.
 
-    basis : (B, K, G, g, 3, 2). whiten : (B, K, G, 2g, 2g). shift : (B, K, G, 2g) rad/px.
+    basis : (B, K, G, g, 3, 2). whiten : (B, K, G, 2g, 2g). optics : (B, K, G, 2g, w) change of
+    the measured normals, less the predicted ones', by the w unknowns of their camera: the edge
+    shift (px), then its intrinsics where they are refined (in units of their prior).
     joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale squared.
     """
 
     basis: Array
     whiten: Array
-    shift: Array
+    optics: Array
     joints: Array
     weight: Array
 
@@ -71,13 +73,13 @@ class Data:
 @dataclass(frozen=True)
 class BatchState:
     """Unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
-    T_base_platform (B, K, 4, 4), edge_shift (B, C).
+    T_base_platform (B, K, 4, 4), optics (B, C, w).
     """
 
     z: Array
     T_camera_base: Array
     T_base_platform: Array
-    edge_shift: Array
+    optics: Array
 
 
 class Ends(NamedTuple):
@@ -97,7 +99,7 @@ class Problem:
 
     layout, drawing (P,), free (P, nz) : the machine. blocks, data : the measurements.
     joint_noise : standard deviation of a reading.
-    prior : (c, na) rows on the shared unknowns (z, stations, shifts) and prior_target : (c,).
+    prior : (c, na) rows on the shared unknowns (z, stations, optics) and prior_target : (c,).
     frames : (12, g) frame changes that the model allows.
     """
 
@@ -116,7 +118,12 @@ class Problem:
     @property
     def n_shared(self) -> int:
         """Number of shared unknowns."""
-        return self.free.shape[1] + 6 * self.n_stations + self.n_cameras
+        return self.free.shape[1] + 6 * self.n_stations + self.n_cameras * self.n_optics
+
+    @property
+    def n_optics(self) -> int:
+        """Number of unknowns of a camera."""
+        return self.data.optics.shape[-1]
 
     @property
     def n_edge_rows(self) -> int:
@@ -174,7 +181,7 @@ class Problem:
             state.z + z,
             perturb(state.T_camera_base, camera),
             perturb(state.T_base_platform, pose),
-            state.edge_shift + shared[:, nz + ns :],
+            state.optics + shared[:, nz + ns :].reshape(state.optics.shape),
         )
         return self._in_frames(inner, y[..., 0])
 
@@ -186,7 +193,7 @@ class Problem:
             (theta - self.drawing) @ np.linalg.pinv(self.free).T,
             state.T_camera_base @ inverse(e)[:, None],
             e[:, None] @ state.T_base_platform @ inverse(f)[:, None],
-            state.edge_shift,
+            state.optics,
         )
 
     def select(self, runs: Integers) -> Problem:
@@ -229,7 +236,7 @@ class Problem:
         nz = self.free.shape[1]
         x = np.zeros((state.z.shape[0], self.n_shared))
         x[:, :nz] = state.z
-        x[:, nz + 6 * self.n_stations :] = state.edge_shift
+        x[:, nz + 6 * self.n_stations :] = state.optics.reshape(len(x), -1)
         return x @ self.prior.T - self.prior_target
 
     def _normals(self, state: BatchState, a: Array, b: Array) -> Ends:
@@ -250,13 +257,13 @@ class Problem:
         flat = flat.reshape(*flat.shape[:3], -1, flat.shape[-1])
         return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ flat)
 
-    def _shift_column(self) -> Array:
-        column = (self.data.whiten @ self.data.shift[..., None])[..., 0]
-        return np.sqrt(self.data.weight)[..., None] * column
+    def _optics_columns(self) -> Array:
+        """Edge rows by their camera's unknowns, (B, K, G, 2g, w)."""
+        return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ self.data.optics)
 
     def _edge_rows(self, state: BatchState, n: Array) -> Array:
-        shift = state.edge_shift[:, self.blocks.camera]
-        rows = self._project(n[..., None])[..., 0] + self._shift_column() * shift[..., None]
+        optics = state.optics[:, self.blocks.camera, :, None]
+        rows = (self._project(n[..., None]) + self._optics_columns() @ optics)[..., 0]
         unused = np.broadcast_to((self.data.weight == 0)[..., None], rows.shape)
         return np.where(unused, 0.0, rows).reshape(*rows.shape[:2], -1)
 
@@ -291,11 +298,12 @@ class Problem:
                 (self.blocks.radius[..., None], self._project(e.by_radius[..., None])),
             ]
         )
-        shift = np.broadcast_to(self._shift_column()[..., None], (*by_station.shape[:-1], 1))
+        optics = self._optics_columns()
+        optics = np.broadcast_to(optics, (*by_station.shape[:-1], optics.shape[-1]))
         parts = [
             machine,
             _one_hot(by_station, self.blocks.station, self.n_stations),
-            _one_hot(shift, self.blocks.camera, self.n_cameras),
+            _one_hot(optics, self.blocks.camera, self.n_cameras),
         ]
         out = np.concatenate(parts, axis=-1)
         return out.reshape(*out.shape[:2], -1, out.shape[-1])

@@ -112,9 +112,7 @@ def _first(grey: Array, weight: Array, axes: Array) -> Array:
     return np.stack([zero, zero, angle[:, 0], angle[:, 1], zero, mean, spread], axis=-1)
 
 
-def _fit(
-    grey: Array, weight: Array, offsets: Array, p: Array, saddle: bool
-) -> tuple[Array, Array]:
+def _fit(grey: Array, weight: Array, offsets: Array, p: Array, saddle: bool) -> tuple[Array, Array]:
     """Weighted Levenberg-Marquardt of all corners at once; parameters (n, 7), residuals (n, m)."""
     p = _levelled(grey, weight, offsets, p, saddle)
     value, by = _model(p, offsets, saddle)
@@ -147,7 +145,9 @@ _MOST = np.array([1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3])
 
 def _levelled(grey: Array, weight: Array, offsets: Array, p: Array, saddle: bool) -> Array:
     """The start with level and amplitude fitted: these two are linear."""
-    shape = _model(np.concatenate([p[:, :5], 0 * p[:, :1], 0 * p[:, :1] + 1], axis=1), offsets, saddle)[0]
+    shape = _model(
+        np.concatenate([p[:, :5], 0 * p[:, :1], 0 * p[:, :1] + 1], axis=1), offsets, saddle
+    )[0]
     total = np.maximum(weight.sum(axis=1), 1e-9)
     mean = np.sum(weight * shape, axis=1) / total
     grey_mean = np.sum(weight * grey, axis=1) / total

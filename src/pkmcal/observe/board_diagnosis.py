@@ -177,5 +177,10 @@ def _other_markers(image: Integers, mine: str) -> str | None:
     if best < 4 or counts.get(mine, 0) > 0.7 * best:
         return None
     names = [name for name in counts if counts[name] >= 0.9 * best]
-    names.sort(key=lambda name: (int(np.prod([int(n) for n in name.split("_")[2:] if n.isdigit()] or [9999])), name))
+    names.sort(
+        key=lambda name: (
+            int(np.prod([int(n) for n in name.split("_")[2:] if n.isdigit()] or [9999])),
+            name,
+        )
+    )
     return f"{best} markers of {names[0]}"

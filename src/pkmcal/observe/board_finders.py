@@ -78,9 +78,7 @@ def _axes(board: Board, ids: Integers, pixels: Array) -> Array:
         pad = [(0, 0), (0, 0), (0, 0)]
         before, after = list(pad), list(pad)
         before[axis], after[axis] = (1, 0), (0, 1)
-        both = np.stack(
-            [np.pad(step, p, constant_values=np.nan) for p in (before, after)]
-        )
+        both = np.stack([np.pad(step, p, constant_values=np.nan) for p in (before, after)])
         known = np.isfinite(both)
         total = np.where(known, both, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
         side = np.where(known.any(axis=0), total, np.nan).reshape(-1, 2)[ids]
@@ -191,9 +189,7 @@ def _chessboard(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     return (np.arange(len(pixels)), pixels), False, ""
 
 
-def find_chessboard(
-    image: Integers, counts: tuple[int, int], quick: bool = False
-) -> Array | None:
+def find_chessboard(image: Integers, counts: tuple[int, int], quick: bool = False) -> Array | None:
     """Corners (rows * columns, 2) px in the board's order, None where not found.
 
     quick : the first way only, for trying many counts.

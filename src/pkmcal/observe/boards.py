@@ -232,9 +232,7 @@ def _marker_grid(fields: GridSchema, data: dict[str, Any]) -> Board:
         for axis in (1, 0)
         for value in np.unique(points[:, axis])
     ]
-    return Board(
-        "aruco_grid", fields.markers, points, tuple(v for v in lines if len(v) > 2), data
-    )
+    return Board("aruco_grid", fields.markers, points, tuple(v for v in lines if len(v) > 2), data)
 
 
 def dictionaries() -> tuple[str, ...]:

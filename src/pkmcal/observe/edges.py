@@ -5,7 +5,7 @@ Everything after the image works on :class:`EdgeSet`, whatever the camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -25,6 +25,8 @@ class EdgeSet:
     shift : (N, 2) change of the normal, in that basis, when every point of the edge moves
         outward by one pixel (rad/px).
     span : (N, 2) first and last seen place along the leg, m from A.
+    by_intrinsics : (N, 2, n) change of the normal, in that basis, by the camera's parameters with
+        the edge's pixels held; n = 0 where nobody asked.
     """
 
     station: Integers
@@ -37,6 +39,12 @@ class EdgeSet:
     covariance: Array
     shift: Array
     span: Array
+    by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
+
+    def __post_init__(self) -> None:
+        """Edges without derivatives by intrinsics get empty ones, so that all select alike."""
+        if len(self.by_intrinsics) != len(self.station):
+            object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 2, 0)))
 
     def __len__(self) -> int:
         return len(self.station)
@@ -80,7 +88,15 @@ class Observation:
 
 
 def concatenate(sets: list[EdgeSet]) -> EdgeSet:
-    """Several edge sets as one."""
-    return EdgeSet(
-        **{f.name: np.concatenate([getattr(s, f.name) for s in sets]) for f in fields(EdgeSet)}
-    )
+    """Several edge sets as one; cameras with fewer parameters get zeros for the rest."""
+    widest = max(s.by_intrinsics.shape[-1] for s in sets)
+    padded = [
+        np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
+        for s in sets
+    ]
+    joined = {
+        f.name: np.concatenate([getattr(s, f.name) for s in sets])
+        for f in fields(EdgeSet)
+        if f.name != "by_intrinsics"
+    }
+    return EdgeSet(**joined, by_intrinsics=np.concatenate(padded))

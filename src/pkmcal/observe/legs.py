@@ -118,10 +118,12 @@ def measure(
     T_camera_base: Array,
     poses: Array,
     blur: float | None = None,
+    refine_camera: bool = False,
 ) -> StationEdges:
     """Every edge to sub-pixel, by the shading-aware model of :mod:`profiles`.
 
-    blur : px, from an earlier look; estimated from these profiles when absent.
+    blur : px, from an earlier look; estimated from these profiles when absent. refine_camera :
+    also how the edges depend on the camera's parameters.
     """
     tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, SAMPLES, CLEARANCE)
     offsets = profiles.profile_offsets()
@@ -137,7 +139,10 @@ def measure(
     position, sigma, found = np.zeros(full.shape), np.ones(full.shape), full.copy()
     position[full], sigma[full], found[full] = at.position, at.sigma, at.found
     fits = fit_edges(places, position, sigma, found)
-    edges = edge_set(places, fits, tubes, photographs.station, photographs.configuration, fits.good)
+    by_camera = photographs.camera.project_jacobians(places.point)[1] if refine_camera else None
+    edges = edge_set(
+        places, fits, tubes, photographs.station, photographs.configuration, fits.good, by_camera
+    )
     rejected = _rejections(photographs, tubes, full, found, fits)
     k, e, s = np.nonzero(fits.used & fits.good[..., None])
     xy = places.pixel[k, e, s] + position[k, e, s, None] * places.outward[k, e, s]

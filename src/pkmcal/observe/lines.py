@@ -26,16 +26,15 @@ FEWEST = 3
 class EdgeFits:
     """Planes fitted to positions along edges; all (K, E, ...).
 
-    turn : (2,) of the normal in ``basis`` (3, 2). covariance : (2, 2). shift : (2,) rad a px.
-    spread : rms of the weighted positions about the fit, in their sigmas. used : samples taken
-    as the edge's. good : enough of them.
+    turn : (2,) of the normal in ``basis`` (3, 2). covariance : (2, 2). operator : (2, n) turn by
+    the positions at the n samples, with the final weights. used : samples taken as the edge's.
+    good : enough of them.
     """
 
     turn: Array
     basis: Array
     covariance: Array
-    shift: Array
-    spread: Array
+    operator: Array
     used: Booleans
     good: Booleans
 
@@ -62,14 +61,13 @@ def fit_edges(
         off2 = _squared_misfit(rows, value, turn, base)
     used = found & (off2 < 9.0)
     count = used.sum(axis=-1)
-    spread2 = np.sum(weight * off2, axis=-1) / np.maximum(np.sum(weight, axis=-1), 1e-30)
     scatter = np.sum(used * off2, axis=-1) / np.maximum(count - 2, 1)
     factor = np.maximum(scatter, 1.0) * np.maximum(count / HALVES, 1.0)
     covariance = np.linalg.inv(normal) * factor[..., None, None]
-    shift = _weighted(rows, np.where(found, 1.0, 0.0), weight)[0]
+    operator = np.linalg.solve(normal, np.swapaxes(rows * weight[..., None], -1, -2))
     good = (count >= FEWEST) & (count >= 0.5 * found.sum(axis=-1))
     good &= np.isfinite(covariance).all(axis=(-1, -2))
-    return EdgeFits(turn, basis, covariance, shift, np.sqrt(spread2), used, good)
+    return EdgeFits(turn, basis, covariance, operator, used, good)
 
 
 def _middle_ray(points: EdgePoints) -> Array:
@@ -97,8 +95,13 @@ def edge_set(
     station: int,
     configuration: Integers,
     keep: Booleans,
+    by_parameters: Array | None = None,
 ) -> EdgeSet:
-    """The fits at ``keep`` (K, E) as measurements; configuration : (K,) of the photographs."""
+    """The fits at ``keep`` (K, E) as measurements; configuration : (K,) of the photographs.
+
+    by_parameters : (K, E, n, 2, p) motion of the predicted pixels by the camera's parameters,
+    where the intrinsics are to be refined: the measured places then move the other way.
+    """
     k, e = np.nonzero(keep)
     basis = fits.basis[k, e]
     normal = points.normal[k, e] + (basis @ fits.turn[k, e, :, None])[..., 0]
@@ -115,6 +118,16 @@ def edge_set(
         # the turn is a few milliradians: the same two coordinates serve at the turned normal
         basis=tangent_basis(normal, middle),
         covariance=fits.covariance[k, e],
-        shift=fits.shift[k, e],
+        shift=fits.operator[k, e].sum(axis=-1),
         span=np.stack([np.nanmin(along, axis=1), np.nanmax(along, axis=1)], axis=1),
+        by_intrinsics=_by_intrinsics(points, fits, by_parameters)[k, e],
     )
+
+
+def _by_intrinsics(points: EdgePoints, fits: EdgeFits, by_parameters: Array | None) -> Array:
+    """Turn of the fitted planes by the camera's parameters, the pixels held; (K, E, 2, p)."""
+    if by_parameters is None:
+        return np.zeros((*fits.turn.shape, 0))
+    outward = (points.outward[..., None, :] @ by_parameters)[..., 0, :]
+    used = fits.used[..., None] & np.isfinite(outward)
+    return -fits.operator @ np.where(used, outward, 0.0)

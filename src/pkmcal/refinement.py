@@ -1,0 +1,90 @@
+"""Cameras estimated with the machine: their intrinsics, held by their own calibration's covariance.
+
+The unknowns are whitened: parameters = calibrated + F x with the covariance F F^T, so x has unit
+variance before the machine is seen. Edges are measured with the best cameras so far, at x = at,
+and the estimate finds the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.identify.problem import Estimate
+from pkmcal.session import Session
+
+
+@dataclass(frozen=True)
+class CameraRefinement:
+    """The cameras of a session and where their refinement stands.
+
+    files, calibrated : names and cameras as calibrated, C of them. factor : (C, n, r) the F above,
+    r = 0 where cameras are held. at : (C, r).
+    """
+
+    files: tuple[str, ...]
+    calibrated: tuple[Camera, ...]
+    factor: Array
+    at: Array
+
+    @property
+    def active(self) -> bool:
+        """Whether there is anything to refine."""
+        return self.factor.shape[-1] > 0
+
+    def camera(self, file: str) -> Camera:
+        """A camera with its intrinsics at the present place."""
+        number = self.files.index(file)
+        camera = self.calibrated[number]
+        if not self.active:
+            return camera
+        change = (self.factor[number] @ self.at[number])[: len(camera.parameters)]
+        return replace(camera, parameters=camera.parameters + change)
+
+    def moved(self, estimate: Estimate) -> CameraRefinement:
+        """The refinement after an estimate."""
+        if estimate.state.intrinsics.shape != self.at.shape:
+            return self
+        return replace(self, at=self.at + estimate.state.intrinsics)
+
+    def result(self, estimate: Estimate, file: str) -> Camera:
+        """A camera as the last estimate has it, with its covariance."""
+        camera = self.moved(estimate).camera(file)
+        if not self.active:
+            return camera
+        covariance = estimate.intrinsics_covariance[self.files.index(file)]
+        n = len(camera.parameters)
+        return replace(camera, covariance=covariance[:n, :n])
+
+
+def refinement_of(session: Session, refine: bool) -> CameraRefinement:
+    """The session's cameras, held or to be refined; an InputError where one has no covariance."""
+    cameras = {s.camera_file: s.camera for s in session.stations}
+    files, calibrated = tuple(cameras), tuple(cameras.values())
+    if not refine:
+        held = np.zeros((len(files), 0, 0))
+        return CameraRefinement(files, calibrated, held, np.zeros((len(files), 0)))
+    roots = [_root(file, camera) for file, camera in cameras.items()]
+    n, r = (max(root.shape[k] for root in roots) for k in (0, 1))
+    factor = np.stack([np.pad(f, ((0, n - len(f)), (0, r - f.shape[1]))) for f in roots])
+    return CameraRefinement(files, calibrated, factor, np.zeros((len(files), r)))
+
+
+def _root(file: str, camera: Camera) -> Array:
+    """F (n, r) of a camera; what its calibration held fixed has no variance and no column."""
+    if camera.covariance is None:
+        raise InputError(
+            "the camera's covariance is not known, so its intrinsics cannot be refined",
+            where=file,
+            expected="covariance: [[...], ...], as `pkmcal camera` writes it",
+            next_step="Calibrate the camera with `pkmcal camera`, or leave --refine-camera out",
+        )
+    scale = np.sqrt(np.diag(camera.covariance))
+    scale[scale == 0] = 1.0
+    values, vectors = np.linalg.eigh(camera.covariance / np.outer(scale, scale))
+    used = values > 1e-12 * values[-1]
+    return scale[:, None] * vectors[:, used] * np.sqrt(values[used])

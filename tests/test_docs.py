@@ -1,0 +1,223 @@
+"""The documentation against the program: links, examples, commands, keys, functions, pictures."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from functools import reduce
+from pathlib import Path
+
+import pytest
+
+from conftest import run
+from pkmcal.cameras import camera_models
+from pkmcal.cameras.files import load_camera
+from pkmcal.files import parse_yaml, read_json, validate
+from pkmcal.mechanisms import MechanismDocument, load_mechanism, machine_from_document
+from pkmcal.session import SessionDocument
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+PICTURES = ROOT / "docs" / "pictures"
+FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+FILES = (".py", ".yaml", ".json", ".csv", ".html")
+NAMES = {page.relative_to(ROOT).as_posix(): page for page in PAGES}
+
+
+def text_of(name: str) -> str:
+    return NAMES[name].read_text(encoding="utf-8")
+
+
+def prose(text: str) -> str:
+    """A page without its code blocks."""
+    return FENCE.sub("", text)
+
+
+def blocks(text: str, kind: str) -> list[str]:
+    """Code blocks whose opening line is ``kind``, in their order."""
+    return [body for info, body in FENCE.findall(text) if info.strip() == kind]
+
+
+def anchors(text: str) -> set[str]:
+    """What GitHub makes of a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", prose(text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+def quoted(text: str) -> set[str]:
+    """Every word between backticks, paths taken apart."""
+    spans = re.findall(r"`([^`\n]+)`", text)
+    return {word for span in spans for word in re.findall(r"\w+", span)}
+
+
+# ------------------------------------------------------------------ links and pictures
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_links_lead_somewhere(name):
+    page, text = NAMES[name], text_of(name)
+    for link in LINK.findall(prose(text)):
+        if link.startswith(("http://", "https://")):
+            continue
+        target, _, anchor = link.partition("#")
+        path = (page.parent / target).resolve() if target else page
+        assert path.exists(), f"{name}: {link}"
+        if anchor:
+            assert anchor in anchors(path.read_text(encoding="utf-8")), f"{name}: {link}"
+
+
+def test_pictures_are_used_small_and_made_by_the_script(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    script = importlib.import_module("pictures")
+    there = {path.stem for path in PICTURES.iterdir()}
+    shown = {Path(link).stem for name in NAMES for link in LINK.findall(text_of(name))
+             if link.endswith(".png")}  # fmt: skip
+    assert there == shown == set(script.PICTURES)
+    for path in PICTURES.iterdir():
+        assert path.read_bytes().startswith(b"\x89PNG"), path.name
+        assert path.stat().st_size <= 200_000, path.name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pages_name_no_place_of_one_computer(name):
+    assert not re.search(r"(^|[\s\"'(`])/(home|root|tmp|work|Users)/", text_of(name))
+
+
+# ------------------------------------------------------------------ examples
+
+
+@pytest.fixture(scope="module")
+def workplace(demo, tmp_path_factory) -> Path:
+    """A folder with ``session``, its calibration ``out``, and the machine of docs/machines.md."""
+    folder = tmp_path_factory.mktemp("docs")
+    (folder / "session").symlink_to(demo.session, target_is_directory=True)
+    (folder / "out").symlink_to(demo.calibration, target_is_directory=True)
+    (folder / "table.yaml").write_text(blocks(text_of("docs/machines.md"), "yaml machine")[0])
+    return folder
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if blocks(text_of(n), "python runnable")])
+def test_examples_run(name, workplace, monkeypatch):
+    """Blocks of one page share their names, as a reader who types them in would have it."""
+    monkeypatch.chdir(workplace)
+    namespace: dict[str, object] = {}
+    for body in blocks(text_of(name), "python runnable"):
+        exec(compile(body, name, "exec"), namespace)
+
+
+def test_runnable_examples_are_where_readers_look():
+    assert {n for n in NAMES if blocks(text_of(n), "python runnable")} >= {
+        "README.md", "docs/files.md", "docs/formulation.md", "docs/machines.md",
+    }  # fmt: skip
+
+
+def test_example_files_are_valid(tmp_path):
+    session, mechanism, camera = blocks(text_of("docs/files.md"), "yaml")
+    validate(parse_yaml(session, Path("session.yaml")), SessionDocument)
+    document = parse_yaml(mechanism, Path("mechanism.yaml"))
+    document.data["legs"] *= 6  # the page shows one leg
+    machine = machine_from_document(validate(document, MechanismDocument))
+    assert machine.parameters.fixed
+    assert machine.parameters.tied
+    (tmp_path / "camera.yaml").write_text(camera)
+    assert load_camera(tmp_path / "camera.yaml").image_size == (1024, 768)
+
+
+def test_the_machine_described_from_scratch_works(workplace):
+    machine = load_mechanism(workplace / "table.yaml")
+    assert (machine.n_legs, machine.n_joints) == (3, 3)
+    assert machine.forward_result(machine.inverse(machine.home())).singularity > 0.1
+
+
+# ------------------------------------------------------------------ what is named exists
+
+
+def calls(text: str) -> list[tuple[str, str]]:
+    """Commands of pkmcal in a page's code, with what follows each on its line."""
+    code = re.findall(r"`([^`\n]+)`", prose(text)) + [body for _, body in FENCE.findall(text)]
+    call = re.compile(r"(?:^|[\s/])pkmcal +([a-z]+)\b([^\n#]*)")
+    return [found for part in code for found in call.findall(part)]
+
+
+def test_commands_named_exist():
+    known = set(re.findall(r"^  (\w+) ", run("--help").out.partition("Commands:")[2], re.MULTILINE))
+    assert {"demo", "new", "check", "calibrate"} <= known
+    assert {command for command, _ in calls(text_of("README.md"))} >= {"demo", "new", "check"}
+    for name in NAMES:
+        assert {command for command, _ in calls(text_of(name))} <= known, name
+    assert known <= quoted(text_of("docs/commands.md"))
+
+
+def test_options_named_exist():
+    for name in NAMES:
+        for command, rest in calls(text_of(name)):
+            for option in re.findall(r"(?<!\S)--[a-z-]+", rest):
+                assert option in run(command, "--help").out, f"{name}: {command} {option}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_functions_named_exist(name):
+    package = Path(importlib.import_module("pkmcal").__path__[0])
+    modules = {p.stem for p in package.iterdir() if p.suffix == ".py" or p.is_dir()}
+    for span in re.findall(r"`([\w.]+)`", prose(text_of(name))):
+        first, *rest = span.removeprefix("pkmcal.").split(".")
+        if not rest or first not in modules or span.endswith(FILES):
+            continue
+        assert _found(f"pkmcal.{first}", rest), f"{name}: {span}"
+
+
+def _found(module: str, names: list[str]) -> bool:
+    try:
+        here = importlib.import_module(module)
+    except ImportError:
+        return False
+    if not names or reduce(lambda o, n: getattr(o, n, None), names, here) is not None:
+        return True
+    return _found(f"{module}.{names[0]}", names[1:])
+
+
+def schema_keys(schema: dict) -> set[str]:
+    """Property names anywhere in a JSON schema."""
+    parts = [schema, *schema.get("$defs", {}).values()]
+    return {key for part in parts for key in part.get("properties", {})}
+
+
+@pytest.mark.parametrize(
+    "schema",
+    [SessionDocument, MechanismDocument, *(m.schema for m in camera_models().values())],
+    ids=lambda s: s.__name__,
+)
+def test_keys_of_files_are_explained(schema):
+    keys = schema_keys(schema.model_json_schema(by_alias=True))
+    assert keys
+    assert keys <= quoted(text_of("docs/files.md"))
+
+
+FREE = {"mechanism", "session", "versions", "timings"}
+"""Parts of calibration.json whose keys are names, or those of another file."""
+
+
+def written_keys(value: object, free: set[str]) -> set[str]:
+    """Keys anywhere in a JSON value, but for the inside of ``free`` ones."""
+    if isinstance(value, dict):
+        inner = (written_keys(v, free) for k, v in value.items() if k not in free)
+        return set(value).union(*inner)
+    if isinstance(value, list):
+        return set().union(*(written_keys(v, free) for v in value[:3]))
+    return set()
+
+
+def test_keys_of_a_calibration_are_explained(demo):
+    document = read_json(demo.calibration / "calibration.json").data
+    keys = written_keys(document, FREE)
+    assert {"parameters", "sigma", "noise_scale", "T_base_camera"} <= keys
+    assert keys <= quoted(text_of("docs/files.md"))
+
+
+def test_keys_of_a_truth_are_explained(demo):
+    document = read_json(demo.session / "truth.json").data
+    keys = set(document)
+    for group in ("stations", "configurations"):
+        keys |= set(next(iter(document[group].values())))
+    assert keys <= quoted(text_of("docs/files.md"))

@@ -1,0 +1,199 @@
+"""Pictures of legs for the tests of observation, drawn without pkmcal's own geometry or simulation.
+
+Every pixel's ray is met with every tube (a quadratic equation); pixels at borders are looked at
+through 36 points. Lens blur, noise and 8 bits follow. The tests below are of the drawing itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from pkmcal.cameras import camera_models
+from pkmcal.geometry.rigid import look_at, perturb
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.observe.distance import distance_tables
+from pkmcal.observe.predict import tubes_of
+from pkmcal.observe.stations import View
+
+BLUR = 0.6
+"""Lens, px; with the pixel's own 0.29 and the interpolation, pictures have about 0.7."""
+LAMP = np.array([-0.5, -0.7, 0.5]) / np.linalg.norm([-0.5, -0.7, 0.5])
+"""Towards the light, base frame: from the camera's left, and above."""
+FRONT = look_at(np.array([0.1, -0.85, 0.32]), np.array([0.0, 0.0, 0.18]), np.array([0.0, 0.0, 1.0]))
+
+
+@cache
+def camera_of(distorted=True):
+    distortion = [-0.2, 0.08, 1e-3, -2e-3, 0.0] if distorted else [0.0] * 5
+    parameters = np.array([600.0, 603.0, 321.3, 238.2, *distortion])
+    return camera_models()["pinhole"]((640, 480), parameters)
+
+
+@dataclass(frozen=True)
+class Tube:
+    """A cylinder without ends: its axis from ``start`` along unit ``axis``, base frame."""
+
+    leg: int
+    start: np.ndarray
+    axis: np.ndarray
+    length: float
+    radius: float
+
+
+def tubes_at(machine, T_base_platform):
+    """The machine's tubes at a pose, from its file's fields."""
+    tubes = []
+    for number, leg in enumerate(machine.to_document()["legs"]):
+        a = np.array(leg["base"]["center"])
+        b = T_base_platform[:3, :3] @ leg["platform"]["center"] + T_base_platform[:3, 3]
+        whole = np.linalg.norm(b - a)
+        u = (b - a) / whole
+        for tube in leg["tubes"]:
+            stop = min(tube["to"], whole)
+            tubes.append(Tube(number, a + tube["from"] * u, u, stop - tube["from"], tube["radius"]))
+    return tubes
+
+
+def meet(tube, T_camera_base, rays):
+    """Distance along rays (..., 3) to a tube, inf beside it, and the surface's normal there."""
+    a = T_camera_base[:3, :3] @ tube.start + T_camera_base[:3, 3]
+    u = T_camera_base[:3, :3] @ tube.axis
+    d_along, a_along = rays @ u, a @ u
+    dd = np.sum(rays**2, axis=-1) - d_along**2
+    da = rays @ a - d_along * a_along
+    rest = da**2 - dd * (a @ a - a_along**2 - tube.radius**2)
+    with np.errstate(invalid="ignore"):
+        far = (da - np.sqrt(rest)) / dd
+    place = far * d_along - a_along
+    hit = (rest > 0) & (far > 0) & (place >= 0) & (place <= tube.length)
+    normal = (far[..., None] * rays - a - place[..., None] * u) / tube.radius
+    return np.where(hit, far, np.inf), normal
+
+
+def light_on(tubes, T_camera_base, rays, background):
+    """Light (...) seen along rays (N, 3) and the leg that it comes from, -1 for none."""
+    level, leg = np.array(background, dtype=float), np.full(len(rays), -1)
+    nearest = np.full(len(rays), np.inf)
+    lamp = T_camera_base[:3, :3] @ LAMP
+    for tube in tubes:
+        maybe = np.flatnonzero(near(tube, T_camera_base, rays))
+        distance, normal = meet(tube, T_camera_base, rays[maybe])
+        first = distance < nearest[maybe]
+        at = maybe[first]
+        nearest[at], leg[at] = distance[first], tube.leg
+        level[at] = 190 * (0.3 + 0.7 * np.maximum(normal[first] @ lamp, 0))
+    return level, leg
+
+
+def near(tube, T_camera_base, rays):
+    """Rays (N, 3) of z = 1 that may meet a tube: in the box around its ends."""
+    R, t = T_camera_base[:3, :3], T_camera_base[:3, 3]
+    ends = [R @ (tube.start + s * tube.axis) + t for s in (0.0, tube.length)]
+    low = np.min([(e[:2] - 1.5 * tube.radius) / e[2] for e in ends], axis=0)
+    high = np.max([(e[:2] + 1.5 * tube.radius) / e[2] for e in ends], axis=0)
+    return np.all((rays[:, :2] > low) & (rays[:, :2] < high), axis=1)
+
+
+@cache
+def pixel_rays(camera_name):
+    """Rays of z = 1 through all pixels (H W, 3), and their change by a pixel in x and in y."""
+    camera = camera_of(camera_name)
+    width, height = camera.image_size
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    pixel = np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
+    corners = [camera.ray(pixel + d) for d in ([0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5])]
+    middle, right, left, down, up = (ray / ray[:, 2:] for ray in corners)
+    return middle, right - left, down - up
+
+
+def draw(tubes, T_camera_base, *, distorted=True, background=45.0, noise=1.0, seed=0):
+    """A photograph (480, 640) uint8 and which leg each pixel's centre shows."""
+    middle, by_x, by_y = pixel_rays(distorted)
+    flat = np.broadcast_to(background, (480, 640)).reshape(-1)
+    level, leg = light_on(tubes, T_camera_base, middle, flat)
+    grid = leg.reshape(480, 640)
+    border = np.zeros(grid.shape, dtype=bool)
+    for axis in (0, 1):
+        step = np.diff(grid, axis=axis) != 0
+        border |= np.insert(step, 0, False, axis) | np.insert(step, step.shape[axis], False, axis)
+    # tubes of one leg differ in radius: their common end is a border too, but nobody looks there
+    again = np.flatnonzero(border)
+    place = (np.arange(6) + 0.5) / 6 - 0.5
+    dx, dy = (v.ravel()[:, None, None] for v in np.meshgrid(place, place))
+    inner = middle[again] + dx * by_x[again] + dy * by_y[again]
+    shades = light_on(tubes, T_camera_base, inner.reshape(-1, 3), np.tile(flat[again], 36))[0]
+    level[again] = shades.reshape(36, -1).mean(axis=0)
+    soft = gaussian_filter(level.reshape(480, 640), BLUR, mode="nearest")
+    read = soft + noise * np.random.default_rng(seed).normal(size=soft.shape)
+    return np.clip(np.round(read), 0, 255).astype(np.uint8), grid
+
+
+@cache
+def machine():
+    return load_mechanism("gough-stewart")
+
+
+@cache
+def poses(count=6):
+    """Platform poses over the workspace, the same in all tests."""
+    rng = np.random.default_rng(7)
+    steps = rng.uniform(-1, 1, (count, 6)) * np.repeat([0.2, 0.03], 3)
+    return perturb(machine().home(), steps)
+
+
+@cache
+def photographs(distorted=True, count=6):
+    """Pictures of the machine as drawn, from FRONT, and the legs that their pixels show."""
+    made = [
+        draw(tubes_at(machine(), T), FRONT, distorted=distorted, seed=k)
+        for k, T in enumerate(poses()[:count])
+    ]
+    return [image for image, _ in made], [legs for _, legs in made]
+
+
+def view_of(images, configurations=None, of=None):
+    """What the search for the station looks at."""
+    seen = poses()[: len(images)] if configurations is None else poses()[configurations]
+    mechanism = of or machine()
+    return View(
+        mechanism,
+        camera_of(),
+        tubes_of(mechanism),
+        mechanism.inverse(seen),
+        seen,
+        distance_tables(images),
+    )
+
+
+# The drawing itself
+
+
+@pytest.mark.parametrize("distorted", [False, True])
+def test_the_drawing_shows_a_tube_where_it_is(distorted):
+    """A ball of pixels beside the projected axis is lit; the tube's area is its length by width."""
+    machine_tubes = tubes_at(machine(), poses()[0])
+    tube = machine_tubes[0]
+    image, legs = draw([tube], FRONT, distorted=distorted, noise=0.0)
+    points = tube.start + np.linspace(0.02, tube.length - 0.02, 9)[:, None] * tube.axis
+    pixels = camera_of(distorted).project(points @ FRONT[:3, :3].T + FRONT[:3, 3])
+    x, y = np.rint(pixels).astype(int).T
+    assert np.all(legs[y, x] == tube.leg)
+    depth = (points @ FRONT[:3, :3].T + FRONT[:3, 3])[:, 2].mean()
+    length = np.linalg.norm(pixels[-1] - pixels[0]) / (tube.length - 0.04) * tube.length
+    # mean depth and the mean of both focal lengths: a few per cent
+    assert (legs == tube.leg).sum() == pytest.approx(length * 2 * tube.radius * 600 / depth, rel=0.06)
+    assert np.all(image[legs < 0][::97] <= 190)
+
+
+def test_borders_are_smooth_and_noise_is_as_asked():
+    """Grey levels along a slanted edge take all values between tube and background."""
+    clean, legs = draw(tubes_at(machine(), poses()[0]), FRONT, noise=0.0)
+    assert len(np.unique(clean[200:300])) > 60
+    noisy, _ = draw(tubes_at(machine(), poses()[0]), FRONT, noise=2.0)
+    away = gaussian_filter((legs >= 0).astype(float), 3) < 1e-6
+    assert np.std(noisy[away]) == pytest.approx(2.0, rel=0.05)
