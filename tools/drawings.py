@@ -42,7 +42,7 @@ def frames(truth: Truth) -> str:
 
     def on_paper(points: Array) -> Array:
         seen = apply(eye, np.asarray(points, dtype=float))
-        return np.array([455.0, 195.0]) + 950.0 * seen[..., :2] / seen[..., 2:]
+        return np.array([455.0, 160.0]) + 950.0 * seen[..., :2] / seen[..., 2:]
 
     def axes(T: Array, name: str, size: float, away: tuple[float, float], anchor: str) -> list[str]:
         ends = on_paper(apply(T, size * np.vstack([np.zeros(3), np.eye(3)])))
@@ -75,7 +75,7 @@ def frames(truth: Truth) -> str:
     parts += axes(T, "platform", 0.1, (12, -24), "start")
     parts += _camera(T_base_camera, on_paper)
     parts += axes(T_base_camera, "camera", 0.1, (-12, 0), "end")
-    return svg(720, 450, *parts)
+    return svg(720, 415, *parts)
 
 
 def _outline(points: Array) -> str:
@@ -295,12 +295,12 @@ def position_errors(places: Places) -> str:
     plots: list[Plot] = []
     for tube, title in ((0, "Cylinders (tube 1)"), (1, "Rods (tube 2)")):
         label = "error of a position, px outward"
-        plot = Plot((-1.5, 1.5), (0, 5.2), (label, "density"), (430, 320), title)
+        plot = Plot((-1.5, 1.5), (0, 6.0), (label, "density"), (430, 320), title)
         mine = places.tube == tube
         plot.histogram(places.gradient_error[mine], borders, DRAWING)
         plot.histogram(places.model_error[mine], borders, CALIBRATED)
-        plot.words(0.4, 4.6, "strongest gradient", DRAWING)
-        plot.words(0.4, 4.2, "profile model", CALIBRATED)
+        plot.words(0.4, 5.3, "strongest gradient", DRAWING)
+        plot.words(0.4, 4.85, "profile model", CALIBRATED)
         plots.append(plot)
     return _beside(*plots)
 

@@ -125,7 +125,8 @@ def result(case: Case) -> Shot:
         " and the joints of the calibrated machine (rings) and of the drawing (crosses)</p></div>"
         '<div class="right">{{ draw.view(view) }}<p>The machine from above, mm: joints by'
         ' <b class="d">the drawing</b> and <b class="c">as calibrated</b>, their'
-        " differences {{ '{:g}'.format(scene.factor) }} times enlarged</p></div></div>"
+        " differences {{ '{:g}'.format(scene.factor) }} times enlarged, ellipses of 2σ"
+        " {{ '{:g}'.format(scene.spread_factor) }} times</p></div></div>"
     )
     body = template.render(shot=shot, view=views["views"][0], scene=views["scene"])
     style = (
@@ -148,7 +149,7 @@ def report(case: Case) -> Shot:
 
 def frames(case: Case) -> Shot:
     """The machine with its frames and cameras."""
-    return whole_page(drawings.frames(case.truth), 720, 450)
+    return whole_page(drawings.frames(case.truth), 720, 415)
 
 
 def edge_planes(_case: Case) -> Shot:

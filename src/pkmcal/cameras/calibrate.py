@@ -198,7 +198,7 @@ def _calibration(
     kept = (fit.weight >= 0.5) & views.seen
     lengths = np.sum(np.nan_to_num(fit.residuals) ** 2, axis=-1)
     calibration = CameraCalibration(
-        camera=fit.camera,
+        camera=replace(fit.camera, covariance=covariance),
         terms=chosen.terms,
         covariance=covariance,
         spread=spread,

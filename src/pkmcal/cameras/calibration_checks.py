@@ -210,7 +210,7 @@ def _outstanding(c: CameraCalibration) -> list[str]:
 
 
 def _inseparable(c: CameraCalibration) -> list[str]:
-    """xi with f, and the like: known together, not alone."""
+    """Xi with f, and the like: known together, not alone."""
     if c.camera.model != "unified":
         return []
     pairs = [p for p in c.correlations if "xi" in p[:2]]

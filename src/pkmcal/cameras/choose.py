@@ -83,7 +83,8 @@ def best_of(pool: tuple[Candidate, ...]) -> Candidate:
 
 def is_worse(candidate: Candidate, best: Candidate) -> bool:
     """True where left-out views tell the two apart: by a hundredth of the error, and by more
-    than the standard error of the difference over the views."""
+    than the standard error of the difference over the views.
+    """
     if candidate.left_out <= best.left_out * (1 + LEAST_GAIN):
         return False
     gain = candidate.by_view - best.by_view

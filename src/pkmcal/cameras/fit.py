@@ -44,7 +44,7 @@ class Views(NamedTuple):
     @property
     def seen(self) -> Booleans:
         """(V, N) True where a corner is seen."""
-        return np.isfinite(self.pixels).all(axis=-1)
+        return np.asarray(np.isfinite(self.pixels).all(axis=-1))
 
     def take(self, views: Integers | Sequence[int]) -> Views:
         """Some of the views."""
@@ -170,7 +170,7 @@ def fit_camera(
     seen = views.seen
     weight = seen.astype(float)
     state = State(camera.parameters, T_camera_board[None])
-    tau, cut, converged = 1.0, 4.0, True
+    tau, cut, converged, off = 1.0, 4.0, True, views.pixels
     for _ in range(rounds):
         problem = _problem(camera, free, views, weight, tau)
         found = minimise(problem, state, max_steps=STEPS)
@@ -216,7 +216,8 @@ def fit_poses(
 
 def covariance_of(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
     """Covariances at a fit: intrinsics (n, n), zero where not free; poses (V, 6, 6); and the
-    poses' derivative by the intrinsics (V, 6, n)."""
+    poses' derivative by the intrinsics (V, 6, n).
+    """
     linear = fit.problem(views).linearize(fit.state)
     n = len(fit.camera.parameters)
     whole = np.zeros((n, n))
@@ -277,8 +278,9 @@ def _off(camera: Camera, state: State, views: Views) -> Array:
 
 
 def _robust_scale(off: Array, sigma: Array, seen: Booleans) -> float:
-    """tau from the median of the residuals' lengths, px: half of a 2-D normal's lie within
-    sqrt(2 ln 2) standard deviations."""
+    """Tau from the median of the residuals' lengths, px: half of a 2-D normal's lie within
+    sqrt(2 ln 2) standard deviations.
+    """
     middle = float(np.median(np.sum(off[seen] ** 2, axis=-1))) / (2 * np.log(2))
     return float(np.sqrt(max(middle - float(np.median(sigma[seen] ** 2)), LEAST_NOISE**2)))
 

@@ -106,7 +106,9 @@ def _from_opencv(text: str, label: str) -> Camera:
 
     try:
         storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-        found = {key: _opencv_node(storage, names) for key, names in _OPENCV_NAMES.items()}
+        found: dict[str, Any] = {
+            key: _opencv_node(storage, names) for key, names in _OPENCV_NAMES.items()
+        }
         flag = storage.getNode("fisheye_model")
         fisheye = (not flag.empty() and flag.real() != 0) or "fisheye" in _word(storage)
         storage.release()
@@ -125,8 +127,7 @@ def _from_opencv(text: str, label: str) -> Camera:
     k = found["distortion"] if found["distortion"] is not None else np.zeros(0)
     xi = found["xi"]
     model = "unified" if xi is not None else "fisheye" if fisheye else "pinhole"
-    matrix = found["matrix"]
-    return _made(model, size, matrix, k, None if xi is None else float(xi[0]), label)
+    return _made(model, size, found["matrix"], k, None if xi is None else float(xi[0]), label)
 
 
 def _word(storage: Any) -> str:
@@ -258,18 +259,18 @@ def _kalibr_data(camera: Camera) -> dict[str, Any]:
 
 
 def _made(
-    model: str, size: tuple[int, int], matrix: Array, k: Array, xi: float | None, where: str
+    model: str, size: tuple[int, int], matrix: Any, k: Array, xi: float | None, where: str
 ) -> Camera:
     """A camera of this program from another's numbers, with its own checks."""
     kind = camera_models()[model]
     most = len([name for name in kind.parameter_names if name[0] in "kp" and name[1:].isdigit()])
-    m = matrix.reshape(3, 3)
+    m = np.asarray(matrix, dtype=float).reshape(3, 3)
     faults = (
         (m[0, 1] != 0, "skew, which no model here has", f"{m[0, 1]:g}"),
         (np.any(k[most:] != 0), f"distortion beyond the model's {most} terms", f"{len(k)} terms"),
         (min(m[0, 0], m[1, 1]) <= 0, "a focal length that is not positive", f"{m[0, 0]:g}"),
         (xi is not None and xi < 0, "a negative xi; it should be 0 or more", f"{xi}"),
-        (not np.all(np.isfinite([*matrix, *k])), "numbers that are not finite", "nan or inf"),
+        (not np.all(np.isfinite([*m.ravel(), *k])), "numbers that are not finite", "nan or inf"),
         (
             min(m[0, 0], m[1, 1]) < LEAST_FOCAL * size[0],
             "a focal length that looks like millimetres; it is wanted in pixels",

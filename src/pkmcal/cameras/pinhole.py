@@ -41,15 +41,14 @@ def distort(xy: Array, k: Array) -> tuple[Array, Array, Array]:
     by_xy[..., 0, 1] = x * y * slope + 2 * p1 * x + 2 * p2 * y
     by_xy[..., 1, 0] = x * y * slope + 2 * p1 * x + 2 * p2 * y
     by_xy[..., 1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
-    zero = np.zeros_like(x)
-    by_k = np.stack(
-        [
-            np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], axis=-1),
-            np.stack([y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3], axis=-1),
-        ],
-        axis=-2,
-    )
-    return out, by_xy, by_k + zero[..., None, None]
+    by_k = np.empty((*xy.shape, 5))
+    for row, (own, other) in enumerate(((x, y), (y, x))):
+        by_k[..., row, 0] = own * r2
+        by_k[..., row, 1] = own * r2 * r2
+        by_k[..., row, 2 + row] = 2 * own * other
+        by_k[..., row, 3 - row] = r2 + 2 * own * own
+        by_k[..., row, 4] = own * r2 * r2 * r2
+    return out, by_xy, by_k
 
 
 def undistort(target: Array, k: Array) -> Array:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras.contract import Camera
-from pkmcal.cameras.fit import Fit, Views, covariance_of, fit_poses, fit_camera
+from pkmcal.cameras.fit import Views, covariance_of, fit_camera, fit_poses
 from pkmcal.geometry.rigid import dot, pose, rotation
 
 
@@ -33,18 +34,16 @@ def board_poses(camera: Camera, views: Views) -> BoardPoses:
     """The board's pose in every view, by maximum likelihood with a known camera."""
     start = settled_poses(camera, views)
     fit = fit_camera(camera, np.zeros(0, dtype=int), views, start)
-    everything = np.arange(len(camera.parameters))
-    # The derivative by all intrinsics, none of which was estimated here.
-    free = Fit(camera, everything, *(getattr(fit, name) for name in _SAME))
-    _, poses, by = covariance_of(free, views)
-    by_free_covariance = covariance_of(fit, views)[1]
-    del poses
+    # The derivative by all intrinsics, though none of them is estimated here.
+    as_if_free = replace(fit, free=np.arange(len(camera.parameters)))
     return BoardPoses(
-        fit.T_camera_board, by_free_covariance, by, fit.residuals, fit.weight, fit.tau
+        fit.T_camera_board,
+        covariance_of(fit, views)[1],
+        covariance_of(as_if_free, views)[2],
+        fit.residuals,
+        fit.weight,
+        fit.tau,
     )
-
-
-_SAME = ("T_camera_board", "residuals", "weight", "tau", "converged")
 
 
 def settled_poses(camera: Camera, views: Views, start: Array | None = None) -> Array:
@@ -76,7 +75,7 @@ def linear_poses(rays: Array, points: Array) -> Array:
     ray x (r1 X + r2 Y + t) = 0 is linear in r1, r2 and t, for rays to all sides; r1 and r2 are
     made orthonormal afterwards. NaN rays are left out.
     """
-    known = np.isfinite(rays).all(axis=-1)
+    known = np.asarray(np.isfinite(rays).all(axis=-1))
     s = np.where(known[..., None], rays, 0.0)
     middle, spread = points[:, :2].mean(axis=0), points[:, :2].std() + 1e-12
     plane = np.concatenate([(points[:, :2] - middle) / spread, np.ones((len(points), 1))], axis=-1)
@@ -111,14 +110,14 @@ def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ..
     """
     rays = camera.ray(pixels)
     by_pixel = camera.ray_jacobians(pixels)[0]
-    good = np.isfinite(rays).all(axis=-1)
+    good = np.asarray(np.isfinite(rays).all(axis=-1))
     out: list[Array] = []
     for line in lines:
         ids = np.array(line)[good[list(line)]]
         if len(ids) < 3:
             continue
         s, turn = rays[ids], by_pixel[ids]
-        weight = np.ones(len(ids))
+        weight, normal = np.ones(len(ids)), np.zeros(3)
         for _ in range(3):
             normal = np.linalg.eigh((s * weight[:, None]).T @ s)[1][:, 0]
             slope = np.linalg.norm(np.einsum("nik,i->nk", turn, normal), axis=-1)

@@ -7,8 +7,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pkmcal.arrays import Integers
 from pkmcal.errors import InputError
 from pkmcal.files import Document, listed
@@ -177,10 +175,11 @@ def _other_markers(image: Integers, mine: str) -> str | None:
     if best < 4 or counts.get(mine, 0) > 0.7 * best:
         return None
     names = [name for name in counts if counts[name] >= 0.9 * best]
-    names.sort(
-        key=lambda name: (
-            int(np.prod([int(n) for n in name.split("_")[2:] if n.isdigit()] or [9999])),
-            name,
-        )
-    )
+    names.sort(key=lambda name: (_size_of(name), name))
     return f"{best} markers of {names[0]}"
+
+
+def _size_of(name: str) -> int:
+    """Markers in a dictionary by its name, DICT_5X5_100; those without a number come last."""
+    last = name.rpartition("_")[2]
+    return int(last) if last.isdigit() else 9999

@@ -113,7 +113,7 @@ def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     for mirrored in (False, True):
         picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
         corners, ids, _, marker_ids = detector.detectBoard(picture)
-        markers = max(markers, 0 if marker_ids is None else len(marker_ids))
+        markers = max(markers, _length(marker_ids))
         found = _raw(corners, ids, image.shape[1], mirrored)
         if len(found[0]) >= LEAST_CORNERS:
             return found, mirrored, ""
@@ -124,12 +124,17 @@ def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
 
 def _raw(corners: Any, ids: Any, width: int, mirrored: bool) -> Raw:
     """OpenCV's corners and ids, whose shapes differ between versions."""
-    if ids is None or len(ids) == 0:
+    if _length(ids) == 0:
         return np.zeros(0, dtype=int), np.zeros((0, 2))
     pixels = np.asarray(corners, dtype=float).reshape(-1, 2)
     if mirrored:
         pixels = pixels * [-1, 1] + [width - 1, 0]
     return np.asarray(ids).reshape(-1).astype(int), pixels
+
+
+def _length(found: Any) -> int:
+    """Entries of what OpenCV found; None where it found nothing."""
+    return 0 if found is None else len(found)
 
 
 def charuco_detector(data: dict[str, Any]) -> Any:
@@ -160,7 +165,7 @@ def detect_markers(image: Integers, name: str) -> tuple[Integers, Array]:
     import cv2
 
     corners, ids, _ = cv2.aruco.ArucoDetector(dictionary(name)).detectMarkers(image)
-    if ids is None or len(ids) == 0:
+    if _length(ids) == 0:
         return np.zeros(0, dtype=int), np.zeros((0, 4, 2))
     return np.asarray(ids).reshape(-1).astype(int), np.asarray(corners, float).reshape(-1, 4, 2)
 
@@ -214,13 +219,12 @@ def _attempts(image: Integers, counts: tuple[int, int], quick: bool) -> Iterator
         ]
         for way in ways[:1] if quick else ways:
             found, corners = way()
-            if found and corners is not None:
+            if found and _length(corners) == counts[0] * counts[1]:
                 pixels = np.asarray(corners, dtype=float).reshape(-1, 2)
-                if len(pixels) == counts[0] * counts[1]:
-                    yield (pixels + 0.5) / scale - 0.5
+                yield (pixels + 0.5) / scale - 0.5
 
 
-def _pictures(image: Integers, quick: bool) -> Iterator[tuple[Integers, float]]:
+def _pictures(image: Integers, quick: bool) -> Iterator[tuple[Any, float]]:
     """The photograph; with its contrast evened out; smaller; larger; each with its scale."""
     import cv2
 

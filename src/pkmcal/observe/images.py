@@ -27,13 +27,16 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=label) from None
-    if data[:4] == b"\x89PNG" and PNG_END not in data[-64:]:
+    if data[:4] == b"\x89PNG" and PNG_END not in data:
         raise _broken(label, "a PNG file that ends early")
-    if data[:2] == b"\xff\xd8" and JPEG_END not in data[-64:]:
+    if data[:2] == b"\xff\xd8" and not _jpeg_reaches_its_end(data):
         raise _broken(label, "a JPEG file that ends early")
     # a turned picture would no longer be its camera's: flags that ask for turning are ignored
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    try:
+        image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error:  # a size beyond what OpenCV takes on: a spoilt header
+        image = None
     if image is None:
         raise _broken(label, "no readable image")
     if (image.shape[1], image.shape[0]) != tuple(image_size):
@@ -45,6 +48,18 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
             next_step="Use the photograph as the camera gave it, neither scaled nor cropped",
         )
     return image
+
+
+def _jpeg_reaches_its_end(data: bytes) -> bool:
+    """Whether the end mark follows the picture's data: cameras put a preview, which has one too,
+    before it, and phones append what they like behind.
+    """
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:  # segments up to the start of the scan
+        if data[at + 1] == 0xDA:
+            return JPEG_END in data[at:]
+        at += 1 if data[at + 1] == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4])
+    return at + 4 <= len(data)  # no JPEG as we know it: the decoder judges
 
 
 def _broken(label: str, found: str) -> InputError:

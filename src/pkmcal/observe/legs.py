@@ -29,10 +29,12 @@ from pkmcal.observe.predict import (
 from pkmcal.observe.search import SEARCH_SIGMA, sample, search_legs
 
 SEARCH_SAMPLES = 12
-SAMPLES = 192
-"""Points along an edge whose profiles are taken, about one a pixel: faint edges need it."""
 SEGMENTS = 8
 """Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
+PLACES = 5 * SEGMENTS
+"""Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
+BETWEEN = 5
+"""Profiles taken about each of these, so about one a pixel in all: faint edges need it."""
 FEWEST_SHARE = 1 / 3
 """Share of a segment's samples that must be clear for its mean profile to count."""
 BLUR = 0.7
@@ -125,14 +127,11 @@ def measure(
     blur : px, from an earlier look; estimated from these profiles when absent. refine_camera :
     also how the edges depend on the camera's parameters.
     """
-    tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, SAMPLES, CLEARANCE)
-    offsets = profiles.profile_offsets()
-    pixel = points.pixel[..., None, :] + offsets[:, None] * points.outward[..., None, :]
-    grey = sample(photographs.images, pixel)
-    middles = np.arange(SEGMENTS) * (SAMPLES // SEGMENTS) + SAMPLES // SEGMENTS // 2
-    places = _at_samples(points, middles)
+    tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, PLACES, CLEARANCE)
+    grey = sample(photographs.images, _profile_pixels(photographs.camera, points))
+    places = _at_samples(points, np.arange(SEGMENTS) * 5 + 2)
     half_width = places.gain * machine.values[tubes.radius][:, None]
-    full, across = _segment_profiles(grey, clear, half_width)
+    full, across = _segment_profiles(grey, np.repeat(clear, BETWEEN, axis=-1), half_width)
     if blur is None:
         blur = profiles.estimate_blur(across) if full.any() else BLUR
     at = profiles.locate(across, blur)
@@ -163,6 +162,19 @@ def _predict(
     points = edge_points(machine, photographs.camera, legs, tubes, samples)
     clear = unobstructed(machine, photographs.camera, legs, tubes, points, clearance)
     return tubes, points, clear
+
+
+def _profile_pixels(camera: Camera, points: EdgePoints) -> Array:
+    """Pixels (K, E, PLACES * BETWEEN, offsets, 2) of profiles across the edges.
+
+    Points of an edge lie evenly on a line in space, so those between are interpolated there and
+    projected; the profiles' directions hardly turn from one to the next.
+    """
+    start, step = points.point[..., :1, :], np.diff(points.point[..., :2, :], axis=-2)
+    fraction = (np.arange(PLACES * BETWEEN) + 0.5) / BETWEEN - 0.5
+    pixel = camera.project(start + fraction[:, None] * step)
+    outward = np.repeat(points.outward, BETWEEN, axis=-2)
+    return pixel[..., None, :] + profiles.profile_offsets()[:, None] * outward[..., None, :]
 
 
 def _segment_profiles(

@@ -34,6 +34,11 @@ RETRIES = 400
 GOOD_SCORE = 0.34
 """Mean truncated distance above which no leg was recognised. Photographs of the machine give 0.2;
 another configuration, station or order of legs 0.36 to 0.6."""
+BY_CHANCE = 0.5
+"""Share of the score by chance that recognised legs stay below. Photographs that are all texture
+score 0.3 anywhere; photographs of a machine score 0.2 where chance has 0.9."""
+LAST_REACH = 4.0
+"""Reduced pixels at which the final score cuts distances off."""
 
 
 @dataclass(frozen=True)
@@ -58,15 +63,19 @@ class View:
 
 @dataclass(frozen=True)
 class StationPose:
-    """A found pose T_camera_base (4, 4) and its score: 0 perfect, 1 nothing fits."""
+    """A found pose T_camera_base (4, 4) and its score: 0 perfect, 1 nothing fits.
+
+    chance : the score of legs laid anywhere, low where the photographs are full of edges.
+    """
 
     T_camera_base: Array
     score: float
+    chance: float
 
     @property
     def good(self) -> bool:
         """Whether the machine was recognised at all."""
-        return self.score < GOOD_SCORE
+        return self.score < min(GOOD_SCORE, BY_CHANCE * self.chance)
 
 
 def find_station(view: View, T_camera_base: Array, rng: np.random.Generator) -> StationPose:
@@ -78,7 +87,9 @@ def find_station(view: View, T_camera_base: Array, rng: np.random.Generator) -> 
     candidates = _descend(view, candidates, more, 6, (5, 4, 4, 3))
     candidates = _best(view, candidates, more, reach=3, keep=1)
     candidates = _descend(view, candidates, every, 8, (3, 2, 2, 1.5, 1.5))
-    return StationPose(candidates[0], float(score(view, candidates, every, reach=4)[0]))
+    chance = np.minimum(view.tables.tables, LAST_REACH).mean() / LAST_REACH
+    last = score(view, candidates, every, reach=LAST_REACH)
+    return StationPose(candidates[0], float(last[0]), float(chance))
 
 
 def _random_search(view: View, T_camera_base: Array, rng: np.random.Generator) -> Array:

@@ -1,0 +1,79 @@
+"""Observation against what anybody would run first: decoding the photographs and cv2.Canny.
+
+    python benchmarks/observe.py [SESSION]
+
+Without a session, one is simulated. Each part is run a few times and its best time taken, in one
+process, so the ratio means something on any machine.
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+
+def best_of(run: Callable[[], float], times: int = 3) -> float:
+    """Smallest of several results, s."""
+    return min(run() for _ in range(times))
+
+
+def decode_and_canny(paths: list[Path]) -> float:
+    """Seconds to decode the photographs one after the other and find Canny's edges in each."""
+    import cv2
+
+    begin = time.perf_counter()
+    for path in paths:
+        cv2.Canny(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), 50, 150)
+    return time.perf_counter() - begin
+
+
+def main() -> None:
+    """Print the ratio, the parts of a calibration, and the memory used."""
+    begin = time.perf_counter()
+    from pkmcal.calibration import calibrate
+    from pkmcal.report import report_html
+    from pkmcal.session import load_session
+
+    start_up = time.perf_counter() - begin
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(sys.argv[1]) if len(sys.argv) > 1 else simulated(Path(folder) / "session")
+        session = load_session(source)
+        first = calibrate(session)
+        runs = [calibrate(session).timings for _ in range(3)]
+        parts = {name: min(run[name] for run in runs) for name in runs[0]}
+        begin = time.perf_counter()
+        report_html(session, first.observation, first.estimate, first.verdict)
+        parts["report"] = time.perf_counter() - begin
+        paths = [p.path for s in session.stations for p in s.photographs]
+        plain = best_of(lambda: decode_and_canny(paths))
+    observation = parts["decode"] + parts["observe"]
+    print(f"{len(paths)} photographs")
+    print(f"start-up (imports)          {start_up:6.2f} s")
+    for name, seconds in parts.items():
+        print(f"{name:27} {seconds:6.2f} s")
+    print(f"decoding and cv2.Canny      {plain:6.2f} s")
+    print(f"observation / that          {observation / plain:6.2f}")
+    print(f"largest memory              {peak_memory():6.0f} MB")
+
+
+def simulated(folder: Path) -> Path:
+    """A session of 45 photographs, 1024x768."""
+    from pkmcal.mechanisms import load_mechanism
+    from pkmcal.simulate.demo import demo_camera
+    from pkmcal.simulate.session import Settings, simulate_session
+
+    simulate_session(folder, load_mechanism("gough-stewart"), demo_camera(), Settings(), seed=1)
+    return folder
+
+
+def peak_memory() -> float:
+    """Largest resident memory of this process so far, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+if __name__ == "__main__":
+    main()

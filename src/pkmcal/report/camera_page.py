@@ -1,0 +1,344 @@
+"""The page of a camera's calibration: verdict, intrinsics, corners over the photographs, field."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.cameras.calibrate import CameraCalibration
+from pkmcal.cameras.calibration_checks import CELLS, coverage, tilts
+from pkmcal.errors import InputError
+from pkmcal.observe.images import decode
+from pkmcal.report import charts, wording
+from pkmcal.report.headline import Headline
+from pkmcal.report.wording import brief, count, decimals, number
+
+if TYPE_CHECKING:
+    import jinja2
+
+LARGEST_WIDTH = 640
+QUALITY = 70
+THREADS = 4
+ARROW = 0.05
+"""Length of a large residual's arrow as a share of the picture's width."""
+FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000)
+ANGLE_STEP = 5.0
+"""degrees of the angle from the axis that one bar of the histogram holds."""
+FIELD_CELLS = (16, 12)
+SCRIPT_END = "// The table sorts"
+"""The report's script up to here serves this page; what follows is of its table and its plot."""
+UNITS = {"focal": "px", "center": "px"}
+WORDS = {
+    "focal.x": "focal length x",
+    "focal.y": "focal length y",
+    "center.x": "centre x",
+    "center.y": "centre y",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One intrinsic in text; sigma is empty where it was not estimated."""
+
+    name: str
+    value: str
+    sigma: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One model with its terms, and its errors in text."""
+
+    model: str
+    terms: str
+    rms: str
+    left_out: str
+    chosen: bool
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph; corners are (x, y, dx, dy, in use, tip), residuals already enlarged."""
+
+    name: str
+    width: int
+    height: int
+    jpeg: str
+    corners: tuple[tuple[float, float, float, float, bool, str], ...]
+    caption: str
+
+
+@dataclass(frozen=True)
+class Field:
+    """The picture in cells: (x, y, width, height, corners, share of the most) and mean residuals
+    (x, y, dx, dy), enlarged by `factor`, which is larger than that of single corners.
+    """
+
+    width: int
+    height: int
+    cells: tuple[tuple[float, float, float, float, int, float], ...]
+    arrows: tuple[tuple[float, float, float, float], ...]
+    factor: int
+
+
+def camera_report_html(calibration: CameraCalibration, paths: Sequence[Path | str] = ()) -> str:
+    """One HTML page that needs nothing else. paths : the photographs, to show them; by name."""
+    used = calibration.residuals[calibration.kept]
+    factor = _factor(used, calibration.camera.image_size[0])
+    return (
+        _environment()
+        .get_template("camera.html.j2")
+        .render(
+            c=calibration,
+            headline=headline(calibration),
+            cards=_cards(calibration),
+            rows=parameter_rows(calibration),
+            compared=_compared(calibration),
+            shots=_shots(calibration, [Path(path) for path in paths], factor),
+            factor=factor,
+            field=_field(calibration),
+            views=_views_chart(calibration),
+            angles=_angles_chart(calibration),
+            missed=[d for d in calibration.detections if not d.found],
+            script=_script(),
+        )
+    )
+
+
+def headline(c: CameraCalibration) -> str:
+    """The result in one sentence."""
+    focal, sigma = c.camera.parameters[:2].mean(), c.sigma[:2].mean()
+    kind = {"unified": "unified (mirror or wide-lens)"}.get(c.camera.model, c.camera.model)
+    return (
+        f"A {kind} camera, focal length {number(focal, decimals(sigma))} ± {brief(sigma)} px;"
+        f" photographs outside the fit are predicted to {brief(c.held_out.rms)} px."
+    )
+
+
+def parameter_rows(c: CameraCalibration) -> tuple[Row, ...]:
+    """The intrinsics with two digits of their sigma."""
+    out: list[Row] = []
+    values = zip(
+        c.camera.parameter_names, c.camera.parameters.tolist(), c.sigma.tolist(), strict=True
+    )
+    for name, value, sigma in values:
+        places = decimals(sigma)
+        unit = UNITS.get(name.partition(".")[0], "")
+        shown = number(value, places) if sigma > 0 else f"{value:g}"
+        out.append(
+            Row(WORDS.get(name, name), shown, number(sigma, places) if sigma > 0 else "", unit)
+        )
+    return tuple(out)
+
+
+def _cards(c: CameraCalibration) -> tuple[Headline, ...]:
+    focal, sigma = c.camera.parameters[:2], c.sigma[:2]
+    share = float(np.max(sigma / focal)) * 100
+    tilt = tilts(c.T_camera_board, c.board.points)
+    covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
+    seen = int(np.isfinite(c.residuals).all(axis=-1).sum())
+    return (
+        Headline(
+            "How sure is the focal length?",
+            ((brief(share), "%"),),
+            f"1σ, from {count(len(c.views), 'photograph')}; "
+            + (
+                f"the views disagree by {c.spread:.1f} times the corners' noise, which is in it"
+                if c.spread > 1
+                else "the views agree as far as the corners' noise lets them"
+            ),
+        ),
+        Headline(
+            "How well does it predict other photographs?",
+            ((brief(c.held_out.rms), "px"),),
+            f"length of a residual, root mean square, camera fitted to the other views;"
+            f" {brief(c.rms)} px on the views that it was fitted to",
+        ),
+        Headline(
+            "Are straight lines straight?",
+            ((brief(c.held_out.straightness), "px"),),
+            "distance of corners from their board line's great circle, on held-out views; no pose"
+            " takes part in this",
+        ),
+        Headline(
+            "What is it based on?",
+            ((f"{len(c.views)} of {len(c.detections)}", "photographs"),),
+            f"{count(seen, 'corner')}, {seen - int(c.kept.sum())} of them put aside",
+        ),
+        Headline(
+            "How different are the views?",
+            ((f"{tilt.min():.0f} to {tilt.max():.0f}", "°"),),
+            "tilt of the board from facing the camera; 20 to 45° to all sides tell most",
+        ),
+        Headline(
+            "How much of the picture was tested?",
+            ((f"{covered:.0f}", "%"),),
+            f"of {CELLS[0]}×{CELLS[1]} cells hold corners; elsewhere the lens is extrapolated",
+        ),
+    )
+
+
+def _compared(c: CameraCalibration) -> tuple[Compared, ...]:
+    return tuple(
+        Compared(
+            model=one.model,
+            terms=" ".join(one.terms) or "none",
+            rms=number(one.rms, decimals(one.rms) + 1),
+            left_out=number(one.left_out, decimals(one.left_out) + 1),
+            chosen=(one.model, one.terms) == (c.camera.model, c.terms),
+        )
+        for one in c.compared
+    )
+
+
+def _factor(residuals: Array, width: int) -> int:
+    """Enlargement by which a large residual's arrow becomes visible and no longer than that."""
+    large = float(np.quantile(np.linalg.norm(residuals, axis=-1), 0.95)) if len(residuals) else 1.0
+    wanted = ARROW * width / max(large, 1e-9)
+    return max((f for f in FACTORS if f <= wanted), default=1)
+
+
+def _shots(c: CameraCalibration, paths: list[Path], factor: int) -> tuple[Shot, ...]:
+    by_name = {path.name: path for path in paths}
+    size = c.camera.image_size
+    with ThreadPoolExecutor(THREADS) as pool:
+        jpegs = pool.map(lambda name: _jpeg(by_name.get(name), size), c.views)
+        return tuple(_shot(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
+
+
+def _shot(c: CameraCalibration, v: int, jpeg: str, factor: int) -> Shot:
+    seen = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
+    corners: list[tuple[float, float, float, float, bool, str]] = []
+    for i in seen.tolist():
+        (x, y), off = c.pixels[v, i].tolist(), c.residuals[v, i]
+        places = decimals(max(c.rms, 1e-6)) + 1
+        tip = (
+            f"Corner {i}: {number(off[0], places, signed=True)},"
+            f" {number(off[1], places, signed=True)} px; weight {c.weight[v, i]:.2f}"
+        )
+        dx, dy = (off * factor).tolist()
+        corners.append((x, y, dx, dy, bool(c.kept[v, i]), tip))
+    aside = int(np.sum([not corner[4] for corner in corners]))
+    caption = f"{count(len(seen), 'corner')}" + (f", {aside} put aside" if aside else "")
+    caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
+    width, height = c.camera.image_size
+    return Shot(c.views[v], width, height, jpeg, tuple(corners), caption)
+
+
+def _jpeg(path: Path | None, size: tuple[int, int]) -> str:
+    """The photograph in grey, small, as base64; empty where it is not there."""
+    import cv2
+
+    if path is None:
+        return ""
+    try:
+        image: Any = decode(path, size, path.name)
+    except InputError:
+        return ""
+    if size[0] > LARGEST_WIDTH:
+        height = max(1, round(size[1] * LARGEST_WIDTH / size[0]))
+        image = cv2.resize(image, (LARGEST_WIDTH, height), interpolation=cv2.INTER_AREA)
+    packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    return base64.b64encode(packed.tobytes()).decode("ascii")
+
+
+def _field(c: CameraCalibration) -> Field:
+    """Corners a cell, and the mean residual of cells with three or more."""
+    width, height = c.camera.image_size
+    columns, rows = FIELD_CELLS
+    pixels, off = c.pixels[c.kept], c.residuals[c.kept]
+    dx, dy = width / columns, height / rows
+    column = np.clip(((pixels[:, 0] + 0.5) / dx).astype(int), 0, columns - 1)
+    row = np.clip(((pixels[:, 1] + 0.5) / dy).astype(int), 0, rows - 1)
+    flat = row * columns + column
+    counts = np.bincount(flat, minlength=rows * columns)
+    most = max(int(counts.max()), 1)
+    cells = [
+        (k % columns * dx - 0.5, k // columns * dy - 0.5, dx, dy, int(n), float(n) / most)
+        for k, n in enumerate(counts.tolist())
+        if n
+    ]
+    full = np.flatnonzero(counts >= 3)
+    roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
+    means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
+    factor = _factor(means, width)
+    arrows = np.concatenate([roots, means * factor], axis=1).tolist()
+    return Field(width, height, tuple(cells), tuple((x, y, u, v) for x, y, u, v in arrows), factor)
+
+
+def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
+    """Held-out error a view; the fit's own beside it in the tooltip."""
+    squares = np.where(c.kept, np.sum(np.nan_to_num(c.residuals) ** 2, axis=-1), 0.0)
+    fitted = np.sqrt(squares.sum(axis=1) / np.maximum(c.kept.sum(axis=1), 1))
+    middle = float(np.median(c.held_out.by_view))
+    bars = [
+        charts.Bar(
+            name,
+            f"{name}: {brief(float(out))} px held out, {brief(float(own))} px when fitted",
+            float(out),
+            quiet=bool(out < 2 * middle),
+        )
+        for name, out, own in zip(c.views, c.held_out.by_view, fitted, strict=True)
+    ]
+    return charts.bar_chart(
+        "Held-out error of each photograph", "photographs; root mean square, px", bars, (),
+        f"Bars of {len(bars)} photographs, the middle one {brief(middle)} px",
+    )  # fmt: skip
+
+
+def _angles_chart(c: CameraCalibration) -> charts.BarChart | None:
+    """How far from the axis the corners lie."""
+    rays = c.camera.ray(c.pixels[c.kept])
+    angle = np.rad2deg(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
+    angle = angle[np.isfinite(angle)]
+    last = int(np.ceil((angle.max() if angle.size else 1.0) / ANGLE_STEP)) + 1
+    counts = np.bincount((angle / ANGLE_STEP).astype(int), minlength=last)
+    bars = [
+        charts.Bar(
+            f"{k * ANGLE_STEP:.0f}",
+            f"{k * ANGLE_STEP:.0f} to {(k + 1) * ANGLE_STEP:.0f}°: {count(n, 'corner')}",
+            float(n),
+            quiet=True,
+        )
+        for k, n in enumerate(counts.tolist())
+    ]
+    every = max(1, len(bars) // 8)
+    labels = tuple((float(k), f"{k * ANGLE_STEP:.0f}") for k in range(0, len(bars) + 1, every))
+    return charts.bar_chart(
+        "Corners by their angle from the axis", "degrees", bars, labels,
+        f"Corners from {angle.min(initial=180):.0f} to {angle.max(initial=0):.0f} degrees",
+    )  # fmt: skip
+
+
+def _script() -> str:
+    """Tooltips and enlarged photographs, as in the report."""
+    source = resources.files("pkmcal.report") / "templates" / "script.js"
+    return source.read_text(encoding="utf-8").partition(SCRIPT_END)[0]
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("pkmcal.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    shared: dict[str, Any] = {"charts": charts, "count": wording.count}
+    environment.globals.update(shared)
+    # The charts' template colours by leg; a camera has none.
+    environment.filters["leg"] = lambda _leg: "no-leg"
+    return environment
