@@ -33,8 +33,11 @@ from pkmcal.refinement import CameraRefinement, refinement_of
 from pkmcal.session import Session, load_session
 
 ROUNDS = 3
-"""Looks at the edges, each from the estimate before: the first corrects a pixel, the second a
-tenth, the third changes nothing that matters."""
+"""Most looks at the edges, each from the estimate before."""
+SETTLED = 0.15
+"""Median distance (px) of edges from their prediction below which another look changes nothing:
+the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
+far."""
 FEWEST_EDGES = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
 
@@ -190,6 +193,8 @@ def _take_turns(
         start = better_start(machine, measurements, known) if turn == 0 else known
         estimate = bundle(machine, measurements, start)
         clock.lap("identify")
+        if max(look.moved for look in looks) < SETTLED and not cameras.active:
+            break
     return _Turns(_observation(looks, estimate), measurements, estimate, cameras)
 
 

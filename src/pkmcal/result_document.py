@@ -159,10 +159,12 @@ def _refined(calibration: Calibration, file: str) -> dict[str, Any]:
     if not calibration.cameras.active:
         return {}
     camera = calibration.cameras.result(calibration.estimate, file)
+    n = len(camera.parameters)
+    covariance = np.zeros((n, n)) if camera.covariance is None else camera.covariance
     return {
         "parameters": list(camera.parameter_names),
         "values": camera.parameters,
-        "deviations": np.sqrt(np.diag(camera.covariance)),
+        "deviations": np.sqrt(np.diag(covariance)),
     }
 
 

@@ -64,7 +64,7 @@ class Camera(ABC):
 
     model: ClassVar[str]
     parameter_names: ClassVar[tuple[str, ...]]
-    schema: ClassVar[type[Schema]]
+    schema: ClassVar[type[CameraSchema]]
 
     image_size: tuple[int, int]
     parameters: Array

@@ -14,7 +14,6 @@ from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
-from pkmcal.files import Schema
 
 _POWERS = np.array([3, 5, 7, 9])
 _NEWTON_STEPS = 30
@@ -37,7 +36,7 @@ class Fisheye(Camera):
     """p = K r(t) (x, y) / sqrt(x^2 + y^2), OpenCV's fisheye model."""
 
     model: ClassVar[str] = "fisheye"
-    schema: ClassVar[type[Schema]] = FisheyeSchema
+    schema: ClassVar[type[CameraSchema]] = FisheyeSchema
     parameter_names: ClassVar[tuple[str, ...]] = (
         "focal.x", "focal.y", "center.x", "center.y", "k1", "k2", "k3", "k4",
     )  # fmt: skip

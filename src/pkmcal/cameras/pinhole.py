@@ -10,7 +10,6 @@ from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
-from pkmcal.files import Schema
 
 _NEWTON_STEPS = 20
 _TABLE = 513
@@ -131,7 +130,7 @@ class Pinhole(Camera):
     """Perspective camera: p = K distort(x / z, y / z), OpenCV's model."""
 
     model: ClassVar[str] = "pinhole"
-    schema: ClassVar[type[Schema]] = PinholeSchema
+    schema: ClassVar[type[CameraSchema]] = PinholeSchema
     parameter_names: ClassVar[tuple[str, ...]] = (
         "focal.x", "focal.y", "center.x", "center.y", "k1", "k2", "p1", "p2", "k3",
     )  # fmt: skip

@@ -16,7 +16,6 @@ from pydantic import Field
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
 from pkmcal.cameras.pinhole import distort, undistort, unfolded
-from pkmcal.files import Schema
 
 _LEAST = 1e-9
 """Cosine by which a ray must lie inside the field's border, where the image runs to infinity."""
@@ -36,7 +35,7 @@ class Unified(Camera):
     """p = K distort(x / (z + xi r), y / (z + xi r)) with r the point's distance."""
 
     model: ClassVar[str] = "unified"
-    schema: ClassVar[type[Schema]] = UnifiedSchema
+    schema: ClassVar[type[CameraSchema]] = UnifiedSchema
     parameter_names: ClassVar[tuple[str, ...]] = (
         "focal.x", "focal.y", "center.x", "center.y", "xi", "k1", "k2", "p1", "p2",
     )  # fmt: skip

@@ -149,7 +149,7 @@ def _other_charuco(image: Integers, board: Board) -> str | None:
         for legacy in (False, True) if rows % 2 == 0 else (False,):
             data = {**board.document, "squares": [columns, rows], "legacy": legacy}
             count, share = _score(image, data)
-            if (count, share) > best[:2] and count > 1.2 * mine:
+            if (count, share) > best[:2] and count > mine:
                 best = (count, share, data)
     if best[0] < LEAST_CORNERS or not best[2]:
         return None

@@ -21,8 +21,9 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, closest, listed, read_yaml, shown, validate
 
-Count = Annotated[int, Field(ge=2, le=100)]
+Count = Annotated[int, Field(ge=3, le=100)]
 Counts = tuple[Count, Count]
+InnerCorners = tuple[Annotated[int, Field(ge=3, le=100)], Annotated[int, Field(ge=3, le=100)]]
 Length = Annotated[float, Field(gt=0)]
 LONGEST = 5.0
 """m; a square or marker longer than this was written in millimetres."""
@@ -72,7 +73,7 @@ class ChessboardSchema(Schema):
     """``type: chessboard``, with ``corners`` (inner ones) or ``squares``."""
 
     type: Literal["chessboard"]
-    corners: Counts | None = None
+    corners: InnerCorners | None = None
     squares: Counts | None = Field(default=None, validate_default=True)
     square: Length = Field(description="the length of a square's side in metres")
 
@@ -85,9 +86,6 @@ class ChessboardSchema(Schema):
                 "a chessboard needs either corners, the inner ones, such as [7, 6], or squares,"
                 " one more each way"
             )
-        smallest = min(corners or [n - 1 for n in squares or ()])
-        if smallest < 3:
-            raise ValueError("a chessboard needs three inner corners each way at least")
         return squares
 
     @field_validator("square")

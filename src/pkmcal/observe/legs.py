@@ -26,7 +26,7 @@ from pkmcal.observe.predict import (
     tubes_of,
     unobstructed,
 )
-from pkmcal.observe.search import SEARCH_SIGMA, sample, search_legs
+from pkmcal.observe.search import REACH, SEARCH_SIGMA, sample, search_legs
 
 SEARCH_SAMPLES = 12
 SEGMENTS = 8
@@ -64,7 +64,8 @@ class StationEdges:
     """What one look at one station gave.
 
     points : (M, 2) px and point_edge (M,) the edge in ``edges`` that each supports.
-    blur : px, of the pictures' edges; nan where not estimated.
+    blur : px, of the pictures' edges; nan where not estimated. moved : median distance (px) of
+    the edges from where they were predicted.
     """
 
     edges: EdgeSet
@@ -72,6 +73,7 @@ class StationEdges:
     points: Array
     point_edge: Integers
     blur: float
+    moved: float
 
 
 def photographs_of(
@@ -105,7 +107,7 @@ def search(
         if leg in tubes.leg
     ]
     nowhere = np.zeros((0, 2)), np.zeros(0, dtype=int)
-    return StationEdges(edges, tuple(rejected), *nowhere, float("nan"))
+    return StationEdges(edges, tuple(rejected), *nowhere, float("nan"), REACH)
 
 
 def _search_reason(share: float) -> str:
@@ -146,7 +148,8 @@ def measure(
     k, e, s = np.nonzero(fits.used & fits.good[..., None])
     xy = places.pixel[k, e, s] + position[k, e, s, None] * places.outward[k, e, s]
     number = np.cumsum(fits.good.ravel()).reshape(fits.good.shape) - 1
-    return StationEdges(edges, rejected, xy, number[k, e], blur)
+    moved = float(np.median(np.abs(position[k, e, s]))) if len(k) else 0.0
+    return StationEdges(edges, rejected, xy, number[k, e], blur, moved)
 
 
 def _predict(

@@ -1,0 +1,339 @@
+"""Boards: their files, their corners in rendered photographs, and what is said of wrong ones."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from pkmcal.cameras import camera_models
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import apply, inverse, pose, rotation
+from pkmcal.observe.boards import chessboard, detect_board, detect_boards, load_board
+
+SIZE = (480, 360)
+GREY = 110
+FILES = {
+    "charuco": "type: charuco\nsquares: [9, 7]\nsquare: 0.03\nmarker: 0.022\n"
+    "dictionary: DICT_5X5_100\n",
+    "chessboard": "type: chessboard\ncorners: [8, 5]\nsquare: 0.03\n",
+    "aruco_grid": "type: aruco_grid\nmarkers: [5, 4]\nmarker: 0.04\ngap: 0.012\n"
+    "dictionary: DICT_APRILTAG_36h11\n",
+}
+
+
+def board_of(tmp_path, text):
+    path = tmp_path / "board.yaml"
+    path.write_text(text)
+    return load_board(path)
+
+
+def camera_of(model, *values):
+    kind = camera_models()[model]
+    parameters = np.zeros(len(kind.parameter_names))
+    parameters[: len(values)] = values
+    return kind(SIZE, parameters)
+
+
+CAMERAS = {
+    "pinhole": camera_of("pinhole", 520, 522, 243, 176, -0.15, 0.05, 4e-4, -3e-4),
+    "fisheye": camera_of("fisheye", 190, 190.5, 238, 181, 0.02, -4e-3),
+    "unified": camera_of("unified", 300, 301, 240, 178, 0.9),
+}
+
+
+def texture(board, per_square=60):
+    """The printed board as grey levels, its place of (0, 0) in pixels, and pixels a metre."""
+    data = board.document
+    if board.type == "chessboard":
+        columns, rows = (n + 1 for n in board.counts)
+        y, x = np.mgrid[: rows * per_square, : columns * per_square] // per_square
+        image = np.where((x + y) % 2 == 0, 20, 230).astype(np.uint8)
+        return image, per_square, per_square / data["square"]
+    words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, data["dictionary"]))
+    if board.type == "charuco":
+        printed = cv2.aruco.CharucoBoard(
+            tuple(data["squares"]), data["square"], data["marker"], words
+        )
+        size = [n * per_square for n in data["squares"]]
+        scale = per_square / data["square"]
+    else:
+        return marker_grid(data, words)
+    image = printed.generateImage(tuple(size), marginSize=0, borderBits=1)
+    return (20 + image * (210 / 255)).astype(np.uint8), 0, scale
+
+
+def marker_grid(data, words, side=80):
+    """As :func:`texture`; OpenCV's own picture of a grid does not keep a scale."""
+    columns, rows = data["markers"]
+    step = round(side * (1 + data["gap"] / data["marker"]))
+    image = np.full((rows * step, columns * step), 230, dtype=np.uint8)
+    for k in range(rows * columns):
+        y, x = k // columns * step, k % columns * step
+        marker = cv2.aruco.generateImageMarker(words, k, side)
+        image[y : y + side, x : x + side] = 20 + marker * (210 / 255)
+    return image, 0, side / data["marker"]
+
+
+def render(camera, T_camera_board, board, seed=0, noise=2.0, fine=4, hide=None):
+    """A photograph of the board on a white sheet before a grey room, through the camera's rays.
+
+    hide : (x0, y0, x1, y1) px that something grey covers.
+    """
+    printed, first, scale = texture(board)
+    printed = cv2.copyMakeBorder(printed, *[round(0.02 * scale)] * 4, cv2.BORDER_CONSTANT, value=230)
+    shift = first + round(0.02 * scale)
+    width, height = camera.image_size
+    x, y = np.arange(width, dtype=float), np.arange(height, dtype=float)
+    rays = camera.ray(np.stack(np.meshgrid(x, y), axis=-1))
+    # between the pixels' centres rays are smooth; cv2 lays the finer grid centre on centre
+    rays = cv2.resize(rays, None, fx=fine, fy=fine, interpolation=cv2.INTER_CUBIC)
+    back = inverse(T_camera_board)
+    direction = rays @ back[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = -back[2, 3] / direction[..., 2]
+        xy = (back[:2, 3] + far[..., None] * direction[..., :2]) * scale + shift - 0.5
+    good = np.isfinite(xy).all(axis=-1) & (far > 0)
+    place = np.where(good[..., None], xy, -1e4).astype(np.float32)
+    seen = cv2.remap(
+        printed, place[..., 0], place[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, GREY
+    )
+    image = seen.reshape(height, fine, width, fine).mean(axis=(1, 3))
+    if hide:
+        x0, y0, x1, y1 = hide
+        image[y0:y1, x0:x1] = 90
+    image = cv2.GaussianBlur(image, (0, 0), 0.6)
+    image = image + np.random.default_rng(seed).normal(0, noise, image.shape)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def view(board, turn, at, distance):
+    """T_camera_board with the board's middle in direction `at` (m at unit depth), turned."""
+    rot = rotation(np.array(turn, dtype=float))
+    middle = np.array([*at, 1.0]) * distance
+    return pose(rot, middle - rot @ board.points.mean(axis=0))
+
+
+VIEWS = {
+    ("charuco", "pinhole"): ((0.3, -0.4, 0.1), (0.02, -0.03), 0.42),
+    ("charuco", "fisheye"): ((-0.2, 0.3, 0.0), (0.3, 0.1), 0.15),
+    ("chessboard", "pinhole"): ((0.4, 0.2, -0.3), (0.0, 0.05), 0.4),
+    ("chessboard", "unified"): ((0.3, -0.5, 0.2), (0.5, 0.3), 0.15),
+    ("chessboard", "fisheye"): ((0.2, 0.5, 0.1), (-0.5, 0.1), 0.14),
+    ("aruco_grid", "pinhole"): ((0.3, 0.3, 0.05), (0.0, 0.0), 0.45),
+}
+
+
+@pytest.fixture(params=VIEWS, ids="-".join)
+def shot(request, tmp_path):
+    kind, model = request.param
+    board, camera = board_of(tmp_path, FILES[kind]), CAMERAS[model]
+    T_camera_board = view(board, *VIEWS[request.param])
+    return board, camera, T_camera_board
+
+
+def test_corners_are_found_where_they_are(shot):
+    """All of them, to a few hundredths of a pixel, and as surely as they say."""
+    board, camera, T_camera_board = shot
+    found = detect_board(render(camera, T_camera_board, board), board)
+    truth = camera.project(apply(T_camera_board, board.points))
+    assert found.found
+    assert not found.mirrored
+    assert set(found.ids) | set(found.weak) == set(range(len(board.points)))
+    assert len(found.ids) >= 0.9 * len(board.points)
+    off = found.pixels - truth[found.ids]
+    assert np.sqrt(np.mean(off**2)) < 0.04
+    assert 0.5 < np.sqrt(np.mean((off / found.sigma[:, None]) ** 2)) < 1.8
+
+
+def test_own_corners_beat_opencv(tmp_path):
+    board, camera = board_of(tmp_path, FILES["charuco"]), CAMERAS["pinhole"]
+    own, other = [], []
+    for k, turn in enumerate(((0.5, 0.0, 0.0), (0.0, 0.6, 0.1), (-0.4, -0.4, 0.3))):
+        T_camera_board = view(board, turn, (0.0, 0.0), 0.42)
+        image = render(camera, T_camera_board, board, seed=k)
+        found = detect_board(image, board)
+        truth = camera.project(apply(T_camera_board, board.points))[found.ids]
+        own.append(found.pixels - truth)
+        rough = found.pixels.astype(np.float32).reshape(-1, 1, 2).copy()
+        until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
+        fine = cv2.cornerSubPix(image, rough, (4, 4), (-1, -1), until)
+        other.append(fine.reshape(-1, 2) - truth)
+    ours, theirs = (np.sqrt(np.mean(np.concatenate(e) ** 2)) for e in (own, other))
+    assert ours < 0.7 * theirs
+
+
+def test_a_partly_hidden_charuco_board_is_used(tmp_path):
+    board, camera = board_of(tmp_path, FILES["charuco"]), CAMERAS["pinhole"]
+    T_camera_board = view(board, (0.2, -0.2, 0.0), (0.0, 0.0), 0.42)
+    image = render(camera, T_camera_board, board, hide=(0, 0, 190, 360))
+    found = detect_board(image, board)
+    truth = camera.project(apply(T_camera_board, board.points))
+    assert 15 <= len(found.ids) < 48
+    assert np.all(truth[found.ids, 0] > 185)
+    assert np.abs(found.pixels - truth[found.ids]).max() < 0.2
+
+
+def test_a_board_out_of_sight_has_a_reason(tmp_path):
+    board = board_of(tmp_path, FILES["charuco"])
+    found = detect_board(np.full((360, 480), 90, dtype=np.uint8), board)
+    assert not found.found
+    assert found.reason == "none of the board's markers is recognised"
+    assert found.ids.shape == (0,)
+    assert found.pixels.shape == (0, 2)
+
+
+@pytest.mark.parametrize("turn", [0.0, np.pi])
+def test_colours_tell_which_way_up_a_chessboard_is(tmp_path, turn):
+    board = board_of(tmp_path, FILES["chessboard"])
+    assert not board.turnable
+    assert chessboard((7, 5), 0.03).turnable
+    camera = CAMERAS["pinhole"]
+    T_camera_board = view(board, (0.2, 0.1, 0.0), (0.0, 0.0), 0.4)
+    about = pose(rotation(np.array([0.0, 0.0, turn])), np.zeros(3))
+    middle = board.points.mean(axis=0)
+    about[:3, 3] = middle - about[:3, :3] @ middle
+    found = detect_board(render(camera, T_camera_board @ about, board), board)
+    truth = camera.project(apply(T_camera_board @ about, board.points))
+    assert np.abs(found.pixels - truth[found.ids]).max() < 0.3
+
+
+def test_mirror_images_are_told(tmp_path):
+    board, camera = board_of(tmp_path, FILES["charuco"]), CAMERAS["pinhole"]
+    T_camera_board = view(board, (0.2, -0.2, 0.0), (0.0, 0.0), 0.42)
+    image = np.ascontiguousarray(render(camera, T_camera_board, board)[:, ::-1])
+    found = detect_board(image, board)
+    assert found.mirrored
+    truth = camera.project(apply(T_camera_board, board.points))[found.ids]
+    np.testing.assert_allclose(found.pixels, [SIZE[0] - 1, 0] + [-1, 1] * truth, atol=0.2)
+
+
+def photographs(folder, board, count=3, size=None, start=0):
+    paths = []
+    for k in range(start, start + count):
+        T_camera_board = view(board, (0.2 * k - 0.2, 0.25, 0.1), (0.0, 0.0), 0.42)
+        image = render(CAMERAS["pinhole"], T_camera_board, board, seed=k)
+        paths.append(folder / f"p{k}.png")
+        cv2.imwrite(str(paths[-1]), image if size is None else cv2.resize(image, size))
+    return paths
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """Three photographs of each board."""
+    folder = tmp_path_factory.mktemp("boards")
+    boards = {}
+    for kind, text in FILES.items():
+        (folder / kind).mkdir()
+        board = board_of(folder / kind, text)
+        boards[kind] = board, photographs(folder / kind, board)
+    return boards
+
+
+def described(tmp_path, kind, *pairs):
+    text = FILES[kind]
+    for old, new in pairs:
+        assert old in text
+        text = text.replace(old, new)
+    return board_of(tmp_path, text)
+
+
+def test_every_photograph_has_a_result(pictures):
+    board, paths = pictures["charuco"]
+    found = detect_boards(paths, board)
+    assert [d.name for d in found] == ["p0.png", "p1.png", "p2.png"]
+    assert all(len(d.ids) == 48 for d in found)
+
+
+@pytest.mark.parametrize(
+    ("kind", "pairs", "shows", "says"),
+    [
+        ("chessboard", (("[8, 5]", "[7, 5]"),), "8x5 inner", "7x5 inner"),
+        ("chessboard", (("[8, 5]", "[9, 5]"),), "8x5 inner", "9x5 inner"),
+        ("chessboard", (("[8, 5]", "[9, 6]"),), "8x5 inner", "9x6 inner"),
+        ("charuco", (("[9, 7]", "[7, 9]"),), "9x7 squares", "7x9 squares"),
+        ("charuco", (("[9, 7]", "[9, 6]"),), "9x7 squares", "9x6 squares"),
+        ("charuco", (("5X5_100", "4X4_100"),), "markers of DICT_5X5_50", "9x7 squares"),
+    ],
+)
+def test_a_wrong_board_file_says_what_fits(pictures, tmp_path, kind, pairs, shows, says):
+    board = described(tmp_path, kind, *pairs)
+    with pytest.raises(InputError) as caught:
+        detect_boards(pictures[kind][1], board)
+    assert "another board than the one described" in str(caught.value)
+    assert shows in caught.value.found
+    assert says in caught.value.expected
+
+
+def test_two_boards_mixed(pictures):
+    board, paths = pictures["charuco"]
+    with pytest.raises(InputError, match="two boards are mixed") as caught:
+        detect_boards([*paths, pictures["chessboard"][1][0]], board)
+    assert caught.value.found == "a chessboard of 8x5 inner corners"
+
+
+def test_no_board_anywhere(tmp_path, pictures):
+    paths = [tmp_path / f"{k}.png" for k in range(2)]
+    for k, path in enumerate(paths):
+        noise = np.random.default_rng(k).normal(90, 5, (360, 480))
+        cv2.imwrite(str(path), noise.astype(np.uint8))
+    with pytest.raises(InputError, match="in none of the photographs") as caught:
+        detect_boards(paths, pictures["charuco"][0])
+    assert caught.value.found == "none of the board's markers is recognised"
+
+
+def test_photographs_of_two_sizes(tmp_path, pictures):
+    board, paths = pictures["charuco"]
+    odd = photographs(tmp_path, board, 1, (640, 480), start=7)
+    with pytest.raises(InputError) as caught:
+        detect_boards([*paths, *odd], board)
+    assert str(caught.value) == (
+        "p7.png: the photographs differ in size, so one camera as it was calibrated did not take"
+        " them; found 640x480 pixels, expected 480x360, as the other 3. Calibrate each resolution"
+        " on its own, from unscaled, uncropped photographs."
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("type: charucco\n", "board.yaml, line 1, type: no such type of board; found charucco, "
+         "expected charuco."),
+        ("square: 0.03\n", "board.yaml, type: the board's type is missing; expected charuco or "
+         "chessboard or aruco_grid."),
+        (FILES["charuco"].replace("0.022", "0.04"), "board.yaml, line 4, marker: a marker of 0.04 "
+         "m does not fit into a square of 0.03 m."),
+        (FILES["charuco"].replace("5X5_100", "5X5_10"), "board.yaml, line 5, dictionary: OpenCV "
+         "has no dictionary of markers 'DICT_5X5_10'; DICT_5X5_100 comes near."),
+        (FILES["chessboard"].replace("0.03", "30"), "board.yaml, line 3, square: 30 looks like "
+         "millimetres; lengths are wanted in metres."),
+        (FILES["chessboard"].replace("corners", "corner"), "board.yaml: a chessboard needs either "
+         "corners, the inner ones, such as [7, 6], or squares, one more each way. Then look at "
+         "line 2, corner."),
+        (FILES["chessboard"].replace("[8, 5]", "[8, 2]"), "board.yaml, line 2, corners[2]: this "
+         "value cannot be used; found 2, expected a number of 3 or more. Then look at squares."),
+    ],
+)  # fmt: skip
+def test_faults_of_board_files(tmp_path, text, sentence):
+    with pytest.raises(InputError) as caught:
+        board_of(tmp_path, text)
+    assert str(caught.value) == sentence
+
+
+def test_squares_or_inner_corners(tmp_path):
+    one = board_of(tmp_path, FILES["chessboard"])
+    two = board_of(tmp_path, FILES["chessboard"].replace("corners: [8, 5]", "squares: [9, 6]"))
+    np.testing.assert_array_equal(one.points, two.points)
+    assert one.lines == two.lines
+    assert len(one.lines) == 13
+
+
+def test_points_stand_where_opencv_has_them(tmp_path):
+    board = board_of(tmp_path, FILES["charuco"])
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    theirs = cv2.aruco.CharucoBoard((9, 7), 0.03, 0.022, words).getChessboardCorners()
+    np.testing.assert_allclose(board.points, np.asarray(theirs).reshape(-1, 3), atol=1e-7)
+    grid = board_of(tmp_path, FILES["aruco_grid"])
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    theirs = cv2.aruco.GridBoard((5, 4), 0.04, 0.012, words).getObjPoints()
+    np.testing.assert_allclose(grid.points, np.asarray(theirs).reshape(-1, 3), atol=1e-7)
