@@ -234,7 +234,7 @@ def _edges(looks: list[legs.StationEdges]) -> EdgeSet:
 def _measurements(
     session: Session, edges: EdgeSet, cameras: CameraRefinement | None
 ) -> Measurements:
-    """cameras : None at the first look, which is too coarse to refine any."""
+    """What is measured; no cameras at the first look, which is too coarse to refine any."""
     files = [station.camera_file for station in session.stations]
     numbers = {name: k for k, name in enumerate(dict.fromkeys(files))}
     measurements = Measurements(

@@ -51,11 +51,16 @@ class Corners(NamedTuple):
     sigma: Array
 
 
-def refine(image: Integers, start: Array, axes: Array, window: Window) -> Corners:
+def refine(
+    image: Integers, start: Array, axes: Array, window: Window, bends: Array | None = None
+) -> Corners:
     """Fit corners near `start`.
 
     image : (height, width) grey levels. start : (n, 2) px.
-    axes : (n, 2, 2) px; axes[:, k] is the picture of one square along the board's axis k.
+    axes : (n, 2, 2) px; axes[:, k] is the picture of one square along the board's axis k; of a
+        marker's corner, of its side, away from the corner.
+    bends : (n, 2, 2) px; second differences of the picture along the same axes, by which a lens
+        or mirror bends the edges; none for straight ones.
     """
     if len(start) == 0:
         return Corners(start, np.zeros(0, dtype=bool), np.zeros(0))
@@ -64,9 +69,10 @@ def refine(image: Integers, start: Array, axes: Array, window: Window) -> Corner
     offsets, grey, inside = _pixels(image, start, axes, window.reach * widened)
     weight = _weights(offsets, axes, window, widened) * inside
     offsets, grey, weight = _packed(offsets, grey, weight)
-    first = _first(grey, weight, axes)
-    p, residual = _fit(grey, weight, offsets, first, window.saddle)
-    return _judged(start, p, residual, grey, weight, scale, window.saddle, offsets)
+    first = _first(grey, weight, axes, window.saddle)
+    shape = _Shape(offsets, _curvature(first, axes, bends), window.saddle)
+    p, residual = _fit(grey, weight, shape, first)
+    return _judged(start, p, residual, grey, weight, scale, shape)
 
 
 def _pixels(
@@ -102,9 +108,15 @@ def _packed(offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, A
     return offsets[rows, order], grey[rows, order], weight[rows, order]
 
 
-def _first(grey: Array, weight: Array, axes: Array) -> Array:
-    """Start of the fit: x, y, two directions, log blur, level, amplitude; (n, 7)."""
+def _first(grey: Array, weight: Array, axes: Array, saddle: bool) -> Array:
+    """Start of the fit: x, y, two directions, log blur, level, amplitude; (n, 7).
+
+    Of a marker's corner both edges are directed so that the marker is on their positive side.
+    """
     angle = np.arctan2(axes[..., 1], axes[..., 0])
+    if not saddle:
+        inward = np.sum(_normals(angle) * axes[:, ::-1], axis=-1)
+        angle = angle + np.where(inward < 0, np.pi, 0.0)
     total = np.maximum(weight.sum(axis=1), 1e-9)
     mean = np.sum(weight * grey, axis=1) / total
     spread = np.sqrt(np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total)
@@ -112,10 +124,32 @@ def _first(grey: Array, weight: Array, axes: Array) -> Array:
     return np.stack([zero, zero, angle[:, 0], angle[:, 1], zero, mean, spread], axis=-1)
 
 
-def _fit(grey: Array, weight: Array, offsets: Array, p: Array, saddle: bool) -> tuple[Array, Array]:
+def _normals(angle: Array) -> Array:
+    """Positive sides (..., 2) of edges with these directions."""
+    return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+
+
+class _Shape(NamedTuple):
+    """What a corner's picture is made of: pixels' offsets (n, m, 2), curvatures (n, 2) 1/px of its
+    two edges towards their positive sides, and whether two dark squares meet."""
+
+    offsets: Array
+    curvature: Array
+    saddle: bool
+
+
+def _curvature(first: Array, axes: Array, bends: Array | None) -> Array:
+    """Curvatures of the edges, (n, 2): the part of the second difference across the edge."""
+    if bends is None:
+        return np.zeros((len(first), 2))
+    across = np.sum(_normals(first[:, 2:4]) * bends, axis=-1)
+    return across / np.maximum(np.sum(axes**2, axis=-1), 1e-9)
+
+
+def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Array]:
     """Weighted Levenberg-Marquardt of all corners at once; parameters (n, 7), residuals (n, m)."""
-    p = _levelled(grey, weight, offsets, p, saddle)
-    value, by = _model(p, offsets, saddle)
+    p = _levelled(grey, weight, shape, p)
+    value, by = _model(p, shape)
     cost = np.sum(weight * (grey - value) ** 2, axis=1)
     damping = np.full(len(p), 1e-3)
     for _ in range(STEPS):
@@ -126,7 +160,7 @@ def _fit(grey: Array, weight: Array, offsets: Array, p: Array, saddle: bool) -> 
         normal = normal + (damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
         step = np.clip(np.linalg.solve(normal, right[..., None])[..., 0], -_MOST, _MOST)
         trial = p + step
-        trial_value, trial_by = _model(trial, offsets, saddle)
+        trial_value, trial_by = _model(trial, shape)
         trial_cost = np.sum(weight * (grey - trial_value) ** 2, axis=1)
         better = trial_cost < cost
         p = np.where(better[:, None], trial, p)
@@ -143,68 +177,59 @@ _MOST = np.array([1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3])
 """Longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur."""
 
 
-def _levelled(grey: Array, weight: Array, offsets: Array, p: Array, saddle: bool) -> Array:
+def _levelled(grey: Array, weight: Array, shape: _Shape, p: Array) -> Array:
     """The start with level and amplitude fitted: these two are linear."""
-    shape = _model(
-        np.concatenate([p[:, :5], 0 * p[:, :1], 0 * p[:, :1] + 1], axis=1), offsets, saddle
-    )[0]
+    bare = p.copy()
+    bare[:, 5], bare[:, 6] = 0.0, 1.0
+    form = _model(bare, shape)[0]
     total = np.maximum(weight.sum(axis=1), 1e-9)
-    mean = np.sum(weight * shape, axis=1) / total
-    grey_mean = np.sum(weight * grey, axis=1) / total
-    off = shape - mean[:, None]
+    mean = np.sum(weight * form, axis=1) / total
+    off = form - mean[:, None]
     variance = np.maximum(np.sum(weight * off * off, axis=1), 1e-9)
-    amplitude = np.sum(weight * off * grey, axis=1) / variance
-    return np.concatenate(
-        [p[:, :5], (grey_mean - amplitude * mean)[:, None], amplitude[:, None]], axis=1
-    )
+    bare[:, 6] = np.sum(weight * off * grey, axis=1) / variance
+    bare[:, 5] = np.sum(weight * grey, axis=1) / total - bare[:, 6] * mean
+    return bare
 
 
-def _model(p: Array, offsets: Array, saddle: bool) -> tuple[Array, Array]:
+def _model(p: Array, shape: _Shape) -> tuple[Array, Array]:
     """Grey levels (n, m) and their derivatives by the seven unknowns (n, m, 7)."""
     from scipy.special import erf
 
-    d = offsets - p[:, None, :2]
+    d = shape.offsets - p[:, None, :2]
     blur = np.exp(p[:, 4])[:, None]
+    half = 1.0 if shape.saddle else 0.5
+    forms: list[Array] = []
+    chains: list[Array] = []
+    for k in (0, 1):
+        cos, sin = np.cos(p[:, 2 + k])[:, None], np.sin(p[:, 2 + k])[:, None]
+        bend = shape.curvature[:, k, None]
+        along, across = d[..., 0] * cos + d[..., 1] * sin, d[..., 1] * cos - d[..., 0] * sin
+        z = (across - 0.5 * bend * along**2) / blur
+        forms.append(half * erf(z / np.sqrt(2)) + (1 - half))
+        slope = half * np.sqrt(2 / np.pi) * np.exp(-0.5 * z * z) / blur
+        by_angle = -along - bend * along * across
+        parts = (sin + bend * along * cos, bend * along * sin - cos, by_angle, -z * blur)
+        chains.append(slope[..., None] * np.stack(np.broadcast_arrays(*parts), axis=-1))
     level, amplitude = p[:, 5:6], p[:, 6:7]
-    shapes: list[Array] = []
-    slopes: list[Array] = []
-    parts: list[tuple[Array, Array, Array, Array]] = []
-    half = 1.0 if saddle else 0.5
-    for k in (2, 3):
-        cos, sin = np.cos(p[:, k])[:, None], np.sin(p[:, k])[:, None]
-        z = (d[..., 1] * cos - d[..., 0] * sin) / blur
-        shapes.append(half * erf(z / np.sqrt(2)) + (1 - half))
-        slopes.append(half * np.sqrt(2 / np.pi) * np.exp(-0.5 * z * z) / blur)
-        parts.append((cos, sin, z, d[..., 0] * cos + d[..., 1] * sin))
     by = np.empty((*d.shape[:-1], 7))
-    first, second = amplitude * slopes[0] * shapes[1], amplitude * slopes[1] * shapes[0]
-    (c1, s1, z1, t1), (c2, s2, z2, t2) = parts
-    by[..., 0] = first * s1 + second * s2
-    by[..., 1] = -(first * c1 + second * c2)
-    by[..., 2], by[..., 3] = -first * t1, -second * t2
-    by[..., 4] = -(first * z1 + second * z2) * blur
-    by[..., 5] = 1.0
-    by[..., 6] = shapes[0] * shapes[1]
+    first = (amplitude * forms[1])[..., None] * chains[0]
+    second = (amplitude * forms[0])[..., None] * chains[1]
+    by[..., :2] = first[..., :2] + second[..., :2]
+    by[..., 2], by[..., 3] = first[..., 2], second[..., 2]
+    by[..., 4] = first[..., 3] + second[..., 3]
+    by[..., 5], by[..., 6] = 1.0, forms[0] * forms[1]
     return level + amplitude * by[..., 6], by
 
 
 def _judged(
-    start: Array,
-    p: Array,
-    residual: Array,
-    grey: Array,
-    weight: Array,
-    scale: Array,
-    saddle: bool,
-    offsets: Array,
+    start: Array, p: Array, residual: Array, grey: Array, weight: Array, scale: Array, shape: _Shape
 ) -> Corners:
     """Where the fit is a corner, and how sure its place is by what it leaves unexplained."""
     total = np.maximum(weight.sum(axis=1), 1e-9)
     mean = np.sum(weight * grey, axis=1) / total
     variance = np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total
     left = np.sum(weight * residual**2, axis=1) / total
-    blur = np.exp(p[:, 4])
-    moved = np.hypot(p[:, 0], p[:, 1])
+    blur, moved = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
     good = (
         (left < (1 - LEAST_SHARE) * variance)
         & (blur > BLURS[0] / 2)
@@ -213,7 +238,7 @@ def _judged(
         & (weight.sum(axis=1) > 12)
         & np.isfinite(p).all(axis=1)
     )
-    by = _model(p, offsets, saddle)[1]
+    by = _model(p, shape)[1]
     normal = np.swapaxes(by, 1, 2) @ (by * weight[..., None]) + 1e-9 * np.eye(7)
     # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.
     noise = np.maximum(left, 1 / 12)

@@ -55,16 +55,21 @@ def _fitted(image: Integers, board: Board, raw: Raw) -> Corners:
         axes = _marker_axes(ids, pixels)
         plain = refine(image, pixels, axes, Window(reach, CLEAR * module, False))
         touching = refine(image, pixels, axes, Window(reach, CLEAR * module, True))
-        choice = plain.good.sum() >= touching.good.sum()
-        return plain if choice else touching
+        # Both may be found: on a marker's inner pattern too. The right ones are the surer ones.
+        right = plain.good.sum() > touching.good.sum() or (
+            np.median(plain.sigma) <= np.median(touching.sigma)
+        )
+        return plain if right else touching
     margin = REACH
     if board.type == "charuco":
         margin = min(REACH, CLEAR * 0.5 * (1 - data["marker"] / data["square"]))
-    return refine(image, pixels, _axes(board, ids, pixels), Window(REACH, margin, True))
+    sides, bends = _axes(board, ids, pixels)
+    return refine(image, pixels, sides, Window(REACH, margin, True), bends)
 
 
-def _axes(board: Board, ids: Integers, pixels: Array) -> Array:
-    """Pictures of the square's two sides at every corner, (n, 2, 2) px; [:, k] along axis k.
+def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
+    """Pictures of the square's two sides at every corner, (n, 2, 2) px, [:, k] along axis k; and
+    second differences along them, (n, 2, 2) px.
 
     From the neighbours found; where a corner has none along an axis, from the mean of the rest.
     """
@@ -72,32 +77,53 @@ def _axes(board: Board, ids: Integers, pixels: Array) -> Array:
     grid = np.full((rows * columns, 2), np.nan)
     grid[ids] = pixels
     grid = grid.reshape(rows, columns, 2)
-    out = np.empty((len(ids), 2, 2))
+    sides = np.empty((len(ids), 2, 2))
+    bends = np.zeros((len(ids), 2, 2))
     for k, axis in enumerate((1, 0)):
         step = np.diff(grid, axis=axis)
-        pad = [(0, 0), (0, 0), (0, 0)]
-        before, after = list(pad), list(pad)
-        before[axis], after[axis] = (1, 0), (0, 1)
-        both = np.stack([np.pad(step, p, constant_values=np.nan) for p in (before, after)])
-        known = np.isfinite(both)
-        total = np.where(known, both, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-        side = np.where(known.any(axis=0), total, np.nan).reshape(-1, 2)[ids]
         mean = np.nanmean(step.reshape(-1, 2), axis=0) if np.isfinite(step).any() else np.nan
-        out[:, k] = np.where(np.isfinite(side), side, mean)
+        side = _beside(step, axis).reshape(-1, 2)[ids]
+        sides[:, k] = np.where(np.isfinite(side), side, mean)
+        # At the board's border the bend of the nearest corner inside serves as well.
+        second = _nearest(_padded(np.diff(step, axis=axis), axis, 1, 1), axis)
+        bends[:, k] = np.nan_to_num(second.reshape(-1, 2)[ids])
     # A single row of corners has no second side: take it square.
     for k in (0, 1):
-        bare = ~np.isfinite(out[:, k]).all(axis=1)
-        out[bare, k] = (1 - 2 * k) * out[bare, 1 - k][:, ::-1] * [1, -1]
-    return out
+        bare = ~np.isfinite(sides[:, k]).all(axis=1)
+        sides[bare, k] = (1 - 2 * k) * sides[bare, 1 - k][:, ::-1] * [1, -1]
+    return sides, bends
+
+
+def _padded(values: Array, axis: int, before: int, after: int) -> Array:
+    """With NaN before and after along an axis."""
+    pad = [(0, 0)] * values.ndim
+    pad[axis] = (before, after)
+    return np.pad(values, pad, constant_values=np.nan)
+
+
+def _beside(step: Array, axis: int) -> Array:
+    """Mean of the steps to both sides, or the one that there is."""
+    both = np.stack([_padded(step, axis, 1, 0), _padded(step, axis, 0, 1)])
+    known = np.isfinite(both)
+    total = np.where(known, both, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(known.any(axis=0), total, np.nan)
+
+
+def _nearest(values: Array, axis: int) -> Array:
+    """NaN replaced by the mean of the two neighbours' values, or the one that there is."""
+    around = [np.roll(values, shift, axis) for shift in (1, -1)]
+    known = np.isfinite(np.stack(around))
+    total = np.where(known, np.stack(around), 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(np.isfinite(values), values, total)
 
 
 def _marker_axes(ids: Integers, pixels: Array) -> Array:
-    """As :func:`_axes`, with a marker's side for a square; ids come in fours."""
+    """As :func:`_axes`, with a marker's sides, away from the corner; ids come in fours."""
     corner = pixels.reshape(-1, 4, 2)
     top, right = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 1]
     bottom, left = corner[:, 2] - corner[:, 3], corner[:, 3] - corner[:, 0]
-    x = np.stack([top, top, bottom, bottom], axis=1)
-    y = np.stack([left, right, right, left], axis=1)
+    x = np.stack([top, -top, -bottom, bottom], axis=1)
+    y = np.stack([left, right, -right, -left], axis=1)
     return np.stack([x, y], axis=2).reshape(len(ids), 2, 2)
 
 

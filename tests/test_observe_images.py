@@ -1,0 +1,133 @@
+"""Photographs decoded: whole ones as their camera gave them; others named with what is wrong."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from pkmcal.errors import InputError
+from pkmcal.observe.images import decode, decode_all
+
+SIZE = (64, 48)
+GREY = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
+
+
+def encoded(kind, image=GREY):
+    return cv2.imencode(kind, image)[1].tobytes()
+
+
+def chunk(kind, body):
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def png_of(width, height):
+    """A PNG of well-formed chunks that states a size and holds no such picture."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    parts = [(b"IHDR", header), (b"IDAT", zlib.compress(b"0" * 100)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
+
+
+def with_preview(jpeg):
+    """The same JPEG with a whole small one in a segment before it, as cameras write it."""
+    small = encoded(".jpg", GREY[:8, :8])
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(small)) + small + jpeg[2:]
+
+
+def decoded(tmp_path, data, size=SIZE):
+    path = tmp_path / "a.png"
+    path.write_bytes(data)
+    return decode(path, size, "images/front/a.png")
+
+
+def sentence(tmp_path, data, size=SIZE):
+    with pytest.raises(InputError) as caught:
+        decoded(tmp_path, data, size)
+    return str(caught.value)
+
+
+def test_grey_levels_come_as_they_are(tmp_path):
+    np.testing.assert_array_equal(decoded(tmp_path, encoded(".png")), GREY)
+
+
+def test_colour_and_sixteen_bits_become_grey(tmp_path):
+    colour = encoded(".png", np.dstack([GREY] * 3))
+    deep = encoded(".png", GREY.astype(np.uint16) * 257)
+    np.testing.assert_array_equal(decoded(tmp_path, colour), GREY)
+    np.testing.assert_allclose(decoded(tmp_path, deep).astype(int), GREY, atol=1)
+
+
+def test_a_turned_jpeg_stays_as_the_sensor_gave_it(tmp_path):
+    """EXIF orientation 6 asks viewers for a quarter turn; the camera model knows none."""
+    entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
+    exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0)
+    plain = encoded(".jpg")
+    turned = plain[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + plain[2:]
+    np.testing.assert_array_equal(decoded(tmp_path, turned), decoded(tmp_path, plain))
+
+
+@pytest.mark.parametrize("kind", [".png", ".jpg"])
+def test_what_phones_append_does_no_harm(tmp_path, kind):
+    whole = encoded(kind)
+    expected = decoded(tmp_path, whole)
+    np.testing.assert_array_equal(decoded(tmp_path, whole + b"\0trailer" * 40), expected)
+
+
+CUT = (
+    "images/front/a.png: the photograph cannot be decoded; found {found}, expected a whole PNG or "
+    "JPEG file. Copy it again from the camera, or remove it: an absent photograph is allowed."
+)
+PNG, JPEG = encoded(".png"), encoded(".jpg")
+
+
+@pytest.mark.parametrize(
+    ("data", "found"),
+    [
+        pytest.param(PNG[: len(PNG) // 2], "a PNG file that ends early", id="half a PNG"),
+        pytest.param(PNG[:-4], "a PNG file that ends early", id="PNG without its last bytes"),
+        pytest.param(JPEG[: len(JPEG) // 2], "a JPEG file that ends early", id="half a JPEG"),
+        pytest.param(JPEG[:3], "a JPEG file that ends early", id="three bytes of a JPEG"),
+        pytest.param(
+            with_preview(JPEG)[:-200], "a JPEG file that ends early", id="JPEG with whole preview"
+        ),
+        pytest.param(b"", "no readable image", id="empty"),
+        pytest.param(b"joints.csv\n1,2,3\n", "no readable image", id="text"),
+        pytest.param(png_of(0, 0), "no readable image", id="no pixels"),
+        pytest.param(png_of(100_000, 100_000), "no readable image", id="ten billion pixels"),
+    ],
+)
+def test_files_that_cannot_be_decoded(tmp_path, data, found):
+    assert sentence(tmp_path, data) == CUT.format(found=found)
+
+
+def test_a_whole_jpeg_with_a_preview_is_read(tmp_path):
+    np.testing.assert_array_equal(decoded(tmp_path, with_preview(JPEG)), decoded(tmp_path, JPEG))
+
+
+def test_a_photograph_of_another_size(tmp_path):
+    assert sentence(tmp_path, PNG, (640, 480)) == (
+        "images/front/a.png: the photograph has another size than its camera; found 64x48 pixels, "
+        "expected 640x480, the camera file's image_size. Use the photograph as the camera gave "
+        "it, neither scaled nor cropped."
+    )
+
+
+def test_a_photograph_that_is_not_there(tmp_path):
+    with pytest.raises(InputError) as caught:
+        decode(tmp_path / "b.png", SIZE, "images/front/b.png")
+    assert str(caught.value) == "images/front/b.png: cannot be read (No such file or directory)."
+
+
+def test_several_keep_their_order_and_the_first_fault_is_told(tmp_path):
+    paths = [tmp_path / f"{k}.png" for k in range(4)]
+    for k, path in enumerate(paths):
+        path.write_bytes(encoded(".png", np.full((48, 64), 10 * k, np.uint8)))
+    labels = [path.name for path in paths]
+    images = decode_all(paths, SIZE, labels)
+    assert [int(image[0, 0]) for image in images] == [0, 10, 20, 30]
+    paths[1].write_bytes(b"")
+    with pytest.raises(InputError, match=r"^1\.png: the photograph cannot be decoded"):
+        decode_all(paths, SIZE, labels)

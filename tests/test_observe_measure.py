@@ -1,0 +1,222 @@
+"""Edges to sub-pixel: planes fitted to positions, and photographs to planes with covariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pkmcal.observe.legs import Photographs, measure, photographs_of
+from pkmcal.observe.lines import FLOOR, HALVES, edge_set, fit_edges
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
+from test_observe_drawing import (
+    FRONT,
+    camera_of,
+    draw,
+    machine,
+    outward_to,
+    photographs,
+    poses,
+    redrawn,
+    true_normals,
+    tubes_at,
+)
+
+
+def taken(pictures=None) -> Photographs:
+    pictures = pictures or photographs()[0]
+    readings = machine().inverse(poses())
+    rows = np.arange(len(pictures))
+    return photographs_of(0, camera_of(), rows, readings, pictures)
+
+
+def errors(edges):
+    """Error of each edge: shift in px, its two coordinates in rad, and half its chi squared."""
+    truth = true_normals(edges.leg, edges.tube, edges.side, edges.configuration)
+    turn = np.einsum("nij,ni->nj", edges.basis, edges.normal - truth)
+    chi2 = np.einsum("ni,nij,nj->n", turn, np.linalg.inv(edges.covariance), turn)
+    return turn[:, 0] / edges.shift[:, 0], turn, chi2 / 2
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+# Photographs to edges
+
+
+@pytest.mark.parametrize(("seed", "spread"), [(0, 0.0), (0, 0.0005), (1, 0.0005), (1, 0.001)])
+def test_edges_are_measured_to_hundredths_of_a_pixel(seed, spread):
+    """From a drawing whose joints are wrong by up to a millimetre (half a pixel to a whole one).
+
+    0.03 px an edge, of which 0.02 are common to all: blur and edge shift stand for one another,
+    and the identification has an edge shift for what is left.
+    """
+    found = measure(taken(), redrawn(seed, spread), FRONT, poses())
+    edges = found.edges
+    assert len(edges) > 95
+    shift, turn, chi = errors(edges)
+    assert abs(shift.mean()) < 0.03
+    assert rms(shift) < 0.05
+    assert np.abs(shift).max() < 0.3
+    # one, were it not for surfaces that differ from the model, which the covariance allows for
+    assert 0.1 < chi.mean() < 1.2
+    assert np.mean(chi > 4.5) < 0.03
+    np.testing.assert_allclose(np.linalg.norm(edges.normal, axis=1), 1, atol=1e-12)
+    # the blur of lens, pixel and interpolation
+    assert 0.62 < found.blur < 0.78
+    assert np.all(np.abs(turn[:, 1]) < 5 * np.sqrt(edges.covariance[:, 1, 1]))
+
+
+def test_every_edge_is_measured_or_has_a_reason():
+    found = measure(taken(), redrawn(0, 0.0005), FRONT, poses())
+    edges = found.edges
+    keys = (edges.configuration, edges.leg, edges.tube, edges.side)
+    measured = set(zip(*(key.tolist() for key in keys), strict=True))
+    rejected = {(r.configuration, r.leg, r.tube, r.side) for r in found.rejected}
+    assert len(measured) == len(edges)
+    assert not measured & rejected
+    assert len(measured | rejected) == 6 * len(tubes_of(machine()))
+    hidden = sum("hidden" in r.reason for r in found.rejected)
+    assert hidden > 0.5 * len(rejected)
+
+
+def test_the_points_lie_on_the_true_edges():
+    """Each point supports its edge's number; all are within a tenth of a pixel or two."""
+    found = measure(taken(), redrawn(1, 0.0005), FRONT, poses())
+    edges, camera = found.edges, camera_of()
+    assert found.points.shape == (len(found.point_edge), 2)
+    assert set(found.point_edge) == set(range(len(edges)))
+    truth = true_normals(edges.leg, edges.tube, edges.side, edges.configuration)
+    normal = truth[found.point_edge]
+    # across the edge: along the image of its normal
+    ray = camera.ray(found.points)
+    moved = camera.project(ray + 1e-4 * normal) - found.points
+    outward = moved / np.linalg.norm(moved, axis=1, keepdims=True)
+    off = outward_to(normal, found.points[:, None], outward[:, None], camera)[:, 0]
+    assert rms(off) < 0.06
+    assert np.abs(off).max() < 0.5
+
+
+def test_spans_lie_on_the_tubes():
+    edges = measure(taken(), machine(), FRONT, poses()).edges
+    tubes = tubes_of(machine())
+    at = 4 * edges.leg + 2 * edges.tube + edges.side
+    assert np.all(edges.span[:, 0] >= tubes.start[at])
+    assert np.all(edges.span[:, 1] <= tubes.stop[at])
+    assert np.all(edges.span[:, 1] - edges.span[:, 0] > 0.02)
+
+
+def test_a_known_blur_is_used_and_told():
+    found = measure(taken(), machine(), FRONT, poses(), blur=0.7)
+    assert found.blur == 0.7
+    assert rms(errors(found.edges)[0]) < 0.05
+
+
+def test_overexposed_photographs_give_no_edges_rather_than_wrong_ones():
+    """The wall at 290 of 255 levels, the tubes before it at 190 and less: no edge is left."""
+    bright = [draw(tubes_at(machine(), T), background=290.0)[0] for T in poses()[:2]]
+    found = measure(taken(bright), machine(), FRONT, poses()[:2])
+    assert len(found.edges) == 0
+    assert len(found.rejected) == 2 * len(tubes_of(machine()))
+
+
+def test_photographs_of_nothing_give_no_edges():
+    empty = [np.full((480, 640), 120, np.uint8)] * 2
+    assert len(measure(taken(empty), machine(), FRONT, poses()[:2]).edges) == 0
+
+
+# Positions to planes
+
+SAMPLES = 8
+
+
+def predicted():
+    legs = legs_in_camera(machine(), FRONT, poses(), machine().inverse(poses()))
+    tubes = tubes_of(machine())
+    return tubes, edge_points(machine(), camera_of(), legs, tubes, SAMPLES)
+
+
+def fitted(position, sigma=0.1, found=None):
+    tubes, points = predicted()
+    found = np.ones(position.shape, dtype=bool) if found is None else found
+    fits = fit_edges(points, position, np.full(position.shape, sigma), found)
+    return fits, edge_set(points, fits, tubes, 0, np.arange(6), fits.good)
+
+
+def positions_of(mechanism):
+    """Where a mechanism's edges cross the outward lines of the predicted points, (K, E, n) px."""
+    tubes, points = predicted()
+    legs = legs_in_camera(mechanism, FRONT, poses(), machine().inverse(poses()))
+    normal = edge_points(mechanism, camera_of(), legs, tubes, 2).normal
+    return outward_to(normal, points.pixel, points.outward, camera_of()), normal
+
+
+def test_exact_positions_give_the_exact_plane():
+    """Half a pixel from the prediction: second order, a thousandth of a pixel, is what remains."""
+    position, normal = positions_of(redrawn(2, 0.0005))
+    assert 0.5 < np.abs(position).max() < 3
+    fits, edges = fitted(position)
+    assert fits.good.all()
+    turn = np.einsum("nij,ni->nj", edges.basis, edges.normal - normal.reshape(-1, 3))
+    shift = turn[:, 0] / edges.shift[:, 0]
+    assert np.abs(shift).max() < 3e-3
+
+
+def test_a_common_shift_of_all_points_is_what_shift_says():
+    """The plane's change by a pixel outward at every point, for a lens with distortion."""
+    tubes, points = predicted()
+    still = fitted(np.zeros(points.along.shape))[1]
+    moved = fitted(np.full(points.along.shape, 0.1))[1]
+    turn = np.einsum("nij,ni->nj", still.basis, moved.normal - still.normal)
+    scale = np.abs(still.shift[:, :1])
+    np.testing.assert_allclose(turn / 0.1 / scale, still.shift / scale, atol=2e-3)
+    np.testing.assert_array_equal(still.normal, points.normal.reshape(-1, 3))
+    np.testing.assert_array_equal(still.leg, np.tile(tubes.leg, 6))
+
+
+def test_positions_on_a_highlight_do_not_pull_the_edge():
+    """Two of eight places half a pixel inside: left out, and the edge stays within 0.03 px."""
+    noise = 0.05 * np.random.default_rng(0).normal(size=(6, 24, SAMPLES))
+    clean = fitted(noise, 0.05)[1]
+    noise[..., [2, 3]] -= 0.5
+    fits, spoiled = fitted(noise, 0.05)
+    assert not fits.used[..., [2, 3]].any()
+    turn = np.einsum("nij,ni->nj", clean.basis, spoiled.normal - clean.normal)
+    assert rms(turn[:, 0] / clean.shift[:, 0]) < 0.03
+
+
+def test_an_edge_counts_as_two_measurements_however_many_its_places():
+    """Positions that err together, as shading has it: the shift's sigma is the place's over
+    the root of HALVES, and errors that are common to an edge stay within it."""
+    rng = np.random.default_rng(1)
+    sigma = 0.1
+    common = sigma / np.sqrt(HALVES) * rng.normal(size=(6, 24, 1))
+    own = 0.02 * rng.normal(size=(6, 24, SAMPLES))
+    tubes, points = predicted()
+    _, edges = fitted(common + own, sigma)
+    shift = np.sqrt(edges.covariance[:, 0, 0]) / np.abs(edges.shift[:, 0])
+    expected = np.hypot(sigma, FLOOR) / np.sqrt(HALVES)
+    # tilt and shift are not quite independent, and weights differ a little along an edge
+    np.testing.assert_allclose(shift, expected, rtol=0.15)
+    turn = np.einsum("nij,ni->nj", edges.basis, edges.normal - points.normal.reshape(-1, 3))
+    ratio = turn[:, 0] / np.sqrt(edges.covariance[:, 0, 0])
+    # 144 edges: the rms of a normal law is 1 within 0.06
+    assert rms(ratio) == pytest.approx(1.0, abs=0.2)
+
+
+def test_scatter_beyond_the_stated_sigmas_widens_the_covariance():
+    noise = np.random.default_rng(2).normal(size=(6, 24, SAMPLES))
+    told = fitted(0.02 * noise, 0.05)[1]
+    worse = fitted(0.10 * noise, 0.05)[1]
+    wider = worse.covariance[:, 0, 0] / told.covariance[:, 0, 0]
+    assert np.median(wider) > 1.5
+
+
+def test_edges_with_too_few_places_are_not_good():
+    found = np.zeros((6, 24, SAMPLES), dtype=bool)
+    found[..., :2] = True
+    found[0] = True
+    fits, edges = fitted(np.zeros(found.shape), found=found)
+    assert fits.good[0].all()
+    assert not fits.good[1:].any()
+    assert set(edges.configuration) == {0}

@@ -1,0 +1,267 @@
+"""The machine recognised in photographs, the station's pose found, each leg found to a pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
+from pkmcal.observe.distance import DIRECTIONS, direction_of, distance_tables
+from pkmcal.observe.legs import photographs_of, search
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.observe.search import REACH, search_legs
+from pkmcal.observe.stations import View, find_station
+from test_observe_drawing import (
+    FRONT,
+    camera_of,
+    draw,
+    machine,
+    outward_to,
+    photographs,
+    poses,
+    redrawn,
+    true_normals,
+    tubes_at,
+)
+
+CLEARANCE = 5.0
+
+
+def images():
+    return photographs()[0]
+
+
+# Legs
+
+
+def looked_for(mechanism, pictures, samples=12):
+    """Legs searched from a mechanism's prediction, and where their edges really are.
+
+    Returns the places, found and true outward positions (K, E, n) px, and which count.
+    """
+    readings = machine().inverse(poses())[: len(pictures)]
+    seen = poses()[: len(pictures)]
+    tubes, camera = tubes_of(mechanism), camera_of()
+    legs = legs_in_camera(mechanism, FRONT, seen, readings)
+    points = edge_points(mechanism, camera, legs, tubes, samples)
+    clear = unobstructed(mechanism, camera, legs, tubes, points, CLEARANCE)
+    places = search_legs(pictures, tubes, points, clear)
+    k, e = np.indices(clear.shape[:2])
+    flat = (v.ravel() for v in (tubes.leg[e], tubes.tube[e], tubes.side[e], k))
+    normal = true_normals(*flat).reshape(*clear.shape[:2], 3)
+    truth = outward_to(normal, points.pixel, points.outward, camera)
+    counted = clear & places.clear[:, tubes.leg][..., None]
+    return places, places.outward(points, clear, tubes), truth, counted
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.001, 0.002, 0.004])
+def test_legs_are_found_where_a_wrong_drawing_does_not_put_them(spread):
+    """Drawing errors of up to 4 mm shift and tilt legs by up to ten pixels: found to 0.6 px.
+
+    Shifts are tried by whole pixels and tilts too, so 0.3 px each is the best there is.
+    """
+    shifts = []
+    for seed in range(2):
+        places, found, truth, counted = looked_for(redrawn(seed, spread), images())
+        assert places.clear.mean() > 0.8
+        off = (found - truth)[counted]
+        assert np.sqrt(np.mean(off**2)) < 0.6
+        assert np.abs(off).max() < 2.0
+        shifts.append(np.abs(truth[counted]).max())
+    assert max(shifts) > 2000 * spread - 0.1
+
+
+def test_a_leg_that_is_not_there_is_not_found():
+    """The picture without leg 3: the others are found as before, it is nowhere clear."""
+    without = [draw([t for t in tubes_at(machine(), T) if t.leg != 2])[0] for T in poses()[:3]]
+    places, found, truth, counted = looked_for(redrawn(0, 0.001), without)
+    assert not places.clear[:, 2].any()
+    assert places.clear[:, [0, 1, 3, 4, 5]].mean() > 0.8
+    assert np.sqrt(np.mean((found - truth)[counted] ** 2)) < 0.6
+
+
+def test_a_leg_beyond_the_search_is_not_found():
+    """All edges moved sideways by more than the reach: the place at its end is no place."""
+    far = int(REACH) + 6
+    moved = [np.roll(image, far, axis=1) for image in images()[:3]]
+    assert looked_for(machine(), moved)[0].clear.mean() < 0.2
+
+
+def test_what_a_search_gives_and_why_it_leaves_legs_out():
+    """Edges with sigmas of about a pixel; every leg that is left out has a reason."""
+    pictures, readings = images(), machine().inverse(poses())
+    taken = photographs_of(3, camera_of(), np.arange(6), readings, pictures)
+    wrong = redrawn(1, 0.001)
+    found = search(taken, wrong, FRONT, poses())
+    edges = found.edges
+    assert set(edges.station) == {3}
+    truth = true_normals(edges.leg, edges.tube, edges.side, edges.configuration)
+    shift = np.einsum("nij,ni->nj", edges.basis, edges.normal - truth)[:, 0] / edges.shift[:, 0]
+    assert np.sqrt(np.mean(shift**2)) < 0.6
+    sigma = np.sqrt(edges.covariance[:, 0, 0]) / np.abs(edges.shift[:, 0])
+    assert 0.5 < np.median(sigma) < 1.5
+    missing = {(r.configuration, r.leg) for r in found.rejected}
+    present = set(zip(edges.configuration.tolist(), edges.leg.tolist(), strict=True))
+    assert missing | present == {(k, leg) for k in range(6) for leg in range(6)}
+    assert not missing & present
+
+
+# The station
+
+
+def rough_pose(seed, degrees=10.0, distance=0.1):
+    """FRONT moved by a turn and a shift of given sizes in random directions."""
+    rng = np.random.default_rng(seed)
+    turn, shift = rng.normal(size=(2, 3))
+    turn *= np.radians(degrees) / np.linalg.norm(turn)
+    shift *= distance / np.linalg.norm(shift)
+    return inverse(inverse(FRONT) @ pose(rotation(turn), shift))
+
+
+def view_of(pictures, mechanism=None, seen=None):
+    mechanism = mechanism or machine()
+    seen = poses()[: len(pictures)] if seen is None else seen
+    readings = machine().inverse(seen)
+    tables = distance_tables(pictures)
+    return View(mechanism, camera_of(), tubes_of(mechanism), readings, seen, tables)
+
+
+def misplaced(T_camera_base):
+    """Pixels by which leg points of all configurations are off, the median."""
+    ends = machine().base_centers(), machine().platform_centers()
+    base = np.broadcast_to(ends[0], (6, 6, 3))
+    platform = ends[1] @ poses()[:, :3, :3].swapaxes(1, 2) + poses()[:, None, :3, 3]
+    points = np.concatenate([base, platform]).reshape(-1, 3)
+
+    def seen(T):
+        return camera_of().project(points @ T[:3, :3].T + T[:3, 3])
+
+    return np.median(np.linalg.norm(seen(T_camera_base) - seen(FRONT), axis=1))
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_station_is_found_from_ten_degrees_and_ten_centimetres(seed, count):
+    """To a few pixels, within the reach of the search for legs that follows.
+
+    Tables are of reduced pictures, a table's pixel is 2.5 of the photograph's.
+    """
+    rough = rough_pose(seed)
+    found = find_station(view_of(images()[:count]), rough, np.random.default_rng(seed))
+    assert found.good
+    assert found.score < 0.3 < found.chance
+    assert misplaced(rough) > 50
+    assert misplaced(found.T_camera_base) < 5
+    off = pose_difference(found.T_camera_base, FRONT)
+    assert np.degrees(np.linalg.norm(off[:3])) < 1.5
+    assert np.linalg.norm(off[3:]) < 0.015
+
+
+def test_a_drawing_that_is_2_mm_wrong_is_recognised():
+    view = view_of(images(), redrawn(5, 0.002))
+    found = find_station(view, rough_pose(9), np.random.default_rng(9))
+    assert found.good
+    assert misplaced(found.T_camera_base) < 6
+
+
+def test_the_same_generator_gives_the_same_pose():
+    view = view_of(images()[:2])
+    twice = [find_station(view, rough_pose(0), np.random.default_rng(4)) for _ in range(2)]
+    np.testing.assert_array_equal(twice[0].T_camera_base, twice[1].T_camera_base)
+
+
+def blank(_rng):
+    return np.full((480, 640), 120, np.uint8)
+
+
+def noisy(rng):
+    return np.clip(120 + 10 * rng.normal(size=(480, 640)), 0, 255).astype(np.uint8)
+
+
+def texture(rng):
+    """Gravel: edges of every direction everywhere, so that any leg lies near some."""
+    return np.clip(120 + 40 * rng.normal(size=(480, 640)), 0, 255).astype(np.uint8)
+
+
+def clouds(rng):
+    field = gaussian_filter(rng.normal(size=(480, 640)), 6) * 2000 + 120
+    return field.clip(0, 255).astype(np.uint8)
+
+
+def sticks(rng):
+    """Tubes like the machine's, thrown anywhere."""
+    thrown = perturb(np.eye(4), rng.normal(size=(6, 6)) * np.repeat([1.0, 0.15], 3))
+    tubes = [t for T in thrown for t in tubes_at(machine(), T)]
+    return draw([t for k, t in enumerate(tubes) if k % 7 == 0])[0]
+
+
+@pytest.mark.parametrize("count", [2, 6])
+@pytest.mark.parametrize("scene", [blank, noisy, texture, clouds, sticks])
+def test_photographs_of_something_else_are_not_recognised(scene, count):
+    rng = np.random.default_rng(1)
+    view = view_of([scene(rng) for _ in range(count)])
+    for seed in range(2):
+        assert not find_station(view, rough_pose(seed), np.random.default_rng(seed)).good
+
+
+def test_photographs_of_other_configurations_are_not_recognised():
+    """Each photograph under its neighbour's name."""
+    view = view_of([*images()[1:], images()[0]])
+    for seed in range(2):
+        assert not find_station(view, rough_pose(seed), np.random.default_rng(seed)).good
+
+
+# Distance tables
+
+
+def test_directions_are_of_lines_not_of_arrows():
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False) + 1e-3
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    number = direction_of(normal)
+    np.testing.assert_array_equal(number, direction_of(-normal))
+    np.testing.assert_array_equal(np.unique(number), np.arange(DIRECTIONS))
+    assert np.all(np.diff(number[:100]) >= 0)
+
+
+def test_tables_hold_the_distance_to_an_edge_of_that_direction():
+    """A dark half picture: its upright border is at 320, and there is no level one."""
+    image = np.full((480, 640), 200, np.uint8)
+    image[:, :320] = 40
+    tables = distance_tables([image])
+    upright, level = direction_of(np.array([[1.0, 0.0], [0.0, 1.0]]))
+    x = np.array([20.0, 200.0, 319.5, 400.0, 620.0])
+    pixel = np.stack([x, np.full(5, 240.0)], axis=-1)
+    found, inside = tables.look(upright, pixel, np.array(0))
+    assert inside.all()
+    # the distance transform's 3x3 mask is exact along rows; two table pixels of Canny's and of
+    # rounding
+    np.testing.assert_allclose(found * tables.scale, np.abs(x - 319.5), atol=2 * tables.scale)
+    smooth, _ = tables.look_smooth(upright, pixel, np.array(0))
+    np.testing.assert_allclose(smooth * tables.scale, np.abs(x - 319.5), atol=2 * tables.scale)
+    assert tables.look(level, pixel, np.array(0))[0].min() > 100
+
+
+def test_outside_the_picture_and_without_an_image_nothing_is_inside():
+    tables = distance_tables([blank(None)])
+    pixel = np.array([[-5.0, 10.0], [700.0, 10.0], [10.0, 481.0], [np.nan, np.nan]])
+    for look in (tables.look, tables.look_smooth):
+        assert not look(np.zeros(4, dtype=int), pixel, np.zeros(4, dtype=int))[1].any()
+
+
+def test_edges_that_never_move_are_left_out_where_photographs_can_be_compared():
+    """A shelf in all of five photographs is background; in two it cannot be told."""
+    shelf = np.full((480, 640), 180, np.uint8)
+    shelf[100:140] = 60
+    pictures = []
+    for k in range(5):
+        picture = shelf.copy()
+        picture[200:400, 100 + 60 * k : 130 + 60 * k] = 20
+        pictures.append(picture)
+    level = direction_of(np.array([0.0, 1.0]))
+    on_shelf, number = np.array([[600.0, 100.0]]), np.zeros(1, dtype=int)
+    few, many = distance_tables(pictures[:2]), distance_tables(pictures)
+    assert few.look(level, on_shelf, number)[0] < 2
+    assert many.look(level, on_shelf, number)[0] > 20
+    upright = direction_of(np.array([1.0, 0.0]))
+    assert many.look(upright, np.array([[100.0, 300.0]]), number)[0] < 2
