@@ -425,6 +425,12 @@ def test_the_parameters_of_a_file_stand_in_their_order(tmp_path):
             "expected a number above 0.",
         ),
         (
+            "focal: [600, 601.5]",
+            "focal: [6.0, 6.0]",
+            "a.yaml, line 3, focal: the focal length [6.0, 6.0] looks like millimetres; it is "
+            "wanted in pixels, which is millimetres divided by the size of a pixel in mm.",
+        ),
+        (
             "center: [319.5, 239.5]\n",
             "",
             "a.yaml, center: this is missing; expected [cx, cy] in pixels, pixel centres at "

@@ -115,7 +115,9 @@ def make(
         grey.append(samples.mean(axis=0))
         truth.append(shift)
         widths.append(limb.half_width)
-        cuts.append(cut_of(np.any(samples >= SATURATED, axis=0)))
+        cuts.append(
+            cut_of(np.any(samples >= SATURATED, axis=0)[None], np.array([limb.half_width]))[0]
+        )
     profiles = Profiles(
         np.array(grey), np.full(number, float(count)), np.array(widths), np.array(cuts)
     )
@@ -142,17 +144,18 @@ DARK_TUBE = {"albedo": (60, 120), "ground": (150, 235)}
 @pytest.mark.parametrize("blur", [0.55, 0.7, 0.8])
 @pytest.mark.parametrize("scene", [BRIGHT_TUBE, DARK_TUBE], ids=["bright tube", "dark tube"])
 def test_well_exposed_edges_are_unbiased(blur, scene):
-    """Less than 0.01 px off in the mean, for any width, light and contrast above 40 levels.
+    """A hundredth of a pixel off in the mean, for any width, light and contrast above 40 levels.
 
-    Noise alone leaves 0.02 / sqrt(300) = 0.001 px; the tabulated half widths and the beliefs
-    about the shading leave the rest.
+    Noise alone leaves 0.02 / sqrt(300) = 0.001 px; the tabulated half widths leave the rest, and
+    the beliefs about the shading: on slim legs only the limb's few samples are used, so much blur
+    lets the beliefs speak, towards less shading (0.013 px at 0.8 px).
     """
     made = make(1, blur=blur, **scene)
     at = locate(made.profiles, blur)
     assert at.found.mean() > 0.98
     off = (at.position - made.truth)[at.found]
-    assert abs(off.mean()) < 0.01
-    assert rms(off) < 0.025
+    assert abs(off.mean()) < (0.01 if blur < 0.75 else 0.015)
+    assert rms(off) < 0.03
     assert np.abs(off).max() < 0.15
 
 
@@ -165,7 +168,7 @@ def test_the_strongest_gradient_is_biased_where_the_model_is_not():
     model = at.position - made.truth
     assert np.median(gradient) < -0.12
     assert abs(np.median(model)) < 0.01
-    assert rms(gradient) > 8 * rms(model)
+    assert rms(gradient) > 6 * rms(model)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +214,8 @@ def test_overexposed_edges_are_cut_or_dropped():
 
 def test_what_is_cut_off_widens_the_sigma():
     """Well-exposed profiles with their inner samples withheld: off by more, and told to be."""
-    made = make(5)
+    made = make(5, half_width=(9, 50))  # wide enough for all samples to be used
+    assert np.all(made.profiles.cut == 0)
     whole = locate(made.profiles, 0.7)
     for cut, wider in ((2, 1.1), (5, 1.3)):
         part = replace(made.profiles, cut=np.full(len(made.truth), cut))
@@ -234,7 +238,21 @@ def test_clipped_samples_that_are_not_cut_would_bias():
 
 def test_cut_of_reaches_to_the_outermost_saturated_sample():
     saturated = np.array([[0, 0, 0, 0], [1, 0, 0, 0], [1, 0, 1, 0], [0, 0, 0, 1]], dtype=bool)
-    assert cut_of(saturated).tolist() == [0, 1, 3, 4]
+    # profiles of four samples would be all outside: a wide leg keeps every unsaturated one
+    offsets = profile_offsets()
+    wide = np.zeros((4, len(offsets)), dtype=bool)
+    wide[:, :4] = saturated
+    assert cut_of(wide, np.full(4, 40.0)).tolist() == [0, 1, 3, 4]
+
+
+def test_slim_legs_are_looked_at_near_their_limb_only():
+    """A third of the half width, where shading is diffuse; never less than a pixel and a bit."""
+    offsets = profile_offsets()
+    width = np.array([2.0, 5.0, 8.0, 50.0])
+    cut = cut_of(np.zeros((4, len(offsets)), dtype=bool), width)
+    depth = -offsets[cut]
+    assert depth.tolist() == [1.0, 1.5, 2.5, 3.0]
+    assert np.all(depth <= np.maximum(0.35 * width, 1.25))
 
 
 @pytest.mark.parametrize("blur", [0.55, 0.63, 0.7, 0.85, 1.0])

@@ -131,7 +131,8 @@ def _normals(angle: Array) -> Array:
 
 class _Shape(NamedTuple):
     """What a corner's picture is made of: pixels' offsets (n, m, 2), curvatures (n, 2) 1/px of its
-    two edges towards their positive sides, and whether two dark squares meet."""
+    two edges towards their positive sides, and whether two dark squares meet.
+    """
 
     offsets: Array
     curvature: Array

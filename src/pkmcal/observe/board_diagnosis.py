@@ -7,7 +7,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from pkmcal.arrays import Integers
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import Document, listed
 from pkmcal.observe.board_finders import (
@@ -138,34 +140,40 @@ def _chess(counts: tuple[int, int]) -> str:
 
 def _other_charuco(image: Integers, board: Board) -> str | None:
     """The counts of squares, or the older pattern, with which most corners are found."""
-    ids, _ = detect_markers(image, board.document["dictionary"])
+    ids, corners = detect_markers(image, board.document["dictionary"])
     if len(ids) < 2:
         return None
-    mine, _ = _score(image, board.document)
-    best: tuple[int, float, dict[str, Any]] = (mine, 0.0, {})
-    for columns, rows in product(range(3, MOST_SQUARES), repeat=2):
-        if columns * rows // 2 <= ids.max():
-            continue
-        for legacy in (False, True) if rows % 2 == 0 else (False,):
-            data = {**board.document, "squares": [columns, rows], "legacy": legacy}
-            count, share = _score(image, data)
-            if (count, share) > best[:2] and count > mine:
-                best = (count, share, data)
-    if best[0] < LEAST_CORNERS or not best[2]:
+    most = int(ids.max()) + 1
+    # A board has at least as many markers as its highest says, and seldom twice as many.
+    layouts = [
+        {**board.document, "squares": [columns, rows], "legacy": legacy}
+        for columns, rows in product(range(3, MOST_SQUARES), repeat=2)
+        if most <= (columns * rows) // 2 <= 2 * most + 4
+        for legacy in ((False, True) if rows % 2 == 0 else (False,))
+    ]
+    scored = [(_found(image, data, ids, corners), data) for data in layouts]
+    mine = _found(image, board.document, ids, corners)
+    scored = [item for item in scored if item[0][0] >= max(LEAST_CORNERS, mine[0] + 1)]
+    if not scored:
         return None
-    data = best[2]
+    data = max(scored, key=lambda item: item[0])[1]
+    if len(find(image, board_from_document(Document(Path(), "", data, {})), "").ids) <= mine[0]:
+        return None
     changed = bool(data["legacy"]) != bool(board.document.get("legacy", False))
     pattern = f" with legacy: {str(data['legacy']).lower()}" if changed else ""
     return "a ChArUco board of {}x{} squares".format(*data["squares"]) + pattern
 
 
-def _score(image: Integers, data: dict[str, Any]) -> tuple[int, float]:
-    """Corners of a ChArUco board that look like corners, and their share of the board's."""
-    corners, ids, _, _ = charuco_detector(data).detectBoard(image)
-    if corners is None or ids is None or len(ids) < LEAST_CORNERS:
-        return 0, 0.0
-    board = board_from_document(Document(Path(), "", data, {}))
-    return (count := len(find(image, board, "").ids)), count / len(board.points)
+def _found(
+    image: Integers, data: dict[str, Any], ids: Integers, corners: Array
+) -> tuple[int, float]:
+    """Corners of a ChArUco board between given markers, and their share of the board's."""
+    marker_corners = [corner[None].astype(np.float32) for corner in corners]
+    marker_ids = ids.astype(np.int32)[:, None]
+    found = charuco_detector(data).detectBoard(image, None, None, marker_corners, marker_ids)[1]
+    count = 0 if found is None else len(found)
+    columns, rows = data["squares"]
+    return count, count / ((columns - 1) * (rows - 1))
 
 
 def _other_markers(image: Integers, mine: str) -> str | None:

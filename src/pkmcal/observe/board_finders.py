@@ -13,6 +13,8 @@ from pkmcal.observe.boards import Board, Detection
 
 REACH = 0.25
 """Squares around a corner that its fit uses: longer edges say little more, and begin to bend."""
+BENT = 0.02
+"""px by which an edge may leave its tangent within the window before its bend is put in."""
 CLEAR = 0.9
 """Share of the blank border between edge and marker that the window may fill."""
 LEAST_CORNERS = 6
@@ -63,8 +65,13 @@ def _fitted(image: Integers, board: Board, raw: Raw) -> Corners:
     margin = REACH
     if board.type == "charuco":
         margin = min(REACH, CLEAR * 0.5 * (1 - data["marker"] / data["square"]))
-    sides, bends = _axes(board, ids, pixels)
-    return refine(image, pixels, sides, Window(REACH, margin, True), bends)
+    window = Window(REACH, margin, True)
+    fitted = refine(image, pixels, _axes(board, ids, pixels)[0], window)
+    # How lines bend is told by the fitted corners; the detector's are too rough for it.
+    sides, bends = _axes(board, ids, fitted.pixels)
+    if np.abs(bends).max() * REACH**2 / 2 < BENT:
+        return fitted
+    return refine(image, fitted.pixels, sides, window, bends)
 
 
 def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:

@@ -195,7 +195,7 @@ def _segment_profiles(
     kept, weight = grey[full], weight[full][..., None]
     mean = np.sum(kept * weight, axis=-2) / count[full][:, None]
     saturated = np.any((kept >= profiles.SATURATED) & weight, axis=-2)
-    cut = profiles.cut_of(saturated)
+    cut = profiles.cut_of(saturated, half_width[full])
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
 
 

@@ -22,6 +22,11 @@ from pkmcal.arrays import Array, Booleans, Integers
 INSIDE, OUTSIDE = 3.0, 3.0
 """Pixels of a profile that the model explains: less is ill-conditioned, more meets the leg's
 other features and neighbours."""
+LIMB = 0.35
+"""Share of a leg's half width, from its limb inwards, that the model explains: highlights of bare
+metal begin further in. On slim legs this is less than INSIDE."""
+LEAST_INSIDE = 1.25
+"""Pixels inside that are used in any case: less would not hold the limb's own brightness."""
 STEP = 0.5
 SHIFTS = np.arange(-1.5, 1.55, 0.1)
 """Trial positions of the edge about the predicted one, px."""
@@ -87,7 +92,7 @@ def _blurred_model(blur: float, half_width: float) -> tuple[Array, Array]:
 def _projections(blur: float, half_width: float, cut: int) -> Array:
     """Orthonormal bases of the model's profiles at each trial position, (shifts, samples, 5).
 
-    cut : samples at the inner end that are saturated and say nothing; their rows are zero.
+    cut : samples at the inner end that are not used; their rows are zero.
     The weak beliefs about the shading are rows below the samples, whose data are zero; only the
     samples' rows are returned, which is all that a projection of such data needs.
     """
@@ -107,7 +112,7 @@ class Profiles:
 
     grey : (N, samples) at :func:`profile_offsets`. count : (N,) photograph profiles that each
     averages. half_width : (N,) of the legs there, px. cut : (N,) samples at the inner end that
-    touch the brightest level the camera has: clipped, they would pull the edge inwards.
+    are not used: clipped at the camera's brightest level, or too deep inside a slim leg.
     """
 
     grey: Array
@@ -124,11 +129,17 @@ class Profiles:
         return np.maximum(np.ptp(self.grey, axis=-1), 1e-3)
 
 
-def cut_of(saturated: Booleans) -> Integers:
-    """Samples (N,) to leave out at the inner end: up to the outermost saturated one."""
+def cut_of(saturated: Booleans, half_width: Array) -> Integers:
+    """Samples (N,) to leave out at the inner end of profiles.
+
+    Up to the outermost saturated one of ``saturated`` (N, samples), and what lies deeper than the
+    limb of a leg of ``half_width`` (N,) px.
+    """
     count = saturated.shape[-1]
     last = count - np.argmax(saturated[..., ::-1], axis=-1)
-    return np.where(saturated.any(axis=-1), last, 0)
+    depth = np.maximum(LIMB * half_width, LEAST_INSIDE)
+    beyond = np.sum(profile_offsets() < -depth[:, None] - 1e-9, axis=-1)
+    return np.maximum(np.where(saturated.any(axis=-1), last, 0), beyond)
 
 
 def residual_curves(profiles: Profiles, blur: float) -> Array:
@@ -177,7 +188,7 @@ def estimate_blur(profiles: Profiles) -> float:
     Contrast differs by edge, so each profile's residual is taken relative to its best; the
     median over profiles decides, so that half of them may be anything.
     """
-    whole = np.flatnonzero(profiles.cut == 0)
+    whole = np.flatnonzero(profiles.cut == profiles.cut.min(initial=99))
     if whole.size:
         profiles = profiles.select(whole[:: max(whole.size // ENOUGH_FOR_BLUR, 1)])
     costs = np.stack([residual_curves(profiles, b).min(axis=-1) for b in BLURS], axis=-1)

@@ -1,0 +1,173 @@
+"""From photographs to parameters: the whole of `calibrate`, on a session rendered for the tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pkmcal
+from pkmcal.cameras import camera_models
+from pkmcal.commands.comparison import compare
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import inverse, pose, rotation
+from pkmcal.identify.gauge import ThreeCentres, apply
+from pkmcal.identify.problem import State
+from pkmcal.session import load_session
+from pkmcal.simulate import Settings, load_truth, simulate_session
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A rendered session: three stations, six configurations each, 640x480."""
+
+    session: Path
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bench") / "session"
+    parameters = np.array([565.0, 566.0, 322.0, 238.5, -0.1, 0.08, 4e-4, -3e-4, 0.0])
+    camera = camera_models()["pinhole"]((640, 480), parameters)
+    settings = Settings(configurations=6)
+    simulate_session(folder, pkmcal.load_mechanism("gough-stewart"), camera, settings, seed=11)
+    return Bench(folder)
+
+
+@pytest.fixture(scope="module")
+def calibrated(demo):
+    return pkmcal.calibrate(demo.session)
+
+
+def errors_in_sigmas(calibration, folder):
+    """Kinematic parameters' errors over their deviations, frames as the calibration has them."""
+    truth = load_truth(folder, calibration.session.machine)
+    estimate = calibration.estimate
+    true = apply(
+        truth.machine, replace(estimate.state, theta=truth.machine.values), ThreeCentres()
+    ).theta
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    kinds = np.array(estimate.machine.parameters.kinds)
+    free = (sigma > 1e-9) & (kinds != "radius")
+    return (estimate.machine.values - true)[free] / sigma[free]
+
+
+def test_the_machine_is_found(demo, calibrated):
+    """The joint centres come from millimetres to a tenth, and the deviations say how far off."""
+    found = compare(calibrated, demo.session)
+    assert found.drawing.centre > 1e-3
+    # eighteen photographs, 640x480: deviations of 0.1 mm, so errors of 0.2 mm would be wrong
+    assert found.calibrated.centre < 0.2e-3
+    assert found.calibrated.orientation < found.drawing.orientation / 5
+    # 30 values, correlated: their rms over sigma scatters by some 0.2 about 1
+    z = errors_in_sigmas(calibrated, demo.session)
+    assert 0.5 < np.sqrt(np.mean(z**2)) < 1.6
+    assert calibrated.verdict.usable
+
+
+def test_same_seed_same_answer(demo, calibrated):
+    again = pkmcal.calibrate(demo.session)
+    np.testing.assert_array_equal(again.machine.values, calibrated.machine.values)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_start_ten_centimetres_and_ten_degrees_off(demo, calibrated, seed):
+    """The rough poses do not matter: the same edges, so the same answer."""
+    rng = np.random.default_rng(seed)
+    session, truth = load_session(demo.session), load_truth(demo.session, calibrated.machine)
+    stations = []
+    for number, station in enumerate(session.stations):
+        turn, shift = rng.normal(size=(2, 3))
+        turn *= np.radians(10) / np.linalg.norm(turn)
+        shift *= 0.1 / np.linalg.norm(shift)
+        true = inverse(truth.T_camera_base[number])
+        stations.append(replace(station, T_camera_base=inverse(true @ pose(rotation(turn), shift))))
+    found = pkmcal.calibrate(replace(session, stations=tuple(stations)))
+    sigma = np.sqrt(np.diag(calibrated.estimate.covariance))
+    change = found.machine.values - calibrated.machine.values
+    # another path to the last look moves its profiles by hundredths of a pixel
+    assert np.max(np.abs(change) / np.maximum(sigma, 1e-6)) < 1.0
+
+
+def test_start_from_a_bad_drawing(demo, calibrated):
+    """A drawing 5 mm off on every coordinate, and said to be: the same machine is found."""
+    rng = np.random.default_rng(1)
+    session = load_session(demo.session)
+    table = session.machine.parameters
+    kinematic = np.array(table.kinds) != "radius"
+    off = np.where(kinematic, rng.uniform(-5e-3, 5e-3, len(table)), 0.0)
+    loose = np.where(kinematic, 5e-3, table.tolerance)
+    table = replace(table, drawing=table.drawing + off, tolerance=loose)
+    machine = replace(session.machine, parameters=table, values=table.drawing)
+    found = pkmcal.calibrate(replace(session, machine=machine))
+    errors = compare(found, demo.session).calibrated
+    assert errors.centre < 1.5 * compare(calibrated, demo.session).calibrated.centre + 0.05e-3
+
+
+def test_one_station_alone(demo, calibrated):
+    """Less is seen, so deviations grow, and still tell the truth."""
+    session = load_session(demo.session)
+    found = pkmcal.calibrate(replace(session, stations=session.stations[:1]))
+    z = errors_in_sigmas(found, demo.session)
+    assert np.sqrt(np.mean(z**2)) < 1.8
+    before, after = (np.diag(c.estimate.covariance) for c in (calibrated, found))
+    free = before > 1e-18
+    assert np.median(after[free] / before[free]) > 2
+    assert any("configurations" in w for w in found.verdict.warnings)
+
+
+@pytest.mark.parametrize("method", ["four-step", "linear"])
+def test_papers_methods_are_told_apart_from_the_joint_one(demo, calibrated, method):
+    """They run on the same edges and come nowhere near; the verdict names the better method."""
+    found = pkmcal.calibrate(demo.session, method=method)
+    assert found.method == method
+    worse = compare(found, demo.session).calibrated.centre
+    assert worse > 3 * compare(calibrated, demo.session).calibrated.centre
+    if not found.verdict.usable:
+        assert any("bundle" in reason for reason in found.verdict.reasons)
+    assert np.all(np.diag(found.estimate.covariance) >= 0)
+
+
+def test_rejected_edges_have_reasons(calibrated):
+    reasons = {r.reason for r in calibrated.observation.rejected}
+    assert reasons
+    assert all(len(reason.split()) >= 4 for reason in reasons)
+    edges = calibrated.observation.edges
+    place = (edges.station, edges.configuration, edges.leg, edges.tube, edges.side)
+    assert len(set(zip(*place, strict=True))) == len(edges)
+
+
+def test_cameras_are_refined(demo, calibrated):
+    """Intrinsics off by two of their deviations spoil the machine; refined, they do not."""
+    session = load_session(demo.session)
+    camera = session.stations[0].camera
+    sigma = np.zeros(len(camera.parameters))
+    sigma[:4] = [1.5, 1.5, 2.0, 2.0]
+    off = np.zeros(len(camera.parameters))
+    off[:4] = [3.0, 2.5, -3.0, 4.0]
+    wrong = replace(camera, parameters=camera.parameters + off, covariance=np.diag(sigma**2))
+    stations = tuple(replace(s, camera=wrong) for s in session.stations)
+    held = pkmcal.calibrate(replace(session, stations=stations))
+    found = pkmcal.calibrate(replace(session, stations=stations), refine_camera=True)
+    spoilt, mended = (compare(c, demo.session).calibrated for c in (held, found))
+    assert mended.position < spoilt.position / 2
+    refined = found.cameras.result(found.estimate, session.stations[0].camera_file)
+    left = (refined.parameters - camera.parameters)[:2]
+    assert np.all(np.abs(left) < 0.4 * np.abs(off[:2]))
+    assert np.all(np.diag(refined.covariance)[:2] < sigma[:2] ** 2)
+
+
+def test_a_camera_without_covariance_is_not_refined(demo):
+    with pytest.raises(InputError, match="the camera's covariance is not known"):
+        pkmcal.calibrate(demo.session, refine_camera=True)
+
+
+def test_state_of_a_calibration_closes(calibrated):
+    """Readings, poses and parameters fit together: the closure is met to the readings' noise."""
+    estimate = calibrated.estimate
+    assert isinstance(estimate.state, State)
+    predicted = estimate.machine.inverse(estimate.state.T_base_platform)
+    gap = (predicted - calibrated.session.joints) / calibrated.session.joint_noise
+    assert np.sqrt(np.mean(gap**2)) < 1.2

@@ -1,0 +1,315 @@
+"""Camera calibration: synthetic truth comes back, its uncertainty is honest, misuse is told."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from test_boards import CAMERAS, render, view
+
+from pkmcal.cameras import camera_models
+from pkmcal.cameras.calibrate import calibrate_camera, calibrate_photographs, views_of
+from pkmcal.cameras.fit import covariance_of, fit_camera
+from pkmcal.cameras.resection import board_poses, line_offsets, linear_poses, settled_poses
+from pkmcal.cameras.starts import positions
+from pkmcal.errors import InputError, ResultError
+from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
+from pkmcal.observe.boards import Detection, chessboard
+from pkmcal.report.camera_page import camera_report_html
+
+BOARD = chessboard((8, 6), 0.03)
+SIZE = (1024, 768)
+
+
+def camera_of(model, *values):
+    kind = camera_models()[model]
+    parameters = np.zeros(len(kind.parameter_names))
+    parameters[: len(values)] = values
+    return kind(SIZE, parameters)
+
+
+TRUE = {
+    "pinhole": camera_of("pinhole", 1050, 1052, 515, 378, -0.17, 0.07, 8e-4, -6e-4),
+    "fisheye": camera_of("fisheye", 320, 321, 508, 390, 0.03, -0.012),
+    "unified": camera_of("unified", 270, 269, 514, 383, 0.97),
+}
+DEPTH = {"pinhole": 0.42, "fisheye": 0.16, "unified": 0.2}
+TERMS = {"pinhole": ("k1", "k2", "p1", "p2"), "fisheye": ("k1", "k2"), "unified": ()}
+
+
+def poses_for(camera, count, seed, tilt=0.6):
+    """Poses with the whole board in the picture, in many directions, tilted to all sides."""
+    rng = np.random.default_rng(seed)
+    found = []
+    while len(found) < count:
+        pixel = rng.uniform([80, 80], [SIZE[0] - 80, SIZE[1] - 80])
+        ray = camera.ray(pixel)
+        side = np.cross([0.0, 1.0, 0.0], ray)
+        side /= np.linalg.norm(side)
+        facing = np.stack([side, np.cross(ray, side), ray], axis=-1)
+        rot = rotation(rng.normal(0, tilt, 3)) @ facing
+        middle = ray * DEPTH[camera.model] * rng.uniform(0.8, 1.5)
+        T = pose(rot, middle - rot @ BOARD.points.mean(axis=0))
+        pixels = camera.project(apply(T, BOARD.points))
+        if camera.in_image(pixels, 5).all() and abs(rot[:, 2] @ ray) > 0.6:
+            found.append(T)
+    return np.stack(found)
+
+
+def detections(camera, T_camera_board, seed=0, noise=0.05, known=True, wrong=0):
+    """Corners of every pose with noise, the first ``wrong`` of each view 5 px off."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for k, T in enumerate(T_camera_board):
+        pixels = camera.project(apply(T, BOARD.points))
+        pixels = pixels + rng.normal(0, noise, pixels.shape)
+        pixels[:wrong] += 5.0
+        ids = np.arange(len(pixels))
+        sigma = np.full(len(ids), noise if known else 0.0)
+        out.append(Detection(f"p{k}.png", SIZE, ids, pixels, sigma))
+    return out
+
+
+@pytest.fixture(params=TRUE)
+def true(request):
+    return TRUE[request.param]
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    """One calibration a model, chosen by itself."""
+    return {
+        model: calibrate_camera(detections(camera, poses_for(camera, 10, 1), 2), BOARD)
+        for model, camera in TRUE.items()
+    }
+
+
+def test_the_truth_comes_back(true, calibrated):
+    """Model and terms are found, and every intrinsic within its uncertainty."""
+    found = calibrated[true.model]
+    assert found.camera.model == true.model
+    assert set(TERMS[true.model]) <= set(found.terms) or true.model != "pinhole"
+    off = found.camera.parameters - true.parameters
+    free = found.sigma > 0
+    chi2 = off[free] @ np.linalg.inv(found.covariance[np.ix_(free, free)]) @ off[free]
+    assert chi2 < 4 * free.sum()
+    assert found.rms == pytest.approx(0.05 * np.sqrt(2), rel=0.1)
+    assert found.rms < found.held_out.rms < 1.2 * found.rms
+    assert found.held_out.straightness < 0.06
+    assert found.spread == 1.0
+    np.testing.assert_array_equal(found.camera.covariance, found.covariance)
+
+
+def test_photographs_give_the_camera(tmp_path):
+    """From rendered pictures, corners and all."""
+    camera, board = CAMERAS["pinhole"], chessboard((8, 5), 0.03)
+    turns = ((0.5, 0.1, 0.1), (-0.5, 0.2, 0.0), (0.1, 0.6, 0.3), (0.0, -0.6, 0.0), (0.3, 0.4, 1.0))
+    at = ((0.05, 0.02), (-0.06, 0.0), (0.0, -0.05), (0.04, 0.05), (0.0, 0.0))
+    paths = []
+    for k, (turn, where) in enumerate(zip(turns, at, strict=True)):
+        image = render(camera, view(board, turn, where, 0.38), board, seed=k)
+        paths.append(tmp_path / f"p{k}.png")
+        cv2.imwrite(str(paths[-1]), image)
+    found = calibrate_photographs(paths, board, "pinhole")
+    focal, sigma = found.camera.parameters[:2], found.sigma[:2]
+    np.testing.assert_allclose(focal, camera.parameters[:2], rtol=2e-3)
+    assert np.all(np.abs(focal - camera.parameters[:2]) < 4 * sigma)
+    assert found.held_out.rms < 0.1
+
+
+def test_sigma_is_honest(true):
+    """Over many runs, deviations over sigma have the spread 1 that they should have."""
+    poses = poses_for(true, 8, 5)
+    free = positions(true, TERMS[true.model])
+    scaled = []
+    for seed in range(40):
+        views = views_of(detections(true, poses, seed, known=seed % 2 == 0), BOARD)
+        fit = fit_camera(true, free, views, poses)
+        sigma = np.sqrt(np.diag(covariance_of(fit, views)[0]))[free]
+        scaled.append((fit.camera.parameters - true.parameters)[free] / sigma)
+    # 40 runs: the spread is known to 11 %
+    spread = np.sqrt(np.mean(np.square(scaled), axis=0))
+    assert np.all((spread > 0.65) & (spread < 1.4)), spread
+    assert np.mean(np.abs(scaled) < 1) == pytest.approx(0.68, abs=0.08)
+
+
+def test_opencv_agrees():
+    """cv2.calibrateCamera, with the same terms and equal weights, is the same least squares."""
+    true = TRUE["pinhole"]
+    found = detections(true, poses_for(true, 8, 3), 4, known=False)
+    views = views_of(found, BOARD)
+    free = positions(true, TERMS["pinhole"])
+    ours = fit_camera(true, free, views, settled_poses(true, views)).camera.parameters
+    objects = [BOARD.points.astype(np.float32)] * 8
+    pictures = [d.pixels.astype(np.float32).reshape(-1, 1, 2) for d in found]
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
+    _, k, d, *_ = cv2.calibrateCamera(
+        objects, pictures, SIZE, None, None, flags=cv2.CALIB_FIX_K3, criteria=until
+    )
+    k, d = np.asarray(k), np.asarray(d).ravel()
+    np.testing.assert_allclose(ours[:4], [k[0, 0], k[1, 1], k[0, 2], k[1, 2]], rtol=2e-4)
+    np.testing.assert_allclose(ours[4:8], d[:4], atol=3e-3)
+
+
+def test_single_bad_corners_do_no_harm(true):
+    found = calibrate_camera(
+        detections(true, poses_for(true, 10, 1), 2, wrong=2), BOARD, true.model
+    )
+    free = found.sigma > 0
+    assert np.all(found.weight[:, :2] < 0.1)
+    assert np.mean(found.weight[:, 2:] > 0.99) > 0.97
+    off = (found.camera.parameters - true.parameters)[free] / found.sigma[free]
+    assert np.abs(off[:5]).max() < 4
+    assert any("20 of 480 corners" in text for text in found.warnings)
+
+
+def test_views_that_disagree_widen_sigma():
+    """A board bent anew in every view: noise alone would promise too much."""
+    true = TRUE["pinhole"]
+    poses, rng = poses_for(true, 10, 1), np.random.default_rng(0)
+    x, y = ((BOARD.points - BOARD.points.mean(axis=0)) / 0.1)[:, :2].T
+    found = []
+    for k, T in enumerate(poses):
+        bent = BOARD.points.copy()
+        bent[:, 2] += 1e-3 * (rng.normal() * x * x + rng.normal() * y * y + rng.normal() * x * y)
+        pixels = true.project(apply(T, bent)) + rng.normal(0, 0.05, (48, 2))
+        found.append(Detection(f"p{k}.png", SIZE, np.arange(48), pixels, np.full(48, 0.05)))
+    result = calibrate_camera(found, BOARD, "pinhole")
+    assert result.spread > 1.5
+    assert any("views disagree" in text for text in result.warnings)
+    assert np.all(np.abs(result.camera.parameters - true.parameters)[:2] < 4 * result.sigma[:2])
+
+
+def test_linear_poses_are_exact(true):
+    """Rays of noise-free corners give the poses, beyond 90 degrees too."""
+    poses = poses_for(true, 12, 8)
+    rays = true.ray(true.project(apply(poses[:, None], BOARD.points)))
+    np.testing.assert_allclose(linear_poses(rays, BOARD.points), poses, atol=1e-7)
+
+
+def test_board_poses_and_their_sigma(true):
+    poses = poses_for(true, 40, 9)
+    found = board_poses(true, views_of(detections(true, poses, 1), BOARD))
+    off = pose_difference(found.T_camera_board, poses)
+    scaled = np.linalg.solve(np.linalg.cholesky(found.covariance), off[..., None])
+    assert np.sqrt(np.mean(scaled**2)) == pytest.approx(1, abs=0.2)
+    # by intrinsics: a camera with another focal length moves the poses as foretold
+    step = np.zeros(len(true.parameters))
+    step[0] = step[1] = 0.05
+    other = replace(true, parameters=true.parameters + step)
+    moved = board_poses(other, views_of(detections(true, poses, 1), BOARD)).T_camera_board
+    foretold = found.by_intrinsics @ step
+    error = np.linalg.norm(pose_difference(moved, found.T_camera_board) - foretold, axis=1)
+    assert np.median(error) < 0.1 * np.median(np.linalg.norm(foretold, axis=1))
+
+
+def test_lines_are_great_circles(true):
+    T = poses_for(true, 1, 3)[0]
+    pixels = true.project(apply(T, BOARD.points))
+    assert np.abs(line_offsets(true, pixels, BOARD.lines)).max() < 1e-6
+    shifted = pixels.copy()
+    shifted[10] += [0.3, 0.4]
+    off = line_offsets(true, shifted, BOARD.lines)
+    assert 0.1 < np.abs(off).max() < 0.5
+
+
+def test_ten_views_in_time():
+    true = TRUE["unified"]
+    found = detections(true, poses_for(true, 10, 1), 2)
+    began = time.process_time()
+    calibrate_camera(found, BOARD)
+    assert time.process_time() - began < 5
+
+
+# What is refused, and what is only said
+
+
+@pytest.fixture(scope="module")
+def wide_views():
+    true = TRUE["unified"]
+    return detections(true, poses_for(true, 8, 1), 2)
+
+
+def test_a_model_that_does_not_fit(wide_views):
+    with pytest.raises(InputError) as caught:
+        calibrate_camera(wide_views, BOARD, "pinhole")
+    assert caught.value.what == "the model pinhole does not fit the photographs"
+    assert caught.value.expected.split(",")[0] in ("unified", "fisheye")
+
+
+def test_no_such_model(wide_views):
+    with pytest.raises(InputError, match="no such camera model; found fishey, expected fisheye"):
+        calibrate_camera(wide_views, BOARD, "fishey")
+
+
+def test_too_few_views(wide_views):
+    nothing = replace(wide_views[2], ids=np.zeros(0, dtype=int), reason="dark")
+    with pytest.raises(InputError, match="too few photographs show the board; found 2 of 3"):
+        calibrate_camera([*wide_views[:2], nothing], BOARD)
+
+
+def test_views_that_are_all_alike():
+    """Facing the camera at one distance: focal length and distance cannot be told apart."""
+    true = camera_of("pinhole", 1050, 1052, 515, 378)
+    rng = np.random.default_rng(0)
+    poses = []
+    for _ in range(8):
+        rot = rotation(np.array([0.0, 0.0, rng.normal()]))
+        middle = np.array([*rng.uniform(-0.05, 0.05, 2), 0.5])
+        poses.append(pose(rot, middle - rot @ BOARD.points.mean(axis=0)))
+    with pytest.raises(ResultError, match="do not tell the focal length") as caught:
+        calibrate_camera(detections(true, np.stack(poses)), BOARD, "pinhole")
+    assert "tilted by" in caught.value.found
+
+
+def test_corners_of_no_board(wide_views):
+    rng = np.random.default_rng(0)
+    wild = [replace(d, pixels=d.pixels + rng.normal(0, 25, d.pixels.shape)) for d in wide_views]
+    with pytest.raises((ResultError, InputError)) as caught:
+        calibrate_camera(wild, BOARD)
+    assert "no camera model explains" in str(caught.value) or "do not tell" in str(caught.value)
+
+
+def test_a_photograph_without_a_board_is_not_dropped_silently(wide_views):
+    nothing = replace(wide_views[0], name="dark.png", ids=np.zeros(0, dtype=int), reason="too dark")
+    found = calibrate_camera([*wide_views, nothing], BOARD, "unified")
+    assert found.views == tuple(d.name for d in wide_views)
+    assert "1 of 9 photographs are not used: dark.png (too dark)." in found.warnings
+    assert found.document()["not_used"] == {"dark.png": "too dark"}
+
+
+def test_the_strong_correlation_of_xi_is_named():
+    true = camera_of("unified", 1500, 1502, 515, 378, 0.9)
+    near = replace(TRUE["pinhole"], parameters=TRUE["pinhole"].parameters * 1.0)
+    found = calibrate_camera(detections(true, poses_for(near, 10, 1), 2), BOARD, "unified")
+    pairs = [pair for pair in found.correlations if "xi" in pair[:2]]
+    assert pairs
+    assert pairs[0][2] > 0.95
+    assert any(text.startswith("xi is hardly told apart from") for text in found.warnings)
+
+
+# The page
+
+
+def test_the_page(calibrated, tmp_path):
+    found = calibrated["fisheye"]
+    path = tmp_path / "p0.png"
+    cv2.imwrite(str(path), np.full((768, 1024), 120, dtype=np.uint8))
+    html = camera_report_html(found, [path])
+    assert html.count('class="shot"') == 10
+    assert html.count("data:image/jpeg;base64,") == 1
+    assert html.count('class="seen"') == 480
+    assert "http://" not in html
+    assert "https://" not in html
+    assert "parameter-table" not in html
+    assert "Usable" in html
+
+
+def test_importing_cameras_needs_no_opencv():
+    code = "import sys, pkmcal.cameras; sys.exit('cv2' in sys.modules or 'scipy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
