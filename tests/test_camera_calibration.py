@@ -10,7 +10,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from test_boards import CAMERAS, render, view
 
 from pkmcal.cameras import camera_models
 from pkmcal.cameras.calibrate import calibrate_camera, calibrate_photographs, views_of
@@ -21,6 +20,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
 from pkmcal.observe.boards import Detection, chessboard
 from pkmcal.report.camera_page import camera_report_html
+from test_boards import CAMERAS, render, view
 
 BOARD = chessboard((8, 6), 0.03)
 SIZE = (1024, 768)

@@ -118,7 +118,13 @@ def test_files_as_others_write_them(tmp_path):
     )
     assert read_text(tmp_path, KALIBR, "cam1").model == "fisheye"
     assert read_text(tmp_path, OPENCV).model == "pinhole"
-    assert read_text(tmp_path, OPENCV.replace("rows: 5", "rows: 4").replace(", 0. ]\n", " ]\n") + "fisheye_model: 1\n").model == "fisheye"
+    assert (
+        read_text(
+            tmp_path,
+            OPENCV.replace("rows: 5", "rows: 4").replace(", 0. ]\n", " ]\n") + "fisheye_model: 1\n",
+        ).model
+        == "fisheye"
+    )
     mirror = OPENCV + "xi: !!opencv-matrix\n   rows: 1\n   cols: 1\n   dt: d\n   data: [ 1.5 ]\n"
     assert read_text(tmp_path, mirror).parameters[4] == 1.5
 
@@ -167,7 +173,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path):
     camera = camera_of("pinhole")
     parameters = camera.parameters.copy()
     parameters[8] = 0.25
-    with pytest.raises(InputError, match="no third radial term; found k3 = 0.25"):
+    with pytest.raises(InputError, match=r"no third radial term; found k3 = 0\.25"):
         write_camera(replace(camera, parameters=parameters), tmp_path / "a.yaml", "kalibr")
     with pytest.raises(InputError, match="no such format of camera files; found rso"):
         write_camera(camera, tmp_path / "a.yaml", "rso")

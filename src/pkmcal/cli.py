@@ -17,7 +17,7 @@ from typing import Annotated, cast
 import typer
 
 from pkmcal import __version__
-from pkmcal.commands import calibrate, check, demo, new, simulate
+from pkmcal.commands import calibrate, camera, check, demo, new, simulate
 from pkmcal.commands.console import print_error
 from pkmcal.errors import InputError, PkmcalError
 
@@ -34,6 +34,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo.demo,
     "new": new.new,
     "check": check.check,
+    "camera": camera.camera,
     "calibrate": calibrate.calibrate,
     "simulate": simulate.simulate,
 }

@@ -43,7 +43,7 @@ def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board
     if other is not None:
         raise _another(shown[0], other, board)
     for path in missed[:LOOKED_AT]:
-        other = other_board(decode(path, size, path.name), board)
+        other = other_board(decode(path, size, path.name), board, part=not shown)
         if other is not None and not shown:
             raise _another(path, other, board)
         if other is not None:
@@ -54,10 +54,14 @@ def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board
                 expected=f"{board.described}, as in {listed([f.name for f in shown], 3)}",
                 next_step="Calibrate with the photographs of one board",
             )
-    if not shown:
+
+
+def check_any(found: Sequence[Detection], board: Board) -> None:
+    """Raise `InputError` where no photograph shows the board."""
+    if not any(detection.found for detection in found):
         raise InputError(
             "the board is in none of the photographs",
-            where=listed([path.name for path in files], 3),
+            where=listed([detection.name for detection in found], 3),
             found=found[0].reason,
             expected=board.described,
             next_step="Check the board file, the light and the focus; a chessboard's white border"
@@ -75,17 +79,20 @@ def _another(path: Path, other: str, board: Board) -> InputError:
     )
 
 
-def other_board(image: Integers, board: Board) -> str | None:
-    """The board that a photograph shows in place of `board`, in words; None for none."""
+def other_board(image: Integers, board: Board, part: bool) -> str | None:
+    """The board that a photograph shows in place of `board`, in words; None for none.
+
+    part : whether a part of a described chessboard is another one, or badly seen.
+    """
     if board.type == "chessboard":
-        found = _other_chessboard(image, board.counts)
+        found = _other_chessboard(image, board.counts, part)
         return found or _other_markers(image, "")
     name = board.document["dictionary"]
     if board.type == "charuco":
         best = _other_charuco(image, board)
         if best:
             return best
-    return _other_markers(image, name) or _other_chessboard(image, (0, 0))
+    return _other_markers(image, name) or _other_chessboard(image, (0, 0), part=True)
 
 
 def _larger(image: Integers, board: Board) -> str | None:
@@ -111,7 +118,7 @@ def _larger(image: Integers, board: Board) -> str | None:
     return f"markers {listed([str(i) for i in sorted(beyond.tolist())], 4)} beyond its {count}"
 
 
-def _other_chessboard(image: Integers, counts: tuple[int, int]) -> str | None:
+def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> str | None:
     """The counts near the described ones that fit; with (0, 0), of the usual ones."""
     if counts == (0, 0):
         candidates = [(9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (6, 5), (11, 8), (10, 7), (6, 4)]
@@ -121,6 +128,8 @@ def _other_chessboard(image: Integers, counts: tuple[int, int]) -> str | None:
     # The largest first: a smaller grid is found inside a larger one.
     for candidate in sorted(candidates, key=lambda c: -c[0] * c[1]):
         if min(candidate) < 3 or candidate in (counts, counts[::-1]):
+            continue
+        if not part and all(n <= m for n, m in zip(sorted(candidate), sorted(counts), strict=True)):
             continue
         if _all_corners(image, candidate):
             return _chess(candidate)
@@ -145,11 +154,11 @@ def _other_charuco(image: Integers, board: Board) -> str | None:
         return None
     most = int(ids.max()) + 1
     # A board has at least as many markers as its highest says, and seldom twice as many.
-    layouts = [
+    layouts: list[dict[str, Any]] = [
         {**board.document, "squares": [columns, rows], "legacy": legacy}
         for columns, rows in product(range(3, MOST_SQUARES), repeat=2)
         if most <= (columns * rows) // 2 <= 2 * most + 4
-        for legacy in ((False, True) if rows % 2 == 0 else (False,))
+        for legacy in [False, True][: 2 - rows % 2]
     ]
     scored = [(_found(image, data, ids, corners), data) for data in layouts]
     mine = _found(image, board.document, ids, corners)
@@ -170,7 +179,8 @@ def _found(
     """Corners of a ChArUco board between given markers, and their share of the board's."""
     marker_corners = [corner[None].astype(np.float32) for corner in corners]
     marker_ids = ids.astype(np.int32)[:, None]
-    found = charuco_detector(data).detectBoard(image, None, None, marker_corners, marker_ids)[1]
+    detector: Any = charuco_detector(data)
+    found: Any = detector.detectBoard(image, None, None, marker_corners, marker_ids)[1]
     count = 0 if found is None else len(found)
     columns, rows = data["squares"]
     return count, count / ((columns - 1) * (rows - 1))

@@ -19,6 +19,9 @@ CLEAR = 0.9
 """Share of the blank border between edge and marker that the window may fill."""
 LEAST_CORNERS = 6
 """Corners below which a photograph says nothing: four fix a board's pose, two more test it."""
+WHOLE = 0.75
+"""Share of a chessboard's corners that must look like corners: what is found there is the whole
+board, or something else."""
 SMALL = 1000
 """px; pictures wider than this are tried at half their size as well."""
 STRAIGHT_ENOUGH = 0.35
@@ -28,10 +31,12 @@ Raw = tuple[Integers, Array]
 """Corner ids (n,) and pixels (n, 2) as a detector gives them."""
 
 
-def find(image: Integers, board: Board, name: str) -> Detection:
-    """One photograph's detection."""
-    finders = {"charuco": _charuco, "chessboard": _chessboard, "aruco_grid": _marker_grid}
-    raw, mirrored, why = finders[board.type](image, board)
+def find(image: Integers, board: Board, name: str, quick: bool = False) -> Detection:
+    """One photograph's detection; quick : see :func:`find_chessboard`."""
+    if board.type == "chessboard":
+        raw, mirrored, why = _chessboard(image, board, quick)
+    else:
+        raw, mirrored, why = (_charuco if board.type == "charuco" else _marker_grid)(image, board)
     size = (image.shape[1], image.shape[0])
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
     if len(raw[0]) < LEAST_CORNERS:
@@ -39,7 +44,8 @@ def find(image: Integers, board: Board, name: str) -> Detection:
     fitted = _fitted(image, board, raw)
     ids, good = raw[0], fitted.good
     weak = tuple(int(i) for i in ids[~good])
-    if good.sum() < LEAST_CORNERS or _on_a_line(board.points[ids[good], :2]):
+    least = WHOLE * len(board.points) if board.type == "chessboard" else LEAST_CORNERS
+    if good.sum() < least or _on_a_line(board.points[ids[good], :2]):
         why = f"only {good.sum()} of {len(board.points)} corners are sharp and uncovered"
         return Detection(name, size, *nothing, reason=why, weak=weak)
     return Detection(
@@ -219,8 +225,8 @@ def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     return _raw([], [], 0, False), False, "fewer than two of the board's markers are recognised"
 
 
-def _chessboard(image: Integers, board: Board) -> tuple[Raw, bool, str]:
-    pixels = find_chessboard(image, board.counts)
+def _chessboard(image: Integers, board: Board, quick: bool) -> tuple[Raw, bool, str]:
+    pixels = find_chessboard(image, board.counts, quick)
     if pixels is None:
         why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners is recognised"
         return _raw([], [], 0, False), False, why
@@ -250,7 +256,8 @@ def _attempts(image: Integers, counts: tuple[int, int], quick: bool) -> Iterator
             lambda p=picture: cv2.findChessboardCornersSB(p, counts, flags=thorough),
             lambda p=picture: cv2.findChessboardCorners(p, counts, flags=adaptive),
         ]
-        for way in ways[:1] if quick else ways:
+        # Enlarged, the second way takes seconds on a cluttered picture.
+        for way in ways[:1] if quick or scale > 1 else ways:
             found, corners = way()
             if found and _length(corners) == counts[0] * counts[1]:
                 pixels = np.asarray(corners, dtype=float).reshape(-1, 2)

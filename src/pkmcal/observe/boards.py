@@ -240,11 +240,14 @@ def dictionaries() -> tuple[str, ...]:
     return tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 
 
-def detect_board(image: Integers, board: Board, name: str = "") -> Detection:
-    """Find the board's corners in one photograph, grey levels (height, width) uint8."""
+def detect_board(image: Integers, board: Board, name: str = "", quick: bool = False) -> Detection:
+    """Find the board's corners in one photograph, grey levels (height, width) uint8.
+
+    quick : only the first way of finding a chessboard.
+    """
     from pkmcal.observe.board_finders import find
 
-    return find(image, board, name)
+    return find(image, board, name, quick)
 
 
 def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection, ...]:
@@ -253,20 +256,28 @@ def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection,
     Raises `InputError` where the photographs differ in size, or show another board than the one
     described, all of them or some.
     """
-    from pkmcal.observe.board_diagnosis import check_boards
+    from pkmcal.observe.board_diagnosis import check_any, check_boards
 
     files = [Path(path) for path in paths]
     size = _common_size(files)
     with ThreadPoolExecutor(THREADS) as pool:
-        found = tuple(pool.map(lambda path: _detect(path, size, board), files))
+        found = list(pool.map(lambda path: _detect(path, size, board, quick=True), files))
+        if not any(detection.found for detection in found):
+            # Before all that can be tried is tried on photographs of something else.
+            check_boards(files, found, board)
+        missed = [k for k, detection in enumerate(found) if not detection.found]
+        again = pool.map(lambda k: _detect(files[k], size, board, quick=False), missed)
+        for k, detection in zip(missed, again, strict=True):
+            found[k] = detection
     check_boards(files, found, board)
-    return found
+    check_any(found, board)
+    return tuple(found)
 
 
-def _detect(path: Path, size: tuple[int, int], board: Board) -> Detection:
+def _detect(path: Path, size: tuple[int, int], board: Board, *, quick: bool) -> Detection:
     from pkmcal.observe.images import decode
 
-    return detect_board(decode(path, size, path.name), board, path.name)
+    return detect_board(decode(path, size, path.name), board, path.name, quick)
 
 
 def _common_size(files: Sequence[Path]) -> tuple[int, int]:

@@ -144,9 +144,6 @@ def parameter_rows(c: CameraCalibration) -> tuple[Row, ...]:
 def _cards(c: CameraCalibration) -> tuple[Headline, ...]:
     focal, sigma = c.camera.parameters[:2], c.sigma[:2]
     share = float(np.max(sigma / focal)) * 100
-    tilt = tilts(c.T_camera_board, c.board.points)
-    covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
-    seen = int(np.isfinite(c.residuals).all(axis=-1).sum())
     return (
         Headline(
             "How sure is the focal length?",
@@ -170,6 +167,15 @@ def _cards(c: CameraCalibration) -> tuple[Headline, ...]:
             "distance of corners from their board line's great circle, on held-out views; no pose"
             " takes part in this",
         ),
+        *_data_cards(c),
+    )
+
+
+def _data_cards(c: CameraCalibration) -> tuple[Headline, ...]:
+    tilt = tilts(c.T_camera_board, c.board.points)
+    covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
+    seen = int(np.isfinite(c.residuals).all(axis=-1).sum())
+    return (
         Headline(
             "What is it based on?",
             ((f"{len(c.views)} of {len(c.detections)}", "photographs"),),

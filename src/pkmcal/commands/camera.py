@@ -1,0 +1,195 @@
+"""``pkmcal camera``: a camera calibrated from photographs of a board."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pkmcal.commands import console
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pkmcal.cameras.calibrate import CameraCalibration
+
+ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"}
+WHAT = {
+    "camera.html": "open it in a browser",
+    "camera.yaml": "the camera, for a session's cameras/",
+    "camera.json": "everything, with covariances",
+}
+OTHERS = {"opencv": "camera.opencv.yaml", "ros": "camera.ros.yaml", "kalibr": "camera.kalibr.yaml"}
+
+
+class Model(StrEnum):
+    """Which camera model."""
+
+    AUTO = "auto"
+    PINHOLE = "pinhole"
+    FISHEYE = "fisheye"
+    UNIFIED = "unified"
+
+
+class Form(StrEnum):
+    """Other programs' camera files."""
+
+    OPENCV = "opencv"
+    ROS = "ros"
+    KALIBR = "kalibr"
+
+
+def camera(
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SESSION|IMAGES...",
+            help="A session whose stations observe a board, or photographs, or their folder.",
+        ),
+    ],
+    board: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The board's file; board.yaml beside them unless given."),
+    ] = None,
+    model: Annotated[
+        Model, typer.Option(metavar="NAME", help="auto, pinhole, fisheye, or unified (mirrors).")
+    ] = Model.AUTO,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="DIR", help="Where the results go.")
+    ] = Path("camera"),
+    to: Annotated[
+        list[Form] | None,
+        typer.Option(metavar="NAME", help="Write it for opencv, ros or kalibr as well."),
+    ] = None,
+    as_json: console.Json = False,
+) -> int:
+    """Calibrate a camera from photographs of a board."""
+    from pkmcal.cameras.calibrate import calibrate_photographs
+    from pkmcal.files import check_writable
+    from pkmcal.observe.boards import load_board
+
+    if len(images) == 1 and (images[0] / "session.yaml").is_file():
+        paths, there = of_session(images[0])
+    else:
+        paths, there = photographs(images), board or beside(images)
+    described = load_board(board or there)
+    check_writable(out)
+    with console.progress(as_json) as told:
+        told(f"Looking for the board in {len(paths)} photographs", 0.1)
+        found = calibrate_photographs(paths, described, model.value)
+        told("Writing the report", 0.9)
+        files = save(found, paths, out, [form.value for form in to or []])
+    if as_json:
+        console.print_json({**found.document(), "files": files})
+    else:
+        tell(console.out(), found, out, files)
+    return 0
+
+
+def of_session(folder: Path) -> tuple[list[Path], Path]:
+    """A session's photographs of its board, all of one camera, and the board's file."""
+    from pkmcal.errors import InputError
+    from pkmcal.files import listed, read_yaml
+
+    session = read_yaml(folder / "session.yaml")
+    stations: dict[str, Any] = session.data.get("stations") or {}
+    seen = {name: s for name, s in stations.items() if s.get("observe") == "board"}
+    if not seen or not session.data.get("board"):
+        raise InputError(
+            "no station of this session observes a board",
+            where=session.where("stations"),
+            expected="observe: board on a station, and board: board.yaml",
+            next_step="Name the board's photographs instead: pkmcal camera IMAGES... --board FILE",
+        )
+    cameras = sorted({str(s.get("camera")) for s in seen.values()})
+    if len(cameras) > 1:
+        raise InputError(
+            "the session's boards are seen by several cameras",
+            where=session.where("stations"),
+            found=listed(cameras),
+            expected="one camera at a time",
+            next_step="Name one camera's photographs: pkmcal camera IMAGES... --board FILE",
+        )
+    patterns = [str(s["images"]) for s in seen.values()]
+    wild = [p.replace("{configuration}", "*").replace("{repeat}", "*") for p in patterns]
+    paths = sorted({path for pattern in wild for path in folder.glob(pattern)})
+    if not paths:
+        raise InputError("no photographs found", where=session.where("stations"), found=wild[0])
+    return paths, folder / str(session.data["board"])
+
+
+def photographs(images: list[Path]) -> list[Path]:
+    """The photographs named, folders opened; in the order of their names."""
+    from pkmcal.errors import InputError
+
+    out: list[Path] = []
+    for path in images:
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS)
+            if not inside:
+                raise InputError("the folder holds no photographs", where=str(path))
+            out += inside
+        elif path.is_file():
+            out.append(path)
+        else:
+            raise InputError("there is no such photograph or folder", where=str(path))
+    return list(dict.fromkeys(out))
+
+
+def beside(images: list[Path]) -> Path:
+    """board.yaml in the photographs' folder, or in the one above it."""
+    from pkmcal.errors import InputError
+
+    first = images[0] if images[0].is_dir() else images[0].parent
+    for folder in (first, first.resolve().parent):
+        if (folder / "board.yaml").is_file():
+            return folder / "board.yaml"
+    raise InputError(
+        "the board is not described",
+        where=str(first),
+        expected="a file board.yaml here or above, or --board FILE",
+    )
+
+
+def save(found: CameraCalibration, paths: list[Path], folder: Path, forms: list[str]) -> list[str]:
+    """Write camera.yaml, camera.json, camera.html and other programs' files; returns the names."""
+    from dataclasses import replace
+
+    from pkmcal.cameras.files import save_camera
+    from pkmcal.cameras.foreign import write_camera
+    from pkmcal.files import json_text, staged_folder
+    from pkmcal.report.camera_page import camera_report_html
+
+    page = camera_report_html(found, paths)
+    with staged_folder(folder) as stage:
+        (stage / "camera.html").write_text(page, encoding="utf-8", newline="\n")
+        # with its covariance, so that `calibrate --refine-camera` knows how far to move it
+        measured = replace(found.camera, covariance=found.covariance)
+        save_camera(measured, stage / "camera.yaml")
+        (stage / "camera.json").write_text(json_text(found.document()), encoding="utf-8")
+        for form in forms:
+            write_camera(found.camera, stage / OTHERS[form], form)
+    return [*WHAT, *(OTHERS[form] for form in forms)]
+
+
+def tell(out: Console, found: CameraCalibration, folder: Path, files: list[str]) -> None:
+    """The result in a sentence, its numbers, what should be known, and the files."""
+    from pkmcal.report.camera_page import headline, parameter_rows
+
+    out.print(headline(found), style="bold")
+    table = console.plain_table()
+    for _ in range(3):
+        table.add_column()
+    for row in parameter_rows(found):
+        sigma = f"± {row.sigma}" if row.sigma else "not estimated"
+        table.add_row(row.name, f"{row.value} {row.unit}".strip(), sigma)
+    out.print(table)
+    points: list[tuple[str, str]] = [(console.MARKS["doubtful"], text) for text in found.warnings]
+    console.print_points(out, points)
+    notes: dict[str, Any] = {
+        **WHAT,
+        **{name: "for that program" for name in files if name not in WHAT},
+    }
+    console.print_files(out, [(str(folder / name), notes[name]) for name in files])
