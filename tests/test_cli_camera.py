@@ -1,0 +1,73 @@
+"""`pkmcal camera` as a person uses it: photographs of a board in, a camera file out."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.cameras import load_camera
+from test_boards import board_of, camera_of, render
+from test_camera_calibration import poses_for
+
+BOARD = "type: charuco\nsquares: [8, 6]\nsquare: 0.03\nmarker: 0.022\ndictionary: DICT_5X5_100\n"
+TRUTH = camera_of("pinhole", 620.0, 622.0, 318.0, 242.0, -0.12, 0.05, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def boards(tmp_path_factory):
+    """A folder with board.yaml and eight photographs of it."""
+    folder = tmp_path_factory.mktemp("boards")
+    board = board_of(folder, BOARD)
+    (folder / "board.yaml").write_text(BOARD)
+    for k, pose in enumerate(poses_for(TRUTH, 8, seed=2)):
+        cv2.imwrite(str(folder / f"p{k}.png"), render(TRUTH, pose, board, seed=k))
+    return folder
+
+
+def test_a_camera_is_calibrated(boards, tmp_path):
+    done = run("camera", boards, "-o", tmp_path / "out", "--to", "opencv", "--json")
+    assert done.code == 0, done.err
+    found = load_camera(tmp_path / "out" / "camera.yaml")
+    assert found.model == done.json["camera"]["model"] == "pinhole"
+    sigma = np.sqrt(np.diag(found.covariance))
+    off = (found.parameters - TRUTH.parameters)[:4] / sigma[:4]
+    # four numbers of eight pictures; beyond four deviations the deviations would be wrong
+    assert np.all(np.abs(off) < 4)
+    assert sigma[0] < 1.0
+    assert {"camera.html", "camera.json", "camera.opencv.yaml"} <= {
+        p.name for p in (tmp_path / "out").iterdir()
+    }
+
+
+def test_a_sessions_board_photographs(boards, tmp_path):
+    """A session that observes a board is enough: its photographs and its board are known."""
+    folder = tmp_path / "session"
+    (folder / "images").mkdir(parents=True)
+    for path in boards.glob("*.png"):
+        (folder / "images" / path.name).write_bytes(path.read_bytes())
+    (folder / "board.yaml").write_text(BOARD)
+    (folder / "session.yaml").write_text(
+        "pkmcal: 1\nmechanism: m.yaml\njoints: {file: j.csv}\nboard: board.yaml\nstations:\n"
+        "  top: {camera: c.yaml, images: 'images/{configuration}.png', observe: board}\n"
+    )
+    done = run("camera", folder, "-o", tmp_path / "out", "--model", "pinhole", "--json")
+    assert done.code == 0, done.err
+    text = (folder / "session.yaml").read_text().replace("observe: board", "observe: legs")
+    (folder / "session.yaml").write_text(text)
+    refused = run("camera", folder, "-o", tmp_path / "out2")
+    assert refused.code == 2
+    assert "no station of this session observes a board" in refused.err
+
+
+def test_faults_are_sentences(boards, tmp_path):
+    cases = {
+        ("camera", tmp_path / "nowhere"): "there is no such photograph or folder",
+        ("camera", tmp_path): "the folder holds no photographs",
+        ("camera", boards, "--board", tmp_path / "b.yaml"): "the file does not exist",
+    }
+    for words, sentence in cases.items():
+        done = run(*words, "-o", tmp_path / "out")
+        assert done.code == 2
+        assert sentence in " ".join(done.err.split())
