@@ -22,7 +22,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 INSIDE, OUTSIDE = 3.0, 3.0
 """Pixels of a profile that the model explains: less is ill-conditioned, more meets the leg's
 other features and neighbours."""
-LIMB = 0.35
+LIMB = 0.45
 """Share of a leg's half width, from its limb inwards, that the model explains: highlights of bare
 metal begin further in. On slim legs this is less than INSIDE."""
 LEAST_INSIDE = 1.25
