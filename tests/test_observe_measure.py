@@ -8,6 +8,7 @@ import pytest
 from pkmcal.observe.legs import Photographs, measure, photographs_of
 from pkmcal.observe.lines import FLOOR, HALVES, edge_set, fit_edges
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
+from pkmcal.observe.profiles import FAINT
 from test_observe_drawing import (
     FRONT,
     camera_of,
@@ -94,7 +95,8 @@ def test_the_points_lie_on_the_true_edges():
     outward = moved / np.linalg.norm(moved, axis=1, keepdims=True)
     off = outward_to(normal, found.points[:, None], outward[:, None], camera)[:, 0]
     assert rms(off) < 0.06
-    assert np.abs(off).max() < 0.5
+    # a place supports an edge within three of its sigmas, which reach FAINT
+    assert np.abs(off).max() < 3 * FAINT
 
 
 def test_spans_lie_on_the_tubes():
