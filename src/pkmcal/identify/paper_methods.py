@@ -56,8 +56,11 @@ def _solve(method: Method, machine: Machine, measurements: Measurements, guess: 
 
 
 def linear_state(machine: Machine, measurements: Measurements) -> State:
-    """[B] 14 robustly for the base centres, 15 for the stations; all else as drawn.
+    """[B] 14 robustly for the base centres, 16 for their scale, 15 for the stations; rest drawn.
 
+    An edge shift or a wrong radius scales what a station sees (16 tells why), so each station's
+    centres are brought to the drawing's size, by Procrustes: as printed, the mean ratio of
+    distances, close pairs and their noise decide.
     Base centres of several stations are averaged after registration, weighted by how well each
     station knows them.
     """
@@ -70,12 +73,14 @@ def linear_state(machine: Machine, measurements: Measurements) -> State:
             found=f"{known.sum(axis=1).min()} legs at one of them",
             next_step="Use the joint method (bundle), which is the default",
         )
-    stations = np.stack(
-        [register(drawing[k], a[k]) for a, k in zip(found.centres, known, strict=True)]
-    )
+    sizes = [
+        linear.procrustes_scale(a[k], drawing[k]) for a, k in zip(found.centres, known, strict=True)
+    ]
+    centres = found.centres / np.array(sizes)[:, None, None]
+    stations = np.stack([register(drawing[k], a[k]) for a, k in zip(centres, known, strict=True)])
     spread = np.trace(found.covariance, axis1=-2, axis2=-1)
     weight = np.where(known, 1 / np.where(known, spread, 1.0), 0.0)
-    in_base = move(inverse(stations)[:, None], np.where(known[..., None], found.centres, 0.0))
+    in_base = move(inverse(stations)[:, None], np.where(known[..., None], centres, 0.0))
     total = weight.sum(axis=0)
     mean = np.einsum("sl,slc->lc", weight, in_base) / np.where(total > 0, total, 1.0)[:, None]
     theta = machine.values.copy()
