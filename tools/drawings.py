@@ -216,20 +216,21 @@ class Places:
 def measured_places(case: Case) -> Places:
     """All profiles of the session, taken about the edges that truth predicts."""
     found: list[tuple[Array, ...]] = []
-    truth, offsets = case.truth, profiles.profile_offsets()
-    middles = np.arange(legs.SEGMENTS) * (legs.SAMPLES // legs.SEGMENTS) + 12
+    truth = case.truth
+    middles = np.arange(legs.SEGMENTS) * 5 + 2
     for p in case.photographs:
         tubes, points, clear = legs._predict(
             p, truth.machine, truth.T_camera_base[p.station],
-            truth.T_base_platform[p.configuration], legs.SAMPLES, legs.CLEARANCE,
+            truth.T_base_platform[p.configuration], legs.PLACES, legs.CLEARANCE,
         )  # fmt: skip
-        pixel = points.pixel[..., None, :] + offsets[:, None] * points.outward[..., None, :]
+        grey = sample(p.images, legs._profile_pixels(p.camera, points))
         places = legs._at_samples(points, middles)
         half = places.gain * truth.machine.values[tubes.radius][:, None]
-        full, across = legs._segment_profiles(sample(p.images, pixel), clear, half)
+        clear = np.repeat(clear, legs.BETWEEN, axis=-1)
+        full, across = legs._segment_profiles(grey, clear, half)
         blur = profiles.estimate_blur(across)
         at = profiles.locate(across, blur)
-        good = at.found & (across.cut == 0)
+        good = at.found
         tube = tubes.tube[np.nonzero(full)[1]]
         steep = strongest_gradient(across.grey)
         blurs = np.full(len(good), blur)
