@@ -28,11 +28,16 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("bench") / "session"
+    """A session whose rods show clearly; :func:`test_slim_rods_are_a_known_weakness` has one
+    whose rods do not."""
+    return rendered(tmp_path_factory.mktemp("bench") / "session", seed=11)
+
+
+def rendered(folder, seed):
     parameters = np.array([565.0, 566.0, 322.0, 238.5, -0.1, 0.08, 4e-4, -3e-4, 0.0])
     camera = camera_models()["pinhole"]((640, 480), parameters)
     settings = Settings(configurations=6)
-    simulate_session(folder, pkmcal.load_mechanism("gough-stewart"), camera, settings, seed=11)
+    simulate_session(folder, pkmcal.load_mechanism("gough-stewart"), camera, settings, seed=seed)
     return Bench(folder)
 
 
@@ -65,6 +70,20 @@ def test_the_machine_is_found(demo, calibrated):
     z = errors_in_sigmas(calibrated, demo.session)
     assert 0.5 < np.sqrt(np.mean(z**2)) < 1.6
     assert calibrated.verdict.usable
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    strict=True,
+    reason="bare rods nine pixels wide: their edges come out 0.1 px inwards, all alike, which"
+    " neither the profiles' sigmas nor one edge shift a camera tell; 33 of 44 values are within"
+    " two deviations",
+)
+def test_slim_rods_are_a_known_weakness(tmp_path):
+    """The deviations should hold here too. When they do, this fails: take the mark away."""
+    bench = rendered(tmp_path / "session", seed=5)
+    result = compare(pkmcal.calibrate(bench.session), bench.session)
+    assert result.within >= 0.85 * result.count
 
 
 def test_same_seed_same_answer(demo, calibrated):
