@@ -345,7 +345,7 @@ def test_wrong_inputs_are_told():
     scene = make_scene(rng)
     good = scene.measurements(rng)
     start = scene.state()
-    with pytest.raises(InputError, match="no edge"):
+    with pytest.raises(InputError, match="neither an edge nor"):
         bundle(scene.machine, replace(good, edges=good.edges.select(np.zeros(0, int))), start)
     with pytest.raises(InputError, match="5 columns"):
         bundle(scene.machine, replace(good, joints=good.joints[:, :5]), start)

@@ -30,7 +30,7 @@ from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.problem import Measurements
 from pkmcal.observe import legs
 from pkmcal.recognition import platform_poses, read_photographs, recognise
-from pkmcal.report import page
+from pkmcal.report import page, templating
 from pkmcal.results import save
 from pkmcal.session import Session, load_session
 from pkmcal.simulate import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
@@ -119,7 +119,7 @@ def result(case: Case) -> Shot:
     views = page.report_views(case.session, case.result.observation, case.result.estimate)
     shots = {(p.station, p.configuration): p for p in views["pictures"]}
     shot = shots.get(("station2", "0011")) or next(iter(shots.values()))
-    template = page._environment().from_string(
+    template = templating.environment().from_string(
         '{% import "charts.html.j2" as draw with context %}'
         '<div class="grid"><div>{{ draw.picture(shot) }}<p>A photograph, the edges fitted in it,'
         " and the joints of the calibrated machine (rings) and of the drawing (crosses)</p></div>"
@@ -184,7 +184,7 @@ def positions(case: Case) -> Shot:
 def residuals(case: Case) -> Shot:
     """The report's histogram of the edges' residuals, and the boxes by leg."""
     views = page.report_views(case.session, case.result.observation, case.result.estimate)
-    template = page._environment().from_string(
+    template = templating.environment().from_string(
         '{% import "charts.html.j2" as draw with context %}<div class="two">'
         "<div><h3>{{ r.histogram.title }}</h3>{{ draw.bars(r.histogram) }}</div>"
         "<div><h3>{{ r.by_leg.title }}</h3>{{ draw.rows(r.by_leg) }}</div></div>"

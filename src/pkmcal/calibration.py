@@ -18,17 +18,26 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.boards import Boards
 from pkmcal.errors import ResultError
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle, start_state, what_data_tell
+from pkmcal.identify.conditions import conditions
 from pkmcal.identify.paper_methods import Method as PaperMethod
 from pkmcal.identify.paper_methods import by_paper
 from pkmcal.identify.problem import Estimate, Measurements
 from pkmcal.identify.start import better_start
 from pkmcal.identify.verdict import Verdict, judge
+from pkmcal.identify.words import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.edges import EdgeSet, Observation, Rejection, concatenate
-from pkmcal.recognition import WORKERS, check_observable, found_stations, read_photographs
+from pkmcal.recognition import (
+    WORKERS,
+    boards_of,
+    check_observable,
+    found_stations,
+    read_photographs,
+)
 from pkmcal.refinement import CameraRefinement, refinement_of
 from pkmcal.session import Session, load_session
 
@@ -51,7 +60,8 @@ Progress = Callable[[str, float], None]
 class Calibration:
     """Everything that a calibration found.
 
-    timings : seconds by step.
+    boards : the calibration board, where stations observe one. findings : what the data tell of
+    the machine and what they leave open. timings : seconds by step.
     """
 
     session: Session
@@ -63,6 +73,8 @@ class Calibration:
     method: str
     seed: int
     timings: dict[str, float] = field(default_factory=dict)
+    boards: Boards = field(default_factory=Boards)
+    findings: Findings | None = None
 
     @property
     def machine(self) -> Machine:
@@ -111,15 +123,17 @@ def _calibrate(
     photographs = read_photographs(session)
     clock.lap("decode")
     told("Recognising the machine", 0.2)
-    poses = found_stations(session, photographs, np.random.default_rng(seed))
+    boards = boards_of(session, photographs)
+    poses = found_stations(session, photographs, np.random.default_rng(seed), boards)
     clock.lap("observe")
-    turns = _take_turns(session, photographs, poses, cameras, told, clock)
+    turns = _take_turns(session, photographs, boards, poses, cameras, told, clock)
     estimate = turns.estimate
     if method != "bundle":
         told("Repeating the paper's method", 0.9)
         estimate = by_paper(method, session.machine, turns.measurements, estimate, seed)
     told("Judging", 0.95)
-    verdict = judge(turns.observation, estimate, method)
+    findings = _findings(turns.measurements, estimate)
+    verdict = judge(turns.observation, estimate, method, findings=findings)
     clock.lap("identify")
     return Calibration(
         session=session,
@@ -131,7 +145,22 @@ def _calibrate(
         method=method,
         seed=seed,
         timings=clock.laps,
+        boards=boards,
+        findings=findings,
     )
+
+
+def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
+    """What the data tell of the machine, in words, and the paper's conditions."""
+    seen = seen_legs(
+        measurements.edges,
+        estimate.edge_weights,
+        measurements.n_stations,
+        estimate.machine.n_legs,
+    )
+    told = what_data_tell(measurements, estimate)
+    counted = conditions(estimate.machine, seen)
+    return explain(told, estimate, joined_by_boards(seen, measurements), counted)
 
 
 class _Clock:
@@ -160,6 +189,7 @@ class _Turns(NamedTuple):
 def _take_turns(
     session: Session,
     photographs: list[legs.Photographs],
+    boards: Boards,
     T_camera_base: Array,
     cameras: CameraRefinement,
     told: Progress,
@@ -172,7 +202,7 @@ def _take_turns(
         photographs,
         lambda p: legs.search(p, machine, T_camera_base[p.station], poses[p.configuration]),
     )
-    measurements = _measurements(session, _edges(looks), None)
+    measurements = _measurements(session, _edges(looks), boards, None)
     clock.lap("observe")
     estimate = bundle(machine, measurements, start_state(machine, measurements, T_camera_base))
     clock.lap("identify")
@@ -187,7 +217,7 @@ def _take_turns(
         look = partial(_measure, estimate=estimate, blur=blur, refine=cameras.active)
         looks = _each(photographs, look)
         blur = [look.blur for look in looks]
-        measurements = _measurements(session, _edges(looks), cameras)
+        measurements = _measurements(session, _edges(looks), boards, cameras)
         clock.lap("observe")
         known = replace(estimate.state, intrinsics=np.zeros_like(cameras.at))
         start = better_start(machine, measurements, known) if turn == 0 else known
@@ -195,7 +225,7 @@ def _take_turns(
         clock.lap("identify")
         if max(look.moved for look in looks) < SETTLED and not cameras.active:
             break
-    return _Turns(_observation(looks, estimate), measurements, estimate, cameras)
+    return _Turns(_observation(looks, boards, estimate), measurements, estimate, cameras)
 
 
 def _measure(
@@ -232,7 +262,7 @@ def _edges(looks: list[legs.StationEdges]) -> EdgeSet:
 
 
 def _measurements(
-    session: Session, edges: EdgeSet, cameras: CameraRefinement | None
+    session: Session, edges: EdgeSet, boards: Boards, cameras: CameraRefinement | None
 ) -> Measurements:
     """What is measured; no cameras at the first look, which is too coarse to refine any."""
     files = [station.camera_file for station in session.stations]
@@ -249,7 +279,7 @@ def _measurements(
     return replace(measurements, intrinsics_factor=cameras.factor, intrinsics_at=cameras.at)
 
 
-def _observation(looks: list[legs.StationEdges], estimate: Estimate) -> Observation:
+def _observation(looks: list[legs.StationEdges], boards: Boards, estimate: Estimate) -> Observation:
     """The last looks joined, with the edges that the estimate gave up among the rejected."""
     edges = concatenate([look.edges for look in looks])
     first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
@@ -266,7 +296,9 @@ def _observation(looks: list[legs.StationEdges], estimate: Estimate) -> Observat
     ]
     return Observation(
         edges=edges,
-        rejected=tuple(r for look in looks for r in look.rejected) + tuple(given_up),
+        rejected=tuple(r for look in looks for r in look.rejected)
+        + boards.rejected
+        + tuple(given_up),
         points=np.concatenate([look.points for look in looks]),
         point_edge=np.concatenate(
             [look.point_edge + k for look, k in zip(looks, first, strict=True)]

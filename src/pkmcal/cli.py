@@ -17,7 +17,7 @@ from typing import Annotated, cast
 import typer
 
 from pkmcal import __version__
-from pkmcal.commands import calibrate, camera, check, demo, new, simulate
+from pkmcal.commands import calibrate, camera, check, demo, new, reproduce, simulate
 from pkmcal.commands.console import print_error
 from pkmcal.errors import InputError, PkmcalError
 
@@ -37,6 +37,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "camera": camera.camera,
     "calibrate": calibrate.calibrate,
     "simulate": simulate.simulate,
+    "reproduce": reproduce.reproduce,
 }
 """In the order of the help: the order in which a newcomer needs them."""
 

@@ -103,6 +103,11 @@ def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, 
     )
 
 
+def label_of(folder: Path, path: Path) -> str:
+    """A photograph's name in messages: its path inside the session."""
+    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
+
+
 def _parts(pattern: str, where: str) -> list[tuple[str, str | None]]:
     """Split a pattern into (text, None) and ("", field)."""
     try:

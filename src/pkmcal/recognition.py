@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.boards import Boards, find_boards
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import listed
 from pkmcal.observe import legs
@@ -16,27 +16,41 @@ from pkmcal.observe.diagnose import unrecognised
 from pkmcal.observe.images import decode_all
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import StationPose, View, find_station
-from pkmcal.session import Session, Station
+from pkmcal.photographs import label_of
+from pkmcal.session import Session
 
 WORKERS = 2
 """Threads beside one another: decoding and array work release Python's lock."""
 
+NOWHERE = StationPose(np.eye(4), score=1.0, chance=1.0)
+"""Of a station for whose search there was no start."""
+
 
 def check_observable(session: Session) -> None:
     """What the session's form allows but this observation cannot use."""
+    on_base = session.board_body == "base"
     for station in session.stations:
         where = f"session.yaml, stations.{station.name}"
-        if station.observe != "legs":
+        if "board" in station.observe and not on_base:
             raise InputError(
-                "boards are not observed yet", where=where, found=f"observe: {station.observe}",
+                "boards on the platform are not observed yet", where=where,
+                found=f"observe: {' and '.join(station.observe)}",
                 expected="observe: legs",
+                next_step="If the board is on the base, write board: {file: ..., fixed_to: base}",
             )  # fmt: skip
-        if station.T_camera_base is None:
+    joining = [
+        station.name
+        for station in session.stations
+        if "board" in station.observe and station.T_camera_base is not None
+    ]
+    for station in session.stations:
+        if station.T_camera_base is None and not (joining and "board" in station.observe):
             raise InputError(
                 "the station has no rough pose",
-                where=where,
+                where=f"session.yaml, stations.{station.name}",
                 expected="pose: {position: [x, y, z], look_at: [x, y, z], up: [0, 0, 1]}",
-                next_step="Measure by hand where the camera stands; 10 cm and 10 degrees will do",
+                next_step="Measure by hand where the camera stands; 10 cm and 10 degrees will do."
+                " Of stations that see one board fixed to the base, one pose is enough",
             )
     if not any(leg.tubes for leg in session.machine.document.legs):
         raise InputError(
@@ -60,11 +74,6 @@ def read_photographs(session: Session) -> list[legs.Photographs]:
 
     with ThreadPoolExecutor(WORKERS) as pool:
         return list(pool.map(read, range(len(session.stations))))
-
-
-def label_of(folder: Path, path: Path) -> str:
-    """A photograph's name in messages: its path inside the session."""
-    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
 
 
 def platform_poses(session: Session) -> Array:
@@ -93,7 +102,10 @@ def platform_poses(session: Session) -> Array:
 
 @dataclass(frozen=True)
 class Recognition:
-    """Where the search for each station's pose ended; rough : the poses it began from."""
+    """Where the search for each station's pose ended.
+
+    rough : the poses it began from, by hand, or through the board from a station that was found.
+    """
 
     views: tuple[View, ...]
     rough: tuple[Array, ...]
@@ -110,20 +122,55 @@ def recognise(
     photographs: list[legs.Photographs],
     poses: Array,
     rngs: list[np.random.Generator],
+    boards: Boards | None = None,
 ) -> Recognition:
     """Look for the machine in every station's photographs, nothing raised.
 
-    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one a station.
+    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one a station. boards : give
+    stations without a pose by hand a start, from the stations that were found.
     """
+    boards = boards or Boards()
     machine, tubes = session.machine, tubes_of(session.machine)
     views = tuple(
         View(machine, p.camera, tubes, p.joints, poses[p.configuration], p.tables)
         for p in photographs
     )
-    rough = tuple(_rough(station) for station in session.stations)
+    by_hand = [station.T_camera_base for station in session.stations]
+    found = _searched(views, by_hand, rngs)
+    # Through the board a pose by hand would be off by its angle times the stations' distance, so
+    # the rest are searched from where the search has ended with those that were found.
+    good = [pose.T_camera_base if pose and pose.good else None for pose in found]
+    ahead = boards.joined(good)
+    retried = [T if known is None else None for T, known in zip(ahead, good, strict=True)]
+    again = _searched(views, retried, rngs)
+    # Of a station that is not found, a start is told all the same.
+    rough = [
+        second if pose and pose.good else first
+        for first, second, pose in zip(boards.joined(by_hand), retried, again, strict=True)
+    ]
+    return Recognition(
+        views,
+        tuple(np.eye(4) if T is None else T for T in rough),
+        tuple(_better(first, second) for first, second in zip(found, again, strict=True)),
+    )
+
+
+def _searched(
+    views: tuple[View, ...], starts: list[Array | None], rngs: list[np.random.Generator]
+) -> list[StationPose | None]:
+    """The search from each start that there is."""
+
+    def search(view: View, start: Array | None, rng: np.random.Generator) -> StationPose | None:
+        return None if start is None else find_station(view, start, rng)
+
     with ThreadPoolExecutor(WORKERS) as pool:
-        found = tuple(pool.map(find_station, views, rough, rngs))
-    return Recognition(views, rough, found)
+        return list(pool.map(search, views, starts, rngs))
+
+
+def _better(first: StationPose | None, second: StationPose | None) -> StationPose:
+    """The end of two searches, or of the one that there was."""
+    ends = [pose for pose in (first, second) if pose is not None]
+    return min(ends, key=lambda pose: pose.score, default=NOWHERE)
 
 
 def why_unrecognised(
@@ -145,16 +192,19 @@ def why_unrecognised(
 
 
 def found_stations(
-    session: Session, photographs: list[legs.Photographs], rng: np.random.Generator
+    session: Session,
+    photographs: list[legs.Photographs],
+    rng: np.random.Generator,
+    boards: Boards | None = None,
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of all stations, or the reason why one is not recognised."""
     rngs = rng.spawn(len(photographs) + 1)
-    found = recognise(session, photographs, platform_poses(session), rngs[1:])
+    found = recognise(session, photographs, platform_poses(session), rngs[1:], boards)
     if not found.complete:
         raise why_unrecognised(session, photographs, found, rngs[0])
     return np.stack([pose.T_camera_base for pose in found.found])
 
 
-def _rough(station: Station) -> Array:
-    """The station's pose by hand; :func:`check_observable` has seen that there is one."""
-    return np.eye(4) if station.T_camera_base is None else station.T_camera_base
+def boards_of(session: Session, photographs: list[legs.Photographs]) -> Boards:
+    """The session's board in its photographs; see :func:`pkmcal.boards.find_boards`."""
+    return find_boards(session, {p.station: p.images for p in photographs})

@@ -20,6 +20,7 @@ from pkmcal.geometry.rigid import inverse, skew
 
 if TYPE_CHECKING:
     from pkmcal.calibration import Calibration
+    from pkmcal.identify.words import Findings
     from pkmcal.report.parameters import Group
 
 FORMAT = 1
@@ -47,6 +48,7 @@ def document_of(calibration: Calibration) -> dict[str, Any]:
         "parameters": _parameters(calibration),
         "covariance": estimate.covariance,
         "not_identified": _not_identified(calibration),
+        "identifiability": _identifiability(calibration.findings),
         "stations": _stations(calibration),
         "cameras": _cameras(calibration),
         "configurations": _configurations(calibration),
@@ -103,7 +105,27 @@ def _not_identified(calibration: Calibration) -> list[str]:
     """The report's sentences about what the data could not decide."""
     from pkmcal.report.parameters import unidentified
 
-    return list(unidentified(_groups(calibration), calibration.estimate))
+    return list(unidentified(_groups(calibration), calibration.estimate, calibration.findings))
+
+
+def _identifiability(findings: Findings | None) -> dict[str, Any] | None:
+    """The rank, what is open in words, and the paper's conditions; null where not looked at.
+
+    moves_platform : m, root mean square over the platform's joints and poses.
+    """
+    if findings is None:
+        return None
+    told = findings.told
+    return {
+        "rank": told.rank,
+        "n_parameters": told.n_parameters,
+        "n_frames": told.n_frames,
+        "singular_values": told.singular_values,
+        "moves_platform_by_drawing": findings.by_drawing,
+        "unidentified": [asdict(sentence) for sentence in findings.unidentified],
+        "weak": [asdict(sentence) for sentence in findings.weak],
+        "conditions": [asdict(condition) for condition in findings.conditions],
+    }
 
 
 def _stations(calibration: Calibration) -> list[dict[str, Any]]:

@@ -77,6 +77,7 @@ def save(calibration: Calibration, folder: Path | str) -> None:
         calibration.observation,
         calibration.estimate,
         calibration.verdict,
+        findings=calibration.findings,
         timings=calibration.timings,
     )
     texts = {

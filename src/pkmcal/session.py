@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, load_camera
@@ -19,7 +18,6 @@ from pkmcal.errors import InputError
 from pkmcal.files import (
     Document,
     Keys,
-    Schema,
     Table,
     listed,
     read_csv,
@@ -32,6 +30,7 @@ from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.photographs import Photograph, find_photographs, photograph_header
 from pkmcal.readings import check_readings
+from pkmcal.session_schema import SessionDocument, StationDocument, Vector
 
 __all__ = [
     "Photograph",
@@ -50,46 +49,6 @@ _NEAREST = 1e-6  # m
 # Under a degree between view and up, a rough up of a few digits leaves the roll to chance.
 _LEAST_ANGLE = np.deg2rad(1.0)
 
-Vector = tuple[float, float, float]
-
-
-class JointsDocument(Schema):
-    """``joints``: where the readings are, and how good."""
-
-    file: str = Field(description="the readings' file, for example joints.csv")
-    noise: Annotated[float, Field(gt=0)] = Field(
-        description="the standard deviation of a reading in metres or radians, such as 3.0e-6"
-    )
-
-
-class PoseDocument(Schema):
-    """``pose``: a rough camera pose, by hand, in metres in the base frame."""
-
-    position: Vector = Field(description="the camera's place in the base frame, [x, y, z] in m")
-    look_at: Vector = Field(description="a point in the image's middle, base frame, [x, y, z] in m")
-    up: Vector = (0.0, 0.0, 1.0)
-
-
-class StationDocument(Schema):
-    """One entry of ``stations``."""
-
-    camera: str = Field(description="the camera's file, for example cameras/front.yaml")
-    images: str = Field(description="a pattern such as images/front/{configuration}.png")
-    observe: Literal["legs", "board"] = Field(description="legs or board")
-    pose: PoseDocument | None = None
-
-
-class SessionDocument(Schema):
-    """The whole of session.yaml."""
-
-    pkmcal: Literal[1] = Field(description="the line pkmcal: 1, the format's version")
-    mechanism: str = Field(description="a mechanism's file, or a built-in's name")
-    joints: JointsDocument = Field(description="file and noise of the joint readings")
-    stations: Annotated[dict[str, StationDocument], Field(min_length=1)] = Field(
-        description="one entry a camera in one place"
-    )
-    board: str | None = None
-
 
 @dataclass(frozen=True)
 class Station:
@@ -98,7 +57,7 @@ class Station:
     camera_file : as session.yaml names it.
     T_camera_base : (4, 4) rough pose, base to camera coordinates in m; None where not given.
     photographs : by configuration and repeat.
-    observe : legs or board.
+    observe : legs, board, or both, in this order.
     """
 
     name: str
@@ -106,7 +65,7 @@ class Station:
     camera_file: str
     T_camera_base: Array | None
     photographs: tuple[Photograph, ...]
-    observe: str
+    observe: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -117,6 +76,7 @@ class Session:
     joints : (K, m) readings, m or rad, in the order of the machine's actuated legs.
     joint_noise : standard deviation of a reading, m or rad.
     board : file that describes the calibration board, where a station observes one.
+    board_body : what the board is fixed to, base or platform.
     document : session.yaml with defaults, readings and found photographs written out.
     warnings : sentences about what is not wrong but should be known.
     """
@@ -130,6 +90,7 @@ class Session:
     board: Path | None
     document: dict[str, Any]
     warnings: tuple[str, ...] = ()
+    board_body: str = "platform"
 
 
 def load_session(folder: Path | str) -> Session:
@@ -141,8 +102,7 @@ def load_session(folder: Path | str) -> Session:
     table = read_csv(joints_file, label=schema.joints.file)
     warnings = check_readings(table, machine.joint_ranges, schema.joints.noise)
     board = _board(folder, document, schema)
-    if board is not None and not _board_users(schema):
-        warnings.append(f"{document.where('board')}: no station observes the board.")
+    warnings += _of_little_use(document, schema)
     stations = tuple(
         _station(folder, document, name, station, table.names)
         for name, station in schema.stations.items()
@@ -159,6 +119,7 @@ def load_session(folder: Path | str) -> Session:
         board=board,
         document=_resolved(folder, schema, table, stations),
         warnings=tuple(warnings),
+        board_body=schema.board.fixed_to if schema.board else "platform",
     )
 
 
@@ -241,21 +202,54 @@ def _machine(folder: Path, document: Document, source: str) -> Machine:
     return load_mechanism(source, label=document.where("mechanism"))
 
 
-def _board_users(schema: SessionDocument) -> list[str]:
-    return [name for name, station in schema.stations.items() if station.observe == "board"]
-
-
 def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | None:
-    if schema.board is not None:
-        return _existing(folder, document, schema.board, ("board",))
-    users = _board_users(schema)
-    if users:
-        raise InputError(
-            f"station {listed(users)} observes a board, and none is described",
-            where=document.where("stations", users[0], "observe"),
-            expected="a line board: board.yaml at the top level",
-        )
-    return None
+    """The board's file, and whether those that observe it can use it."""
+    users = schema.observers("board")
+    if schema.board is None:
+        if users:
+            raise InputError(
+                f"station {listed(users)} observes a board, and none is described",
+                where=document.where("stations", users[0], "observe"),
+                expected="a line board: board.yaml at the top level",
+            )
+        return None
+    if schema.board.fixed_to == "base":
+        _check_base_board(document, schema, users)
+    written = document.data["board"]
+    keys: Keys = ("board",) if isinstance(written, str) else ("board", "file")
+    return _existing(folder, document, schema.board.file, keys)
+
+
+def _check_base_board(document: Document, schema: SessionDocument, users: list[str]) -> None:
+    """A board on the base joins stations that observe legs; alone it tells nothing."""
+    legs = schema.observers("legs")
+    alone = [name for name in users if name not in legs]
+    if not alone:
+        return
+    who = "no station observes legs" if not legs else f"station {listed(alone)} observes no legs"
+    raise InputError(
+        f"the board is fixed to the base, which does not move, and {who}",
+        where=document.where("stations", alone[0], "observe"),
+        found="board",
+        expected="[legs, board], in the same photographs",
+        next_step="If the board is on the platform, write board: {file: "
+        f"{schema.board.file if schema.board else 'board.yaml'}, fixed_to: platform}}",
+    )
+
+
+def _of_little_use(document: Document, schema: SessionDocument) -> list[str]:
+    """A board that is described, and serves nothing."""
+    users = schema.observers("board")
+    if schema.board is None:
+        return []
+    if not users:
+        return [f"{document.where('board')}: no station observes the board."]
+    if schema.board.fixed_to == "base" and len(users) == 1:
+        return [
+            f"{document.where('board')}: only station {users[0]} observes the board on the base;"
+            " it takes two for a board to join them."
+        ]
+    return []
 
 
 def _station(
@@ -299,8 +293,8 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
     owners: dict[tuple[Path, str], str] = {}
     for station in stations:
         for photo in station.photographs:
-            other = owners.setdefault((photo.path, station.observe), station.name)
-            if other != station.name:
+            others = {owners.setdefault((photo.path, w), station.name) for w in station.observe}
+            for other in others - {station.name}:
                 raise InputError(
                     f"station {station.name} has the photographs of station {other}",
                     where=document.where("stations", station.name, "images"),
@@ -335,9 +329,9 @@ def _resolved(
     document["joints"]["columns"] = list(table.columns)
     document["joints"]["readings"] = dict(zip(table.names, table.values.tolist(), strict=True))
     for station in stations:
-        document["stations"][station.name]["photographs"] = [
-            _inside(folder, photo.path) for photo in station.photographs
-        ]
+        entry = document["stations"][station.name]
+        entry["observe"] = station.observe[0] if len(station.observe) == 1 else station.observe
+        entry["photographs"] = [_inside(folder, photo.path) for photo in station.photographs]
     return document
 
 

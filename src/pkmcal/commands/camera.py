@@ -95,8 +95,10 @@ def of_session(folder: Path) -> tuple[list[Path], Path]:
 
     session = read_yaml(folder / "session.yaml")
     stations: dict[str, Any] = session.data.get("stations") or {}
-    seen = {name: s for name, s in stations.items() if s.get("observe") == "board"}
-    if not seen or not session.data.get("board"):
+    board = session.data.get("board")
+    board = board.get("file") if isinstance(board, dict) else board
+    seen = {name: s for name, s in stations.items() if "board" in _words(s.get("observe"))}
+    if not seen or not board:
         raise InputError(
             "no station of this session observes a board",
             where=session.where("stations"),
@@ -117,7 +119,12 @@ def of_session(folder: Path) -> tuple[list[Path], Path]:
     paths = sorted({path for pattern in wild for path in folder.glob(pattern)})
     if not paths:
         raise InputError("no photographs found", where=session.where("stations"), found=wild[0])
-    return paths, folder / str(session.data["board"])
+    return paths, folder / str(board)
+
+
+def _words(observe: Any) -> list[Any]:
+    """What a station observes, a word or a list of them."""
+    return observe if isinstance(observe, list) else [observe]
 
 
 def photographs(images: list[Path]) -> list[Path]:

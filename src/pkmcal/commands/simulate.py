@@ -50,13 +50,16 @@ def simulate(
     blur: Annotated[
         float, typer.Option(metavar="PX", min=0, help="Blur of the lens, pixels.")
     ] = 0.6,
+    board: Annotated[
+        bool, typer.Option("--board", help="A board on the base, which joins the stations.")
+    ] = False,
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
     """Simulate a session with photographs and known truth."""
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import load_mechanism
-    from pkmcal.simulate import Sensor, Settings, simulate_session
+    from pkmcal.simulate import Sensor, Settings, board_for, simulate_session
 
     if not 0 < joint_noise < 1:
         raise InputError(
@@ -72,6 +75,7 @@ def simulate(
         tolerance=tolerance,
         joint_noise=joint_noise,
         sensor=Sensor(blur=blur, read_noise=noise),
+        board=board_for(machine) if board else None,
     )
     with console.progress() as told:
         truth = simulate_session(

@@ -8,19 +8,21 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
-from pkmcal.identify.gauge import Gauge, freedoms
+from pkmcal.identify.blocks import BatchState, Blocks, Data
+from pkmcal.identify.gauge import Gauge, frame_rows, freedoms
+from pkmcal.identify.pose_rows import PoseBlocks, PoseData
 from pkmcal.identify.problem import Measurements, State
-from pkmcal.identify.residuals import SHIFT_SIGMA, BatchState, Blocks, Data, Problem
+from pkmcal.identify.residuals import SHIFT_SIGMA, Problem
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.edges import EdgeSet
 
 
 @dataclass(frozen=True)
 class Assembled:
     """A problem and where its rows come from.
 
-    seen : (K,) configurations with at least one edge; only they are in the problem.
-    row, place : (N,) of each edge: its configuration among the seen ones, its block there.
+    seen : (K,) configurations with at least one edge, or pose of a board on the platform; only
+    they are in the problem. row, place : (N,) of each edge: its configuration among the seen ones,
+    its block there. pose_row, pose_place : the same of the boards' poses.
     priors : names of the kinds of the prior rows, (c,): drawing, camera or gauge.
     """
 
@@ -28,6 +30,8 @@ class Assembled:
     seen: Booleans
     row: Integers
     place: Integers
+    pose_row: Integers
+    pose_place: Integers
     priors: tuple[str, ...]
 
 
@@ -42,9 +46,10 @@ def assemble(
     """The joint problem of one session (B = 1), every edge a block of its own."""
     edges = measurements.edges
     _check(machine, measurements)
-    seen = np.bincount(edges.configuration, minlength=len(measurements.joints)) > 0
-    row, place = _places(edges, seen)
-    shape = (int(seen.sum()), int(place.max()) + 1)
+    seen = seen_configurations(measurements)
+    row, place = _places(edges.configuration, seen)
+    shape = (int(seen.sum()), int(place.max(initial=-1)) + 1)
+    pose_row, pose_place = _pose_places(measurements, seen)
     n_cameras = int(measurements.camera_of_station.max()) + 1
     prior, target, kinds = prior_rows(
         machine,
@@ -54,6 +59,7 @@ def assemble(
         use_drawing,
         radius_prior,
         intrinsics=measurements.intrinsics_factor.shape[-1],
+        n_mounts=len(measurements.mounts),
     )
     if measurements.intrinsics_at.size:
         camera = np.array([kind == "camera" for kind in kinds])
@@ -71,15 +77,25 @@ def assemble(
         prior=prior,
         prior_target=target,
         frames=freedoms(machine),
+        pose_blocks=_pose_blocks(measurements, pose_row, pose_place, shape[0]),
+        pose_data=_pose_data(measurements, pose_row, pose_place, shape[0]),
     )
-    return Assembled(problem, seen, row, place, kinds)
+    return Assembled(problem, seen, row, place, pose_row, pose_place, kinds)
+
+
+def seen_configurations(measurements: Measurements) -> Booleans:
+    """(K,) configurations of which something was seen that depends on the platform's pose."""
+    poses, n = measurements.poses, len(measurements.joints)
+    on_platform = measurements.on_platform[poses.mount]
+    rows = np.concatenate([measurements.edges.configuration, poses.configuration[on_platform]])
+    return np.bincount(rows, minlength=n) > 0
 
 
 def _check(machine: Machine, measurements: Measurements) -> None:
     edges, joints = measurements.edges, measurements.joints
-    if len(edges) == 0:
+    if len(edges) == 0 and len(measurements.poses) == 0:
         raise InputError(
-            what="there is no edge to calibrate from",
+            what="there is neither an edge nor a board's pose to calibrate from",
             next_step="check the photographs, the stations' poses and the tubes of the drawing",
         )
     if joints.shape[-1] != machine.n_joints:
@@ -88,22 +104,54 @@ def _check(machine: Machine, measurements: Measurements) -> None:
             found=f"{joints.shape[-1]} columns",
             expected=f"{machine.n_joints}, one an actuated leg",
         )
-    if edges.configuration.max() >= len(joints) or edges.station.max() >= measurements.n_stations:
-        raise InputError(
-            what="an edge names a configuration or station that does not exist",
-            found=f"{edges.configuration.max()}, {edges.station.max()}",
-            expected=f"below {len(joints)}, {measurements.n_stations}",
-        )
+    for items in (edges, measurements.poses):
+        configuration = int(items.configuration.max(initial=-1))
+        station = int(items.station.max(initial=-1))
+        if configuration >= len(joints) or station >= measurements.n_stations:
+            raise InputError(
+                what="a measurement names a configuration or station that does not exist",
+                found=f"{configuration}, {station}",
+                expected=f"below {len(joints)}, {measurements.n_stations}",
+            )
 
 
-def _places(edges: EdgeSet, seen: Booleans) -> tuple[Integers, Integers]:
-    """Row (configuration among the seen) and place in it of each edge."""
-    row = (np.cumsum(seen) - 1)[edges.configuration]
+def _places(configuration: Integers, seen: Booleans) -> tuple[Integers, Integers]:
+    """Row (configuration among the seen) and place in it of each measurement."""
+    row = np.maximum(np.cumsum(seen) - 1, 0)[configuration]
     order = np.argsort(row, kind="stable")
     first = np.searchsorted(row[order], row[order])
-    place = np.empty(len(edges), dtype=int)
-    place[order] = np.arange(len(edges)) - first
+    place = np.empty(len(row), dtype=int)
+    place[order] = np.arange(len(row)) - first
     return row, place
+
+
+def _pose_places(measurements: Measurements, seen: Booleans) -> tuple[Integers, Integers]:
+    """The same of boards' poses; those on the base hang on no configuration, so the nearest row
+    serves where theirs is not seen.
+    """
+    return _places(measurements.poses.configuration, seen)
+
+
+def _pose_blocks(
+    measurements: Measurements, row: Integers, place: Integers, n_rows: int
+) -> PoseBlocks:
+    shape = (n_rows, int(place.max(initial=-1)) + 1)
+    station, mount = np.zeros((2, *shape), dtype=int)
+    present = np.zeros(shape, dtype=bool)
+    station[row, place] = measurements.poses.station
+    mount[row, place] = measurements.poses.mount
+    present[row, place] = True
+    return PoseBlocks(station, mount, present, measurements.on_platform)
+
+
+def _pose_data(measurements: Measurements, row: Integers, place: Integers, n_rows: int) -> PoseData:
+    shape = (1, n_rows, int(place.max(initial=-1)) + 1)
+    target = np.broadcast_to(np.eye(4), (*shape, 4, 4)).copy()
+    whiten, weight = np.zeros((*shape, 6, 6)), np.zeros(shape)
+    target[0, row, place] = measurements.poses.T_station_target
+    whiten[0, row, place] = measurements.poses.whiten
+    weight[0, row, place] = 1.0
+    return PoseData(target, whiten, weight)
 
 
 def _blocks(
@@ -115,7 +163,8 @@ def _blocks(
 ) -> Blocks:
     edges = measurements.edges
     radius = np.array(
-        [machine.layout.radius[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)]
+        [machine.layout.radius[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)],
+        dtype=int,
     )
 
     def spread(values: Integers) -> Integers:
@@ -124,7 +173,7 @@ def _blocks(
         return out
 
     # padding needs any existing radius; its weight is zero
-    tube_radius = np.full(shape, radius[0])
+    tube_radius = np.full(shape, radius[0] if len(radius) else 0)
     tube_radius[row, place] = radius
     return Blocks(
         leg=spread(edges.leg),
@@ -163,6 +212,7 @@ def prior_rows(
     use_drawing: bool,
     radius_prior: bool = True,
     intrinsics: int = 0,
+    n_mounts: int = 0,
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
@@ -172,18 +222,19 @@ def prior_rows(
     """
     table, free = machine.parameters, machine.parameters.free_matrix()
     nz = free.shape[1]
-    na = nz + 6 * n_stations + n_cameras * (1 + intrinsics)
-    first = np.argmax(free, axis=0)
+    mounts_at = nz + 6 * n_stations + n_cameras * (1 + intrinsics)
+    na = mounts_at + 6 * n_mounts
+    first, tolerance = table.first_of_free(), table.tolerances_free()
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
     held = (radius & radius_prior) | (~radius & use_drawing)
     drawing = np.zeros((int(held.sum()), na))
-    drawing[np.arange(len(drawing)), np.flatnonzero(held)] = 1 / table.tolerance[first[held]]
+    drawing[np.arange(len(drawing)), np.flatnonzero(held)] = 1 / tolerance[held]
     optics = np.zeros((n_cameras * (1 + intrinsics), na))
     sigma = np.tile([SHIFT_SIGMA] + [1.0] * intrinsics, n_cameras)
-    optics[:, nz + 6 * n_stations :] = np.diag(1 / sigma)
+    optics[:, nz + 6 * n_stations : mounts_at] = np.diag(1 / sigma)
     rows, kinds = [drawing, optics], ["drawing"] * len(drawing) + ["camera"] * len(optics)
     if not use_drawing and freedoms(machine).shape[1]:
-        c = gauge.constraints(machine) @ free / float(np.mean(table.tolerance[first[~radius]]))
+        c = frame_rows(machine, gauge) @ free / float(np.mean(tolerance[~radius]))
         rows.append(np.concatenate([c, np.zeros((len(c), na - nz))], axis=1))
         kinds += ["gauge"] * len(c)
     prior = np.concatenate(rows)
@@ -192,8 +243,7 @@ def prior_rows(
 
 def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState:
     """A state as a batch of one, free parameters only."""
-    free = machine.parameters.free_matrix()
-    z = np.linalg.lstsq(free, state.theta - machine.parameters.drawing, rcond=None)[0]
+    z = machine.parameters.to_free(state.theta)
     width = assembled.problem.n_optics - 1
     known = state.intrinsics if state.intrinsics.shape[-1] == width else np.zeros((0, width))
     intrinsics = np.zeros((len(state.edge_shift), width))
@@ -203,6 +253,7 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
         state.T_camera_base[None],
         state.T_base_platform[assembled.seen][None],
         np.concatenate([state.edge_shift[:, None], intrinsics], axis=1)[None],
+        state.T_mount[None],
     )
 
 
@@ -216,4 +267,6 @@ def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
         poses,
         batch.optics[0, :, 0],
         batch.optics[0, :, 1:],
+        batch.T_mount[0],
+        assembled.problem.pose_blocks.on_platform,
     )

@@ -24,9 +24,11 @@ from pkmcal.identify.covariance import (
     information,
     machine_covariance,
 )
-from pkmcal.identify.gauge import Gauge, ThreeCentres, apply
+from pkmcal.identify.blocks import BatchState
+from pkmcal.identify.gauge import Gauge, apply, default_gauge
+from pkmcal.identify.mounts import start_mounts
 from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
-from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.residuals import Problem
 from pkmcal.identify.solver import FIRST_DAMPING, RESTART_DAMPING, Solution, Stop, minimise
 from pkmcal.mechanisms import Machine
 
@@ -137,7 +139,7 @@ def bundle(
     gauge : frames of the result, three centres by default.
     Raises ResultError where the search cannot start or ends without an answer.
     """
-    gauge = gauge or ThreeCentres()
+    gauge = gauge or default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing)
     batch = batch_of(machine, assembled, start)
     result = solve_batch(assembled.problem, batch, robust=robust, scale_noise=scale_noise)
@@ -155,7 +157,15 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
     """
     poses = machine.forward_result(measurements.joints).T_base_platform
     n_cameras = int(np.max(measurements.camera_of_station)) + 1
-    return State(machine.values, np.asarray(T_camera_base_guess), poses, np.zeros(n_cameras))
+    stations = np.asarray(T_camera_base_guess)
+    return State(
+        machine.values,
+        stations,
+        poses,
+        np.zeros(n_cameras),
+        T_mount=start_mounts(measurements, stations, poses),
+        on_platform=measurements.on_platform,
+    )
 
 
 def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiability:
@@ -165,7 +175,7 @@ def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiab
     unidentified, and of what the drawing knows better than the data.
     """
     machine = estimate.machine
-    assembled = assemble(machine, measurements, ThreeCentres())
+    assembled = assemble(machine, measurements, default_gauge(machine))
     weight = assembled.problem.data.weight.copy()
     weight[0, assembled.row, assembled.place] = estimate.edge_weights
     weight = weight / estimate.statistics.noise_scale**2
@@ -186,6 +196,7 @@ def _estimate(
     solved = state_of(assembled, found, start)
     full = machine_covariance(problem, machine, solved, result.info.covariance[0], gauge)
     state = apply(machine, solved, gauge)
+    state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     identified = machine.with_values(state.theta)
     n_par = len(machine.parameters)
     stations = np.arange(6 * problem.n_stations).reshape(-1, 6) + n_par
@@ -207,13 +218,16 @@ def _estimate(
         statistics=_statistics(result, assembled),
         gauge=gauge.name,
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ np.swapaxes(factor, -1, -2),
+        pose_residuals=problem.pose_residuals(found)[0, assembled.pose_row, assembled.pose_place],
     )
 
 
 def _optics_covariance(result: BatchResult) -> Array:
     """Covariance (C, w, w) of each camera's own unknowns."""
     c, w = result.problem.n_cameras, result.problem.n_optics
-    own = result.info.covariance[0][-c * w :, -c * w :].reshape(c, w, c, w)
+    first = result.problem.free.shape[1] + 6 * result.problem.n_stations
+    at = slice(first, first + c * w)
+    own = result.info.covariance[0][at, at].reshape(c, w, c, w)
     return np.einsum("iaib->iab", own)
 
 
@@ -234,28 +248,29 @@ def _joint_residuals(
     result: BatchResult, assembled: Assembled, measurements: Measurements
 ) -> Array:
     """Closures in standard deviations of a reading, (K, m); zero where no pose was fitted."""
-    driven = result.problem.layout.actuated >= 0
-    rows = result.info.linear.value[0, :, result.problem.n_edge_rows :]
+    rows = result.info.linear.value[0, :, result.problem.closure_rows]
     out = np.zeros(measurements.joints.shape)
-    out[np.ix_(assembled.seen, result.problem.layout.actuated[driven])] = rows[:, driven]
+    out[assembled.seen] = rows[:, result.problem.layout.driven_rows]
     return out
 
 
 def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     problem, linear = result.problem, result.info.linear
-    n = problem.n_edge_rows
     kinds = np.array(assembled.priors)
-    chi2_edges = float(np.sum(linear.value[0, :, :n] ** 2))
-    chi2_joints = float(np.sum(linear.value[0, :, n:] ** 2))
+    chi2_edges = float(np.sum(linear.value[0, :, : problem.n_edge_rows] ** 2))
+    closures = linear.value[0, :, problem.closure_rows]
+    chi2_joints = float(np.sum(closures**2))
+    chi2_poses = float(np.sum(linear.value[0, :, problem.pose_rows] ** 2))
+    n_poses = 6 * len(assembled.pose_row)
     chi2_drawing = float(np.sum(linear.shared_value[0, kinds != "gauge"] ** 2))
     n_edges = float(edge_count(problem, result.weight)[0])
-    n_joints = linear.value[0, :, n:].size
+    n_joints = closures.size
     n_drawing = int(np.sum(kinds != "gauge"))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))
     unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
     return Statistics(
-        chi2=chi2_edges + chi2_joints + chi2_drawing,
-        dof=n_edges + n_joints + n_drawing - unknowns,
+        chi2=chi2_edges + chi2_joints + chi2_poses + chi2_drawing,
+        dof=n_edges + n_joints + n_poses + n_drawing - unknowns,
         chi2_edges=chi2_edges,
         n_edges=n_edges,
         chi2_joints=chi2_joints,
@@ -265,4 +280,6 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
         steps=int(result.steps[0]),
         stopped=result.solution.stop[0].value,
         noise_scale=float(result.noise_scale[0]),
+        chi2_poses=chi2_poses,
+        n_poses=n_poses,
     )

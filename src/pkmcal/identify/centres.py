@@ -89,7 +89,8 @@ def _ends(machine: Machine) -> LimbEnds:
 
 def _spread(by: Array, index: Integers, covariance: Array) -> Array:
     """Covariance (3L, 3L) of points whose derivatives (L, 3, n) are by parameters at (L, n)."""
-    flat = (by @ np.eye(len(covariance))[index]).reshape(-1, len(covariance))
+    n = len(covariance)
+    flat = (by @ np.eye(n + 1)[index, :n]).reshape(-1, n)
     return flat @ covariance @ flat.T
 
 

@@ -23,10 +23,11 @@ from pkmcal.identify.gauge import (
     projector,
     transformation,
 )
+from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.problem import State
-from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.residuals import Problem
 from pkmcal.identify.solver import Linear, Reduced, eliminate, reduced_normal, transposed
-from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms import Machine, ParameterTable
 
 RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14
@@ -112,6 +113,7 @@ def machine_covariance(
     spread = carried_errors(machine.layout, before, e, f) @ spread
     spread = transformation(machine, after, gauge) @ spread
     part = shared[: n_free + n_station, : n_free + n_station]
+    spread[:n_par] = _along_units(machine, after.theta, spread[:n_par])
     out = spread @ part @ spread.T
     # constrained and fixed coordinates are exactly known; the product leaves rounding there
     known = np.flatnonzero(np.diag(out)[:n_par] < 1e-18 * machine.parameters.tolerance**2)
@@ -119,13 +121,20 @@ def machine_covariance(
     return 0.5 * (out + out.T)
 
 
+def _along_units(machine: Machine, theta: Array, rows: Array) -> Array:
+    """Rows (P, n) of errors of parameters, those of axes kept across the axis: their length is one."""
+    for index in np.concatenate(machine.layout.turning):
+        axis = theta[index] / np.linalg.norm(theta[index])
+        rows[index] -= np.outer(axis, axis @ rows[index])
+    return rows
+
+
 def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) -> Array:
     """1 - posterior variance / drawing variance in the gauge, (P,); 0 where both vanish."""
     table, free = machine.parameters, machine.parameters.free_matrix()
-    first = np.argmax(free, axis=0)
     change = projector(machine, theta, gauge)
     spread = free - generators(machine.layout, theta) @ (change @ free)
-    drawing = np.sum((spread * table.tolerance[first]) ** 2, axis=1)
+    drawing = np.sum((spread * table.tolerances_free()) ** 2, axis=1)
     known = drawing > 1e-12 * table.tolerance**2
     share = 1 - np.diag(covariance)[: len(table)] / np.where(known, drawing, 1.0)
     return np.where(known, share, 0.0)
@@ -136,12 +145,14 @@ class Direction:
     """A combination of parameters: names with weights, largest first, and how well known.
 
     information : singular value of the data in units of the drawing's tolerance; 1 means that
-    the data know it as well as the drawing does.
+    the data know it as well as the drawing does. vector : (P,) the change of all parameters, m and
+    rad, with the largest entry one tolerance.
     """
 
     names: tuple[str, ...]
     weights: tuple[float, ...]
     information: float
+    vector: Array
 
 
 @dataclass(frozen=True)
@@ -160,6 +171,11 @@ class Identifiability:
     weak: tuple[Direction, ...]
     singular_values: Array
 
+    @property
+    def basis(self) -> Array:
+        """Changes (n, P) of all parameters that the data cannot see, m and rad."""
+        return np.array([d.vector for d in self.unidentified]).reshape(len(self.unidentified), -1)
+
 
 def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Identifiability:
     """Rank of the data's own information, drawing left out; the problem's first run.
@@ -169,22 +185,22 @@ def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Id
     """
     linear = problem.linearize(state)
     rows = eliminate(linear, np.zeros(state.z.shape[0])).rows[0]
-    nz = problem.free.shape[1]
+    table, nz = machine.parameters, problem.free.shape[1]
     rows = rows.reshape(-1, rows.shape[-1])
-    q, _ = np.linalg.qr(_scaled(rows[:, nz:]))
-    first = np.argmax(problem.free, axis=0)
-    tolerance = machine.parameters.tolerance[first]
+    q = _column_space(rows[:, nz:])
+    tolerance = table.tolerances_free()
     left = rows[:, :nz] * tolerance
     left = left - q @ (q.T @ left)
-    theta = problem.theta(state)[0]
-    frames = freedoms(machine)
+    theta, frames = problem.theta(state)[0], freedoms(machine)
     moved = np.linalg.lstsq(problem.free, generators(machine.layout, theta) @ frames, rcond=None)[0]
     basis = np.linalg.qr(moved / tolerance[:, None], mode="complete")[0][:, frames.shape[1] :]
-    _, s, vt = np.linalg.svd(left @ basis, full_matrices=False)
+    s, vt = _all_singular(left @ basis)
     directions = vt @ basis.T
-    names = [machine.parameters.names[k] for k in first]
     lost = s < RANK_TOLERANCE * s[0]
-    made = [_direction(names, v, x) for v, x in zip(directions, s, strict=True)]
+    vectors = (directions * tolerance) @ problem.free.T
+    made = [
+        _direction(table, d, v, float(x)) for d, v, x in zip(directions, vectors, s, strict=True)
+    ]
     return Identifiability(
         n_parameters=nz,
         n_frames=frames.shape[1],
@@ -195,14 +211,31 @@ def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Id
     )
 
 
+def _all_singular(matrix: Array) -> tuple[Array, Array]:
+    """Singular values and all right vectors: as many as columns, however few rows there are."""
+    _, s, vt = np.linalg.svd(np.linalg.qr(matrix, mode="r"), full_matrices=True)
+    return np.pad(s, (0, len(vt) - len(s))), vt
+
+
+def _column_space(columns: Array) -> Array:
+    """An orthonormal basis of what columns can make; a station seen from nowhere spans less."""
+    u, s, _ = np.linalg.svd(_scaled(columns), full_matrices=False)
+    return u[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
+
+
 def _scaled(columns: Array) -> Array:
     norm = np.linalg.norm(columns, axis=0)
     return columns[:, norm > 0] / norm[norm > 0]
 
 
-def _direction(names: list[str], weights: Array, value: float) -> Direction:
+def _direction(table: ParameterTable, weights: Array, vector: Array, value: float) -> Direction:
     order = np.argsort(-np.abs(weights), kind="stable")
     order = order[np.abs(weights[order]) > 0.15 * np.abs(weights).max()][:8]
+    names = table.free_names()
+    size = np.abs(vector / table.tolerance).max()
     return Direction(
-        tuple(names[k] for k in order), tuple(float(weights[k]) for k in order), float(value)
+        tuple(names[k] for k in order),
+        tuple(float(weights[k]) for k in order),
+        value,
+        vector / size,
     )

@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
 from pkmcal.identify.problem import State
@@ -35,6 +35,10 @@ class Gauge(Protocol):
     def constraints(self, machine: Machine) -> Array:
         """C, (12, P): six rows on the base centres, six on the platform centres."""
         ...
+
+
+FLAT = 1e-3
+"""Three points nearer to one line than this part of their distances fix no turn about it."""
 
 
 @dataclass(frozen=True)
@@ -111,15 +115,31 @@ def _three_rows(drawing: Array, index: Integers) -> Array:
     return rows
 
 
-def generators(layout: LimbLayout, theta: Array) -> Array:
-    """How parameters move with the twelve numbers of a frame change, (..., P, 12)."""
+def generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -> Array:
+    """How parameters move with the twelve numbers of a frame change, (..., P, 12).
+
+    drawing : (P,) where directions stay on the tangent planes of the drawing's.
+    """
     out = np.zeros((*theta.shape, 12))
-    for body, index in enumerate(centre_index(layout)):
+    for body, (index, axes) in enumerate(zip(centre_index(layout), layout.turning, strict=True)):
         at = slice(6 * body, 6 * body + 3)
         to = slice(6 * body + 3, 6 * body + 6)
         out[..., index, at] = -skew(theta[..., index])
         out[..., index, to] = np.eye(3)
+        out[..., axes, at] = -skew(theta[..., axes])
+        if drawing is not None:
+            along = drawing[axes][..., None, :] @ out[..., axes, at]
+            out[..., axes, at] -= theta[..., axes, None] * along
     return out
+
+
+def mount_generators(T_mount: Array, on_platform: Booleans) -> Array:
+    """How boards (..., M, 4, 4) fixed to a body move with a frame change, (..., M, 6, 12)."""
+    own = np.zeros((*T_mount.shape[:-2], 6, 6))
+    own[..., :, :] = np.eye(6)
+    own[..., 3:, :3] = -skew(T_mount[..., :3, 3])
+    moves = on_platform[:, None, None]
+    return np.concatenate([np.where(moves, 0.0, own), np.where(moves, own, 0.0)], axis=-1)
 
 
 def station_generators(T_camera_base: Array) -> Array:
@@ -167,6 +187,31 @@ def _respecting_motion(motion: Array) -> Array:
     return np.concatenate([np.eye(12)[:, [3, 4, 5, 9, 10, 11]], both[:, :3]], axis=1)
 
 
+def default_gauge(machine: Machine) -> Gauge:
+    """Three centres where three legs' joints make a triangle on both bodies, else the best fit."""
+    gauge = ThreeCentres()
+    legs = gauge.legs if max(gauge.legs) < machine.n_legs else (0, 1, 2)
+    if machine.n_legs < 3:
+        return BestFit()
+    for index in centre_index(machine.layout):
+        p1, p2, p3 = machine.parameters.drawing[index[list(legs)]]
+        sides = np.linalg.norm([p2 - p1, p3 - p1], axis=1)
+        if np.linalg.norm(np.cross(p2 - p1, p3 - p1)) <= FLAT * sides.prod():
+            return BestFit()
+    return gauge
+
+
+def frame_rows(machine: Machine, gauge: Gauge) -> Array:
+    """The gauge's constraints as rows (g, P) that frame changes alone can meet.
+
+    A machine with fewer frames than the gauge has constraints (planar, translational) cannot meet
+    them all; these are the combinations that it can.
+    """
+    c, drawing = gauge.constraints(machine), machine.parameters.drawing
+    slope = c @ generators(machine.layout, drawing) @ freedoms(machine)
+    return np.linalg.pinv(slope) @ c
+
+
 def projector(machine: Machine, theta: Array, gauge: Gauge) -> Array:
     """What turns any result into the gauge, to first order: N C with y = -N C (theta - drawing).
 
@@ -209,14 +254,25 @@ def changed_frames(layout: LimbLayout, state: State, e: Array, f: Array) -> Stat
         theta=moved_centres(layout, state.theta, e, f),
         T_camera_base=state.T_camera_base @ inverse(e),
         T_base_platform=e @ state.T_base_platform @ inverse(f),
+        T_mount=moved_mounts(state.T_mount, state.on_platform, e, f),
     )
 
 
+def moved_mounts(T_mount: Array, on_platform: Booleans, e: Array, f: Array) -> Array:
+    """Boards' poses (..., M, 4, 4) in their bodies' new frames."""
+    frames = np.stack([e, f], axis=-3)
+    return frames[..., on_platform.astype(int), :, :] @ T_mount
+
+
 def moved_centres(layout: LimbLayout, theta: Array, e: Array, f: Array) -> Array:
-    """Parameters (..., P) with centres moved by E (..., 4, 4) on the base, F on the platform."""
+    """Parameters (..., P) with centres moved by E (..., 4, 4) on the base, F on the platform.
+
+    Directions turn with their body.
+    """
     out = theta.copy()
-    for transform, index in zip((e, f), centre_index(layout), strict=True):
+    for transform, index, axes in zip((e, f), centre_index(layout), layout.turning, strict=True):
         out[..., index] = move(transform[..., None, :, :], theta[..., index])
+        out[..., axes] = (transform[..., None, :3, :3] @ theta[..., axes, None])[..., 0]
     return out
 
 
@@ -228,8 +284,9 @@ def carried_errors(layout: LimbLayout, before: State, e: Array, f: Array) -> Arr
     """
     n_par, n_stations = before.theta.size, len(before.T_camera_base)
     out = np.eye(n_par + 6 * n_stations)
-    for transform, index in zip((e, f), centre_index(layout), strict=True):
-        out[index[:, :, None], index[:, None, :]] = transform[:3, :3]
+    for transform, index, axes in zip((e, f), centre_index(layout), layout.turning, strict=True):
+        turning = np.concatenate([index, axes])
+        out[turning[:, :, None], turning[:, None, :]] = transform[:3, :3]
     arm = before.T_camera_base[:, :3, :3] @ e[:3, :3].T @ e[:3, 3]
     for s in range(n_stations):
         at = n_par + 6 * s

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.edges import EdgeSet
+from pkmcal.observe.poses import PoseSet
+
+
+@dataclass(frozen=True)
+class Mount:
+    """What a board or a tracker's target is fixed to; its place there is estimated."""
+
+    name: str
+    body: Literal["base", "platform"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +30,8 @@ class Measurements:
     that each station uses: one edge shift is estimated for each camera. intrinsics_factor :
     (C, n, r) square roots F of the cameras' intrinsics' covariances F F^T, where these are to be
     refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
-    those units from the calibration's values.
+    those units from the calibration's values. poses : of boards or targets, each on one of the
+    ``mounts``.
     """
 
     edges: EdgeSet
@@ -30,6 +41,13 @@ class Measurements:
     camera_of_station: Integers
     intrinsics_factor: Array = field(default_factory=lambda: np.zeros((1, 0, 0)))
     intrinsics_at: Array = field(default_factory=lambda: np.zeros((1, 0)))
+    poses: PoseSet = field(default_factory=PoseSet.empty)
+    mounts: tuple[Mount, ...] = ()
+
+    @property
+    def on_platform(self) -> Booleans:
+        """(M,) which of the mounts move with the platform."""
+        return np.array([mount.body == "platform" for mount in self.mounts], dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -39,6 +57,8 @@ class State:
     theta : (P,) machine parameters. T_camera_base : (S, 4, 4). T_base_platform : (K, 4, 4).
     edge_shift : (C,) px outward, per camera. intrinsics : (C, r) change of each camera's from
     ``Measurements.intrinsics_at``, in the same units; r = 0 where they are held.
+    T_mount : (M, 4, 4) boards in the frame of what they are fixed to, T_base_board or
+    T_platform_board by ``on_platform`` (M,).
     """
 
     theta: Array
@@ -46,6 +66,8 @@ class State:
     T_base_platform: Array
     edge_shift: Array
     intrinsics: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    T_mount: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    on_platform: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
 
 @dataclass(frozen=True)
@@ -56,7 +78,7 @@ class Statistics:
     chi2_edges, n_edges, chi2_joints, n_joints, chi2_drawing, n_drawing : by kind of residual.
     steps : solver steps. stopped : reason in words. noise_scale : factor by which the edges'
     stated standard deviations had to be enlarged (or shrunk) to agree with the residuals;
-    1 when they were taken as they are.
+    1 when they were taken as they are. chi2_poses, n_poses : of boards' poses, six each.
     """
 
     chi2: float
@@ -70,6 +92,8 @@ class Statistics:
     steps: int
     stopped: str
     noise_scale: float
+    chi2_poses: float = 0.0
+    n_poses: int = 0
 
 
 @dataclass(frozen=True)
@@ -85,6 +109,7 @@ class Estimate:
     joint_residuals : (K, m) in standard deviations.
     data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
         data decide; near 0, the value is the drawing's.
+    pose_residuals : (N, 6) whitened, of the measured boards' poses.
     configurations : (K,) True where the configuration was seen and its pose estimated.
     gauge : its name for people.
     """
@@ -102,3 +127,4 @@ class Estimate:
     statistics: Statistics
     gauge: str
     intrinsics_covariance: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))

@@ -1,22 +1,22 @@
 """Residuals of the joint estimate and their exact Jacobians, all in standard deviations.
 
-Rows of a configuration are its edges, two each, then its limbs' closures, one each:
+Rows of a configuration are its edges, two each, then its limbs' closures, then its boards' poses
+(:mod:`pkmcal.identify.pose_rows`), six each:
 
 - edge: ``L^-1 (basis^T n_predicted + shift * s)`` with L the Cholesky factor of the edge's
   covariance. The measured normal is the true one moved by ``basis @ (shift * s)`` when all
   edge points lie s px outward, and ``basis^T n_measured = 0``; hence the plus sign.
-- closure: ``c / (|dc/dq| sigma_q)``, [B] eq. 4; rods of constant length are held as sharply.
+- closure: ``c / (|dc/dq| sigma_q)``, [B] eq. 4; what no reading enters (rods of constant
+  length, joints' axes) is taken as perfect and held to :data:`PERFECT`.
 
 Rows on shared unknowns: ``(theta - drawing) / tolerance``, the edge shift's prior, the gauge.
 
-Edges that share their noise are whitened together: a *block* is g edges (g = 1 for edges
-fitted in photographs, g = 2 for the two edges that stand for a measured axis, [A] Table 1)
-of one tube at one station, with one 2g x 2g whitening matrix and one robust weight.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,62 +24,24 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import inverse, perturb, skew
+from pkmcal.identify.blocks import BatchState, Blocks, Data
 from pkmcal.identify.gauge import (
     generators,
+    mount_generators,
     moved_centres,
+    moved_mounts,
     pose_generators,
     station_generators,
 )
+from pkmcal.identify.pose_rows import PoseBlocks, PoseData, PoseRows, no_poses, pose_rows
 from pkmcal.identify.solver import Linear, Values
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure
+from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, on_tangents
 
+PERFECT = 1e-6
+"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of
+a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
 SHIFT_SIGMA = 0.3
 """Standard deviation (px) of a camera's constant edge shift before any data: errata, B."""
-
-
-@dataclass(frozen=True)
-class Blocks:
-    """Where the edges are: K configurations of G blocks, padded; the same for all runs.
-
-    leg, station, camera, radius : (K, G) leg, station, camera, position of the tube's radius.
-    side : (K, G, g). present : (K, G) False for padding.
-    """
-
-    leg: Integers
-    station: Integers
-    camera: Integers
-    radius: Integers
-    side: Integers
-    present: Booleans
-
-
-@dataclass(frozen=True)
-class Data:
-    """Numbers measured in each run; leading axis B, or 1 where all runs share them.
-
-    basis : (B, K, G, g, 3, 2). whiten : (B, K, G, 2g, 2g). optics : (B, K, G, 2g, w) change of
-    the measured normals, less the predicted ones', by the w unknowns of their camera: the edge
-    shift (px), then its intrinsics where they are refined (in units of their prior).
-    joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale squared.
-    """
-
-    basis: Array
-    whiten: Array
-    optics: Array
-    joints: Array
-    weight: Array
-
-
-@dataclass(frozen=True)
-class BatchState:
-    """Unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
-    T_base_platform (B, K, 4, 4), optics (B, C, w).
-    """
-
-    z: Array
-    T_camera_base: Array
-    T_base_platform: Array
-    optics: Array
 
 
 class Ends(NamedTuple):
@@ -100,7 +62,7 @@ class Problem:
     layout, drawing (P,), free (P, nz) : the machine. blocks, data : the measurements.
     joint_noise : standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns (z, stations, optics) and prior_target : (c,).
-    frames : (12, g) frame changes that the model allows.
+    frames : (12, g) frame changes that the model allows. pose_blocks, pose_data : of boards.
     """
 
     layout: LimbLayout
@@ -114,10 +76,17 @@ class Problem:
     prior: Array
     prior_target: Array
     frames: Array
+    pose_blocks: PoseBlocks = field(default_factory=no_poses)
+    pose_data: PoseData = field(default_factory=PoseData)
 
     @property
     def n_shared(self) -> int:
         """Number of shared unknowns."""
+        return self._mounts_at + 6 * self.pose_blocks.n_mounts
+
+    @property
+    def _mounts_at(self) -> int:
+        """Where the mounts' unknowns begin: after z, stations and optics."""
         return self.free.shape[1] + 6 * self.n_stations + self.n_cameras * self.n_optics
 
     @property
@@ -130,6 +99,16 @@ class Problem:
         """Rows of a configuration that belong to edges; they come first."""
         return self.blocks.side.size // self.blocks.side.shape[0] * 2
 
+    @property
+    def closure_rows(self) -> slice:
+        """Rows of a configuration that are the closure's."""
+        return slice(self.n_edge_rows, self.n_edge_rows + self.layout.n_equations)
+
+    @property
+    def pose_rows(self) -> slice:
+        """Rows of a configuration that are boards' poses; they come last."""
+        return slice(self.closure_rows.stop, None)
+
     def theta(self, state: BatchState) -> Array:
         """Machine parameters (B, P)."""
         return self.drawing + state.z @ self.free.T
@@ -138,18 +117,35 @@ class Problem:
         """Residuals; NaN where a leg passes through the camera."""
         c = self._closure(state)
         edges = self._normals(state, c.ends.a, c.ends.b)
-        rows = np.concatenate([self._edge_rows(state, edges.n), self._closure_rows(c)], -1)
-        return Values(rows, self._prior_rows(state))
+        rows = [self._edge_rows(state, edges.n), self._closure_rows(c)]
+        if self.pose_blocks.count:
+            value = self._poses(state).value
+            rows.append(value.reshape(*value.shape[:2], -1))
+        return Values(np.concatenate(rows, axis=-1), self._prior_rows(state))
 
     def linearize(self, state: BatchState) -> Linear:
         """Residuals and exact Jacobian."""
         c = self._closure(state)
         edges = self._normals(state, c.ends.a, c.ends.b)
-        value = np.concatenate([self._edge_rows(state, edges.n), self._closure_rows(c)], -1)
         by_a, by_b = self._project(edges.by_a), self._project(edges.by_b)
-        shared = self._edge_by_shared(state, c, edges, by_a, by_b)
-        by_shared = np.concatenate([shared, self._closure_by_shared(c)], axis=-2)
-        by_own = self._by_own(state, c, by_b)
+        value = [self._edge_rows(state, edges.n), self._closure_rows(c)]
+        by_shared = [self._edge_by_shared(state, c, edges, by_a, by_b), self._closure_by_shared(c)]
+        by_own = [self._by_own(state, c, by_b)]
+        if self.pose_blocks.count:
+            poses = self._poses(state)
+            value.append(poses.value.reshape(*poses.value.shape[:2], -1))
+            by_shared.append(self._pose_by_shared(poses))
+            own = poses.by_own @ self.layout.motion
+            by_own.append(own.reshape(*own.shape[:2], -1, own.shape[-1]))
+        return self._linear(
+            state,
+            np.concatenate(value, axis=-1),
+            np.concatenate(by_shared, axis=-2),
+            np.concatenate(by_own, axis=-2),
+        )
+
+    def _linear(self, state: BatchState, value: Array, by_shared: Array, by_own: Array) -> Linear:
+        """The rows with what cannot be predicted, or is not there, put to zero."""
         # padding may lie anywhere, so its derivatives need not be finite though its row is zero
         usable = np.isfinite(value) & self._rows_in_use(value.shape)
         lost = ~np.isfinite(value + by_shared.sum(axis=-1))
@@ -170,18 +166,23 @@ class Problem:
         drawing's soft hold on the frames would be found along a curved valley.
         """
         nz, ns = self.free.shape[1], 6 * self.n_stations
-        by_frames = np.linalg.pinv(self.free) @ generators(self.layout, self.theta(state))
+        by_frames = generators(self.layout, self.theta(state), self.drawing)
+        by_frames = np.linalg.pinv(self.free) @ by_frames
         y = self.frames @ np.linalg.pinv(by_frames @ self.frames) @ shared[:, :nz, None]
         z = shared[:, :nz] - (by_frames @ y)[..., 0]
         camera = shared[:, nz : nz + ns].reshape(-1, self.n_stations, 6)
         camera = camera - (station_generators(state.T_camera_base) @ y[:, None])[..., 0]
         pose = own @ self.layout.motion.T
         pose = pose - (pose_generators(state.T_base_platform) @ y[:, None])[..., 0]
+        m = self._mounts_at
+        mount = shared[:, m:].reshape(*state.T_mount.shape[:2], 6)
+        by_frame = mount_generators(state.T_mount, self.pose_blocks.on_platform)
         inner = BatchState(
             state.z + z,
             perturb(state.T_camera_base, camera),
             perturb(state.T_base_platform, pose),
-            state.optics + shared[:, nz + ns :].reshape(state.optics.shape),
+            state.optics + shared[:, nz + ns : m].reshape(state.optics.shape),
+            perturb(state.T_mount, mount - (by_frame @ y[:, None])[..., 0]),
         )
         return self._in_frames(inner, y[..., 0])
 
@@ -189,20 +190,22 @@ class Problem:
         """The state after exact frame changes y (B, 12)."""
         e, f = perturb(np.eye(4), y[:, :6]), perturb(np.eye(4), y[:, 6:])
         theta = moved_centres(self.layout, self.theta(state), e, f)
+        theta = on_tangents(self.layout, theta, self.drawing)
         return BatchState(
             (theta - self.drawing) @ np.linalg.pinv(self.free).T,
             state.T_camera_base @ inverse(e)[:, None],
             e[:, None] @ state.T_base_platform @ inverse(f)[:, None],
             state.optics,
+            moved_mounts(state.T_mount, self.pose_blocks.on_platform, e, f),
         )
 
     def select(self, runs: Integers) -> Problem:
         """The problem of some runs only."""
-        part = {
-            name: array if array.shape[0] == 1 else array[runs]
-            for name, array in vars(self.data).items()
-        }
-        return replace(self, data=Data(**part))
+        return replace(
+            self,
+            data=Data(**_of_runs(self.data, runs)),
+            pose_data=PoseData(**_of_runs(self.pose_data, runs)),
+        )
 
     @staticmethod
     def take(state: BatchState, runs: Integers) -> BatchState:
@@ -226,7 +229,33 @@ class Problem:
         plain = self.weighted(self.blocks.present[None].astype(float))
         c = plain._closure(state)
         n = plain._normals(state, c.ends.a, c.ends.b).n
-        return plain._edge_rows(state, n).reshape(*n.shape[:3], -1)
+        return plain._edge_rows(state, n).reshape(*n.shape[:3], 2 * self.blocks.side.shape[-1])
+
+    def pose_residuals(self, state: BatchState) -> Array:
+        """Whitened errors of the measured boards' poses, (B, K, G, 6)."""
+        return self._poses(state).value
+
+    def _poses(self, state: BatchState) -> PoseRows:
+        return pose_rows(
+            self.pose_blocks,
+            self.pose_data,
+            state.T_camera_base,
+            state.T_base_platform,
+            state.T_mount,
+        )
+
+    def _pose_by_shared(self, rows: PoseRows) -> Array:
+        """Rows of boards' poses by the shared unknowns, (B, K, 6G, na)."""
+        shape = rows.by_station.shape[:-1]
+        nz, n_optics = self.free.shape[1], self.n_cameras * self.n_optics
+        parts = [
+            np.zeros((*shape, nz)),
+            _one_hot(rows.by_station, self.pose_blocks.station, self.n_stations),
+            np.zeros((*shape, n_optics)),
+            _one_hot(rows.by_mount, self.pose_blocks.mount, self.pose_blocks.n_mounts),
+        ]
+        out = np.concatenate(parts, axis=-1)
+        return out.reshape(*out.shape[:2], -1, out.shape[-1])
 
     def _closure(self, state: BatchState) -> Closure:
         theta = self.theta(state)[:, None, :]
@@ -236,7 +265,7 @@ class Problem:
         nz = self.free.shape[1]
         x = np.zeros((state.z.shape[0], self.n_shared))
         x[:, :nz] = state.z
-        x[:, nz + 6 * self.n_stations :] = state.optics.reshape(len(x), -1)
+        x[:, nz + 6 * self.n_stations : self._mounts_at] = state.optics.reshape(len(x), -1)
         return x @ self.prior.T - self.prior_target
 
     def _normals(self, state: BatchState, a: Array, b: Array) -> Ends:
@@ -272,6 +301,8 @@ class Problem:
         edges = np.repeat(self.data.weight > 0, self.data.whiten.shape[-1], axis=-1)
         used = np.ones(shape, dtype=bool)
         used[..., : edges.shape[-1]] = edges
+        if self.pose_blocks.count:
+            used[..., self.pose_rows] = np.repeat(self.pose_data.weight > 0, 6, axis=-1)
         return used
 
     def _closure_rows(self, c: Closure) -> Array:
@@ -279,8 +310,9 @@ class Problem:
 
     def _closure_sigma(self, c: Closure) -> Array:
         """Standard deviation of each closure; its own derivative is multiplied by c = 0."""
-        slope = np.where(self.layout.actuated >= 0, np.abs(c.by_reading), 1.0)
-        return slope * self.joint_noise
+        read = np.zeros(self.layout.n_equations, dtype=bool)
+        read[self.layout.driven_rows] = True
+        return np.where(read, np.abs(c.by_reading) * self.joint_noise, PERFECT)
 
     def _edge_by_shared(
         self, state: BatchState, c: Closure, e: Ends, by_a: Array, by_b: Array
@@ -305,29 +337,23 @@ class Problem:
             _one_hot(by_station, self.blocks.station, self.n_stations),
             _one_hot(optics, self.blocks.camera, self.n_cameras),
         ]
+        parts.append(np.zeros((*by_station.shape[:-1], 6 * self.pose_blocks.n_mounts)))
         out = np.concatenate(parts, axis=-1)
-        return out.reshape(*out.shape[:2], -1, out.shape[-1])
+        return out.reshape(*out.shape[:2], out.shape[2] * out.shape[3], out.shape[-1])
 
     def _by_own(self, state: BatchState, c: Closure, by_b: Array) -> Array:
         """Edge and closure rows by the platform's motion, (B, K, r, d)."""
         rot = state.T_camera_base[:, self.blocks.station, :3, :3]
         legs, k = self.blocks.leg, np.arange(len(self.blocks.leg))[:, None]
         edges = by_b @ (rot @ c.ends.b_by_pose[:, k, legs])
-        edges = edges.reshape(*edges.shape[:2], -1, 6)
+        edges = edges.reshape(*edges.shape[:2], edges.shape[2] * edges.shape[3], 6)
         closures = c.by_pose / self._closure_sigma(c)[..., None]
         return np.concatenate([edges, closures], axis=-2) @ self.layout.motion
 
     def _closure_by_shared(self, c: Closure) -> Array:
-        """Closure rows by the shared unknowns, (B, K, L, na)."""
-        inverse = 1 / self._closure_sigma(c)[..., None]
-        rod = np.broadcast_to(-inverse, (*c.value.shape, 1))
-        free = self._to_free(
-            [
-                (c.ends.a_index[None], (c.a_by * inverse)[..., None, :]),
-                (c.ends.b_index[None], (c.b_by * inverse)[..., None, :]),
-                (self.layout.rod[None, :, None], rod[..., None, :]),
-            ]
-        )[..., 0, :]
+        """Closure rows by the shared unknowns, (B, K, E, na)."""
+        by_theta = (c.by_theta / self._closure_sigma(c)[..., None])[..., None, :]
+        free = self._to_free([(c.index[None], by_theta)])[..., 0, :]
         rest = np.zeros((*free.shape[:-1], self.n_shared - free.shape[-1]))
         return np.concatenate([free, rest], axis=-1)
 
@@ -337,13 +363,26 @@ class Problem:
         parts : positions (K or 1, G, n) and derivatives (B, K, G, rows, n).
         """
         shape = np.broadcast_shapes(*(values.shape[:-1] for _, values in parts))
-        columns = self.free.sum(axis=0)
-        full = np.zeros((*shape, self.drawing.size))
+        n = self.drawing.size
+        full = np.zeros((*shape, n + 1))  # the last column takes what is no parameter's
         for index, values in parts:
             np.put_along_axis(full, index[None, :, :, None, :], values, axis=-1)
-        if np.all(columns == 1):  # no ties: a choice of columns, far cheaper than a product
-            return full[..., np.argmax(self.free, axis=0)]
-        return full @ self.free
+        if self.choice is not None:  # no ties, no axes: a choice of columns, far cheaper
+            return full[..., self.choice]
+        return full[..., :n] @ self.free
+
+    @cached_property
+    def choice(self) -> Integers | None:
+        """The parameter of each free unknown where each moves one parameter alone."""
+        alone = np.all((self.free != 0).sum(axis=0) == 1) and np.all(self.free.sum(axis=0) == 1)
+        return np.argmax(self.free, axis=0) if alone else None
+
+
+def _of_runs(data: Data | PoseData, runs: Integers) -> dict[str, Array]:
+    """The numbers of some runs; what all runs share stays."""
+    return {
+        name: array if array.shape[0] == 1 else array[runs] for name, array in vars(data).items()
+    }
 
 
 def _one_hot(values: Array, index: Integers, n: int) -> Array:

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.blocks import BatchState
+from pkmcal.identify.residuals import Problem
 from pkmcal.identify.solver import FIRST_DAMPING, RESTART_DAMPING, minimise
 
 FULL, NONE = 4.0, 6.5
@@ -47,6 +48,8 @@ def robust_scale(d: Array) -> Array:
     """Factor by which the noise seems to differ from the stated one, from the median, (B,)."""
     flat = np.sort(d.reshape(d.shape[0], -1), axis=1)  # NaN last
     count = np.sum(np.isfinite(flat), axis=1)
+    if not count.all():  # no edge at all: boards alone
+        return np.ones(len(flat))
     return flat[np.arange(len(flat)), count // 2] / np.sqrt(2 * np.log(2))
 
 

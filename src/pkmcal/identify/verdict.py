@@ -8,7 +8,9 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
+from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.problem import Estimate
+from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
 from pkmcal.observe.edges import Observation
 
 FAR = 5.0
@@ -19,6 +21,12 @@ TOO_MANY_LOST = 0.4
 """Share of edges given up as outliers beyond which the rest may be the outliers."""
 DECIDED = 0.5
 """Share of a value that the data must decide for it to count as calibrated."""
+LEFT_OPEN = 0.05
+"""Share of the platform's error by the drawing that may be left undecided. A calibration makes the
+drawing's error twenty to fifty times smaller; what leaves a twentieth of it would be the result's
+largest error, and one that more of the same photographs do not shrink."""
+LARGE = 0.3
+"""Share of what is undecided from which on a single cause of it is worth a reason."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +49,23 @@ def judge(
     observation: Observation,
     estimate: Estimate,
     method: str = "bundle",
+    told: Identifiability | None = None,
+    *,
+    findings: Findings | None = None,
 ) -> Verdict:
-    """The verdict on an estimate of a session by a method."""
-    reasons = tuple(_reasons(estimate, method))
-    warnings = tuple(_warnings(observation, estimate))
+    """The verdict on an estimate of a session by a method.
+
+    told : what the data tell of the machine; findings : the same in words, made from ``told`` and
+    the edges where absent. Without both, values that the data do not decide speak for themselves.
+    """
+    if findings is None and told is not None:
+        stations, legs = len(estimate.state.T_camera_base), estimate.machine.n_legs
+        seen = seen_legs(observation.edges, estimate.edge_weights, stations, legs)
+        findings = explain(told, estimate, seen)
+    large, small = _left_open(estimate, findings) if findings else ((), ())
+    left = _undecided_text(estimate) if findings is None else _said(large)
+    reasons = tuple(_reasons(estimate, method, left))
+    warnings = tuple(_warnings(observation, estimate) + _said(small))
     if reasons:
         headline = "This calibration should not be used."
     else:
@@ -57,7 +78,7 @@ def judge(
     return Verdict(not reasons, headline, reasons, warnings, tuple(_advice(estimate)))
 
 
-def _reasons(estimate: Estimate, method: str) -> list[str]:
+def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]:
     out: list[str] = []
     lost = float(np.mean(estimate.edge_weights < 0.5))
     if estimate.statistics.noise_scale > TOO_NOISY and method != "bundle":
@@ -77,12 +98,7 @@ def _reasons(estimate: Estimate, method: str) -> list[str]:
             f"{lost:.0%} of the edges do not fit the rest; below {TOO_MANY_LOST:.0%} the majority"
             " can be trusted to be right."
         )
-    undecided = _undecided(estimate)
-    if undecided:
-        out.append(
-            f"The data hardly say more than the drawing about {_names(undecided)}: more"
-            " configurations, with legs that point elsewhere, are needed."
-        )
+    out.extend(undecided)
     bad = np.abs(estimate.joint_residuals) > 6.0
     if np.mean(bad) > 0.02:
         leg = int(np.argmax(bad.sum(axis=0))) + 1
@@ -91,6 +107,40 @@ def _reasons(estimate: Estimate, method: str) -> list[str]:
             f" ({int(bad.sum())} of {bad.size} by more than 6 standard deviations)."
         )
     return out
+
+
+def _left_open(
+    estimate: Estimate, findings: Findings
+) -> tuple[tuple[Sentence, ...], tuple[Sentence, ...]]:
+    """What is undecided: reasons against the result, and what to know of it.
+
+    Only what moves the platform counts. What the data know a little counts where they do not
+    decide one of its values; otherwise its deviations say enough.
+    """
+    undecided = set(_undecided(estimate))
+    weak = tuple(s for s in findings.weak if s.matters and undecided & set(s.parameters))
+    open_ = findings.unidentified + weak
+    total = float(np.sqrt(sum(s.moves_platform**2 for s in open_ if s.matters)))
+    if total <= LEFT_OPEN * findings.by_drawing:
+        return (), open_
+    least = min(LARGE * total, max(s.moves_platform for s in open_))
+    large = tuple(s for s in open_ if s.matters and s.moves_platform >= least)
+    return large, tuple(s for s in open_ if s not in large)
+
+
+def _said(sentences: tuple[Sentence, ...]) -> list[str]:
+    return [f"{s.text} {s.advice}" for s in sentences]
+
+
+def _undecided_text(estimate: Estimate) -> list[str]:
+    """That values are undecided, where nothing more is known of it."""
+    undecided = _undecided(estimate)
+    if not undecided:
+        return []
+    return [
+        f"The data hardly say more than the drawing about {_names(undecided)}: more"
+        " configurations, with legs that point elsewhere, are needed."
+    ]
 
 
 def _undecided(estimate: Estimate) -> list[str]:

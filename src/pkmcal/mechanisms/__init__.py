@@ -46,9 +46,12 @@ def load_mechanism(source: Path | str, label: str | None = None) -> Machine:
     document = read_yaml(path, label)
     checked = validate(document, MechanismDocument)
     try:
-        return machine_from_document(checked)
+        return machine_from_document(checked, document.where)
     except InputError as error:  # a name under fixed or tied that is no parameter's
-        raise error.located(document.label) from None
+        where = error.where or ""
+        raise (
+            error if where.startswith(document.label) else error.located(document.label)
+        ) from None
 
 
 def mechanism_text(machine: Machine) -> str:

@@ -42,10 +42,10 @@ def inverse(layout: LimbLayout, theta: Array, poses: Array) -> Array:
 
     Rods on a fixed centre only; the closure is then linear in the reading.
     """
-    driven = layout.actuated >= 0
-    zeros = np.zeros((*poses.shape[:-2], int(driven.sum())))
+    rows = layout.driven_rows
+    zeros = np.zeros((*poses.shape[:-2], rows.size))
     at_zero = closure(layout, theta, zeros, poses)
-    return -at_zero.value[..., driven] / at_zero.by_reading[..., driven]
+    return -at_zero.value[..., rows] / at_zero.by_reading[..., rows]
 
 
 def forward(layout: LimbLayout, theta: Array, readings: Array, start: Array) -> ForwardResult:
@@ -100,7 +100,7 @@ def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:
     radius = np.where(radius > 0, radius, 1.0)[..., None]  # legs that meet in a point turn nothing
     scale = np.concatenate([np.repeat(1 / radius, 3, -1), np.ones((*radius.shape[:-1], 3))], -1)
     jac = (by_pose * scale[..., None, :]) @ layout.motion
-    if layout.n_legs < jac.shape[-1]:  # with fewer rods than freedoms it can always move
+    if layout.n_equations < jac.shape[-1]:  # fewer than its freedoms: it can always move
         return np.zeros(jac.shape[:-2])
     return np.linalg.svd(jac, compute_uv=False)[..., -1]
 
@@ -111,13 +111,40 @@ def home_candidates(layout: LimbLayout, theta: Array, readings: Array) -> Array:
     """
     ends = limb_ends(layout, theta, np.zeros_like(readings), np.eye(4))
     shift = ends.a.mean(axis=-2) - ends.b.mean(axis=-2)
-    reach = float(np.abs(rod_lengths(layout, theta, readings)).mean())
+    reach = _reach(layout, theta, readings)
     flat = float(np.linalg.norm((ends.b + shift - ends.a)[..., :2], axis=-1).mean())
     height = np.sqrt(max(reach**2 - flat**2, (0.3 * reach) ** 2))
     starts = [pose(np.eye(3), shift + np.array([0.0, 0.0, s * height])) for s in (1, -1)]
     if layout.motion.shape[1] == 3 and layout.motion[2, 0] == 1:
         starts = [pose(rotation(np.array([0, 0, a])), shift) for a in (0.0, 0.5, -0.5, 1.0, -1.0)]
     return np.stack(starts)
+
+
+def _reach(layout: LimbLayout, theta: Array, readings: Array) -> float:
+    """Mean length of the rods whose length is known, m."""
+    return float(np.abs(rod_lengths(layout, theta, readings)[layout.closing]).mean())
+
+
+def on_manifold(layout: LimbLayout, theta: Array, poses: Array) -> ForwardResult:
+    """Poses (..., 4, 4) moved to where everything closes that no drive can change.
+
+    Constant rods and joints' axes leave a platform only some poses; readings follow from these.
+    Gauss-Newton with the shortest step, so a pose that is right stays where it is.
+    """
+    passive = np.ones(layout.n_equations, dtype=bool)
+    passive[layout.driven_rows] = False
+    current, zeros = np.array(poses), np.zeros((*poses.shape[:-2], layout.driven_rows.size))
+    c = closure(layout, theta, zeros, current)
+    for _ in range(MAX_STEPS if passive.any() else 0):
+        value = c.value[..., passive]
+        if np.abs(value).max() < CONVERGED * 1e-2:
+            break
+        jac = c.by_pose[..., passive, :] @ layout.motion
+        step = -np.linalg.pinv(jac) @ value[..., None]
+        current = perturb(current, (layout.motion @ step)[..., 0])
+        c = closure(layout, theta, zeros, current)
+    error = np.abs(c.value[..., passive]).max(axis=-1, initial=0.0)
+    return ForwardResult(current, error < CONVERGED, error, singularity(layout, theta, c.by_pose))
 
 
 def assembly_modes(
@@ -132,7 +159,7 @@ def assembly_modes(
     A multi-start search: every mode returned is one; that none is missing is not proven.
     """
     home = home_candidates(layout, theta, readings)[0]
-    reach = float(np.abs(rod_lengths(layout, theta, readings)).mean())
+    reach = _reach(layout, theta, readings)
     turns = rng.normal(size=(starts, 3)) * 1.2
     shifts = rng.normal(size=(starts, 3)) * reach
     delta = np.concatenate([turns, shifts], axis=-1) @ layout.motion @ layout.motion.T

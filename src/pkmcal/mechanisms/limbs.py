@@ -1,4 +1,4 @@
-"""The closure equation of every machine, |B_j - A_j| = length_j, with its derivatives.
+"""The closure of every machine, |B_j - A_j| = length_j and what its joints' axes add.
 
 All functions take the parameter vector as an array (..., P), so that a whole Monte-Carlo
 batch of machines is one call: leading axes of parameters, readings and poses broadcast.
@@ -6,14 +6,16 @@ batch of machines is one call: leading axes of parameters, readings and poses br
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot
+from pkmcal.mechanisms.angles import AngleLayout, angle_layout, angle_rows
 from pkmcal.mechanisms.carriers.contract import CarriedPoint, base_carriers, platform_carriers
+from pkmcal.mechanisms.rods import ActuatedLength, PassiveLength
 from pkmcal.mechanisms.schema import MechanismDocument
 
 
@@ -34,18 +36,41 @@ class LimbLayout:
     """Where each leg finds its parameters; made once from the document.
 
     base, platform : groups of legs by carrier.
-    rod : (L,) position of each rod's offset or constant length.
-    actuated : (L,) the reading's column, -1 for a rod of constant length.
+    rod : (L,) position of each rod's offset or constant length, -1 for a passive rod.
+    closing : (L,) legs whose length is an equation; all but the passive ones.
+    actuated : (L,) the reading's column, -1 for a leg without.
+    rod_reads : (L,) whether the reading is the rod's own length (and not the carrier's motion).
+    base_axis, platform_axis : (L, 3) positions of the axes' parameters, -1 where none is one.
+    angles : the axes' equations. turning : positions (n, 3) of all directions among the
+    parameters that turn with the base frame, and with the platform frame.
     radius : list of (tubes,) positions of each leg's radii.
+    motion : (6, d) directions in which the platform moves. n_parameters : P.
     """
 
     n_legs: int
     base: tuple[CarrierGroup, ...]
     platform: tuple[CarrierGroup, ...]
     rod: Integers
+    closing: Booleans
     actuated: Integers
+    rod_reads: Booleans
+    base_axis: Integers
+    platform_axis: Integers
+    angles: AngleLayout
+    turning: tuple[Integers, Integers]
     radius: tuple[Integers, ...]
     motion: Array
+    n_parameters: int
+
+    @property
+    def n_equations(self) -> int:
+        """Rows of the closure: lengths, then angles."""
+        return int(self.closing.sum()) + len(self.angles)
+
+    @property
+    def driven_rows(self) -> Integers:
+        """Rows of the closure that belong to legs with a reading, in the legs' order."""
+        return np.flatnonzero(self.actuated[self.closing] >= 0)
 
 
 @dataclass(frozen=True)
@@ -53,9 +78,9 @@ class LimbEnds:
     """Both ends of all limbs with derivatives; leading axes broadcast, then L legs.
 
     a, b : (..., L, 3) m, base frame.
-    a_index, b_index : (L, n) parameters that each end depends on.
+    a_index, b_index : (L, n) parameters that each end depends on, P where there are fewer.
     a_by, b_by : (..., L, 3, n) derivatives by those parameters.
-    a_by_reading : (..., L, 3); b_by_pose : (..., L, 3, 6).
+    a_by_reading : (..., L, 3); b_by_pose : (..., L, 3, 6). n_parameters : P.
     """
 
     a: Array
@@ -66,15 +91,17 @@ class LimbEnds:
     b_by: Array
     a_by_reading: Array
     b_by_pose: Array
+    n_parameters: int
 
 
 @dataclass(frozen=True)
 class Closure:
-    """Residual c = |B - A| - length of every limb, (..., L), and its derivatives.
+    """The closure's rows, (..., E): lengths of the legs that close, then the axes' equations.
 
-    u : (..., L, 3) unit directions from A to B. distance : (..., L) m.
-    by_pose : (..., L, 6); by_reading : (..., L); by_ends : A's (..., L, n) and B's, on the
-    indices of ``ends``; by the rod's own parameter it is -1.
+    value : m. u : (..., L, 3) unit directions from A to B of all legs. distance : (..., L) m.
+    by_pose : (..., E, 6). by_reading : (..., E) by the leg's own reading, zero where it has none.
+    index, by_theta : (E, n) parameters that each row depends on, P where there is none, and the
+    derivatives (..., E, n) by them.
     """
 
     value: Array
@@ -82,8 +109,8 @@ class Closure:
     distance: Array
     by_pose: Array
     by_reading: Array
-    a_by: Array
-    b_by: Array
+    index: Integers
+    by_theta: Array
     ends: LimbEnds
 
 
@@ -98,15 +125,23 @@ MOTIONS: dict[str, Array] = {
 def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLayout:
     """The layout of a document whose parameters stand at ``positions``."""
     legs = document.legs
-    actuated = np.array([leg.length.actuated for leg in legs])
-    columns = np.where(actuated, np.cumsum(actuated) - 1, -1)
-    rod_name = ["offset" if flag else "constant" for flag in actuated]
+    carriers = base_carriers()
+    reads = np.array([isinstance(leg.length, ActuatedLength) for leg in legs])
+    driven = reads | np.array([carriers[leg.base.joint].driven for leg in legs])
+    closing = np.array([not isinstance(leg.length, PassiveLength) for leg in legs])
+    base_axis, platform_axis = (_axis_index(document, s, positions) for s in ("base", "platform"))
     return LimbLayout(
         n_legs=len(legs),
-        base=_groups(document, "base", base_carriers(), positions),
+        base=_groups(document, "base", carriers, positions),
         platform=_groups(document, "platform", platform_carriers(), positions),
-        rod=np.array([positions[f"legs[{j + 1}].length.{rod_name[j]}"] for j in range(len(legs))]),
-        actuated=columns,
+        rod=np.array([_rod_index(j, leg.length, positions) for j, leg in enumerate(legs)]),
+        closing=closing,
+        actuated=np.where(driven, np.cumsum(driven) - 1, -1),
+        rod_reads=reads,
+        base_axis=base_axis,
+        platform_axis=platform_axis,
+        angles=angle_layout(document, base_axis, platform_axis),
+        turning=(_turning("base", positions), _turning("platform", positions)),
         radius=tuple(
             np.array(
                 [positions[f"legs[{j + 1}].tubes[{t + 1}].radius"] for t in range(len(leg.tubes))],
@@ -115,7 +150,27 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
             for j, leg in enumerate(legs)
         ),
         motion=MOTIONS[document.motion],
+        n_parameters=len(positions),
     )
+
+
+def _axis_index(document: MechanismDocument, side: str, positions: dict[str, int]) -> Integers:
+    """Positions (L, 3) of the axes' parameters on one side, -1 where there is none."""
+    names = [[f"legs[{j + 1}].{side}.axis.{c}" for c in "xyz"] for j in range(len(document.legs))]
+    return np.array([[positions.get(name, -1) for name in row] for row in names], dtype=int)
+
+
+def _turning(side: str, positions: dict[str, int]) -> Integers:
+    """Positions (n, 3) of the directions on one side, whoever has them; three in a row."""
+    first = [k for name, k in positions.items() if f".{side}." in name and name.endswith("axis.x")]
+    return np.array(first, dtype=int)[:, None] + np.arange(3)
+
+
+def _rod_index(leg: int, length: Any, positions: dict[str, int]) -> int:
+    if isinstance(length, PassiveLength):
+        return -1
+    field = "offset" if isinstance(length, ActuatedLength) else "constant"
+    return positions[f"legs[{leg + 1}].length.{field}"]
 
 
 def _groups(
@@ -157,17 +212,22 @@ def limb_ends(layout: LimbLayout, theta: Array, readings: Array, poses: Array) -
         b.by_parameters,
         a.by_motion,
         b.by_motion,
+        layout.n_parameters,
     )
 
 
 def leg_readings(layout: LimbLayout, readings: Array) -> Array:
-    """Readings (..., m) spread over the legs (..., L), zero for rods of constant length."""
+    """Readings (..., m) spread over the legs (..., L), zero for legs without one."""
     return np.where(layout.actuated >= 0, readings[..., np.maximum(layout.actuated, 0)], 0.0)
 
 
 def rod_lengths(layout: LimbLayout, theta: Array, readings: Array) -> Array:
-    """Length of every rod (..., L), m: reading + offset, or the constant; [B] eq. 4."""
-    return theta[..., layout.rod] + leg_readings(layout, readings)
+    """Length of every rod (..., L), m: reading + offset, or the constant; [B] eq. 4.
+
+    NaN for passive rods, whose length nobody knows.
+    """
+    own = np.where(layout.closing, theta[..., layout.rod], np.nan)
+    return own + np.where(layout.rod_reads, leg_readings(layout, readings), 0.0)
 
 
 def _gather(
@@ -177,7 +237,7 @@ def _gather(
     if len(groups) == 1:
         return points[0], groups[0].index
     width = max(g.index.shape[1] for g in groups)
-    index = np.zeros((layout.n_legs, width), dtype=int)
+    index = np.full((layout.n_legs, width), layout.n_parameters)
     shape = np.broadcast_shapes(*(p.value.shape[:-2] for p in points))
     motion = points[0].by_motion.shape[len(points[0].value.shape) - 1 :]
     value = np.zeros((*shape, layout.n_legs, 3))
@@ -193,7 +253,7 @@ def _gather(
 
 
 def closure(layout: LimbLayout, theta: Array, readings: Array, poses: Array) -> Closure:
-    """The closure residual of every limb and its exact derivatives; [B] eq. 4, [A] eq. 13.
+    """The closure's residuals and their exact derivatives; [B] eq. 4, [A] eq. 7 and 13.
 
     theta : (..., P). readings : (..., m). poses : T_base_platform (..., 4, 4).
     """
@@ -201,13 +261,127 @@ def closure(layout: LimbLayout, theta: Array, readings: Array, poses: Array) -> 
     d = ends.b - ends.a
     distance = np.sqrt(dot(d, d))
     u = d / distance[..., None]
-    return Closure(
-        value=distance - rod_lengths(layout, theta, readings),
+    lengths = _length_rows(layout, theta, readings, u, distance, ends)
+    if not len(layout.angles):
+        return lengths
+    return _joined(lengths, _angle_closure(layout, theta, poses, d, lengths))
+
+
+def _length_rows(
+    layout: LimbLayout, theta: Array, readings: Array, u: Array, distance: Array, ends: LimbEnds
+) -> Closure:
+    """|B - A| - length of the legs that close."""
+    rod = np.where(layout.closing, layout.rod, layout.n_parameters)[:, None]
+    by_a, by_b = -along(u, ends.a_by), along(u, ends.b_by)
+    value = distance - rod_lengths(layout, theta, readings)
+    shape = np.broadcast_shapes(by_a.shape[:-1], by_b.shape[:-1], value.shape)
+    parts = (by_a, by_b, np.full((1, 1), -1.0))
+    by_theta = [np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts]
+    rows = Closure(
+        value=value,
         u=u,
         distance=distance,
-        by_pose=(u[..., None, :] @ ends.b_by_pose)[..., 0, :],
-        by_reading=-dot(u, ends.a_by_reading) - (layout.actuated >= 0),
-        a_by=-(u[..., None, :] @ ends.a_by)[..., 0, :],
-        b_by=(u[..., None, :] @ ends.b_by)[..., 0, :],
+        by_pose=along(u, ends.b_by_pose),
+        by_reading=-dot(u, ends.a_by_reading) - layout.rod_reads,
+        index=np.concatenate([ends.a_index, ends.b_index, rod], axis=1),
+        by_theta=np.concatenate(by_theta, axis=-1),
         ends=ends,
     )
+    if layout.closing.all():
+        return rows
+    keep = layout.closing
+    return replace(
+        rows,
+        value=rows.value[..., keep],
+        by_pose=rows.by_pose[..., keep, :],
+        by_reading=rows.by_reading[..., keep],
+        index=rows.index[keep],
+        by_theta=rows.by_theta[..., keep, :],
+    )
+
+
+def along(u: Array, by: Array) -> Array:
+    """Derivatives (..., 3, n) of a point, along a direction (..., 3): (..., n)."""
+    return (u[..., None, :] @ by)[..., 0, :]
+
+
+def _angle_closure(
+    layout: LimbLayout, theta: Array, poses: Array, line: Array, lengths: Closure
+) -> Closure:
+    """The axes' equations as closure rows."""
+    angles, ends = layout.angles, lengths.ends
+    leg = angles.leg
+    rows = angle_rows(angles, theta, poses[..., :3, :3], line[..., leg, :])
+    w = rows.by_line
+    by_pose = along(w, ends.b_by_pose[..., leg, :, :])
+    by_pose = by_pose + np.concatenate([rows.by_turn, np.zeros_like(rows.by_turn)], axis=-1)
+    parts = (
+        -along(w, ends.a_by[..., leg, :, :]),
+        along(w, ends.b_by[..., leg, :, :]),
+        rows.by_base_axis,
+        rows.by_platform_axis,
+    )
+    shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    by_theta = [np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts]
+    none = layout.n_parameters
+    index = (
+        ends.a_index[leg],
+        ends.b_index[leg],
+        np.where(angles.on_base[:, None], angles.base, none),
+        np.where(angles.on_platform[:, None], angles.platform, none),
+    )
+    return replace(
+        lengths,
+        value=rows.value,
+        by_pose=by_pose,
+        by_reading=-dot(w, ends.a_by_reading[..., leg, :]),
+        index=np.concatenate(index, axis=1),
+        by_theta=np.concatenate(by_theta, axis=-1),
+    )
+
+
+def _joined(lengths: Closure, angles: Closure) -> Closure:
+    """Length rows, then angle rows; parameters padded to a common count."""
+    width = max(lengths.index.shape[1], angles.index.shape[1])
+    none = lengths.ends.n_parameters
+    index, by_theta = [], []
+    for rows in (lengths, angles):
+        spare = width - rows.index.shape[1]
+        index.append(np.pad(rows.index, ((0, 0), (0, spare)), constant_values=none))
+        padding = [(0, 0)] * (rows.by_theta.ndim - 1) + [(0, spare)]
+        by_theta.append(np.pad(rows.by_theta, padding))
+    return replace(
+        lengths,
+        value=_stacked(lengths.value[..., None], angles.value[..., None])[..., 0],
+        by_pose=_stacked(lengths.by_pose, angles.by_pose),
+        by_reading=_stacked(lengths.by_reading[..., None], angles.by_reading[..., None])[..., 0],
+        index=np.concatenate(index),
+        by_theta=_stacked(*by_theta),
+    )
+
+
+def _stacked(first: Array, second: Array) -> Array:
+    """Rows (..., E, n) of both, one below the other; leading axes broadcast."""
+    shape = np.broadcast_shapes(first.shape[:-2], second.shape[:-2])
+    rows = [np.broadcast_to(part, (*shape, *part.shape[-2:])) for part in (first, second)]
+    return np.concatenate(rows, axis=-2)
+
+
+def on_tangents(layout: LimbLayout, theta: Array, drawing: Array) -> Array:
+    """Directions among theta (..., P) made as long as they must be to end on the tangent plane of
+    the drawing's (P,); see :meth:`pkmcal.mechanisms.parameters.ParameterTable.on_tangents`.
+    """
+    axes = np.concatenate(layout.turning)
+    if not axes.size:
+        return theta
+    out = np.array(theta)
+    out[..., axes] = theta[..., axes] / dot(theta[..., axes], drawing[axes])[..., None]
+    return out
+
+
+def dense(rows: Closure, n_parameters: int) -> Array:
+    """Derivatives of the rows by all parameters, (..., E, P)."""
+    out = np.zeros((*rows.by_theta.shape[:-1], n_parameters + 1))
+    place = np.broadcast_to(rows.index, rows.by_theta.shape)
+    np.put_along_axis(out, place, rows.by_theta, axis=-1)
+    return out[..., :n_parameters]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,9 +13,11 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import kinematics
 from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.drawing_checks import check_drawing
+from pkmcal.mechanisms.joints import AXIS, axes_in_use
 from pkmcal.mechanisms.limbs import LimbLayout, layout_of
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.mechanisms.rods import CONSTANT, OFFSET, ActuatedLength
+from pkmcal.mechanisms.rods import CONSTANT, OFFSET, ActuatedLength, PassiveLength
 from pkmcal.mechanisms.schema import MechanismDocument
 
 
@@ -73,6 +76,14 @@ class Machine:
     def platform_centers(self) -> Array:
         """Joint centres on the platform, (L, 3) m, platform frame."""
         return self._ends()[1]
+
+    def base_axes(self) -> Array:
+        """Unit axes of the joints on the base, (L, 3), base frame; NaN where none is a parameter."""
+        return self._axes(self.layout.base_axis)
+
+    def platform_axes(self) -> Array:
+        """Unit axes of the joints on the platform, (L, 3), platform frame; NaN where none."""
+        return self._axes(self.layout.platform_axis)
 
     def radii(self) -> tuple[Array, ...]:
         """Each leg's tube radii, m."""
@@ -140,9 +151,14 @@ class Machine:
     def to_document(self) -> dict[str, Any]:
         """The mechanism file's fields with the present values."""
         out = self.document.model_dump(by_alias=True, exclude_none=True, mode="json")
-        for name, value in zip(self.parameters.names, self.values, strict=True):
+        values = self.parameters.unit_axes(self.values)
+        for name, value in zip(self.parameters.names, values, strict=True):
             _assign(out, name, float(value))
         return out
+
+    def _axes(self, index: Array) -> Array:
+        axes = np.where(index >= 0, self.parameters.unit_axes(self.values)[index], np.nan)
+        return axes.reshape(-1, 3)
 
     def _ends(self) -> tuple[Array, Array]:
         from pkmcal.mechanisms.limbs import limb_ends
@@ -151,8 +167,15 @@ class Machine:
         return np.array(ends.a), np.array(ends.b)
 
 
-def machine_from_document(document: MechanismDocument) -> Machine:
-    """Build a machine from a checked mechanism file."""
+def machine_from_document(
+    document: MechanismDocument, where: Callable[..., str] | None = None
+) -> Machine:
+    """Build a machine from a checked mechanism file.
+
+    where : names a field's place in the file by its keys. Raises InputError for a drawing that
+    cannot be a machine's.
+    """
+    check_drawing(document, where)
     rows = list(_parameter_rows(document))
     names = [row[0] for row in rows]
     table = ParameterTable(
@@ -161,24 +184,34 @@ def machine_from_document(document: MechanismDocument) -> Machine:
         kinds=tuple(row[2] for row in rows),
         drawing=np.array([row[3] for row in rows]),
         tolerance=np.array([getattr(document.tolerance, row[2]) for row in rows]),
-    ).with_roles(document.fixed, document.tied)
+    ).with_roles(document.fixed, (*document.tied, *_heights(document)))
     positions = {name: k for k, name in enumerate(names)}
     return Machine(document, table, layout_of(document, positions), table.drawing.copy())
 
 
+def _heights(document: MechanismDocument) -> tuple[tuple[str, str], ...]:
+    """Ties of a planar machine: a leg stays in its plane, so both ends have one height."""
+    if document.motion != "planar":
+        return ()
+    legs = range(1, len(document.legs) + 1)
+    return tuple((f"legs[{j}].base.center.z", f"legs[{j}].platform.center.z") for j in legs)
+
+
 def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator of plain rows
     """Rows (name, unit, tolerance's name, drawing value), leg by leg."""
-    for j, leg in enumerate(document.legs, start=1):
+    axes = axes_in_use(document)
+    for j, leg in enumerate(document.legs):
+        path = f"legs[{j + 1}]"
         for side, carriers in (("base", base_carriers()), ("platform", platform_carriers())):
             node = getattr(leg, side)
-            for kind in carriers[node.joint].parameters:
-                path = f"legs[{j}].{side}.{kind.path}"
-                yield path, kind.unit, kind.tolerance, _value(node, kind.path)
-        kind = OFFSET if leg.length.actuated else CONSTANT
-        value = _value(leg.length, kind.path)
-        yield f"legs[{j}].length.{kind.path}", kind.unit, kind.tolerance, value
+            kinds = carriers[node.joint].parameters + (AXIS if (j, side) in axes else ())
+            for kind in kinds:
+                yield f"{path}.{side}.{kind.path}", *kind[1:], _value(node, kind.path)
+        if not isinstance(leg.length, PassiveLength):
+            kind = OFFSET if isinstance(leg.length, ActuatedLength) else CONSTANT
+            yield f"{path}.length.{kind.path}", *kind[1:], _value(leg.length, kind.path)
         for t, tube in enumerate(leg.tubes, start=1):
-            yield f"legs[{j}].tubes[{t}].radius", "m", "radius", tube.radius
+            yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius
 
 
 def _value(node: Any, path: str) -> float:

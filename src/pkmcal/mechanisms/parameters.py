@@ -2,12 +2,13 @@
 
 A parameter's name is its path in the mechanism file: ``legs[1].base.center.z``. Legs are
 counted from 1, as people do. The estimator works on the free vector z; a tie makes several
-parameters move together, so values = drawing + M z with a constant 0-1 matrix M.
+parameters move together and an axis has two turns, so values = drawing + M z, M constant.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from difflib import get_close_matches
 
 import numpy as np
@@ -16,11 +17,15 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 
 
+PARALLEL = 1e-9
+"""Axes whose components differ by less are one direction in the drawing."""
+
+
 @dataclass(frozen=True)
 class ParameterTable:
     """Every parameter of a machine, in one order.
 
-    names, units, kinds : P entries; ``kinds`` is the tolerance's name: center, offset, radius.
+    names, units, kinds : P entries; ``kinds`` is the tolerance's name: center, offset, radius, axis.
     drawing, tolerance : (P,) drawing values and their standard deviations.
     fixed : names that keep their drawing value.
     tied : groups of names that change by the same amount.
@@ -52,21 +57,140 @@ class ParameterTable:
     def with_roles(
         self, fixed: tuple[str, ...] = (), tied: tuple[tuple[str, ...], ...] = ()
     ) -> ParameterTable:
-        """The same table with other fixed and tied parameters; all names are checked."""
-        for name in (*fixed, *(n for group in tied for n in group)):
-            self.index(name)
-        return replace(self, fixed=tuple(fixed), tied=tuple(tied))
+        """The same table with other fixed and tied parameters; all names are checked.
 
-    def free_matrix(self) -> Array:
-        """M (P, n_free) with values = drawing + M z: one column a free parameter or tie."""
+        ``legs[1].base.axis`` and ``legs[1].base.center`` mean all their components. Of an axis
+        single components cannot be held: it is one direction.
+        """
+        fixed = tuple(name for entry in fixed for name in self._members(entry))
+        groups = [part for group in tied for part in self._together(group)]
+        return replace(self, fixed=fixed, tied=tuple(groups))
+
+    def _members(self, entry: str) -> tuple[str, ...]:
+        """The names that an entry under ``fixed`` means."""
+        whole = tuple(n for n in self.names if n.startswith(f"{entry}."))
+        if whole:
+            return whole
+        k = self.index(entry)
+        if self.kinds[k] == "axis":
+            raise InputError(
+                what=f"{entry} cannot be held alone: an axis is one direction",
+                expected=f"the whole axis, {entry.rpartition('.')[0]!r}",
+            )
+        return (entry,)
+
+    def _together(self, group: tuple[str, ...]) -> list[tuple[str, ...]]:
+        """The ties that a group means: of whole centres or axes, component by component."""
+        members = [self._members(entry) for entry in group]
+        if len({len(m) for m in members}) > 1:
+            raise InputError(
+                what="a whole centre or axis is tied to a single number",
+                found=", ".join(group),
+                expected="entries of one kind",
+            )
+        ties = list(zip(*members, strict=True))
+        if self.kinds[self.index(members[0][0])] == "axis":
+            self._check_parallel(group, members)
+        return ties
+
+    def _check_parallel(self, group: tuple[str, ...], members: list[tuple[str, ...]]) -> None:
+        axes = np.array([[self.drawing[self.index(n)] for n in m] for m in members])
+        if np.abs(axes - axes[0]).max() > PARALLEL:
+            raise InputError(
+                what="axes that differ in the drawing are tied",
+                found=", ".join(group),
+                expected="axes with the same direction in their bodies' frames",
+            )
+
+    @cached_property
+    def axes(self) -> Integers:
+        """Positions (n, 3) of the axes' components."""
+        return np.flatnonzero(np.array(self.kinds, dtype=object) == "axis").reshape(-1, 3)
+
+    @cached_property
+    def _free(self) -> Array:
+        owner = self._owners()
+        held = {owner[self.index(name)] for name in self.fixed}
+        plain = [k for k in np.unique(owner) if k not in held and self.kinds[k] != "axis"]
+        matrix = (owner[:, None] == np.array(plain, dtype=int)[None, :]).astype(float)
+        tangents = [
+            self._tangent(np.flatnonzero(owner == axis[0]))
+            for axis in self.axes
+            if owner[axis[0]] == axis[0] and axis[0] not in held
+        ]
+        return np.concatenate([matrix, *tangents], axis=1)
+
+    def _owners(self) -> Integers:
+        """The first parameter that each one moves together with, (P,)."""
         owner = np.arange(len(self))
         for group in self.tied:
             members = [self.index(name) for name in group]
             joined = np.isin(owner, owner[members])  # a name in two ties makes one of them
             owner[joined] = owner[members].min()
-        held = {owner[self.index(name)] for name in self.fixed}
-        columns = [k for k in np.unique(owner) if k not in held]
-        return (owner[:, None] == np.array(columns, dtype=int)[None, :]).astype(float)
+        return owner
+
+    def _tangent(self, first: Integers) -> Array:
+        """Two columns (P, 2): turns of the axes whose x components stand at ``first``."""
+        basis = np.linalg.svd(self.drawing[first[0] : first[0] + 3][None])[2][1:].T
+        out = np.zeros((len(self), 2))
+        for k in first:
+            out[k : k + 3] = basis
+        return out
+
+    def free_matrix(self) -> Array:
+        """M (P, n_free) with values = drawing + M z: one column a free parameter or tie.
+
+        An axis has two: its turns (rad), so its components stay on the tangent plane of the
+        drawing's axis, where no length is free (see :meth:`on_tangents`).
+        """
+        return self._free.copy()
+
+    def on_tangents(self, values: Array) -> Array:
+        """The same machine with each axis made as long as it must be to end on the tangent plane
+        of the drawing's; values (..., P). Directions do not change.
+        """
+        if not self.axes.size:
+            return values
+        axis = values[..., self.axes]
+        size = np.sum(axis * self.drawing[self.axes], axis=-1, keepdims=True)
+        out = np.array(values, dtype=float)
+        out[..., self.axes] = axis / np.where(size > 0.1, size, 1.0)
+        return out
+
+    def to_free(self, values: Array) -> Array:
+        """z (..., n_free) of values (..., P); what is fixed or tied otherwise is left out."""
+        change = self.on_tangents(values) - self.drawing
+        return change @ np.linalg.pinv(self._free).T
+
+    def first_of_free(self) -> Integers:
+        """Position (n_free,) of a parameter that each free unknown moves, the most of all."""
+        return np.argmax(np.abs(self._free), axis=0)
+
+    def tolerances_free(self) -> Array:
+        """The drawing's standard deviation of each free unknown, (n_free,)."""
+        return self.tolerance[self.first_of_free()]
+
+    def free_names(self) -> tuple[str, ...]:
+        """A name for each free unknown; an axis' turns are numbered."""
+        names, seen = [], dict[str, int]()
+        for k in self.first_of_free():
+            name = self.names[k]
+            if self.kinds[k] == "axis":
+                whole = self.names[self.axes[np.any(self.axes == k, axis=1)][0, 0]]
+                whole = whole.rpartition(".")[0]
+                seen[whole] = seen.get(whole, 0) + 1
+                name = f"{whole} ({seen[whole]})"
+            names.append(name)
+        return tuple(names)
+
+    def unit_axes(self, values: Array) -> Array:
+        """Values (..., P) with axes of length one, as files have them."""
+        if not self.axes.size:
+            return values
+        out = np.array(values, dtype=float)
+        axis = out[..., self.axes]
+        out[..., self.axes] = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+        return out
 
     def of_kind(self, kind: str) -> Integers:
         """Positions of the parameters whose tolerance is ``kind``."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from pkmcal.files import Schema
 from pkmcal.mechanisms.carriers.contract import ParameterKind
@@ -30,6 +30,30 @@ class ConstantLength(Schema):
     actuated: Literal[False]
     constant: Annotated[float, Field(gt=0, description="the rod's length in metres")]
 
+
+class PassiveLength(Schema):
+    """``length: {passive: true}``: free to change, nobody reads it; it adds no equation."""
+
+    passive: Literal[True]
+
+
+def rod_kind(value: Any) -> str:
+    """Which of the three a ``length`` in the file is, told apart so that errors name its fields."""
+    if isinstance(value, Schema):
+        value = value.model_dump()
+    if not isinstance(value, dict):
+        return "actuated"
+    if value.get("passive"):
+        return "passive"
+    return "constant" if value.get("actuated") is False else "actuated"
+
+
+Rod = Annotated[
+    Annotated[ActuatedLength, Tag("actuated")]
+    | Annotated[ConstantLength, Tag("constant")]
+    | Annotated[PassiveLength, Tag("passive")],
+    Discriminator(rod_kind),
+]
 
 OFFSET = ParameterKind("offset", "m", "offset")
 CONSTANT = ParameterKind("constant", "m", "offset")

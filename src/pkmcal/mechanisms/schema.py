@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 
 from pkmcal.files import Schema
 from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
-from pkmcal.mechanisms.rods import ActuatedLength, ConstantLength
+from pkmcal.mechanisms.rods import ActuatedLength, Rod
 
 Motion = Literal["spatial", "planar", "translation"]
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:  # a type checker cannot see what the carriers' folder holds
 else:
     BaseNode = _one_of((c.schema for c in base_carriers().values()), "joint")
     PlatformNode = _one_of((c.schema for c in platform_carriers().values()), "joint")
-LengthNode = Annotated[ActuatedLength | ConstantLength, Field(discriminator="actuated")]
 
 
 class Tube(Schema):
@@ -49,16 +48,17 @@ class Leg(Schema):
 
     base: BaseNode
     platform: PlatformNode
-    length: LengthNode
+    length: Rod
     tubes: tuple[Tube, ...] = ()
 
 
 class Tolerance(Schema):
-    """Standard deviations of the drawing's values, metres."""
+    """Standard deviations of the drawing's values, metres; of axes, radians."""
 
     center: Annotated[float, Field(gt=0)] = 0.002
     offset: Annotated[float, Field(gt=0)] = 0.002
     radius: Annotated[float, Field(gt=0)] = 0.0001
+    axis: Annotated[float, Field(gt=0, lt=1)] = 0.005
 
 
 class Home(Schema):
@@ -71,7 +71,7 @@ class Home(Schema):
 def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     if len(legs) < 2:
         raise ValueError("a parallel machine has at least two legs")
-    if not any(leg.length.actuated for leg in legs):
+    if not any(isinstance(leg.length, ActuatedLength) for leg in legs):
         raise ValueError("a machine has at least one leg with actuated: true")
     return legs
 

@@ -6,10 +6,8 @@ import base64
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +16,9 @@ from pkmcal.cameras.calibrate import CameraCalibration
 from pkmcal.cameras.calibration_checks import CELLS, coverage, tilts
 from pkmcal.errors import InputError
 from pkmcal.observe.images import decode
-from pkmcal.report import charts, wording
+from pkmcal.report import charts, templating
 from pkmcal.report.headline import Headline
 from pkmcal.report.wording import brief, count, decimals, number
-
-if TYPE_CHECKING:
-    import jinja2
 
 LARGEST_WIDTH = 640
 QUALITY = 70
@@ -34,8 +29,6 @@ FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000)
 ANGLE_STEP = 5.0
 """degrees of the angle from the axis that one bar of the histogram holds."""
 FIELD_CELLS = (16, 12)
-SCRIPT_END = "// The table sorts"
-"""The report's script up to here serves this page; what follows is of its table and its plot."""
 UNITS = {"focal": "px", "center": "px"}
 WORDS = {
     "focal.x": "focal length x",
@@ -95,23 +88,19 @@ def camera_report_html(calibration: CameraCalibration, paths: Sequence[Path | st
     """One HTML page that needs nothing else. paths : the photographs, to show them; by name."""
     used = calibration.residuals[calibration.kept]
     factor = _factor(used, calibration.camera.image_size[0])
-    return (
-        _environment()
-        .get_template("camera.html.j2")
-        .render(
-            c=calibration,
-            headline=headline(calibration),
-            cards=_cards(calibration),
-            rows=parameter_rows(calibration),
-            compared=_compared(calibration),
-            shots=_shots(calibration, [Path(path) for path in paths], factor),
-            factor=factor,
-            field=_field(calibration),
-            views=_views_chart(calibration),
-            angles=_angles_chart(calibration),
-            missed=[d for d in calibration.detections if not d.found],
-            script=_script(),
-        )
+    return templating.render(
+        "camera.html.j2",
+        c=calibration,
+        headline=headline(calibration),
+        cards=_cards(calibration),
+        rows=parameter_rows(calibration),
+        compared=_compared(calibration),
+        shots=_shots(calibration, [Path(path) for path in paths], factor),
+        factor=factor,
+        field=_field(calibration),
+        views=_views_chart(calibration),
+        angles=_angles_chart(calibration),
+        missed=[d for d in calibration.detections if not d.found],
     )
 
 
@@ -324,27 +313,3 @@ def _angles_chart(c: CameraCalibration) -> charts.BarChart | None:
         "Corners by their angle from the axis", "degrees", bars, labels,
         f"Corners from {angle.min(initial=180):.0f} to {angle.max(initial=0):.0f} degrees",
     )  # fmt: skip
-
-
-def _script() -> str:
-    """Tooltips and enlarged photographs, as in the report."""
-    source = resources.files("pkmcal.report") / "templates" / "script.js"
-    return source.read_text(encoding="utf-8").partition(SCRIPT_END)[0]
-
-
-@cache
-def _environment() -> jinja2.Environment:
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pkmcal.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    shared: dict[str, Any] = {"charts": charts, "count": wording.count}
-    environment.globals.update(shared)
-    # The charts' template colours by leg; a camera has none.
-    environment.filters["leg"] = lambda _leg: "no-leg"
-    return environment

@@ -19,7 +19,7 @@ RING = 25
 
 
 def figure_of(scene: Scene) -> dict[str, Any]:
-    """Traces and layout for ``Plotly.newPlot``."""
+    """Traces, layout and configuration for ``Plotly.newPlot``."""
     base, platform = scene.of_side("base"), scene.of_side("platform")
     return {
         "data": [
@@ -38,6 +38,7 @@ def figure_of(scene: Scene) -> dict[str, Any]:
             _centres(base, platform),
         ],
         "layout": _layout(),
+        "config": {"scrollZoom": True},
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,27 +11,23 @@ from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.observe.edges import Observation
 from pkmcal.report import (
-    charts,
     figure,
     headline,
+    identifiability,
     parameters,
     pictures,
     provenance,
     rejections,
     residuals,
     scene,
+    templating,
     toolpoint,
-    wording,
 )
 from pkmcal.session import Session
 
 if TYPE_CHECKING:
-    import jinja2
-
     from pkmcal.identify.verdict import Verdict
-
-N_COLOURS = 8
-"""Leg colours in the style sheet; machines with more legs use them again."""
+    from pkmcal.identify.words import Findings
 
 
 def report_html(
@@ -41,15 +36,17 @@ def report_html(
     estimate: Estimate,
     verdict: Verdict,
     *,
+    findings: Findings | None = None,
     timings: Mapping[str, float] | None = None,
 ) -> str:
     """One HTML page that needs nothing else: no network, no other file.
 
-    verdict : usable, headline, reasons, warnings, advice. timings : seconds by step.
+    verdict : usable, headline, reasons, warnings, advice. findings : what the data tell of the
+    machine; without them their section is left out. timings : seconds by step.
     """
-    views = report_views(session, observation, estimate)
-    template = _environment().get_template("report.html.j2")
-    return template.render(
+    views = report_views(session, observation, estimate, findings)
+    return templating.render(
+        "report.html.j2",
         **views,
         verdict=verdict,
         timings=provenance.durations(timings),
@@ -57,7 +54,12 @@ def report_html(
     )
 
 
-def report_views(session: Session, observation: Observation, estimate: Estimate) -> dict[str, Any]:
+def report_views(
+    session: Session,
+    observation: Observation,
+    estimate: Estimate,
+    findings: Findings | None = None,
+) -> dict[str, Any]:
     """Everything that the templates show besides the verdict, by its name there."""
     edges, machine = observation.edges, estimate.machine
     camera = residuals.camera_numbers(session)
@@ -83,7 +85,8 @@ def report_views(session: Session, observation: Observation, estimate: Estimate)
         "views": scene.views(drawn),
         "figure": figure.figure_of(drawn),
         "groups": groups,
-        "unidentified": parameters.unidentified(groups, estimate),
+        "unidentified": parameters.unidentified(groups, estimate, findings),
+        "told": findings and identifiability.section(findings, machine.parameters),
         "pictures": pictures.pictures(session, edges, estimate, shifts, centres),
         "residuals": residuals.residual_charts(session, edges, estimate, shifts),
         "reasons": rejections.reasons(session, observation.rejected),
@@ -91,26 +94,3 @@ def report_views(session: Session, observation: Observation, estimate: Estimate)
         "settings": provenance.settings(session, estimate),
         "versions": provenance.versions(),
     }
-
-
-@cache
-def _environment() -> jinja2.Environment:
-    """Templates of this package, every value escaped unless a template says otherwise."""
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pkmcal.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    shared: dict[str, Any] = {"charts": charts, "count": wording.count}
-    environment.globals.update(shared)
-    environment.filters["leg"] = _colour_class
-    return environment
-
-
-def _colour_class(leg: int | None) -> str:
-    """The style sheet's name of a leg's colour; legs from 1."""
-    return f"leg-{(leg - 1) % N_COLOURS + 1}" if leg else "no-leg"

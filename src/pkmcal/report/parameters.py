@@ -9,6 +9,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.problem import Estimate
+from pkmcal.identify.words import Findings
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.report.wording import (
     SCALES,
@@ -86,7 +87,7 @@ def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[Group, ...]:
 
 
 def _row(table: ParameterTable, k: int, before: float, estimate: Estimate) -> Row:
-    factor, unit = SCALES.get(table.units[k], (1.0, table.units[k]))
+    factor, unit = SCALES.get(table.units[k], (1.0, table.units[k].replace("1", "")))
     after = float(estimate.machine.values[k])
     variance = float(estimate.covariance[k, k])
     sigma = np.sqrt(variance) if variance > EXACT**2 else 0.0
@@ -125,17 +126,30 @@ def _tie(table: ParameterTable, name: str) -> str:
     return f"changes together with {joined(others)}" if others else ""
 
 
-def unidentified(groups: tuple[Group, ...], estimate: Estimate) -> tuple[str, ...]:
-    """Sentences: values that stayed the drawing's, then pairs that can hardly be told apart."""
+def unidentified(
+    groups: tuple[Group, ...], estimate: Estimate, findings: Findings | None = None
+) -> tuple[str, ...]:
+    """Sentences: what the data leave open, then pairs that can hardly be told apart.
+
+    findings : what is open, in words; without them, the values that stayed the drawing's.
+    """
+    if findings is None:
+        out = _by_kind(groups, estimate)
+    else:
+        out = [f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak)]
+    names = estimate.machine.parameters.names
+    out += [_pair_text(names[i], names[j], rho) for i, j, rho in tight_pairs(estimate.covariance)]
+    return tuple(out)
+
+
+def _by_kind(groups: tuple[Group, ...], estimate: Estimate) -> list[str]:
+    """Sentences on the values that stayed the drawing's."""
     kinds: dict[str, list[Row]] = {}
     for group in groups:
         for row in group.rows:
             if row.source == "drawing":
                 kinds.setdefault(re.sub(r"tube \d+", "tube", row.label), []).append(row)
-    out = [_kind_text(kind, rows, estimate.machine.n_legs) for kind, rows in kinds.items()]
-    names = estimate.machine.parameters.names
-    out += [_pair_text(names[i], names[j], rho) for i, j, rho in tight_pairs(estimate.covariance)]
-    return tuple(out)
+    return [_kind_text(kind, rows, estimate.machine.n_legs) for kind, rows in kinds.items()]
 
 
 def _kind_text(kind: str, rows: list[Row], all_legs: int) -> str:
@@ -154,12 +168,13 @@ def _kind_text(kind: str, rows: list[Row], all_legs: int) -> str:
 def _pair_text(first: str, second: str, rho: float) -> str:
     what = "difference" if rho > 0 else "sum"
     return (
-        f"{_in_words(first).capitalize()} and {_in_words(second)} move together (correlation "
+        f"{in_words(first).capitalize()} and {in_words(second)} move together (correlation "
         f"{number(rho, 3)}): their {what} is known far better than each alone."
     )
 
 
-def _in_words(name: str) -> str:
+def in_words(name: str) -> str:
+    """A parameter's name for people: ``leg 3 base centre z``."""
     leg, path = split_name(name)
     return f"leg {leg} {label(path)}" if leg else label(path)
 

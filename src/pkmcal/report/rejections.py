@@ -62,7 +62,7 @@ def _photograph(session: Session, item: Rejection) -> str:
 def _what(item: Rejection) -> str:
     """The rejected thing in words; -1 stands for all of them."""
     if item.leg < 0:
-        return "whole photograph"
+        return "board" if item.reason.startswith("the board") else "whole photograph"
     words = [f"leg {item.leg + 1}"]
     if item.tube >= 0:
         words.append(f"tube {item.tube + 1}")

@@ -10,7 +10,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.centres import Centres
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import closure
+from pkmcal.mechanisms.limbs import closure, dense
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,7 @@ def pose_covariance(machine: Machine, covariance: Array, joints: Array, poses: A
     layout = machine.layout
     c = closure(layout, machine.values, joints, poses)
     by_pose = c.by_pose @ layout.motion
-    one_hot = np.eye(len(machine.values))
-    by_theta = -one_hot[layout.rod]
-    for by, index in ((c.a_by, c.ends.a_index), (c.b_by, c.ends.b_index)):
-        by_theta = by_theta + (by[..., None, :] @ one_hot[index])[..., 0, :]
+    by_theta = dense(c, len(machine.values))
     jacobian = -layout.motion @ np.linalg.pinv(by_pose) @ by_theta
     return jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
 

@@ -5,6 +5,7 @@ stations, configurations and truth draw what is in a session; session writes it;
 measurements without photographs; demo holds the demonstration's settings.
 """
 
+from pkmcal.simulate.board import board_for
 from pkmcal.simulate.edges import EdgeNoise, simulate_edges
 from pkmcal.simulate.render import Sensor
 from pkmcal.simulate.session import simulate_session
@@ -17,6 +18,7 @@ __all__ = [
     "Settings",
     "StationPose",
     "Truth",
+    "board_for",
     "draw_truth",
     "load_truth",
     "simulate_edges",

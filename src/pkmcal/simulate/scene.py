@@ -36,7 +36,8 @@ class Discs:
 
     base, platform : (3,) centre of the face towards the joints; base frame, platform frame.
     base_radius, platform_radius : m. side : +1 where the platform stands above the base along
-    the frames' z, -1 below. thickness : m.
+    the frames' z, -1 below. platform_side : the same for the platform's plate and its joints.
+    thickness : m.
     """
 
     base: Array
@@ -44,11 +45,20 @@ class Discs:
     base_radius: float
     platform_radius: float
     side: float
+    platform_side: float
     thickness: float
 
 
+_POSTS = 3.5, 7.5
+"""Heights of the posts on a planar machine's plates, platform and base, in radii of a joint. A
+plate over the legs would hide them; one close below them would show their shadows for edges."""
+
+
 def discs_of(machine: Machine) -> Discs:
-    """Plates outside the joints, along the frames' z, as wide as the joints need."""
+    """Plates outside the joints, along the frames' z, as wide as the joints need.
+
+    A planar machine's plates both lie below its legs, the platform's over the base's.
+    """
     ends = limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), np.eye(4))
     a, b = np.array(ends.a), np.array(ends.b)
     rise = float(apply(machine.home(), b)[:, 2].mean() - a[:, 2].mean())
@@ -58,11 +68,13 @@ def discs_of(machine: Machine) -> Discs:
         float(np.linalg.norm(p[:, :2] - p[:, :2].mean(axis=0), axis=1).max()) for p in (a, b)
     )
     base, platform = a.mean(axis=0), b.mean(axis=0)
-    base[2] = (side * a[:, 2]).min() * side - side * 2.2 * ball
-    platform[2] = (side * b[:, 2]).max() * side + side * 2.2 * ball
-    return Discs(
-        base, platform, width_a + 3.5 * ball, width_b + 2.0 * ball, side, max(0.012, 0.8 * ball)
-    )
+    planar = machine.document.motion == "planar"
+    lift, drop = _POSTS if planar else (2.2, 2.2)
+    over = -side if planar else side
+    base[2] = (side * a[:, 2]).min() * side - side * drop * ball
+    platform[2] = (over * b[:, 2]).max() * over + over * lift * ball
+    thickness = max(0.012, 0.8 * ball)
+    return Discs(base, platform, width_a + 3.5 * ball, width_b + 2.0 * ball, side, over, thickness)
 
 
 @dataclass(frozen=True)
@@ -93,7 +105,7 @@ def machine_parts(
     """The machine at one pose (4, 4) and its readings (m,)."""
     ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
     balls = _ball_radii(machine)
-    up_base, up_platform = discs.side * Z, discs.side * T_base_platform[:3, 2]
+    up_base, up_platform = discs.side * Z, discs.platform_side * T_base_platform[:3, 2]
     centre = apply(T_base_platform, discs.platform)
     parts = [
         Part(Cylinder(discs.base, -up_base, discs.base_radius, discs.thickness), finish.base),

@@ -16,6 +16,8 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, staged_folder, yaml_text
 from pkmcal.mechanisms import Machine, mechanism_text
+from pkmcal.simulate.board import board_part
+from pkmcal.simulate.casting import Part
 from pkmcal.simulate.render import Sensor, View, photograph, render
 from pkmcal.simulate.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
 from pkmcal.simulate.surfaces import SmoothNoise
@@ -46,13 +48,13 @@ def simulate_session(
     truth = draw_truth(drawing, cameras, settings, seed)
     with staged_folder(folder) as stage:
         _write_texts(stage, drawing, cameras, settings, truth)
-        _write_photographs(stage, cameras, settings.sensor, truth, workers, progress)
+        _write_photographs(stage, cameras, settings, truth, workers, progress)
     return truth
 
 
 @dataclass(frozen=True)
 class Studio:
-    """Everything that photographs of one session share; views : by station."""
+    """Everything that photographs of one session share; views : by station; fixed : to the base."""
 
     truth: Truth
     discs: Discs
@@ -60,9 +62,10 @@ class Studio:
     room: Room
     views: tuple[View, ...]
     sensor: Sensor
+    fixed: tuple[Part, ...] = ()
 
     @classmethod
-    def of(cls, truth: Truth, cameras: Sequence[Camera], sensor: Sensor) -> Studio:
+    def of(cls, truth: Truth, cameras: Sequence[Camera], settings: Settings) -> Studio:
         """Draw the room, and work out each camera's rays once."""
         seeds = stream(truth.seed, "room").spawn(2)
         noise = SmoothNoise.from_rng(np.random.default_rng(seeds[0]))
@@ -72,7 +75,10 @@ class Studio:
         room = room_of(discs, reach, noise, np.random.default_rng(seeds[1]))
         known = {id(camera): View.of(camera) for camera in {id(c): c for c in cameras}.values()}
         views = tuple(known[id(camera)] for camera in cameras)
-        return cls(truth, discs, Finish.from_noise(noise), room, views, sensor)
+        fixed: tuple[Part, ...] = ()
+        if settings.board is not None and truth.T_base_board is not None:
+            fixed = (board_part(settings.board, truth.T_base_board),)
+        return cls(truth, discs, Finish.from_noise(noise), room, views, settings.sensor, fixed)
 
     def photograph(self, index: int) -> Integers:
         """The session's photograph number ``index``: 8 bits, (H, W)."""
@@ -81,7 +87,7 @@ class Studio:
         seeds = stream(self.truth.seed, "photographs").spawn(len(self.truth.photographs))
         rng = np.random.default_rng(seeds[index])
         parts = machine_parts(self.truth.machine, self.discs, self.finish, poses[k], joints[k])
-        scene = self.room.with_machine(parts)
+        scene = self.room.with_machine([*parts, *self.fixed])
         light = render(scene, self.views[station], self.truth.T_camera_base[station], rng)
         return photograph(light, self.sensor, rng)
 
@@ -131,6 +137,8 @@ def _write_texts(
         "joints.csv": csv_text(columns, truth.configurations, truth.readings),
         FILE: json.dumps(truth_document(truth), indent=1) + "\n",
     }
+    if settings.board is not None:
+        texts["board.yaml"] = yaml_text(settings.board.document)
     for name, camera in zip(truth.stations, cameras, strict=True):
         texts[files[name]] = yaml_text(camera.document())
     for name, text in texts.items():
@@ -142,6 +150,7 @@ def _write_texts(
 def _session_document(
     settings: Settings, truth: Truth, camera_files: dict[str, str]
 ) -> dict[str, Any]:
+    board = settings.board is not None
     return {
         "pkmcal": 1,
         "mechanism": "mechanism.yaml",
@@ -150,7 +159,7 @@ def _session_document(
             name: {
                 "camera": camera_files[name],
                 "images": f"images/{name}/{{configuration}}.png",
-                "observe": "legs",
+                "observe": ["legs", "board"] if board else "legs",
                 "pose": {
                     "position": list(pose.position),
                     "look_at": list(pose.look_at),
@@ -159,19 +168,20 @@ def _session_document(
             }
             for name, pose in zip(truth.stations, truth.rough, strict=True)
         },
+        **({"board": {"file": "board.yaml", "fixed_to": "base"}} if board else {}),
     }
 
 
 def _write_photographs(
     stage: Path,
     cameras: Sequence[Camera],
-    sensor: Sensor,
+    settings: Settings,
     truth: Truth,
     workers: int,
     progress: Progress | None,
 ) -> None:
     """Render and write all photographs; NumPy releases the interpreter, so threads are enough."""
-    studio = Studio.of(truth, cameras, sensor)
+    studio = Studio.of(truth, cameras, settings)
     for name in truth.stations:
         (stage / "images" / name).mkdir(parents=True)
     total = len(truth.photographs)

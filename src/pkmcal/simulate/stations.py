@@ -41,9 +41,15 @@ def joints_at_home(machine: Machine) -> tuple[Array, Array]:
 
 
 def default_stations(
-    machine: Machine, cameras: tuple[Camera, ...], rng: np.random.Generator
+    machine: Machine,
+    cameras: tuple[Camera, ...],
+    rng: np.random.Generator,
+    on_base: bool = False,
 ) -> tuple[StationPose, ...]:
-    """One place for each camera: evenly round the machine, not quite regular, as by hand."""
+    """One place for each camera: evenly round the machine, not quite regular, as by hand.
+
+    on_base : high enough to look onto the base, past the platform, and with room beside it.
+    """
     a, b = joints_at_home(machine)
     start = rng.uniform(0, 2 * np.pi)
     poses: list[StationPose] = []
@@ -53,7 +59,7 @@ def default_stations(
             poses.append(_inside(a, b, rng))
         else:
             azimuth = start + 2 * np.pi * k / len(cameras) + np.deg2rad(rng.uniform(-8, 8))
-            poses.append(_outside(a, b, min(half, _NEAREST), azimuth, rng))
+            poses.append(_outside(a, b, min(half, _NEAREST), azimuth, rng, on_base))
     return tuple(poses)
 
 
@@ -92,7 +98,7 @@ def _rounded(v: Array) -> Vector:
 
 
 def _outside(
-    a: Array, b: Array, half: float, azimuth: float, rng: np.random.Generator
+    a: Array, b: Array, half: float, azimuth: float, rng: np.random.Generator, on_base: bool
 ) -> StationPose:
     """On a ring from which the machine fills the picture, low, or high for a flat machine."""
     points = np.concatenate([a, b])
@@ -100,8 +106,10 @@ def _outside(
     radius = float(np.linalg.norm(points - centre, axis=1).max())
     flat = np.ptp(points[:, 2]) < 0.25 * radius
     elevation = np.deg2rad(rng.uniform(42, 55) if flat else rng.uniform(7, 17))
+    if on_base and not flat:
+        elevation += np.deg2rad(30)
     # more than the machine at home, because the platform moves and plates reach beyond joints
-    distance = 1.18 * radius / np.sin(half)
+    distance = (1.6 if on_base and flat else 1.18) * radius / np.sin(half)
     way = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
          np.sin(elevation)]

@@ -20,12 +20,14 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine
+from pkmcal.observe.boards import Board
+from pkmcal.simulate.board import place_board
 from pkmcal.simulate.configurations import draw_configurations
 from pkmcal.simulate.render import Sensor
 from pkmcal.simulate.stations import StationPose, default_stations, rough_pose, share_in_image
 
 FILE = "truth.json"
-_STREAMS = ("machine", "stations", "configurations", "readings", "room", "photographs")
+_STREAMS = ("machine", "stations", "configurations", "readings", "room", "photographs", "board")
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Settings:
     tolerance : true values differ from the drawing by this many times its tolerances.
     joint_noise : standard deviation of a reading, m. rough_position, rough_angle : by how much
     the session's station poses are off, m and rad. extreme : share of configurations with legs
-    near the ends of their ranges.
+    near the ends of their ranges. board : fixed to the base, seen by every station.
     """
 
     stations: int | tuple[StationPose, ...] = 3
@@ -49,6 +51,7 @@ class Settings:
     rough_angle: float = float(np.deg2rad(5))
     extreme: float = 0.5
     sensor: Sensor = field(default_factory=Sensor)
+    board: Board | None = None
 
     @property
     def n_stations(self) -> int:
@@ -64,6 +67,7 @@ class Truth:
     T_camera_base : (S, 4, 4). rough : poses written into the session.
     T_base_platform : (K, 4, 4). joints : (K, m) exact readings. readings : (K, m) with noise.
     photographs : (M, 2) station and configuration of each photograph. seed : of everything.
+    T_base_board : (4, 4) of the board, where there is one.
     """
 
     machine: Machine
@@ -76,6 +80,7 @@ class Truth:
     readings: Array
     photographs: Integers
     seed: int
+    T_base_board: Array | None = None
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
@@ -86,14 +91,12 @@ def stream(seed: int, name: str) -> np.random.SeedSequence:
 def true_machine(drawing: Machine, scale: float, rng: np.random.Generator) -> Machine:
     """A machine as it might be built: normal deviations of ``scale`` tolerances.
 
-    Fixed parameters keep their drawing value, tied ones move together.
+    Fixed parameters keep their drawing value, tied ones move together; an axis is turned.
     """
     table = drawing.parameters
-    free = table.free_matrix()
-    # a tie moves by the tolerance of its first member
-    tolerance = table.tolerance[np.argmax(free, axis=0)]
-    step = free @ (scale * tolerance * rng.standard_normal(free.shape[1]))
-    return drawing.with_values(drawing.values + step)
+    tolerance = table.tolerances_free()
+    step = table.free_matrix() @ (scale * tolerance * rng.standard_normal(len(tolerance)))
+    return drawing.with_values(table.unit_axes(drawing.values + step))
 
 
 def draw_truth(
@@ -104,7 +107,7 @@ def draw_truth(
     machine = true_machine(drawing, settings.tolerance, rngs["machine"])
     poses = settings.stations
     if isinstance(poses, int):
-        poses = default_stations(drawing, cameras, rngs["stations"])
+        poses = default_stations(drawing, cameras, rngs["stations"], settings.board is not None)
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
     rough = tuple(
         rough_pose(
@@ -131,6 +134,11 @@ def draw_truth(
         readings=joints + noise,
         photographs=photographs,
         seed=seed,
+        T_base_board=None
+        if settings.board is None
+        else place_board(
+            machine, settings.board, cameras, T_camera_base, T_base_platform, joints, rngs["board"]
+        ),
     )
 
 
@@ -209,6 +217,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
         "photographs": [
             [truth.stations[s], truth.configurations[k]] for s, k in truth.photographs.tolist()
         ],
+        **({} if truth.T_base_board is None else {"T_base_board": truth.T_base_board.tolist()}),
     }
 
 
@@ -238,6 +247,7 @@ def load_truth(folder: Path | str, drawing: Machine) -> Truth:
             [[stations.index(s), configurations.index(k)] for s, k in data["photographs"]]
         ),
         seed=data["seed"],
+        T_base_board=np.array(data["T_base_board"]) if "T_base_board" in data else None,
     )
 
 

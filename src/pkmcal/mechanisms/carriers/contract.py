@@ -42,8 +42,12 @@ class CarriedPoint(NamedTuple):
 
 
 class BaseCarrier(ABC):
-    """Gives A, the limb's end on the base side, as a function of the joint reading."""
+    """Gives A, the limb's end on the base side, as a function of the joint reading.
 
+    driven : the reading moves A; the rod then has a length of its own.
+    """
+
+    driven: ClassVar[bool] = False
     joints: ClassVar[tuple[str, ...]]
     schema: ClassVar[type[Schema]]
     parameters: ClassVar[tuple[ParameterKind, ...]]

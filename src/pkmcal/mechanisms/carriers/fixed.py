@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, final
+from typing import ClassVar, final
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.files import Schema
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
     CarriedPoint,
     ParameterKind,
 )
-
-
-class FixedDocument(Schema):
-    """``base: {joint: spherical, center: [x, y, z]}``, metres, base frame."""
-
-    joint: Literal["spherical", "universal"]
-    center: tuple[float, float, float]
-
+from pkmcal.mechanisms.joints import JointDocument
 
 CENTER = tuple(ParameterKind(f"center.{axis}", "m", "center") for axis in "xyz")
 
 
 @final
 class FixedPoint(BaseCarrier):
-    """Spherical or universal joint on the base."""
+    """Spherical, universal or revolute joint on the base; ``center`` in metres, base frame."""
 
-    joints: ClassVar = ("spherical", "universal")
-    schema: ClassVar = FixedDocument
+    joints: ClassVar = ("spherical", "universal", "revolute")
+    schema: ClassVar = JointDocument
     parameters: ClassVar = CENTER
 
     @staticmethod

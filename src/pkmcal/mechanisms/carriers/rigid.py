@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal, final
+from typing import ClassVar, final
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.files import Schema
 from pkmcal.geometry.rigid import skew
 from pkmcal.mechanisms.carriers.contract import CarriedPoint, PlatformCarrier
 from pkmcal.mechanisms.carriers.fixed import CENTER
-
-
-class RigidDocument(Schema):
-    """``platform: {joint: spherical, center: [x, y, z]}``, metres, platform frame."""
-
-    joint: Literal["spherical", "universal"]
-    center: tuple[float, float, float]
+from pkmcal.mechanisms.joints import JointDocument
 
 
 @final
 class RigidPlatform(PlatformCarrier):
-    """Spherical or universal joint on a platform that is one rigid body."""
+    """Spherical, universal or revolute joint on a platform that is one rigid body."""
 
-    joints: ClassVar = ("spherical", "universal")
-    schema: ClassVar = RigidDocument
+    joints: ClassVar = ("spherical", "universal", "revolute")
+    schema: ClassVar = JointDocument
     parameters: ClassVar = CENTER
 
     @staticmethod

@@ -1,0 +1,205 @@
+"""[A] 3.2, step 1 of four: joint centres and revolute axes from the legs' axes.
+
+Both are least-squares answers to what a leg's axis says about a joint it turns in: it passes
+the centre ([A] 6) and is perpendicular to a revolute joint's axis ([A] 7). The same functions
+serve the camera frame (step 1) and the platform frame (step 4).
+
+Arrays: B runs, C photographs (one station, one configuration each), L legs, S stations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import cross, dot
+from pkmcal.identify import linear
+from pkmcal.identify.problem import Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.limbs import leg_readings
+from pkmcal.observe.edges import EdgeSet
+
+ONE_DIRECTION = 1e-6
+"""Ratio of eigenvalues below which a leg counts as seen in one direction only, for its centre."""
+ONE_PLANE = 1e-4
+"""The same for a revolute axis: directions within 10 mrad of each other leave it to the noise."""
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Leg axes as the photographs show them, camera frame.
+
+    station, configuration : (C,) of each photograph. seen : (C, L).
+    u, point : (B, C, L, 3) direction from A to B, and any point of the axis (m).
+    readings : (B, C, L). information : (B, C, L, 3, 3) how well each direction is known, any
+    scale; it tells where several photographs show the same leg. Without it all count alike.
+    """
+
+    station: Integers
+    configuration: Integers
+    seen: Booleans
+    u: Array
+    point: Array
+    readings: Array
+    information: Array | None = None
+
+
+def across(u: Array) -> Array:
+    """Projections I - u u^T (..., 3, 3) on the planes across unit directions (..., 3)."""
+    return np.eye(3) - u[..., :, None] * u[..., None, :]
+
+
+def nearest_points(
+    u: Array, point: Array, seen: Booleans, group: Integers, n_groups: int
+) -> tuple[Array, Booleans]:
+    """[A] 6: the point nearest to a leg's axes, sum (I - u u^T)(M - A) = 0.
+
+    As printed, AM x u = 0 for all photographs by SVD: the same least squares, without the
+    equations that are not independent. u, point : (B, C, L, 3) in the frames of ``group``
+    (C,). Returns A (B, G, L, 3) and (G, L) whether there are two directions.
+    """
+    project = np.where(seen[..., None, None], across(u), 0.0)
+    right = (project @ np.where(seen[..., None], point, 0.0)[..., None])[..., 0]
+    of_group = (group == np.arange(n_groups)[:, None]).astype(float)
+    normal = np.einsum("sc,bclij->bslij", of_group, project)
+    right = np.einsum("sc,bcli->bsli", of_group, right)
+    values = np.linalg.eigvalsh(normal)
+    found = np.all(values[..., 0] > ONE_DIRECTION * values[..., 2], axis=0)
+    normal = np.where(found[..., None, None], normal, np.eye(3))
+    return np.linalg.solve(normal, right[..., None])[..., 0], found
+
+
+def centres_from_axes(axes: Axes, n_stations: int) -> tuple[Array, Booleans]:
+    """Step 1, [A] 6, for the base centres in the stations' camera frames.
+
+    Returns A (B, S, L, 3) and (S, L) whether each could be found.
+    """
+    return nearest_points(axes.u, axes.point, axes.seen, axes.station, n_stations)
+
+
+def revolute_axes(
+    u: Array, seen: Booleans, group: Integers, n_groups: int
+) -> tuple[Array, Booleans]:
+    """[A] 7: the axis that is perpendicular to all directions of a leg, v . u = 0, by SVD.
+
+    u : (B, C, L, 3) in the frames of ``group`` (C,). Returns unit v (B, G, L, 3), of either
+    sign, and (G, L) whether each is fixed: the leg needs two different directions.
+    """
+    weighted = np.where(seen[..., None], u, 0.0)
+    of_group = (group == np.arange(n_groups)[:, None]).astype(float)
+    normal = np.einsum("sc,bcli,bclj->bslij", of_group, weighted, weighted, optimize=True)
+    values, vectors = np.linalg.eigh(normal)
+    return vectors[..., 0], np.all(values[..., 1] > ONE_PLANE * values[..., 2], axis=0)
+
+
+def plane_normals(
+    u: Array, seen: Booleans, group: Integers, n_groups: int
+) -> tuple[Array, Booleans]:
+    """[A] 7 for a planar machine, whose joints all have one axis: the normal of its plane.
+
+    All legs' directions together, (B, C, L, 3); returns (B, G, 3) and (G,).
+    """
+    shape = u.shape
+    together = u.reshape(shape[0], -1, 1, 3)
+    flat = np.repeat(group, shape[2])
+    v, found = revolute_axes(together, seen.reshape(-1, 1), flat, n_groups)
+    return v[:, :, 0], found[:, 0]
+
+
+def in_base(axes: Axes, T_camera_base: Array) -> Axes:
+    """The directions in the base frame, one row a configuration; ``point`` is not kept.
+
+    T_camera_base : (B, S, 4, 4). A leg that several stations photographed in one configuration
+    gets the direction that all of them see best: least u^T (sum R^T W R) u over the
+    photographs, W their information.
+    """
+    rot = T_camera_base[:, axes.station, None, :3, :3]
+    back = np.swapaxes(rot, -1, -2)
+    u = np.where(axes.seen[..., None], (back @ axes.u[..., None])[..., 0], 0.0)
+    names, first, row = np.unique(axes.configuration, return_index=True, return_inverse=True)
+    member = (row == np.arange(len(names))[:, None]).astype(float)
+    count = member @ axes.seen
+    total = np.einsum("kc,bcli->bkli", member, u)
+    if count.max(initial=0) > 1:
+        info = across(axes.u) if axes.information is None else axes.information
+        info = np.where(axes.seen[..., None, None], back @ info @ rot, 0.0)
+        joined = np.linalg.eigh(np.einsum("kc,bclij->bklij", member, info))[1][..., 0]
+        joined = joined * np.where(dot(joined, total) < 0, -1.0, 1.0)[..., None]
+        total = np.where((count > 1)[..., None], joined, total)
+    none = np.zeros(len(names), dtype=int)
+    return Axes(none, names, count > 0, total, 0.0 * total, axes.readings[:, first])
+
+
+def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array) -> Axes:
+    """Leg axes of a session (B = 1) from the edges that count, [A] 4-5.
+
+    The direction is what is least along the normals, over all edges of the leg in a
+    photograph; both sides are needed, or the direction would be arbitrary.
+    """
+    edges = measurements.edges
+    photo, index = np.unique(
+        edges.station * len(measurements.joints) + edges.configuration, return_inverse=True
+    )
+    n_legs = machine.n_legs
+    u, point, seen, information = _axes_of_groups(
+        edges,
+        linear.edge_radii(machine, edges),
+        weights,
+        index * n_legs + edges.leg,
+        len(photo) * n_legs,
+    )
+    station, configuration = np.divmod(photo, len(measurements.joints))
+    readings = leg_readings(machine.layout, measurements.joints[configuration])
+    full = (1, len(photo), n_legs)
+    return Axes(
+        station,
+        configuration,
+        seen.reshape(full[1:]),
+        u.reshape(*full, 3),
+        point.reshape(*full, 3),
+        readings[None],
+        information.reshape(*full, 3, 3),
+    )
+
+
+def _axes_of_groups(
+    edges: EdgeSet, radius: Array, weights: Array, group: Integers, n_groups: int
+) -> tuple[Array, Array, Booleans, Array]:
+    """Direction, point (n, 3), whether both sides count, and information of each group."""
+    weight = np.where(weights > 0.5, 1 / np.trace(edges.covariance, axis1=1, axis2=2), 0.0)
+    weighted = weight[:, None] * edges.normal
+    information, right = np.zeros((n_groups, 3, 3)), np.zeros((n_groups, 3))
+    sides = np.zeros((2, n_groups, 3))
+    np.add.at(information, group, weighted[:, :, None] * edges.normal[:, None])
+    np.add.at(right, group, -radius[:, None] * weighted)
+    np.add.at(sides, (edges.side, group), weighted)
+    both = np.linalg.norm(sides, axis=-1) > 0
+    seen = both[0] & both[1]
+    total = np.maximum(np.bincount(group, weight, n_groups), 1e-300)
+    normal = np.where(seen[:, None, None], information / total[:, None, None], np.eye(3))
+    u = np.linalg.eigh(normal)[1][..., 0]
+    u = u * np.where(dot(u, cross(sides[1], sides[0])) < 0, -1.0, 1.0)[:, None]
+    # n.M = -R in the plane across the axis, and u.M = 0
+    fixed = normal + u[:, :, None] * u[:, None, :]
+    point = np.linalg.solve(fixed, (right / total[:, None])[..., None])[..., 0]
+    return u, point, seen, information
+
+
+def through_centres(machine: Machine, edges: EdgeSet, centres: Array) -> EdgeSet:
+    """Edges made to pass their base centre exactly, n.A = -R, at the least Mahalanobis change.
+
+    The centre is known from all configurations, so it takes out most of an edge's tilt error.
+    centres : (S, L, 3) m, camera frames; edges of a NaN centre stay as they are.
+    """
+    a = centres[edges.station, edges.leg]
+    known: Booleans = np.all(np.isfinite(a), axis=-1)
+    a = np.where(known[:, None], a, 0.0)
+    along = np.swapaxes(edges.basis, -1, -2) @ a[..., None]
+    gain = edges.covariance @ along
+    spread = np.maximum((np.swapaxes(along, -1, -2) @ gain)[..., 0], 1e-300)
+    miss = np.where(known, dot(edges.normal, a) + linear.edge_radii(machine, edges), 0.0)
+    change = (edges.basis @ gain)[..., 0] * (miss[:, None] / spread)
+    normal = edges.normal - change
+    return replace(edges, normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True))

@@ -1,0 +1,192 @@
+"""Where the data do not allow one of [A]'s four steps: said in words, before or after it.
+
+The papers count equations (``conditions``); these are the tests themselves, the rank of each
+step's Jacobian at the drawing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import ResultError
+from pkmcal.geometry.rigid import dot
+from pkmcal.identify.four_step_axes import Axes, in_base
+from pkmcal.identify.four_step_base import Items
+from pkmcal.identify.four_step_boards import Views
+from pkmcal.identify.four_step_model import Legs, legs_of
+from pkmcal.identify.four_step_offsets import COLLAPSED, offset_slopes
+from pkmcal.identify.registration import fixes_pose, loose
+from pkmcal.mechanisms import Machine
+
+FLAT = 1e-3
+"""Singular value of the distances' derivatives by the offsets, of 1 a photograph at most, below
+which a combination of offsets is free."""
+BUNDLE = "use the joint method (bundle)"
+
+
+def every_leg_seen(machine: Machine, found: Booleans) -> None:
+    """[A] 3.3, first condition; found (S, L) base centres."""
+    lost = np.flatnonzero(~found.any(axis=0))
+    if lost.size:
+        raise ResultError(
+            what=f"leg {lost[0] + 1} of {machine.n_legs} is seen by no station well enough",
+            expected="every leg seen in two directions at least, [A] 3.3",
+            next_step=f"add configurations or a station, or {BUNDLE}",
+        )
+
+
+def stations_are_fixed(items: Items, views: Views, machine: Machine) -> None:
+    """Every station sees enough of the base to know where it stands."""
+    few = np.flatnonzero(~items.fixed()[views.of_station])
+    if not few.size:
+        return
+    seen = items.centres_seen[views.of_station[few[0]]]
+    need = "two" if legs_of(machine).planar else "three"
+    raise ResultError(
+        what=f"station {few[0] + 1} sees too few legs for the four steps",
+        found=f"{seen.sum()} base centres{_legs_in_brackets(seen)}",
+        expected=f"{need} or more that are not on one line, each leg seen in two directions",
+        next_step=f"give the station's pose, fix a board to the base, or {BUNDLE}",
+    )
+
+
+def stations_are_joined(items: Items, views: Views) -> None:
+    """The stations share enough legs, or a board, to become one frame ([A] 3.3)."""
+    free = loose_legs(items)
+    if free is None:
+        return
+    sees = [
+        f"station {s + 1} sees legs {listed(np.flatnonzero(items.centres_seen[view]))}"
+        for s, view in enumerate(views.of_station)
+    ]
+    raise ResultError(
+        what=f"the stations share too few legs: the base joints of legs {listed(free[0])} can "
+        f"move against those of legs {listed(free[1])}",
+        found="; ".join(sees),
+        expected="stations that share three legs, or fewer with revolute axes, [A] 3.3",
+        next_step="fix a calibration board to the base where the stations see it, or let a "
+        f"station see more legs, or {BUNDLE} with the stations' poses",
+    )
+
+
+def loose_legs(items: Items) -> tuple[Integers, Integers] | None:
+    """Legs whose base joints the views leave free against other legs', or None."""
+    use = items.fixed()
+    free = loose(items.drawing, items.seen[use], items.n_directions)
+    return _parts(items.drawn, free[: len(items.drawn)]) if free.shape[-1] else None
+
+
+def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: str) -> None:
+    """[A] 3.5: enough legs with a length at once, each leg with enough others."""
+    legs = legs_of(machine)
+    seen = axes.seen & usable[axes.station][:, None]
+    if form == "corrected":
+        row = np.unique(axes.configuration, return_inverse=True)[1]
+        seen = np.array([seen[row == k].any(axis=0) for k in range(row.max() + 1)])
+    at_once = seen & legs.closing
+    posed = fixes_pose(legs.platform, at_once, motion=legs.motion)
+    if not posed.any():
+        _too_few_at_once(legs, at_once)
+    free = loose(
+        legs.platform[legs.closing], at_once[np.ix_(posed, legs.closing)], motion=legs.motion
+    )
+    if free.shape[-1]:
+        a, b = _parts(legs.platform[legs.closing], free)
+        names = np.flatnonzero(legs.closing)
+        raise ResultError(
+            what=f"the platform joints of legs {listed(names[a])} can move against those of legs "
+            f"{listed(names[b])}",
+            found="no configurations that show enough of both at once",
+            expected="each leg seen at once with others that fix the platform, [A] 3.5",
+            next_step=f"photograph the same configurations from more stations, or {BUNDLE}",
+        )
+    _needs_poses(legs, seen & posed[:, None])
+
+
+def _too_few_at_once(legs: Legs, at_once: Booleans) -> None:
+    need = {6: "three", 3: "two" if legs.planar else "one"}[legs.motion.shape[1]]
+    raise ResultError(
+        what="no configuration shows enough legs with a length at once to place the platform",
+        found=f"{at_once.sum(axis=1).max(initial=0)} at most",
+        expected=f"{need} or more, not on one line, [A] 3.5",
+        next_step=f"let a station see more legs, photograph one configuration from several "
+        f"stations, or {BUNDLE}",
+    )
+
+
+def _needs_poses(legs: Legs, seen: Booleans) -> None:
+    """Passive legs and revolute axes need the platform's pose and the leg, twice."""
+    for which, what in (
+        (~legs.closing, "passive leg {}'s platform joint"),
+        (legs.platform_revolute, "the revolute axis of leg {} on the platform"),
+    ):
+        short = np.flatnonzero(which & (seen.sum(axis=0) < 2))
+        if short.size:
+            raise ResultError(
+                what=what.format(short[0] + 1) + " cannot be found",
+                found=f"seen in {seen[:, short[0]].sum()} configurations together with enough "
+                "legs with a length",
+                expected="two directions at least, with three legs with a length at once, [A] 3.5",
+                next_step=f"add configurations or a station that sees it, or {BUNDLE}",
+            )
+
+
+def lengths_are_fixed(
+    machine: Machine, axes: Axes, usable: Booleans, base: Array, T_camera_base: Array, q0: Array
+) -> None:
+    """[A] 3.4: the distances between platform joints tell each offset; no length collapsed.
+
+    base (1, L, 3), T_camera_base (1, S, 4, 4) and offsets q0 (1, L) as the steps found them.
+    """
+    legs = legs_of(machine)
+    _not_collapsed(legs, q0[0])
+    seen = axes.seen & usable[axes.station][:, None] & legs.closing
+    merged = in_base(replace(axes, seen=seen), T_camera_base)
+    a = np.broadcast_to(base[:, None], merged.u.shape)
+    slopes = offset_slopes(merged, a, q0, "corrected")[0][:, legs.closing]
+    values, vectors = np.linalg.eigh(slopes.T @ slopes / max(len(merged.configuration), 1))
+    if values[0] > FLAT**2:
+        return
+    part = np.abs(vectors[:, values <= FLAT**2]).max(axis=1)
+    names = np.flatnonzero(legs.closing)[part > 0.3 * part.max()]
+    raise ResultError(
+        what=f"the photographs do not tell the lengths of legs {listed(names)}",
+        found="distances between platform joints that do not depend on a combination of them",
+        expected="legs that change their directions against each other, seen at once, [A] 3.4",
+        next_step=f"add configurations that tilt and turn the platform more, or {BUNDLE}",
+    )
+
+
+def _not_collapsed(legs: Legs, q0: Array) -> None:
+    short = np.flatnonzero(legs.constant & (q0 < COLLAPSED * legs.rod))
+    if short.size:
+        raise ResultError(
+            what=f"leg {short[0] + 1} of constant length shrank to nothing in the third step",
+            found=f"{1e3 * q0[short[0]]:.0f} mm",
+            expected=f"about {1e3 * legs.rod[short[0]]:.0f} mm as drawn; at zero length both its "
+            "joints fall together, which fits the photographs for a wrong reason",
+            next_step=f"check the drawing's length, add configurations, or {BUNDLE}",
+        )
+
+
+def _parts(points: Array, free: Array) -> tuple[Integers, Integers]:
+    """Two sets of points between which a distance is free; free (n, 3, f) ways to move."""
+    apart = points[:, None] - points
+    rate = np.abs(dot(apart[..., None, :], np.moveaxis(free[:, None] - free, -1, -2)))
+    rate = rate.max(axis=-1)
+    i, j = np.unravel_index(np.argmax(rate), rate.shape)
+    tied = rate < 0.05 * rate.max()
+    return np.flatnonzero(tied[i] & ~tied[j]), np.flatnonzero(tied[j] & ~tied[i])
+
+
+def listed(numbers: Integers) -> str:
+    """Leg numbers for people, from 1."""
+    words = [str(k + 1) for k in numbers]
+    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
+
+
+def _legs_in_brackets(seen: Booleans) -> str:
+    return f" (legs {listed(np.flatnonzero(seen))})" if seen.any() else ""

@@ -1,0 +1,319 @@
+"""What the data leave open, said so that people know what to do.
+
+The null space of the data's information has no axes of its own: any rotation of it is as good.
+So changes that people can picture (:mod:`pkmcal.identify.words_families`) are held against the
+whole space, one after the other: what lies in it is taken out and said, the rest stays for the
+next. All comparisons are made in units of the drawing's tolerances, with the frames' freedoms
+taken out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.gauge import freedoms, generators
+from pkmcal.identify.problem import Estimate
+from pkmcal.identify.words_effect import platform_by_parameters
+from pkmcal.identify.words_families import Circumstances, Family, circumstances, families
+from pkmcal.identify.words_advice import advice_on
+from pkmcal.identify.words_text import naming, said_of
+from pkmcal.mechanisms import Machine
+
+if TYPE_CHECKING:
+    from pkmcal.identify.conditions import Condition
+    from pkmcal.identify.covariance import Direction, Identifiability
+    from pkmcal.identify.problem import Measurements
+    from pkmcal.observe.edges import EdgeSet
+
+INSIDE = 0.99
+"""Share of a change (squared) that lies in the open space for it to explain part of that space:
+null directions are exact but for the estimate's noise, and their frames' rounding."""
+INSIDE_WEAK = 0.9
+"""Same for what the data know less than the drawing, where nothing is exact."""
+NEW = 0.1
+"""Sine of the angle to what is said already below which a change says nothing new."""
+MOVES = 0.01
+"""Share of a joint centre's tolerance below which a platform counts as not moved: a hundredth
+of what the drawing leaves open disappears beside any calibration's own deviations."""
+MOST = 8
+"""Sentences that people read."""
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """One thing that the data do not tell.
+
+    text, advice : what, and what to do. parameters : the names that it is about, most first.
+    dimensions : independent changes that it stands for. moves_platform : how far (m, root mean
+    square over its joints and poses) the platform moves when these changes are as large as the
+    drawing's tolerance lets expect. matters : whether that is more than nothing.
+    """
+
+    text: str
+    advice: str
+    parameters: tuple[str, ...]
+    dimensions: int
+    moves_platform: float
+    matters: bool
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What the data tell and do not tell: the test, its words, and the paper's conditions.
+
+    told : rank and spectrum. unidentified : what no amount of such data fixes. weak : what the
+    drawing knows better. by_drawing : how far (m, as ``Sentence.moves_platform``) the platform
+    moves when all parameters are as wrong as the drawing's tolerances let expect.
+    """
+
+    told: Identifiability
+    unidentified: tuple[Sentence, ...]
+    weak: tuple[Sentence, ...]
+    by_drawing: float
+    conditions: tuple[Condition, ...] = ()
+
+
+class _Part(NamedTuple):
+    """Families with one text: the space (k, P) of changes that they explain, scaled, their own
+    numbers (k, m) for it, and how many of the k nobody said before."""
+
+    families: tuple[Family, ...]
+    space: Array
+    coefficients: Array
+    new: int
+
+
+class _Open(NamedTuple):
+    """What is left open, in units of the drawing's deviations: rows (n, P) orthonormal, their
+    covariance (n, n) as the estimate leaves it, frames (P, g) orthonormal, unit (P,)."""
+
+    rows: Array
+    covariance: Array
+    frames: Array
+    unit: Array
+
+
+def explain(
+    told: Identifiability,
+    estimate: Estimate,
+    seen: Booleans,
+    conditions: tuple[Condition, ...] = (),
+) -> Findings:
+    """The findings of an estimate; seen : (S, L) legs that each station sees.
+
+    Stations that a board on the base joins are one here, see :func:`joined_by_boards`.
+    """
+    machine, table = estimate.machine, estimate.machine.parameters
+    poses = estimate.state.T_base_platform[estimate.configurations]
+    known = np.array([d.information for d in told.weak])
+    weak = vectors(told.weak, machine)
+    effect = platform_by_parameters(machine, poses)
+    drawing = effect @ (table.free_matrix() * table.tolerances_free())
+    return Findings(
+        told,
+        describe(machine, seen, vectors(told.unidentified, machine), poses),
+        describe(machine, seen, weak, poses, information=known),
+        float(np.linalg.norm(drawing)),
+        conditions,
+    )
+
+
+def vectors(directions: tuple[Direction, ...], machine: Machine) -> Array:
+    """Directions as rows (n, P), in the parameters' units."""
+    return np.array([d.vector for d in directions]).reshape(-1, len(machine.parameters))
+
+
+def seen_legs(edges: EdgeSet, weights: Array, n_stations: int, n_legs: int) -> Booleans:
+    """Legs that each station sees, (S, L); edges given up, of weight (N,) below a half, aside."""
+    kept = np.asarray(weights) >= 0.5
+    out = np.zeros((n_stations, n_legs), dtype=bool)
+    out[edges.station[kept], edges.leg[kept]] = True
+    return out
+
+
+def joined_by_boards(seen: Booleans, measurements: Measurements) -> Booleans:
+    """The same (S, L), where stations that see one board on the base count as one station."""
+    out, poses = seen.copy(), measurements.poses
+    for k, mount in enumerate(measurements.mounts):
+        stations = np.unique(poses.station[poses.mount == k])
+        if mount.body == "base" and stations.size:
+            out[stations] = out[stations].any(axis=0)
+    return out
+
+
+def describe(
+    machine: Machine,
+    seen: Booleans,
+    null: Array,
+    T_base_platform: Array,
+    information: Array | None = None,
+) -> tuple[Sentence, ...]:
+    """Sentences for a space of changes that the data do not see.
+
+    machine : at the estimate. seen : (S, L) legs that each station sees. null : (n, P) changes of
+    all parameters in their units, any basis. T_base_platform : (K, 4, 4) the session's poses.
+    information : (n,) for changes that the data do see, yet less than the drawing knows them:
+    their singular values in units of the tolerance; the words then say so.
+    """
+    weak = information is not None
+    space = _open(machine, null, information)
+    if len(space.rows) == 0:
+        return ()
+    around = circumstances(machine, seen, T_base_platform)
+    effect = platform_by_parameters(machine, T_base_platform) * space.unit
+    parts = _merged(_explained(around, space, INSIDE_WEAK if weak else INSIDE))
+    sentences = [_sentence(around, space, part, effect, weak) for part in parts]
+    return _few(sentences)
+
+
+def _open(machine: Machine, null: Array, information: Array | None) -> _Open:
+    """The open space without frames, in units of the drawing's deviations."""
+    unit = _unit(machine)
+    moved = generators(machine.layout, machine.values) @ freedoms(machine)
+    frames = _orthonormal((moved / unit[:, None]).T).T
+    rows = null / unit
+    rows = rows - (rows @ frames) @ frames.T
+    size = np.linalg.norm(rows, axis=1)
+    s = np.zeros(len(rows)) if information is None else information
+    rows, s = rows[size > 0] / size[size > 0, None], s[size > 0]
+    basis = _orthonormal(rows)
+    if information is None or not len(rows):
+        return _Open(basis, np.eye(len(basis)), frames, unit)
+    mixed = np.linalg.lstsq(rows.T, basis.T, rcond=None)[0].T
+    return _Open(basis, mixed / (1 + s**2) @ mixed.T, frames, unit)
+
+
+def _unit(machine: Machine) -> Array:
+    """The drawing's deviations (P,), larger for tied ones, which share one deviation."""
+    squares = machine.parameters.free_matrix() ** 2
+    shared = np.where(squares.sum(axis=1) > 0, squares @ squares.sum(axis=0), 1.0)
+    return machine.parameters.tolerance * np.sqrt(np.maximum(shared, 1.0))
+
+
+def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
+    """An orthonormal basis (k, P) of the rows' space."""
+    if rows.size == 0:
+        return np.zeros((0, rows.shape[-1]))
+    _, s, vt = np.linalg.svd(rows, full_matrices=False)
+    return vt[s > least * max(float(s[0]), 1e-300)]
+
+
+def _explained(around: Circumstances, space: _Open, inside: float) -> list[_Part]:
+    """Families that lie in the open space, each with what it says anew."""
+    parts: list[_Part] = []
+    done = np.zeros((0, space.rows.shape[1]))
+    for family in families(around):
+        if len(done) == len(space.rows):
+            break
+        found = _within(family, space, inside)
+        new = found - (found @ done.T) @ done
+        new = _directions(new)
+        if len(new) == 0:
+            continue
+        if family.kind == "rest":
+            found = new
+        done = _orthonormal(np.concatenate([done, new]))
+        parts.append(_Part((family,), found, _coefficients(family, space, found), len(new)))
+    return parts
+
+
+def _directions(rows: Array) -> Array:
+    """Orthonormal directions (k, P) that the rows still have, those that rounding left aside."""
+    if rows.size == 0:
+        return rows[:0]
+    _, s, vt = np.linalg.svd(rows, full_matrices=False)
+    return vt[s > NEW]
+
+
+def _within(family: Family, space: _Open, inside: float) -> Array:
+    """Directions (k, P) of the open space that the family can make, orthonormal."""
+    columns = (family.columns / space.unit[:, None]).T
+    size = np.linalg.norm(columns, axis=1)
+    columns = columns[size > 0] / size[size > 0, None]
+    # what only moves the frames changes nothing, whatever rounding leaves of it
+    basis = _orthonormal(columns - (columns @ space.frames) @ space.frames.T, 1e-4)
+    u, s, _ = np.linalg.svd(space.rows @ basis.T)
+    s = np.pad(s, (0, len(space.rows) - len(s)))[: len(space.rows)]
+    return u[:, s**2 > inside].T @ space.rows
+
+
+def _coefficients(family: Family, space: _Open, found: Array) -> Array:
+    """The family's own numbers (k, m) for each direction, frames aside."""
+    columns = family.columns / space.unit[:, None]
+    scale = np.linalg.norm(columns, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    both = np.concatenate([columns / scale, space.frames], axis=1)
+    solved = np.linalg.lstsq(both, found.T, rcond=1e-6)[0]
+    return (solved[: columns.shape[1]] / scale[:, None]).T
+
+
+ONE_SENTENCE = ("unseen", "common turn", "axis", "slide", "rod", "centre", "leg", "radius", "depth")
+"""Kinds that are said of several legs at once where they say the same of each."""
+
+
+def _merged(parts: list[_Part]) -> list[_Part]:
+    """Parts of one kind for several legs as one."""
+    out: dict[tuple[object, ...], _Part] = {}
+    for place, part in enumerate(parts):
+        family = part.families[0]
+        key: tuple[object, ...] = (place,)
+        if family.kind in ONE_SENTENCE:
+            key = (family.kind, family.among, len(part.space), naming(family, part.coefficients))
+        if key not in out:
+            out[key] = part
+            continue
+        old = out[key]
+        space = np.concatenate([old.space, part.space])
+        numbers = np.concatenate([old.coefficients, part.coefficients])
+        out[key] = _Part(old.families + part.families, space, numbers, old.new + part.new)
+    return list(out.values())
+
+
+def _sentence(
+    around: Circumstances, space: _Open, part: _Part, effect: Array, weak: bool
+) -> Sentence:
+    found = _directions(part.space)
+    mixed = found @ space.rows.T
+    moved = effect @ found.T
+    moved = float(np.sqrt(np.trace(moved @ (mixed @ space.covariance @ mixed.T) @ moved.T)))
+    table = around.machine.parameters
+    matters = moved > MOVES * float(table.tolerance[around.at.base].mean())
+    size = np.linalg.norm(found, axis=0)
+    order = np.argsort(-np.round(size, 6), kind="stable")
+    names = tuple(table.names[k] for k in order[: int(np.sum(size > 0.15 * size.max()))])
+    text = said_of(around, part.families, part.coefficients, names, weak)
+    how_far = "This does not move the platform."
+    if matters:
+        how_far = (
+            f"Within the drawing's tolerances this moves the platform by {moved * 1e3:.2g} mm."
+        )
+    return Sentence(
+        f"{text}. {how_far}",
+        advice_on(around, part.families, names, matters, weak),
+        names,
+        part.new,
+        moved,
+        matters,
+    )
+
+
+def _few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
+    """At most ``MOST`` sentences, the rest counted in the last."""
+    if len(sentences) <= MOST:
+        return tuple(sentences)
+    ranked = sorted(sentences, key=lambda s: -s.moves_platform)
+    kept = [s for s in sentences if s in ranked[: MOST - 1]]
+    rest = ranked[MOST - 1 :]
+    moved = float(np.sqrt(sum(s.moves_platform**2 for s in rest)))
+    last = replace(
+        rest[0],
+        text=f"And {len(rest)} more of this kind. {rest[0].text}",
+        parameters=tuple(dict.fromkeys(name for s in rest for name in s.parameters)),
+        dimensions=sum(s.dimensions for s in rest),
+        moves_platform=moved,
+    )
+    return (*kept, last)

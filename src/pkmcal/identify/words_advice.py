@@ -1,0 +1,88 @@
+"""What to do about each kind of change that data leave open."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.geometry.rigid import rotation_vector
+from pkmcal.identify.words_families import Circumstances, Family
+from pkmcal.identify.words_text import named
+
+TURNED = 0.02
+"""Turn (rad) of the platform between configurations below which they only shift it."""
+MOST_FIXED = 3
+BY_CALIPER = ("radius", "radii", "depth")
+
+
+def advice_on(
+    around: Circumstances,
+    families: tuple[Family, ...],
+    names: tuple[str, ...],
+    matters: bool,
+    weak: bool,
+) -> str:
+    """What to do about what the families leave open.
+
+    names : its parameters. matters : whether it moves the platform. weak : whether the data
+    know it, yet less than the drawing does.
+    """
+    kind = families[0].kind
+    if not matters:
+        return f"Nothing needs to be done; {_fixing(names)} silences this."
+    legs = sorted({leg for family in families for leg in family.legs})
+    if kind == "unseen":
+        do = f"Photograph {named(legs)}, from another station if need be"
+    elif kind == "group":
+        do = _tying(around, legs)
+    elif kind == "spread":
+        do = f"{_more(around, legs)}; or measure the tubes with a caliper"
+    elif kind in BY_CALIPER:
+        do = f"Measure the tubes of {named(legs)} with a caliper and give a small tolerance.radius"
+    elif kind == "common turn":
+        do = "Legs look the same however these axes lie: leave them to the drawing"
+    elif kind in ("axis", "axes"):
+        do = "Photograph configurations that turn these joints further, to both sides"
+    else:
+        do = _more(around, legs)
+    return f"{do}; or {_holding(names, weak)}."
+
+
+def _tying(around: Circumstances, legs: list[int]) -> str:
+    """How to tie a group of legs to the others."""
+    others = [j for j in range(around.seen.shape[1]) if j not in legs]
+    with_group = around.seen[around.seen[:, legs].any(axis=1)].any(axis=0)
+    apart = [j for j in others if not with_group[j]]
+    shown = named(apart or others)
+    camera = f"Add a station that sees {named(legs)} together with {shown}"
+    board = "let a board fixed to the base be seen with the legs (observe: [legs, board], board:"
+    return f"{camera}; or {board} {{fixed_to: base}})"
+
+
+def _more(around: Circumstances, legs: list[int]) -> str:
+    """Which configurations are missing."""
+    poses = around.T_base_platform
+    those = named(legs) if len(legs) < around.machine.n_legs else "all legs"
+    point = "points" if len(legs) == 1 else "point"
+    if len(poses) == 1:
+        return f"Photograph more configurations, so that {those} {point} elsewhere too"
+    turn = rotation_vector(poses[:, :3, :3] @ poses[0, :3, :3].T)
+    can_turn = around.machine.layout.motion[:3].any()
+    if can_turn and np.abs(turn).max() < TURNED:
+        return f"Turn the platform in some configurations, so that {those} {point} elsewhere"
+    ends = "with lengths near both ends of their range"
+    return f"Photograph configurations in which {those} {point} elsewhere, {ends}"
+
+
+def _holding(names: tuple[str, ...], weak: bool) -> str:
+    """How the drawing can decide."""
+    if weak:
+        return "state smaller tolerances in the mechanism file if the drawing warrants them"
+    return f"{_fixing(names)} if the drawing is sure of that"
+
+
+def _fixing(names: tuple[str, ...]) -> str:
+    """The line of the mechanism file that takes parameters out."""
+    said = [f'"{name}"' for name in names[:MOST_FIXED]]
+    if len(names) > MOST_FIXED:
+        return f"fixed: [{', '.join(said)}, …] in the mechanism file"
+    return f"fixed: [{', '.join(said)}] in the mechanism file"

@@ -1,0 +1,128 @@
+"""What a mechanism file's schema cannot say: whether its legs can be those of its motion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from pkmcal.errors import InputError
+from pkmcal.files import listed
+from pkmcal.files.yaml_files import field_path
+from pkmcal.mechanisms.joints import equations
+from pkmcal.mechanisms.limbs import MOTIONS
+from pkmcal.mechanisms.rods import PassiveLength
+from pkmcal.mechanisms.schema import Leg, MechanismDocument
+
+IN_PLANE = 1e-6
+"""Metres out of the plane, and radians off its normal, that rounding in a file explains."""
+
+Where = Callable[..., str]
+
+
+def check_drawing(document: MechanismDocument, where: Where | None = None) -> None:
+    """Raise InputError for a drawing whose joints and rods cannot make its motion.
+
+    where : names a field's place in the file by its keys.
+    """
+    place = where or (lambda *keys: field_path(keys))
+    for j, leg in enumerate(document.legs):
+        for side in ("base", "platform"):
+            _check_axis(document, j, side, place)
+        if document.motion == "planar":
+            _check_plane(document, j, leg, place)
+        if document.motion == "translation":
+            _check_parallel(j, leg, place)
+    _check_equations(document, place)
+
+
+def _check_axis(document: MechanismDocument, j: int, side: str, place: Where) -> None:
+    node = getattr(document.legs[j], side)
+    axis = getattr(node, "axis", None)
+    if node.joint == "spherical" and axis is not None:
+        raise InputError(
+            f"leg {j + 1} has a spherical joint with an axis",
+            where=place("legs", j, side, "axis"),
+            expected="no axis, or joint: universal or revolute",
+        )
+    if node.joint == "revolute" and axis is None and document.motion != "planar":
+        raise InputError(
+            f"leg {j + 1} has a revolute joint without an axis",
+            where=place("legs", j, side),
+            expected=f"axis: [x, y, z] in the {side} frame, the direction that it turns about",
+        )
+
+
+def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: Where) -> None:
+    """A planar machine's legs lie in planes z = const, their axes along z."""
+    for side in ("base", "platform"):
+        axis = getattr(getattr(leg, side), "axis", None)
+        if axis is not None and np.hypot(axis[0], axis[1]) > IN_PLANE:
+            raise InputError(
+                f"leg {j + 1} of a planar machine turns about an axis that is not the plane's",
+                where=place("legs", j, side, "axis"),
+                found=f"[{axis[0]:g}, {axis[1]:g}, {axis[2]:g}]",
+                expected="[0, 0, 1]: a planar machine moves in the base frame's x-y plane",
+            )
+    if document.home and np.hypot(*document.home.rotation_vector[:2]) > IN_PLANE:
+        raise InputError(
+            "the home pose of a planar machine is turned out of its plane",
+            where=place("home", "rotation_vector"),
+            expected="[0, 0, angle]",
+        )
+    gap = leg.platform.center[2] + _rise(document) - leg.base.center[2]
+    if abs(gap) > IN_PLANE:
+        raise InputError(
+            f"leg {j + 1} of a planar machine leaves its plane",
+            where=place("legs", j, "platform", "center"),
+            found=f"its platform joint {gap * 1e3:+.4g} mm above its base joint",
+            expected="the same height (z) for both ends of a leg, at the home pose",
+            next_step="Draw the leg in its plane, or write motion: spatial",
+        )
+
+
+def _rise(document: MechanismDocument) -> float:
+    """Height of the platform frame above the base frame, m; by the legs where no home is given."""
+    if document.home is not None:
+        return document.home.position[2]
+    heights = [leg.base.center[2] - leg.platform.center[2] for leg in document.legs]
+    return sum(heights) / len(heights)
+
+
+def _check_parallel(j: int, leg: Leg, place: Where) -> None:
+    """A platform that only translates keeps axes parallel; unequal ones would turn it."""
+    first, second = (getattr(end, "axis", None) for end in (leg.base, leg.platform))
+    if "universal" != leg.base.joint or leg.platform.joint != "universal":
+        return
+    if first is None or second is None:
+        return
+    if np.linalg.norm(np.cross(first, second)) > IN_PLANE:
+        raise InputError(
+            f"the universal joints of leg {j + 1} have axes that are not parallel, so they would "
+            "turn the platform",
+            where=place("legs", j, "platform", "axis"),
+            expected="the axis of its base joint",
+            next_step="Write motion: spatial, and the turn will be computed",
+        )
+
+
+def _check_equations(document: MechanismDocument, place: Where) -> None:
+    passive = [
+        j + 1 for j, leg in enumerate(document.legs) if isinstance(leg.length, PassiveLength)
+    ]
+    count = len(document.legs) - len(passive) + len(equations(document))
+    freedoms = MOTIONS[document.motion].shape[1]
+    if count >= freedoms:
+        return
+    why = ""
+    if passive:
+        one = len(passive) == 1
+        why = f"; {'leg' if one else 'legs'} {listed([str(j) for j in passive])}, passive, "
+        why += "holds nothing" if one else "hold nothing"
+    raise InputError(
+        f"the legs do not hold the platform: {count} equations for {freedoms} freedoms{why}",
+        where=place("legs"),
+        expected="one equation a leg with a length, one a revolute joint, one a pair of universal "
+        f"joints with axes; {freedoms} for motion: {document.motion}",
+        next_step="Add legs or axes, or correct motion",
+    )

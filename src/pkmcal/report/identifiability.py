@@ -1,0 +1,141 @@
+"""What the data can tell of the machine: the rank, its words, and the paper's counts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.identify.conditions import Condition
+from pkmcal.identify.words import Findings, Sentence
+from pkmcal.mechanisms import ParameterTable
+from pkmcal.report.charts import Bar, BarChart
+from pkmcal.report.parameters import in_words
+from pkmcal.report.wording import brief, count, joined
+
+FLOOR = 1e-3
+"""Information below which a bar has no height: the drawing knows a thousand times more."""
+MOST_NAMES = 6
+
+
+@dataclass(frozen=True)
+class Section:
+    """The section's content.
+
+    rank, possible : directions that the data fix, of those that exist. headline : in words.
+    spectrum : how well each direction is known. fixed, tied : values not estimated, and why.
+    """
+
+    rank: int
+    possible: int
+    headline: str
+    spectrum: BarChart | None
+    unidentified: tuple[Sentence, ...]
+    weak: tuple[Sentence, ...]
+    conditions: tuple[Condition, ...]
+    fixed: str
+    tied: str
+
+
+def section(findings: Findings, table: ParameterTable) -> Section:
+    """The section of the findings of a machine with these parameters."""
+    told = findings.told
+    possible = told.n_parameters - told.n_frames
+    return Section(
+        rank=told.rank,
+        possible=possible,
+        headline=_headline(findings, possible),
+        spectrum=_spectrum(findings),
+        unidentified=findings.unidentified,
+        weak=findings.weak,
+        conditions=findings.conditions,
+        fixed=_fixed(table),
+        tied=_tied(table),
+    )
+
+
+def _headline(findings: Findings, possible: int) -> str:
+    told = findings.told
+    frames = f"{told.n_parameters} free values less {told.n_frames} that only place the frames"
+    lost = possible - told.rank
+    start = f"The data fix {told.rank} of {possible} directions ({frames})."
+    if lost == 0 and not told.weak:
+        return f"{start} Each is known better from the data than from the drawing."
+    parts: list[str] = []
+    if lost:
+        parts.append(f"{count(lost, 'direction')} no amount of such data would fix")
+    if told.weak:
+        parts.append(f"{count(len(told.weak), 'direction')} the drawing knows better")
+    return f"{start} {joined(parts)[0].upper()}{joined(parts)[1:]}."
+
+
+def _spectrum(findings: Findings) -> BarChart | None:
+    """Bars of all directions, best known first, on a logarithmic scale from ``FLOOR``."""
+    values = np.asarray(findings.told.singular_values, dtype=float)
+    if values.size == 0:
+        return None
+    decades = math.log10(1 / FLOOR)
+    heights = np.maximum(np.log10(np.maximum(values, FLOOR)) + decades, 0.0)
+    high = 1.06 * max(float(heights.max()), decades + 1)
+    bars = tuple(
+        Bar(str(k + 1), _tip(k, value, findings.told.rank), float(height), quiet=value >= 1)
+        for k, (value, height) in enumerate(zip(values, heights, strict=True))
+    )
+    tops = range(math.floor(high) + 1)
+    ticks = tuple((float(t), _power(t - round(decades))) for t in tops)
+    places = sorted({0, len(bars) - 1} | set(range(9, len(bars) - 2, 10)))
+    return BarChart(
+        title="How well each direction is known",
+        unit="directions of the parameters, best known first",
+        alt=f"{len(bars)} directions; {findings.told.rank} are fixed by the data and "
+        f"{len(findings.told.weak)} of those are known better by the drawing",
+        bars=bars,
+        high=high,
+        ticks=ticks,
+        labels=tuple((k + 0.5, str(k + 1)) for k in places),
+        curve=((0.0, decades), (float(len(bars)), decades)),
+    )
+
+
+def _power(exponent: int) -> str:
+    """``1``, ``10``, ``1000``, ``10⁻²``: plain numbers as far as they are short."""
+    if 0 <= exponent <= 3:
+        return str(10**exponent)
+    return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def _tip(k: int, value: float, rank: int) -> str:
+    if k >= rank:
+        return f"Direction {k + 1}: the data say nothing"
+    if value < 1:
+        return f"Direction {k + 1}: the drawing knows it {brief(1 / value)} times better"
+    return f"Direction {k + 1}: the data know it {brief(value)} times better than the drawing"
+
+
+def _fixed(table: ParameterTable) -> str:
+    """What the mechanism file holds, in a sentence; empty where it holds nothing."""
+    if not table.fixed:
+        return ""
+    verb = "was" if len(table.fixed) == 1 else "were"
+    return (
+        f"{_listed(table.fixed)} {verb} not estimated: the mechanism file lists "
+        f"{'it' if len(table.fixed) == 1 else 'them'} under fixed, so the drawing's value counts "
+        "as exact and no direction belongs to it."
+    )
+
+
+def _tied(table: ParameterTable) -> str:
+    if not table.tied:
+        return ""
+    groups = [joined([in_words(name) for name in group]) for group in table.tied[:MOST_NAMES]]
+    more = f" and {len(table.tied) - MOST_NAMES} more" if len(table.tied) > MOST_NAMES else ""
+    return f"Changes together, as one value: {'; '.join(groups)}{more}."
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    words = [in_words(name) for name in names[:MOST_NAMES]]
+    if len(names) > MOST_NAMES:
+        words.append(f"{len(names) - MOST_NAMES} more")
+    text = joined(words)
+    return text[0].upper() + text[1:]

@@ -1,0 +1,272 @@
+"""A calibration board in the simulated scene: its print to the last module, and a place for it.
+
+The board is a thin plate whose print is part of its shape: black and white are faces of their
+own, so the renderer averages over the pixels between them as it does along every silhouette, and
+a printed corner is right to a hundredth of a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras import Camera
+from pkmcal.errors import GeometryError
+from pkmcal.geometry.rigid import apply, inverse, pose, rotation
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.observe.board_finders import dictionary, marker_bits
+from pkmcal.observe.boards import Board, board_from_document
+from pkmcal.simulate.casting import Part
+from pkmcal.simulate.scene import Discs, Finish, discs_of, machine_parts
+from pkmcal.simulate.shapes import Box, Shape, turned
+from pkmcal.simulate.surfaces import Material, Pattern, SmoothNoise
+
+THICKNESS = 0.004
+"""m."""
+BLACK = 0.06
+"""Light that printed black sends back, as a share of white's."""
+SQUARES = (10, 8)
+"""Of the board made to measure: large squares are read from afar, and past legs."""
+LOOKED_AT = 6
+"""Configurations at which the places for a board are tried."""
+LEAST_SEEN = 0.4
+"""Share of a board's corners that every station has to see, on average."""
+
+
+@dataclass(frozen=True)
+class Print:
+    """What is printed: cells between x (nx + 1,) and y (ny + 1,), m, board frame; dark (ny, nx)."""
+
+    x: Array
+    y: Array
+    dark: Booleans
+
+    @classmethod
+    def of(cls, board: Board) -> Print:
+        """A board's cells: squares, and inside them the modules of the markers."""
+        data = board.document
+        if board.type == "chessboard":
+            columns, rows = (n + 1 for n in board.counts)
+            i, j = np.mgrid[:rows, :columns]
+            edges = [data["square"] * (np.arange(n + 1) - 1.0) for n in (columns, rows)]
+            return cls(edges[0], edges[1], (i + j) % 2 == 0)
+        return _charuco(data) if board.type == "charuco" else _markers(data)
+
+    def dark_at(self, x: Array, y: Array) -> Booleans:
+        """Whether points (n,) of the board's plane are black; white outside the print."""
+        i, j = np.searchsorted(self.y, y) - 1, np.searchsorted(self.x, x) - 1
+        inside = (i >= 0) & (j >= 0) & (i < len(self.y) - 1) & (j < len(self.x) - 1)
+        return self.dark[i * inside, j * inside] & inside
+
+
+def _charuco(data: dict[str, Any]) -> Print:
+    columns, rows = data["squares"]
+    square, marker, bits = data["square"], data["marker"], marker_bits(data["dictionary"]) + 2
+    margin = (square - marker) / 2
+    cells = np.array([0.0, *(margin + marker * np.arange(bits + 1) / bits)])
+    parity = int(bool(data.get("legacy")) and rows % 2 == 0)
+    dark = np.zeros((rows, bits + 2, columns, bits + 2), dtype=bool)
+    number = 0
+    for i, j in np.ndindex(rows, columns):
+        if (i + j) % 2 == parity:
+            dark[i, :, j] = True
+        else:
+            dark[i, 1:-1, j, 1:-1] = _modules(data["dictionary"], number)
+            number += 1
+    x, y = (
+        np.append((np.arange(n)[:, None] * square + cells).ravel(), n * square)
+        for n in (columns, rows)
+    )
+    return Print(x, y, dark.reshape(rows * (bits + 2), -1))
+
+
+def _markers(data: dict[str, Any]) -> Print:
+    columns, rows = data["markers"]
+    bits = marker_bits(data["dictionary"]) + 2
+    cells = data["marker"] * np.arange(bits + 1) / bits
+    dark = np.zeros((rows, bits + 1, columns, bits + 1), dtype=bool)
+    for k, (i, j) in enumerate(np.ndindex(rows, columns)):
+        dark[i, :-1, j, :-1] = _modules(data["dictionary"], data.get("first_id", 0) + k)
+    step = data["marker"] + data["gap"]
+    x, y = (
+        np.append((np.arange(n)[:, None] * step + cells).ravel(), n * step) for n in (columns, rows)
+    )
+    return Print(x, y, dark.reshape(rows * (bits + 1), -1))
+
+
+def _modules(name: str, number: int) -> Booleans:
+    """A marker's modules, its black border included."""
+    import cv2
+
+    picture = cv2.aruco.generateImageMarker(dictionary(name), number, marker_bits(name) + 2)
+    return np.asarray(picture) < 128
+
+
+@final
+@dataclass(frozen=True)
+class Sheet(Shape):
+    """A printed plate: a box with T_outer_board (4, 4), printed on one face."""
+
+    box: Box
+    T_outer_board: Array
+    print: Print
+
+    @classmethod
+    def at(cls, board: Board, T_outer_board: Array) -> Sheet:
+        """A board with a white margin of half a square round its print."""
+        printed = Print.of(board)
+        low = np.array([printed.x[0], printed.y[0]])
+        high = np.array([printed.x[-1], printed.y[-1]])
+        margin = 0.5 * (board.document.get("square") or board.document["marker"])
+        middle = np.array([*(low + high) / 2, THICKNESS / 2])
+        half = np.array([*(high - low) / 2 + margin, THICKNESS / 2])
+        box = Box(apply(T_outer_board, middle), T_outer_board[:3, :3].T, half)
+        return cls(box, T_outer_board, printed)
+
+    def enter(self, origin: Array, d: Array) -> Array:
+        """The plate's."""
+        return self.box.enter(origin, d)
+
+    def normal(self, points: Array) -> Array:
+        """The plate's."""
+        return self.box.normal(points)
+
+    def local(self, points: Array) -> Array:
+        """In the board's frame."""
+        T = inverse(self.T_outer_board)
+        return turned(T[:3, :3], points) + T[:3, 3:]
+
+    def face(self, points: Array) -> Integers:
+        """White, black, and the plate's other sides."""
+        q = self.local(points)
+        dark = self.print.dark_at(q[0], q[1])
+        return np.where(q[2] < THICKNESS / 2, dark.astype(np.int16), np.int16(2)).astype(np.int16)
+
+    def balls(self) -> tuple[Array, Array]:
+        """The plate's."""
+        return self.box.balls()
+
+
+@final
+@dataclass(frozen=True)
+class Printed(Pattern):
+    """Black and white by the print, at points in the board's frame."""
+
+    print: Print
+
+    def factor(self, q: Array) -> Array:
+        """1 on white, and on the plate's sides and back."""
+        dark = self.print.dark_at(q[0], q[1]) & (q[2] < THICKNESS / 2)
+        return np.where(dark, BLACK, 1.0)
+
+
+def board_part(board: Board, T_base_board: Array) -> Part:
+    """The board as a part of the scene, matt."""
+    sheet = Sheet.at(board, T_base_board)
+    return Part(sheet, Material(0.75, Printed(sheet.print)))
+
+
+def board_for(machine: Machine) -> Board:
+    """A ChArUco board that lies between the machine's base joints."""
+    discs = discs_of(machine)
+    ends = limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), np.eye(4))
+    clear = np.linalg.norm((np.array(ends.a) - discs.base)[:, :2], axis=1).min()
+    # its white margin reaches almost to the joints
+    square = round(0.85 * 2 * float(clear) / float(np.hypot(SQUARES[0] + 1, SQUARES[1] + 1)), 3)
+    return board_from_fields(
+        {
+            "type": "charuco",
+            "squares": list(SQUARES),
+            "square": square,
+            "marker": round(0.75 * square, 4),
+            "dictionary": "DICT_4X4_50",
+        }
+    )
+
+
+def board_from_fields(fields: dict[str, Any]) -> Board:
+    """A board of board.yaml's fields."""
+    from pathlib import Path
+
+    from pkmcal.files import Document
+
+    return board_from_document(Document(Path(), "", fields, {}))
+
+
+def place_board(
+    machine: Machine,
+    board: Board,
+    cameras: tuple[Camera, ...],
+    T_camera_base: Array,
+    T_base_platform: Array,
+    joints: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """T_base_board (4, 4): on the base between the legs, or beside it, where it is seen best.
+
+    T_camera_base : (S, 4, 4). T_base_platform (K, 4, 4) and joints (K, m) : configurations. The
+    corners seen are counted past the machine's parts; the station that sees least decides.
+    """
+    discs = discs_of(machine)
+    places = _places(board, discs, rng)
+    few = np.unique(np.linspace(0, len(joints) - 1, LOOKED_AT).astype(int))
+    finish = Finish.from_noise(SmoothNoise.from_rng(rng))
+    scenes = [machine_parts(machine, discs, finish, T_base_platform[k], joints[k]) for k in few]
+    seen = np.array(
+        [
+            min(
+                np.mean([_share_seen(board, T, parts, eye, place) for parts in scenes])
+                for eye, T in zip(cameras, T_camera_base, strict=True)
+            )
+            for place in places
+        ]
+    )
+    best = int(np.argmax(seen))
+    if seen[best] < LEAST_SEEN:
+        raise GeometryError(
+            "there is no place on the base where all stations see the board",
+            found=f"{seen[best]:.0%} of its corners at most",
+            expected=f"{LEAST_SEEN:.0%}",
+            next_step="put the stations higher, or use a wider lens",
+        )
+    return places[best]
+
+
+def _places(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
+    """Lying on the base disc, and beside it, turned as by hand; printed face to the platform."""
+    low, high = board.points.min(axis=0), board.points.max(axis=0)
+    up = discs.side
+    # x, y, z of the board, z into it: away from the platform
+    flat = np.diag([1.0, -up, -up])
+    radius = discs.base_radius + 0.65 * float(np.linalg.norm(high - low))
+    ring = 2 * np.pi * (np.arange(12) + rng.random()) / 12
+    spots = [np.zeros(2), *(radius * np.stack([np.cos(ring), np.sin(ring)], axis=-1))]
+    heights = [THICKNESS, *np.full(len(ring), THICKNESS - discs.thickness)]
+    out: list[Array] = []
+    for spot, height in zip(spots, heights, strict=True):
+        lean = rotation(np.array([*rng.normal(0, 0.01, 2), rng.uniform(-np.pi, np.pi)]))
+        centre = discs.base + np.array([*spot, up * height])
+        # a board that leans stands on its lowest corner
+        rise = up * 0.02 * float(np.linalg.norm(high - low))
+        rot = lean @ flat
+        out.append(pose(rot, centre + np.array([0, 0, rise]) - rot @ ((low + high) / 2)))
+    return out
+
+
+def _share_seen(
+    board: Board, T_camera_base: Array, parts: list[Part], camera: Camera, T_base_board: Array
+) -> float:
+    """Share of the board's corners that a camera sees past a machine's parts."""
+    points = apply(T_base_board, board.points)
+    pixels = camera.project(apply(T_camera_base, points))
+    eye = inverse(T_camera_base)[:3, 3]
+    rays = points - eye
+    distance = np.linalg.norm(rays, axis=1)
+    rays = (rays / distance[:, None]).T
+    front = T_base_board[:3, 2] @ rays > 0.2
+    hit = np.min([part.shape.enter(eye, rays) for part in parts], axis=0)
+    return float(np.mean(camera.in_image(pixels, margin=6.0) & front & (hit > distance - 1e-4)))
