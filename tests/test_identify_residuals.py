@@ -12,9 +12,14 @@ from pkmcal.geometry.rigid import perturb, pose
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.paper_a import Settings, joint_problem, simulate, study_machine
 from pkmcal.identify.residuals import BatchState
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.reproduce.paper_a_simulation import (
+    Settings,
+    joint_problem,
+    simulate,
+    study_machine,
+)
 from test_identify_scene import FOCAL, make_scene
 
 

@@ -14,14 +14,9 @@ from pkmcal.identify.axis_measurements import (
     from_coordinates,
     to_coordinates,
 )
-from pkmcal.identify.paper_a import (
-    Settings,
-    joint,
-    joint_problem,
-    simulate,
-    study,
-    study_machine,
-)
+from pkmcal.reproduce.paper_a_methods import joint, start_off_drawing, thirty
+from pkmcal.reproduce.paper_a_simulation import Settings, joint_problem, simulate, study_machine
+from pkmcal.reproduce.paper_a_study import BOUND, JOINT, METHODS, accuracy, study
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +31,7 @@ def millimetres(accuracy):
 def test_joint_estimate_reaches_its_bound(reduced):
     joint_rms, bound = (reduced.accuracy[name].parameters for name in ("joint", "bound"))
     assert joint_rms < 1.05 * bound
-    assert 1e3 * joint_rms == pytest.approx(0.041, abs=0.004)
+    assert 1e3 * joint_rms == pytest.approx(0.039, abs=0.004)
     # each group too; 75 runs leave 6 % or so
     ratio = millimetres(reduced.accuracy["joint"]) / millimetres(reduced.accuracy["bound"])
     np.testing.assert_allclose(ratio, 1, atol=0.15)
@@ -57,25 +52,101 @@ def test_the_table_of_errata(reduced):
         "bound": [0.034, 0.060, 0.020, 0.030, 0.059],
     }
     for name, values in expected.items():
-        # depth as printed is the drawing's error, whose size the paper leaves open: wider
-        rtol = 0.35 if "printed" in name else 0.25
+        # depth as printed is the drawing's error, whose size the paper leaves open; the others as
+        # far as 75 runs tell, three times 5 %, and the cameras' height lets the bound be: 6 %
+        rtol = 0.35 if "printed" in name else 0.06 if name == "bound" else 0.2
         np.testing.assert_allclose(millimetres(reduced.accuracy[name]), values, rtol=rtol)
 
 
 def test_end_effector(reduced):
-    """[A] eq. 20, mean at random readings: 2.6 mm, 0.27 mm and 0.091 mm in errata."""
+    """[A] eq. 20, mean at random readings: 2.6 mm, 0.27 mm and 0.091 mm in errata; over 3000
+    runs here 3.0 mm, 0.25 mm and 0.0899 mm, 0.0140 degrees.
+    """
     a = reduced.accuracy
-    assert 1e3 * a["four steps as printed"].displacement == pytest.approx(2.8, abs=0.4)
-    assert 1e3 * a["four steps"].displacement == pytest.approx(0.27, abs=0.03)
-    assert 1e3 * a["joint"].displacement == pytest.approx(0.091, abs=0.01)
-    assert np.degrees(a["joint"].orientation) == pytest.approx(0.0142, abs=0.0015)
+    assert 1e3 * a["four steps as printed"].displacement == pytest.approx(3.0, abs=0.5)
+    assert 1e3 * a["four steps"].displacement == pytest.approx(0.25, abs=0.03)
+    assert 1e3 * a["joint"].displacement == pytest.approx(0.0899, abs=0.012)
+    assert np.degrees(a["joint"].orientation) == pytest.approx(0.0140, abs=0.0018)
     # frames by all centres instead of three: what a user of the tool would see
     assert a["joint"].displacement_registered < 0.75 * a["joint"].displacement
 
 
+def test_the_bound_has_its_own_end_effector(reduced):
+    """Errors drawn from the bound move the end-effector as far as the joint estimate's."""
+    joint, bound = (reduced.accuracy[name] for name in (JOINT, BOUND))
+    error = np.hypot(reduced.error[JOINT].displacement, reduced.error[BOUND].displacement)
+    assert abs(joint.displacement - bound.displacement) < 3 * error
+    assert reduced.error[BOUND].displacement < 0.75 * reduced.error[JOINT].displacement
+
+
+def test_depth_as_printed_is_the_drawings(reduced):
+    """Products of distances do not tell depth; the drawing's error stays, to the micrometre."""
+    drawing, printed = (reduced.accuracy[name] for name in ("drawing", "four steps as printed"))
+    assert printed.base_z == pytest.approx(drawing.base_z, rel=1e-3)
+    assert printed.platform_z == pytest.approx(drawing.platform_z, rel=1e-3)
+    assert printed.base_xy < drawing.base_xy / 10
+
+
+def test_standard_errors_are_the_scatter_of_studies():
+    """Eight small studies scatter as each one's standard error says."""
+    studies = [study(runs=12, settings=Settings(poses=6), seed=seed) for seed in range(8)]
+    found = np.array([s.accuracy[JOINT] for s in studies])
+    said = np.array([s.error[JOINT] for s in studies]).mean(axis=0)
+    ratio = found.std(axis=0, ddof=1) / said
+    # chi of seven degrees of freedom over its root: 0.29 to 1.87 in 99.8 of 100
+    assert np.all((ratio > 0.29) & (ratio < 1.87)), ratio
+
+
+def test_the_result_does_not_depend_on_threads(monkeypatch):
+    results = []
+    monkeypatch.setattr("pkmcal.reproduce.paper_a_study.PHOTOGRAPHS", 4 * 45)
+    for count in (1, 3):
+        monkeypatch.setattr("os.cpu_count", lambda count=count: count)
+        results.append(study(runs=12, seed=3))
+    assert [r.threads for r in results] == [1, 3]
+    for name in METHODS:
+        np.testing.assert_array_equal(results[0].accuracy[name], results[1].accuracy[name])
+
+
+def test_the_thirty_parameters():
+    """Frames by centres 1, 3 and 5: their six coordinates vanish, and distances remain."""
+    machine = study_machine()
+    found = thirty(machine)
+    assert len(set(found.names)) == 30
+    assert {"A3 x", "A5 y", "B5 x", "q6"} <= set(found.names)
+    assert not {"A1 x", "A3 y", "A5 z"} & set(found.names)
+    value = dict(zip(found.names, found.drawing, strict=True))
+    centres = machine.base_centers()
+    assert value["A3 x"] == pytest.approx(np.linalg.norm(centres[2] - centres[0]))
+    assert np.hypot(value["A5 x"], value["A5 y"]) == pytest.approx(
+        np.linalg.norm(centres[4] - centres[0])
+    )
+    # rows are unit and independent: an RMSE by them is one of lengths
+    np.testing.assert_allclose(found.rows @ found.rows.T, np.eye(30), atol=1e-12)
+
+
+def test_groups_of_parameters():
+    """An error of one group shows in that one only."""
+    machine = study_machine()
+    names = thirty(machine).names
+    from pkmcal.reproduce.paper_a_methods import Errors
+
+    errors = np.zeros((4, 30))
+    errors[:, [names.index(n) for n in ("B2 z", "B4 z", "B6 z")]] = 1e-3
+    rms, scatter = accuracy(machine, Errors(errors, np.ones((4, 4))))
+    assert rms[:5] == pytest.approx((0, 0, 0, 1e-3, 0))
+    assert rms.parameters == pytest.approx(1e-3 * np.sqrt(3 / 30))
+    assert np.nan_to_num(scatter).max() == 0
+
+
 @pytest.mark.parametrize("error", [0.005, 0.02])
 def test_thirty_of_thirty_starts(error):
-    assert study(runs=30, start_error=error, seed=5).converged == 30
+    """Without the four steps: stations a few degrees, parameters up to 20 mm off."""
+    found = study(runs=30, start_error=error, seed=5)
+    assert found.converged == 30
+    near = study(runs=30, seed=5)
+    assert found.accuracy["joint"] == pytest.approx(near.accuracy["joint"], rel=1e-5)
+    assert near.steps.mean() < found.steps.mean()
 
 
 def test_accuracy_grows_with_the_square_root_of_the_poses():
@@ -101,7 +172,8 @@ def test_noise_free_measurements_give_the_truth():
     truth = simulate(machine, tiny, 3, rng)
     stated = replace(tiny, noise=AxisNoise(), joint_noise=3e-6)
     problem = joint_problem(machine, stated, truth)
-    found = joint(machine, problem, truth, np.zeros_like(truth.theta))
+    start = start_off_drawing(machine, truth, np.zeros_like(truth.theta))
+    found = joint(machine, problem, truth, start)
     np.testing.assert_allclose(problem.theta(found.solution.state), truth.theta, atol=2e-9)
 
 

@@ -18,6 +18,7 @@ from pkmcal.observe.standing import Standing, standing
 from pkmcal.observe.targets import BoardViews, board_views, detect_in, moving_poses
 from pkmcal.photographs import label_of
 from pkmcal.session import Session
+from pkmcal.session_schema import Body
 
 MOUNT = 0
 """A session has one board, so one mount."""
@@ -43,9 +44,13 @@ class StationBoard:
 
 @dataclass(frozen=True)
 class Boards:
-    """The board in all stations that observe it. stations : by their number in the session."""
+    """The board in all stations that observe it.
+
+    stations : by their number in the session. body : what the board is fixed to.
+    """
 
     stations: Mapping[int, StationBoard] = field(default_factory=dict[int, StationBoard])
+    body: Body = "platform"
 
     @property
     def poses(self) -> PoseSet:
@@ -80,16 +85,24 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
     images : decoded photographs by the station's number. Raises `InputError` where a station's
     photographs do not show the board, or show that it moved though it is fixed to the base.
     """
-    if session.board is None or not any("board" in s.observe for s in session.stations):
+    board = board_of(session)
+    if board is None:
         return Boards()
-    board = load_board(session.board)
     return Boards(
         {
             number: station_board(session, board, number, images[number])
             for number, station in enumerate(session.stations)
             if "board" in station.observe
-        }
+        },
+        session.board_body,
     )
+
+
+def board_of(session: Session) -> Board | None:
+    """The board that stations of a session observe, from its file; None where none does."""
+    if session.board is None or not any("board" in s.observe for s in session.stations):
+        return None
+    return load_board(session.board, label=label_of(session.folder, session.board))
 
 
 def station_board(

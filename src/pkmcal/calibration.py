@@ -24,7 +24,7 @@ from pkmcal.identify.bundle import bundle, start_state, what_data_tell
 from pkmcal.identify.conditions import conditions
 from pkmcal.identify.paper_methods import Method as PaperMethod
 from pkmcal.identify.paper_methods import by_paper
-from pkmcal.identify.problem import Estimate, Measurements
+from pkmcal.identify.problem import Estimate, Measurements, Mount
 from pkmcal.identify.start import better_start
 from pkmcal.identify.verdict import Verdict, judge
 from pkmcal.identify.words import Findings, explain, joined_by_boards, seen_legs
@@ -273,6 +273,8 @@ def _measurements(
         joint_noise=session.joint_noise,
         n_stations=len(files),
         camera_of_station=np.array([numbers[name] for name in files]),
+        poses=boards.poses,
+        mounts=(Mount("board", boards.body),) if boards.stations else (),
     )
     if cameras is None:
         return measurements

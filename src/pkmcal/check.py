@@ -7,7 +7,6 @@ decode, are exposed and sharp, and whether the machine is recognised in them.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +15,19 @@ from threadpoolctl import threadpool_limits
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration import Progress
+from pkmcal.check_board import BoardCheck, BoardsCheck, check_boards
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import listed, plain
+from pkmcal.findings import Finding, Level, wrong
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.observe import legs
 from pkmcal.observe.images import decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
+from pkmcal.photographs import label_of
 from pkmcal.recognition import (
     Recognition,
     check_observable,
-    label_of,
     platform_poses,
     recognise,
     why_unrecognised,
@@ -52,29 +53,13 @@ OTHER_MODE = np.deg2rad(20.0)
 """Turn to another assembly below which one could be taken for the other."""
 
 
-class Level(StrEnum):
-    """How bad a finding is."""
-
-    WRONG = "wrong"
-    DOUBTFUL = "doubtful"
-    NOTE = "note"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing found, as a sentence; station : where it is one's."""
-
-    level: Level
-    text: str
-    station: str | None = None
-
-
 @dataclass(frozen=True)
 class StationCheck:
     """One station. mismatch : 0 perfect, 1 nothing fits; NaN where not looked for.
 
     moved, turned : from the pose by hand to the one found, m and rad. legs : mean number found in
-    a photograph. saturated, black : mean shares of the legs' pixels. blur : median, px.
+    a photograph. saturated, black : mean shares of the legs' pixels. blur : median, px. board :
+    where the station observes one and it was found.
     """
 
     name: str
@@ -87,6 +72,7 @@ class StationCheck:
     saturated: float
     black: float
     blur: float
+    board: BoardCheck | None = None
 
 
 @dataclass(frozen=True)
@@ -149,7 +135,7 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
     try:
         session = load_session(folder)
     except PkmcalError as error:
-        return SessionCheck(str(folder), (_wrong(error), *findings))
+        return SessionCheck(str(folder), (wrong(error), *findings))
     findings += [Finding(Level.NOTE, text) for text in session.warnings]
     told("Reading photographs", 0.1)
     photographs, broken = _decoded(session)
@@ -173,10 +159,6 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
     )
 
 
-def _wrong(error: PkmcalError, station: str | None = None) -> Finding:
-    return Finding(Level.WRONG, str(error), station)
-
-
 def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Finding]]:
     """Each station's photographs; those that cannot be decoded are findings."""
     out: list[legs.Photographs | None] = []
@@ -190,7 +172,7 @@ def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Find
                 images.append(decode(photo.path, station.camera.image_size, label))
                 rows.append(photo.configuration)
             except InputError as error:
-                findings.append(_wrong(error, station.name))
+                findings.append(wrong(error, station.name))
         whole = legs.photographs_of(
             number, station.camera, np.array(rows, dtype=int), session.joints, images
         ) if images else None  # fmt: skip
@@ -215,7 +197,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
         found = session.machine.forward_result(session.joints, poses)
         modes = session.machine.assembly_modes(session.joints[0], rng)
     except PkmcalError as error:
-        return _Motion(None, float("nan"), 0, (_wrong(error),))
+        return _Motion(None, float("nan"), 0, (wrong(error),))
     findings: list[Finding] = []
     weak = [session.configurations[k] for k in np.flatnonzero(found.singularity < NEAR_SINGULAR)]
     if weak:
@@ -256,15 +238,27 @@ def _observed(
     try:
         check_observable(session)
     except InputError as error:
-        return _Seen(_unlooked(session, photographs), (_wrong(error),))
+        return _Seen(_unlooked(session, photographs), (wrong(error),))
     if poses is None or len(whole) < len(photographs):
         return _Seen(_unlooked(session, photographs))
+    # Of photographs that are broken is told already.
+    lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
+    boards = BoardsCheck()
+    if not lost:
+        boards = check_boards(session, {p.station: p.images for p in whole})
+        lost = any(finding.level is Level.WRONG for finding in boards.findings)
+    if lost and any(station.T_camera_base is None for station in session.stations):
+        return _Seen(_unlooked(session, photographs), boards.findings)
     rngs = rng.spawn(len(whole) + 1)
-    found = recognise(session, whole, poses, rngs[1:])
-    stations = tuple(_station(session, p, found, poses) for p in whole)
+    found = recognise(session, whole, poses, rngs[1:], boards.boards)
+    stations = tuple(
+        replace(_station(session, p, found, poses), board=boards.checks.get(p.station))
+        for p in whole
+    )
     if found.complete:
-        return _Seen(stations)
-    return _Seen(stations, (_wrong(why_unrecognised(session, whole, found, rngs[0])),))
+        return _Seen(stations, boards.findings)
+    why = why_unrecognised(session, whole, found, rngs[0])
+    return _Seen(stations, (wrong(why), *boards.findings))
 
 
 def _unlooked(
@@ -286,17 +280,19 @@ def _station(
 ) -> StationCheck:
     """One station in which the machine was looked for."""
     number = photographs.station
-    pose, rough = recognition.found[number], recognition.rough[number]
+    pose = recognition.found[number]
     station, machine = session.stations[number], session.machine
     if not pose.good:
         what = unrecognised_quality(photographs.images, machine.n_legs)
         return replace(_summary(station, what, recognised=False), mismatch=pose.score)
     what = quality(photographs, machine, pose.T_camera_base, poses[photographs.configuration])
-    T_base_camera, by_hand = inverse(pose.T_camera_base), inverse(rough)
+    summary = replace(_summary(station, what, recognised=True), mismatch=pose.score)
+    if station.T_camera_base is None:
+        return summary
+    T_base_camera, by_hand = inverse(pose.T_camera_base), inverse(station.T_camera_base)
     change = pose_difference(T_base_camera, by_hand)
     return replace(
-        _summary(station, what, recognised=True),
-        mismatch=pose.score,
+        summary,
         moved=float(np.linalg.norm(change[3:])),
         turned=float(np.linalg.norm(change[:3])),
     )

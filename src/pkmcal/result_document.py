@@ -48,7 +48,7 @@ def document_of(calibration: Calibration) -> dict[str, Any]:
         "parameters": _parameters(calibration),
         "covariance": estimate.covariance,
         "not_identified": _not_identified(calibration),
-        "identifiability": _identifiability(calibration.findings),
+        "identifiability": identifiability_of(calibration.findings),
         "stations": _stations(calibration),
         "cameras": _cameras(calibration),
         "configurations": _configurations(calibration),
@@ -108,7 +108,7 @@ def _not_identified(calibration: Calibration) -> list[str]:
     return list(unidentified(_groups(calibration), calibration.estimate, calibration.findings))
 
 
-def _identifiability(findings: Findings | None) -> dict[str, Any] | None:
+def identifiability_of(findings: Findings | None) -> dict[str, Any] | None:
     """The rank, what is open in words, and the paper's conditions; null where not looked at.
 
     moves_platform : m, root mean square over the platform's joints and poses.

@@ -30,7 +30,7 @@ from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.photographs import Photograph, find_photographs, photograph_header
 from pkmcal.readings import check_readings
-from pkmcal.session_schema import SessionDocument, StationDocument, Vector
+from pkmcal.session_schema import Body, SessionDocument, StationDocument, Vector
 
 __all__ = [
     "Photograph",
@@ -90,7 +90,7 @@ class Session:
     board: Path | None
     document: dict[str, Any]
     warnings: tuple[str, ...] = ()
-    board_body: str = "platform"
+    board_body: Body = "platform"
 
 
 def load_session(folder: Path | str) -> Session:

@@ -8,6 +8,8 @@ from pydantic import BeforeValidator, Field
 
 from pkmcal.files import Schema, closest, shown
 
+Body = Literal["base", "platform"]
+"""What a board may be fixed to."""
 Vector = tuple[float, float, float]
 WORDS = ("legs", "board")
 """What a station can observe, in the order in which it is written back."""
@@ -60,7 +62,7 @@ class BoardDocument(Schema):
     """``board``: its file, and what it is fixed to."""
 
     file: str = Field(description="the board's file, for example board.yaml")
-    fixed_to: Literal["base", "platform"] = "platform"
+    fixed_to: Body = "platform"
 
 
 def _board(value: Any) -> Any:

@@ -26,6 +26,9 @@ STATION_LEGEND = """\
    Mismatch: of drawing and pictures, 0 perfect, below 0.34 recognised.
    Moved: from the pose by hand to the one found. Legs: found in a photograph.
    White, black: of the legs' pixels. Blur: of the sharpest edges."""
+BOARD_LEGEND = """\
+   Seen: photographs that show it. Off: corners from their predicted places.
+   Wander: of the board on the base between photographs; a still one stays below 0.1 px."""
 KINEMATICS = (
     "The drawing's machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
     " singular, 1 far). These lengths allow {0.assemblies} assemblies; the one at home is taken."
@@ -62,6 +65,10 @@ def tell(out: Console, found: SessionCheck) -> None:
         out.print(_stations(found))
         out.print(STATION_LEGEND, style="dim")
         out.print()
+        if any(station.board for station in found.stations):
+            out.print(_boards(found))
+            out.print(BOARD_LEGEND, style="dim")
+            out.print()
         out.print(_joints(found.joints))
         out.print()
     points: list[tuple[str, str]] = []
@@ -102,6 +109,24 @@ def _station(station: StationCheck, found: SessionCheck) -> list[str]:
         _number(station.black, "{:.0%}"),
         _number(station.blur, "{:.1f} px"),
     ]
+
+
+def _boards(found: SessionCheck) -> Table:
+    table = console.plain_table("", "Board", "Seen", "Corners", "Off", "Wander", "Distance")
+    for station in found.stations:
+        board = station.board
+        if board is None:
+            continue
+        table.add_row(
+            console.MARKS["good"],
+            console.escaped(station.name),
+            f"{board.found} of {station.photographs}",
+            f"{board.corners:.0f}/{board.corners_of}",
+            f"{board.rms:.3f} px",
+            _number(board.scatter, "{:.3f} px"),
+            f"{board.distance:.2f} m",
+        )
+    return table
 
 
 def _joints(joints: tuple[JointCheck, ...]) -> Table:

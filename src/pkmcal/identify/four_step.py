@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import dot, inverse
+from pkmcal.geometry.rigid import dot
 from pkmcal.identify import four_step_checks as checks
 from pkmcal.identify import linear
 from pkmcal.identify.four_step_axes import (
@@ -50,7 +50,7 @@ from pkmcal.identify.four_step_boards import (
     gathered_directions,
     gathered_points,
     joined_by_boards,
-    mean_pose,
+    mount_poses,
     together,
 )
 from pkmcal.identify.four_step_model import Legs, base_gauge, legs_of, platform_gauge
@@ -62,10 +62,10 @@ from pkmcal.identify.four_step_platform import (
     platform_by_registration,
     universal_axes,
 )
+from pkmcal.identify.gauge import BestFit, centre_index, default_gauge
 from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.gauge import centre_index, default_gauge
 from pkmcal.identify.problem import Measurements, State
-from pkmcal.identify.registration import fixes_pose, laid
+from pkmcal.identify.registration import Body, fixes_pose, laid
 from pkmcal.mechanisms import Machine
 
 __all__ = [
@@ -81,16 +81,19 @@ __all__ = [
 ]
 
 Form = Literal["corrected", "printed"]
+VAGUE = 0.1
+"""Standard deviation of a base centre, of the base's size, beyond which it does not count."""
 
 
 @dataclass(frozen=True)
 class FourSteps:
     """The steps' results; a spatial machine's frames are those of three centres.
 
-    base, platform (B, L, 3) m, offsets (B, L) m with zero for passive legs, T_camera_base
-    (B, S, 4, 4). base_axes, platform_axes (B, L, 3) unit, NaN where the machine has none; as
-    drawn where nothing could be found. T_base_platform (B, K, 4, 4) of the configurations
-    ``configuration`` (K,) where ``posed`` (K,): enough legs with a length were seen at once.
+    base, platform (B, L, 3) m, the latter NaN for passive legs that could not be found. offsets
+    (B, L) m, zero for passive legs. T_camera_base (B, S, 4, 4). base_axes, platform_axes
+    (B, L, 3) unit, NaN where the machine has none; as drawn where nothing could be found.
+    T_base_platform (B, K, 4, 4) of the configurations ``configuration`` (K,) where ``posed``
+    (K,): enough legs with a length were seen at once.
     """
 
     base: Array
@@ -114,11 +117,10 @@ def base_items(
     legs, n = legs_of(machine), len(found)
     centres, seen = gathered_points(a_camera, found, views)
     if legs.planar:
-        v, v_found = plane_normals(axes.u, axes.seen, axes.station, n)
-        v, v_found = v[:, :, None], v_found[:, None]
+        v, v_found = plane_normals(axes.u, axes.seen, axes.station, n, axes.information)
     else:
-        which = np.flatnonzero(legs.base_revolute)
-        v, v_found = revolute_axes(axes.u[:, :, which], axes.seen[:, which], axes.station, n)
+        some = axes.of_legs(np.flatnonzero(legs.base_revolute))
+        v, v_found = revolute_axes(some.u, some.seen, axes.station, n, some.information)
     v, v_found = gathered_directions(v, v_found, views)
     items = Items(centres, seen, v, v_found, legs.base, legs.directions)
     if not items.n_directions:
@@ -207,13 +209,16 @@ def _rest(
     if form == "printed" and legs.motion.shape[1] == 3 and not legs.planar:
         platform = _turned_with_base(platform, b[:, posed], weight[:, posed])
     T = laid(platform[:, None], b, weight, motion=legs.motion)
-    rows = merged.seen & posed[:, None]
+    if legs.planar:  # the platform frame keeps the height that the drawing gives it
+        T[..., 2, 3] = np.mean(legs.base[:, 2] - legs.platform[:, 2])
     if not legs.closing.all():
+        rows = merged.seen & posed[:, None]
         passive, known = passive_centres(merged.u, base.centres, rows, T)
-        platform = np.where((known & ~legs.closing)[:, None], passive, platform)
-    base_axes, axes = _axes(machine, legs, merged.u, rows, base, T)
+        passive = np.where(known[:, None], passive, np.nan)
+        platform = np.where(legs.closing[:, None], platform, passive)
+    v, w = _axes(machine, legs, merged, posed, base, Body(platform, T), form)
     return FourSteps(
-        base.centres, q0, platform, T_camera_base, base_axes, axes, T, merged.configuration, posed
+        base.centres, q0, platform, T_camera_base, v, w, T, merged.configuration, posed
     )
 
 
@@ -225,24 +230,47 @@ def _turned_with_base(platform: Array, b: Array, weight: Array) -> Array:
 
 
 def _axes(
-    machine: Machine, legs: Legs, u: Array, seen: Booleans, base: Base, T: Array
+    machine: Machine, legs: Legs, merged: Axes, posed: Booleans, base: Base, body: Body, form: Form
 ) -> tuple[Array, Array]:
-    """Axes on base and platform (B, L, 3): revolute by [A] 7, universal by the torsion."""
-    n = len(u)
-    v, w = (np.tile(drawn, (n, 1, 1)) for drawn in (legs.base_axes, legs.platform_axes))
+    """Axes on base and platform (B, L, 3): revolute by [A] 7, universal by the torsion.
+
+    body : the platform's centres and its poses, known where ``posed`` (K,).
+    """
+    u, seen = merged.u, merged.seen & posed[:, None]
+    v = _as_drawn(machine, legs.base_axes, legs.base, base.centres)
+    w = _as_drawn(machine, legs.platform_axes, legs.platform, body.points)
     if legs.base_revolute.any():
         v[:, legs.base_revolute] = base.directions
+        if form == "corrected":  # all stations together know a leg's directions better than one
+            found, known = revolute_axes(u, merged.seen, merged.station, 1, merged.information)
+            v = _where(known[0] & legs.base_revolute, found[:, 0], v)
     if legs.platform_revolute.any():
-        found, known = platform_axes(u, seen, T)
-        sign = np.where(dot(found, legs.platform_axes) < 0, -1.0, 1.0)[..., None]
-        w = np.where((known & legs.platform_revolute)[:, None], sign * found, w)
+        found, known = platform_axes(u, seen, body.poses, merged.information)
+        w = _where(known & legs.platform_revolute, found, w)
     j = np.flatnonzero(legs.torsion)
     if j.size:
-        drawn = (legs.base_axes[j], legs.platform_axes[j])
         tolerance = machine.parameters.tolerance[machine.layout.base_axis[j, 0]]
-        found = universal_axes(u[:, :, j], T[..., :3, :3], seen[:, j], drawn, tolerance)
-        v[:, j], w[:, j] = found
+        drawn, rot = (v[:, j], w[:, j]), body.poses[..., :3, :3]
+        v[:, j], w[:, j] = universal_axes(u[:, :, j], rot, seen[:, j], drawn, tolerance)
     return v, w
+
+
+def _where(legs: Booleans, found: Array, axes: Array) -> Array:
+    """Axes (B, L, 3) replaced by the found ones of some legs, on the same side."""
+    side = np.where(dot(found, axes) < 0, -1.0, 1.0)[..., None]
+    return np.where(legs[:, None], side * found, axes)
+
+
+def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Array:
+    """The drawing's axes (L, 3) as the found centres (B, L, 3) say that it lies, (B, L, 3).
+
+    Its frame is laid on all centres: three of them alone would turn it by their own errors.
+    """
+    out = np.tile(axes, (len(centres), 1, 1))
+    if np.isnan(axes).all() or isinstance(default_gauge(machine), BestFit):
+        return out
+    rot = laid(np.broadcast_to(drawn, centres.shape), centres, np.ones(centres.shape[:2]))
+    return (rot[:, None, :3, :3] @ out[..., None])[..., 0]
 
 
 def four_step(
@@ -261,12 +289,13 @@ def four_step(
     Poses come from the readings by forward kinematics. Frames are those of three centres.
     Raises ResultError where the data do not allow a step, with [A]'s condition in words.
     """
-    found_linear = linear.centres(machine, measurements, "robust", rng)
     edges = measurements.edges
+    checks.there_are_edges(len(edges))
+    found_linear = linear.centres(machine, measurements, "robust", rng)
     if form == "corrected":
         edges = through_centres(machine, edges, found_linear.centres)
     axes = axes_from_edges(machine, replace(measurements, edges=edges), found_linear.weights)
-    found: Booleans = np.all(np.isfinite(found_linear.centres), axis=-1)
+    found = _well_known(found_linear, machine)
     a_camera = np.where(found[..., None], found_linear.centres, 0.0)[None]
     if form == "printed":
         a_camera, found = centres_from_axes(axes, measurements.n_stations)
@@ -284,6 +313,15 @@ def four_step(
     if legs.motion.shape[1] == 6 and legs.closing.all():
         return state  # in those frames already
     return in_gauge(machine, state, default_gauge(machine))
+
+
+def _well_known(found: linear.LinearCentres, machine: Machine) -> Booleans:
+    """Base centres (S, L) that their edges fix, to a part of the base's own size at least."""
+    spread = machine.base_centers() - machine.base_centers().mean(axis=0)
+    size = np.sqrt(np.mean(dot(spread, spread)))
+    finite = np.all(np.isfinite(found.centres), axis=-1)
+    covariance = np.where(finite[..., None, None], found.covariance, np.eye(3))
+    return finite & (np.linalg.eigvalsh(covariance)[..., -1] < (VAGUE * size) ** 2)
 
 
 def _views(
@@ -325,7 +363,8 @@ def _state(
     poses = _poses(machine.with_values(theta), measurements, steps)
     n_cameras = int(np.max(measurements.camera_of_station)) + 1
     state = State(theta, stations, poses, np.zeros(n_cameras))
-    return replace(state, T_mount=mounts(measurements, state), on_platform=measurements.on_platform)
+    boards = mount_poses(measurements, state)
+    return replace(state, T_mount=boards, on_platform=measurements.on_platform)
 
 
 def _poses(machine: Machine, measurements: Measurements, steps: FourSteps) -> Array:
@@ -342,25 +381,3 @@ def _poses(machine: Machine, measurements: Measurements, steps: FourSteps) -> Ar
         poses = poses.copy()
         poses[lost] = again.T_base_platform
     return poses
-
-
-def mounts(measurements: Measurements, state: State) -> Array:
-    """Where the boards sit, (M, 4, 4): on the base or the platform, from the state's poses.
-
-    Their mean over the photographs, by the covariances; a board that none shows is at the
-    body's origin.
-    """
-    poses = measurements.poses
-    out = np.tile(np.eye(4), (len(measurements.mounts), 1, 1))
-    if not len(poses):
-        return out
-    moving = measurements.on_platform[poses.mount, None, None]
-    body = np.where(moving, state.T_base_platform[poses.configuration], np.eye(4))
-    T_camera_body = state.T_camera_base[poses.station] @ body
-    T_body_board = inverse(T_camera_body) @ poses.T_station_target
-    # the left perturbation of T_camera_board is that of T_body_board, turned
-    turn = np.zeros((len(poses), 6, 6))
-    turn[:, :3, :3] = turn[:, 3:, 3:] = T_camera_body[:, :3, :3]
-    names, group = np.unique(poses.mount, return_inverse=True)
-    out[names] = mean_pose(T_body_board, poses.whiten @ turn, group, len(names))
-    return out

@@ -23,6 +23,8 @@ from pkmcal.observe.edges import EdgeSet
 
 ONE_DIRECTION = 1e-6
 """Ratio of eigenvalues below which a leg counts as seen in one direction only, for its centre."""
+REWEIGHTED = 3
+"""Rounds of weighing a revolute axis's equations; the weights change little after the first."""
 ONE_PLANE = 1e-4
 """The same for a revolute axis: directions within 10 mrad of each other leave it to the noise."""
 
@@ -44,6 +46,17 @@ class Axes:
     point: Array
     readings: Array
     information: Array | None = None
+
+    def of_legs(self, legs: Integers) -> Axes:
+        """Some legs only."""
+        return replace(
+            self,
+            seen=self.seen[:, legs],
+            u=self.u[:, :, legs],
+            point=self.point[:, :, legs],
+            readings=self.readings[:, :, legs],
+            information=None if self.information is None else self.information[:, :, legs],
+        )
 
 
 def across(u: Array) -> Array:
@@ -80,32 +93,64 @@ def centres_from_axes(axes: Axes, n_stations: int) -> tuple[Array, Booleans]:
 
 
 def revolute_axes(
-    u: Array, seen: Booleans, group: Integers, n_groups: int
+    u: Array,
+    seen: Booleans,
+    group: Integers,
+    n_groups: int,
+    information: Array | None = None,
 ) -> tuple[Array, Booleans]:
     """[A] 7: the axis that is perpendicular to all directions of a leg, v . u = 0, by SVD.
 
     u : (B, C, L, 3) in the frames of ``group`` (C,). Returns unit v (B, G, L, 3), of either
     sign, and (G, L) whether each is fixed: the leg needs two different directions.
+    information : (B, C, L, 3, 3) of the directions. They are much worse known along the line of
+    sight than across it; with it, each equation counts by the noise that it has along v.
     """
-    weighted = np.where(seen[..., None], u, 0.0)
     of_group = (group == np.arange(n_groups)[:, None]).astype(float)
-    normal = np.einsum("sc,bcli,bclj->bslij", of_group, weighted, weighted, optimize=True)
+    weight = np.broadcast_to(seen, u.shape[:-1]).astype(float)
+    v, values = _least(of_group, weight, u)
+    fixed = np.all(values[..., 1] > ONE_PLANE * values[..., 2], axis=0)
+    if information is not None:
+        spread = _spread(information, u, seen)
+        for _ in range(REWEIGHTED):
+            mine = np.einsum("sc,bsli->bcli", of_group, v)
+            noise = dot(mine, (spread @ mine[..., None])[..., 0])
+            v, _ = _least(of_group, weight / np.maximum(noise, 1e-300), u)
+    return v, fixed
+
+
+def _least(of_group: Array, weight: Array, u: Array) -> tuple[Array, Array]:
+    """The direction least along weighted ones in each group, and the eigenvalues."""
+    weighted = np.where(weight[..., None] > 0, weight[..., None] * u, 0.0)
+    u = np.where(weight[..., None] > 0, u, 0.0)
+    normal = np.einsum("sc,bcli,bclj->bslij", of_group, weighted, u, optimize=True)
     values, vectors = np.linalg.eigh(normal)
-    return vectors[..., 0], np.all(values[..., 1] > ONE_PLANE * values[..., 2], axis=0)
+    return vectors[..., 0], values
+
+
+def _spread(information: Array, u: Array, seen: Booleans) -> Array:
+    """Covariances (..., 3, 3) of directions, across them, up to one factor; identity unseen."""
+    size = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
+    along = u[..., :, None] * u[..., None, :]
+    known = seen[..., None, None] & (size > 0)
+    return np.linalg.inv(np.where(known, information + size * along, np.eye(3)))
 
 
 def plane_normals(
-    u: Array, seen: Booleans, group: Integers, n_groups: int
+    u: Array,
+    seen: Booleans,
+    group: Integers,
+    n_groups: int,
+    information: Array | None = None,
 ) -> tuple[Array, Booleans]:
     """[A] 7 for a planar machine, whose joints all have one axis: the normal of its plane.
 
-    All legs' directions together, (B, C, L, 3); returns (B, G, 3) and (G,).
+    All legs' directions together, (B, C, L, 3); returns (B, G, 1, 3) and (G, 1).
     """
-    shape = u.shape
-    together = u.reshape(shape[0], -1, 1, 3)
-    flat = np.repeat(group, shape[2])
-    v, found = revolute_axes(together, seen.reshape(-1, 1), flat, n_groups)
-    return v[:, :, 0], found[:, 0]
+    n = (u.shape[0], u.shape[1] * u.shape[2], 1)
+    flat = None if information is None else information.reshape(*n, 3, 3)
+    legs = np.repeat(group, u.shape[2])
+    return revolute_axes(u.reshape(*n, 3), seen.reshape(-1, 1), legs, n_groups, flat)
 
 
 def in_base(axes: Axes, T_camera_base: Array) -> Axes:
@@ -122,14 +167,16 @@ def in_base(axes: Axes, T_camera_base: Array) -> Axes:
     member = (row == np.arange(len(names))[:, None]).astype(float)
     count = member @ axes.seen
     total = np.einsum("kc,bcli->bkli", member, u)
-    if count.max(initial=0) > 1:
+    info = None
+    if count.max(initial=0) > 1 or axes.information is not None:
         info = across(axes.u) if axes.information is None else axes.information
         info = np.where(axes.seen[..., None, None], back @ info @ rot, 0.0)
-        joined = np.linalg.eigh(np.einsum("kc,bclij->bklij", member, info))[1][..., 0]
+        info = np.einsum("kc,bclij->bklij", member, info)
+        joined = np.linalg.eigh(info)[1][..., 0]
         joined = joined * np.where(dot(joined, total) < 0, -1.0, 1.0)[..., None]
         total = np.where((count > 1)[..., None], joined, total)
     none = np.zeros(len(names), dtype=int)
-    return Axes(none, names, count > 0, total, 0.0 * total, axes.readings[:, first])
+    return Axes(none, names, count > 0, total, 0.0 * total, axes.readings[:, first], info)
 
 
 def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array) -> Axes:

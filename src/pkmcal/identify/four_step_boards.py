@@ -12,6 +12,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference
+from pkmcal.identify.problem import Measurements, State
 from pkmcal.observe.poses import PoseSet
 
 
@@ -136,3 +137,25 @@ def _mean(values: Array, found: Booleans, views: Views) -> tuple[Array, Booleans
     count = member @ found
     total = np.einsum("vs,bsli->bvli", member, values)
     return total / np.maximum(count, 1)[..., None], count > 0
+
+
+def mount_poses(measurements: Measurements, state: State) -> Array:
+    """Where the boards sit, (M, 4, 4): on the base or the platform, from the state's poses.
+
+    Their mean over the photographs, by the covariances; a board that none shows is at the
+    body's origin.
+    """
+    poses = measurements.poses
+    out = np.tile(np.eye(4), (len(measurements.mounts), 1, 1))
+    if not len(poses):
+        return out
+    moving = measurements.on_platform[poses.mount, None, None]
+    body = np.where(moving, state.T_base_platform[poses.configuration], np.eye(4))
+    T_camera_body = state.T_camera_base[poses.station] @ body
+    T_body_board = inverse(T_camera_body) @ poses.T_station_target
+    # the left perturbation of T_camera_board is that of T_body_board, turned
+    turn = np.zeros((len(poses), 6, 6))
+    turn[:, :3, :3] = turn[:, 3:, 3:] = T_camera_body[:, :3, :3]
+    names, group = np.unique(poses.mount, return_inverse=True)
+    out[names] = mean_pose(T_body_board, poses.whiten @ turn, group, len(names))
+    return out

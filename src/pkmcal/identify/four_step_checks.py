@@ -17,14 +17,25 @@ from pkmcal.identify.four_step_axes import Axes, in_base
 from pkmcal.identify.four_step_base import Items
 from pkmcal.identify.four_step_boards import Views
 from pkmcal.identify.four_step_model import Legs, legs_of
-from pkmcal.identify.four_step_offsets import COLLAPSED, offset_slopes
+from pkmcal.identify.four_step_offsets import COLLAPSED, deviations
 from pkmcal.identify.registration import fixes_pose, loose
 from pkmcal.mechanisms import Machine
 
 FLAT = 1e-3
 """Singular value of the distances' derivatives by the offsets, of 1 a photograph at most, below
 which a combination of offsets is free."""
+VAGUE = 0.1
+"""Standard deviation of a combination of lengths, of a leg's own, beyond which it is free."""
 BUNDLE = "use the joint method (bundle)"
+
+
+def there_are_edges(count: int) -> None:
+    """The steps work on legs alone; a board does not replace them."""
+    if not count:
+        raise ResultError(
+            what="the four steps need photographs of the legs, and no edge of one was measured",
+            next_step=f"photograph the legs, or {BUNDLE} with a board on the platform",
+        )
 
 
 def every_leg_seen(machine: Machine, found: Booleans) -> None:
@@ -146,11 +157,15 @@ def lengths_are_fixed(
     seen = axes.seen & usable[axes.station][:, None] & legs.closing
     merged = in_base(replace(axes, seen=seen), T_camera_base)
     a = np.broadcast_to(base[:, None], merged.u.shape)
-    slopes = offset_slopes(merged, a, q0, "corrected")[0][:, legs.closing]
-    values, vectors = np.linalg.eigh(slopes.T @ slopes / max(len(merged.configuration), 1))
-    if values[0] > FLAT**2:
+    value, slopes = (rows[0] for rows in deviations(merged, a, q0, "corrected"))
+    freedom = max(np.count_nonzero(np.any(slopes, axis=1)) - int(legs.closing.sum()), 1)
+    values, vectors = np.linalg.eigh(slopes[:, legs.closing].T @ slopes[:, legs.closing])
+    sigma = np.sqrt(np.sum(value**2) / freedom / np.maximum(values, 1e-300))
+    length = float(np.mean(legs.rod[legs.closing] + merged.readings[0][:, legs.closing]))
+    free = (values < FLAT**2 * len(merged.configuration)) | (sigma > VAGUE * length)
+    if not free.any():
         return
-    part = np.abs(vectors[:, values <= FLAT**2]).max(axis=1)
+    part = np.abs(vectors[:, free]).max(axis=1)
     names = np.flatnonzero(legs.closing)[part > 0.3 * part.max()]
     raise ResultError(
         what=f"the photographs do not tell the lengths of legs {listed(names)}",
@@ -169,6 +184,18 @@ def _not_collapsed(legs: Legs, q0: Array) -> None:
             expected=f"about {1e3 * legs.rod[short[0]]:.0f} mm as drawn; at zero length both its "
             "joints fall together, which fits the photographs for a wrong reason",
             next_step=f"check the drawing's length, add configurations, or {BUNDLE}",
+        )
+
+
+def passive_legs_are_fixed(machine: Machine, platform: Array) -> None:
+    """[A] 19 needs two directions of a passive leg in the platform frame; NaN centres lack them."""
+    lost = np.flatnonzero(np.isnan(platform[0, :, 0]))
+    if lost.size:
+        raise ResultError(
+            what=f"passive leg {lost[0] + 1} of {machine.n_legs} does not change its direction "
+            "on the platform, so its joint could lie anywhere along it",
+            expected="two directions at least, [A] 3.5",
+            next_step=f"add configurations that tilt or shift the platform, or {BUNDLE}",
         )
 
 

@@ -30,10 +30,10 @@ def offsets(axes: Axes, a_photo: Array, start: Array, form: str) -> Array:
     return minimise_dense(rows, np.broadcast_to(start, (len(a_photo), len(start))).copy()).state
 
 
-def offset_slopes(axes: Axes, a_photo: Array, at: Array, form: str) -> Array:
-    """Derivatives (B, r, L) of the distances' deviations by the offsets (B, L): 0 to 1 each."""
-    problem = _Distances(axes, a_photo, form)
-    return problem.rows(at, np.arange(len(at)))[1] * SCALE
+def deviations(axes: Axes, a_photo: Array, at: Array, form: str) -> tuple[Array, Array]:
+    """The criterion's rows (B, r) m at offsets (B, L), and their derivatives (B, r, L)."""
+    value, jac = _Distances(axes, a_photo, form).rows(at, np.arange(len(at)))
+    return value * SCALE, jac * SCALE
 
 
 class _Distances:

@@ -7,15 +7,19 @@ centre of a passive leg (19), and the joints' equations give universal axes.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, inverse
-from pkmcal.identify.four_step_axes import nearest_points, revolute_axes
+from pkmcal.identify.four_step_axes import across, nearest_points, revolute_axes
 from pkmcal.identify.registration import ANY_MOTION, SCALE, fit_body, minimise_dense
 
-TORSION_STEPS = 40
+WIDE = 20.0
+"""Tolerances within which the torsion's noise is looked for."""
+TORSION_STEPS, SETTLED = 40, 1e-13
 ROUNDING = 1e-12
 """Share of the best known direction's information below which a direction is rounding."""
 
@@ -66,14 +70,20 @@ def platform_by_distances(
     return minimise_dense(rows, start).state.reshape(-1, *drawing.shape)
 
 
-def platform_axes(u: Array, seen: Booleans, T_base_platform: Array) -> tuple[Array, Booleans]:
+def platform_axes(
+    u: Array, seen: Booleans, T_base_platform: Array, information: Array | None = None
+) -> tuple[Array, Booleans]:
     """[A] 18, then 7 in the platform frame: axes v' (B, L, 3) of either sign, (L,) found.
 
-    u : (B, K, L, 3) directions, base frame; T_base_platform (B, K, 4, 4) of the same
-    photographs, by registration: (18) as printed, a cross product, drops the depth (errata).
+    u : (B, K, L, 3) directions, base frame, and information (B, K, L, 3, 3) on them;
+    T_base_platform (B, K, 4, 4) of the same photographs, by registration: (18) as printed, a
+    cross product, drops the depth (errata).
     """
-    turned = (np.swapaxes(T_base_platform[..., None, :3, :3], -1, -2) @ u[..., None])[..., 0]
-    v, found = revolute_axes(turned, seen, np.zeros(len(seen), dtype=int), 1)
+    rot = T_base_platform[..., None, :3, :3]
+    back = np.swapaxes(rot, -1, -2)
+    info = None if information is None else back @ information @ rot
+    none = np.zeros(len(seen), dtype=int)
+    v, found = revolute_axes((back @ u[..., None])[..., 0], seen, none, 1, info)
     return v[:, 0], found[0]
 
 
@@ -88,8 +98,9 @@ def passive_centres(
     back = inverse(T_base_platform)[:, :, None]
     turned = (back[..., :3, :3] @ u[..., None])[..., 0]
     through = apply(back, np.broadcast_to(base[:, None], u.shape))
-    b, found = nearest_points(turned, through, seen, np.zeros(len(seen), dtype=int), 1)
-    return b[:, 0], found[0]
+    none = np.zeros(len(seen), dtype=int)
+    b, _ = nearest_points(turned, through, seen, none, 1)
+    return b[:, 0], revolute_axes(turned, seen, none, 1)[1][0]
 
 
 def torsion(u: Array, rot: Array, v: Array, w: Array) -> tuple[Array, Array, Array]:
@@ -112,39 +123,69 @@ def universal_axes(
     Least squares of the torsion over the photographs, beside the drawing with its tolerance
     (rad): what the photographs do not tell stays as drawn. Of a leg's four freedoms that is a
     common turn of both axes wherever the platform does not turn, as on a 3-UPU. The torsion's
-    own noise is taken from the residuals, so that data decide where they know better.
+    own noise is taken from the residuals of a fit that hardly looks at the drawing, so that
+    the data decide where they know better.
     u : (B, K, L, 3) base frame. rot : (B, K, 3, 3) platform to base. seen : (K, L).
-    drawn : axes v, w (L, 3). tolerance : (L,). Returns v, w (B, L, 3) unit.
+    drawn : axes v, w (B, L, 3). tolerance : (L,). Returns v, w (B, L, 3) unit.
     """
-    bases = [_tangents(axis) for axis in drawn]
-    x = np.zeros((len(u), u.shape[2], 4))
-    count = np.maximum(np.broadcast_to(seen, u.shape[:-1]).sum(axis=1), 5)
-    share = np.full(x.shape, 0.0)
-    for _ in range(TORSION_STEPS):
-        value, jac = _torsion_rows(u, rot, seen, drawn, bases, x)
-        variance = np.sum(value**2, axis=1) / (count - share.sum(axis=-1))
-        new, share = _beside_drawing(value, jac, x, variance / tolerance**2)
-        done = np.max(np.abs(new - x), initial=0.0) < 1e-13
-        x = new
-        if done:
-            break
-    v, w, _ = _turned(drawn, bases, x)
+    legs = _Torsions(u, rot, seen, drawn, (_tangents(drawn[0]), _tangents(drawn[1])))
+    x, variance = _settled(legs, np.zeros((len(u), u.shape[2], 4)), WIDE * tolerance)
+    x, _ = _settled(legs, x, tolerance, variance)
+    v, w, _ = legs.axes(x)
     return v, w
 
 
-def _torsion_rows(
-    u: Array,
-    rot: Array,
-    seen: Booleans,
-    drawn: tuple[Array, Array],
-    bases: list[Array],
-    x: Array,
+class _Torsions(NamedTuple):
+    """What the torsions of :func:`universal_axes` depend on; tangents (B, L, 3, 2) each."""
+
+    u: Array
+    rot: Array
+    seen: Booleans
+    drawn: tuple[Array, Array]
+    tangents: tuple[Array, Array]
+
+    def axes(self, x: Array) -> tuple[Array, Array, tuple[Array, Array]]:
+        """Unit axes moved by x (B, L, 4) in their tangents, and derivatives (B, L, 3, 4)."""
+        axes, slopes = [], []
+        for side in (0, 1):
+            part = slice(2 * side, 2 * side + 2)
+            tangents = self.tangents[side]
+            long = self.drawn[side] + (tangents @ x[..., part, None])[..., 0]
+            size = np.sqrt(dot(long, long))[..., None]
+            unit = long / size
+            by_x = np.zeros((*x.shape[:-1], 3, 4))
+            by_x[..., part] = across(unit) @ tangents / size[..., None]
+            axes.append(unit)
+            slopes.append(by_x)
+        return axes[0], axes[1], (slopes[0], slopes[1])
+
+    def rows(self, x: Array) -> tuple[Array, Array]:
+        """Torsions (B, K, L) and their derivatives (B, K, L, 4) by x."""
+        v, w, (v_by, w_by) = self.axes(x)
+        value, by_v, by_w = torsion(self.u, self.rot[:, :, None], v[:, None], w[:, None])
+        jac = by_v[..., None, :] @ v_by[:, None] + by_w[..., None, :] @ w_by[:, None]
+        mask = self.seen
+        return np.where(mask, value, 0.0), np.where(mask[..., None], jac[..., 0, :], 0.0)
+
+
+def _settled(
+    legs: _Torsions, x: Array, tolerance: Array, variance: Array | None = None
 ) -> tuple[Array, Array]:
-    """Torsions (B, K, L) and their derivatives (B, K, L, 4) by the axes' tangents x (B, L, 4)."""
-    v, w, (v_by, w_by) = _turned(drawn, bases, x)
-    value, by_v, by_w = torsion(u, rot[:, :, None], v[:, None], w[:, None])
-    jac = (by_v[..., None, :] @ v_by[:, None] + by_w[..., None, :] @ w_by[:, None])[..., 0, :]
-    return np.where(seen, value, 0.0), np.where(seen[..., None], jac, 0.0)
+    """Gauss-Newton from x with the drawing beside; the torsion's variance (B, L) from its
+    residuals where it is not given.
+    """
+    count = np.maximum(np.broadcast_to(legs.seen, legs.u.shape[:-1]).sum(axis=1), 5)
+    share, found = np.zeros(x.shape), variance
+    for _ in range(TORSION_STEPS):
+        value, jac = legs.rows(x)
+        found = np.sum(value**2, axis=1) / (count - share.sum(axis=-1))
+        found = found if variance is None else variance
+        new, share = _beside_drawing(value, jac, x, found / tolerance**2)
+        done = np.max(np.abs(new - x), initial=0.0) < SETTLED
+        x = new
+        if done:
+            break
+    return x, np.zeros(x.shape[:-1]) if found is None else found
 
 
 def _beside_drawing(value: Array, jac: Array, x: Array, ridge: Array) -> tuple[Array, Array]:
@@ -162,24 +203,6 @@ def _beside_drawing(value: Array, jac: Array, x: Array, ridge: Array) -> tuple[A
 
 
 def _tangents(axis: Array) -> Array:
-    """Two unit directions (L, 3, 2) across each axis (L, 3)."""
+    """Two unit directions (..., 3, 2) across each axis (..., 3)."""
     other = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     return tangent_basis(axis, other)
-
-
-def _turned(
-    drawn: tuple[Array, Array], bases: list[Array], x: Array
-) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Axes moved by x (B, L, 4) in their tangents, unit, and their derivatives (B, L, 3, 4)."""
-    axes, slopes = [], []
-    for side in (0, 1):
-        part = x[..., 2 * side : 2 * side + 2]
-        long = drawn[side] + (bases[side] @ part[..., None])[..., 0]
-        size = np.sqrt(dot(long, long))[..., None]
-        unit = long / size
-        flat = bases[side] - unit[..., None] * (unit[..., None, :] @ bases[side])
-        by_x = np.zeros((*x.shape[:-1], 3, 4))
-        by_x[..., 2 * side : 2 * side + 2] = flat / size[..., None]
-        axes.append(unit)
-        slopes.append(by_x)
-    return axes[0], axes[1], (slopes[0], slopes[1])

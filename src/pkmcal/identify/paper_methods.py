@@ -14,13 +14,15 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply as move
-from pkmcal.geometry.rigid import inverse, pose_difference, register
+from pkmcal.geometry.rigid import inverse, perturb, pose_difference, register
 from pkmcal.identify import linear
-from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.assembly import Assembled, assemble, batch_of
 from pkmcal.identify.covariance import data_share
 from pkmcal.identify.four_step import four_step
-from pkmcal.identify.gauge import ThreeCentres, apply, centre_index
+from pkmcal.identify.four_step_boards import mount_poses
+from pkmcal.identify.gauge import apply, centre_index, default_gauge
 from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
+from pkmcal.identify.residuals import BatchState
 from pkmcal.mechanisms import Machine
 
 Method = Literal["four-step", "linear"]
@@ -50,9 +52,11 @@ def by_paper(
 
 def _solve(method: Method, machine: Machine, measurements: Measurements, guess: Array) -> State:
     if method == "linear":
-        return apply(machine, linear_state(machine, measurements), ThreeCentres())
-    state = four_step(machine, measurements, T_camera_base_guess=guess)
-    return apply(machine, state, ThreeCentres())
+        state = linear_state(machine, measurements)
+    else:
+        state = four_step(machine, measurements, T_camera_base_guess=guess)
+    state = apply(machine, state, default_gauge(machine))
+    return replace(state, theta=machine.parameters.unit_axes(state.theta))
 
 
 def linear_state(machine: Machine, measurements: Measurements) -> State:
@@ -84,11 +88,16 @@ def linear_state(machine: Machine, measurements: Measurements) -> State:
     total = weight.sum(axis=0)
     mean = np.einsum("sl,slc->lc", weight, in_base) / np.where(total > 0, total, 1.0)[:, None]
     theta = machine.values.copy()
-    base_index, _ = centre_index(machine.layout)
+    base_index, platform_index = centre_index(machine.layout)
     theta[base_index] = np.where(total[:, None] > 0, mean, drawing)
+    if machine.document.motion == "planar":  # both ends of a leg have one height
+        rise = theta[base_index[:, 2]] - drawing[:, 2]
+        theta[platform_index[:, 2]] = machine.platform_centers()[:, 2] + rise
     poses = machine.with_values(theta).forward_result(measurements.joints, machine.home())
     n_cameras = int(np.max(measurements.camera_of_station)) + 1
-    return State(theta, stations, poses.T_base_platform, np.zeros(n_cameras))
+    state = State(theta, stations, poses.T_base_platform, np.zeros(n_cameras))
+    boards = mount_poses(measurements, state)
+    return replace(state, T_mount=boards, on_platform=measurements.on_platform)
 
 
 def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements:
@@ -98,8 +107,13 @@ def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements
     normal = edges.normal + (edges.basis @ turn)[..., 0]
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     noise = measurements.joint_noise * rng.normal(size=measurements.joints.shape)
+    poses = measurements.poses
+    move = np.linalg.solve(poses.whiten, rng.normal(size=(len(poses), 6, 1)))[..., 0]
     return replace(
-        measurements, edges=replace(edges, normal=normal), joints=measurements.joints + noise
+        measurements,
+        edges=replace(edges, normal=normal),
+        joints=measurements.joints + noise,
+        poses=replace(poses, T_station_target=perturb(poses.T_station_target, move)),
     )
 
 
@@ -107,7 +121,7 @@ def _estimate(
     machine: Machine, measurements: Measurements, state: State, theta: Array, stations: Array
 ) -> Estimate:
     """The method's result with its residuals; edges far off the rest have weight 0."""
-    assembled = assemble(machine, measurements, ThreeCentres(), use_drawing=False)
+    assembled = assemble(machine, measurements, default_gauge(machine), use_drawing=False)
     batch = batch_of(machine, assembled, state)
     rows = assembled.problem.block_residuals(batch)[0][assembled.row, assembled.place]
     rows = np.nan_to_num(rows)
@@ -121,13 +135,20 @@ def _estimate(
         station_covariance=stations,
         edge_shift_sigma=np.zeros(len(state.edge_shift)),
         edge_residuals=rows / scale,
+        pose_residuals=_pose_residuals(assembled, batch),
         edge_weights=weight,
         joint_residuals=_joint_residuals(machine, measurements, state),
-        data_share=data_share(machine, state.theta, theta, ThreeCentres()),
+        data_share=data_share(machine, state.theta, theta, default_gauge(machine)),
         configurations=assembled.seen,
         statistics=_statistics(rows, weight, scale),
-        gauge=ThreeCentres().name,
+        gauge=default_gauge(machine).name,
     )
+
+
+def _pose_residuals(assembled: Assembled, batch: BatchState) -> Array:
+    """Whitened residuals of the boards' poses, (N, 6)."""
+    rows = assembled.problem.pose_residuals(batch)
+    return rows[0, assembled.pose_row, assembled.pose_place]
 
 
 def _joint_residuals(machine: Machine, measurements: Measurements, state: State) -> Array:

@@ -152,7 +152,8 @@ def laid(
     target[..., :n, :] -= seen[..., None, :]
     h = np.swapaxes(target, -1, -2) @ (w[..., None] * centred)
     rot = _rotation_within(h, motion)
-    return pose(rot, seen - (rot @ mean[..., None])[..., 0])
+    shift = seen - (rot @ mean[..., None])[..., 0]
+    return pose(rot, shift @ motion[3:] @ motion[3:].T)
 
 
 def _rotation_within(h: Array, motion: Array) -> Array:

@@ -11,6 +11,8 @@ from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
+from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, singularity
+from pkmcal.mechanisms.limbs import closure
 from pkmcal.observe.edges import Observation
 
 FAR = 5.0
@@ -25,6 +27,8 @@ LEFT_OPEN = 0.05
 """Share of the platform's error by the drawing that may be left undecided. A calibration makes the
 drawing's error twenty to fifty times smaller; what leaves a twentieth of it would be the result's
 largest error, and one that more of the same photographs do not shrink."""
+MOSTLY = 0.5
+"""Share of configurations near a singular pose from which on nothing said here can be trusted."""
 LARGE = 0.3
 """Share of what is undecided from which on a single cause of it is worth a reason."""
 
@@ -99,6 +103,7 @@ def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]
             " can be trusted to be right."
         )
     out.extend(undecided)
+    out.extend(_singular(estimate))
     bad = np.abs(estimate.joint_residuals) > 6.0
     if np.mean(bad) > 0.02:
         leg = int(np.argmax(bad.sum(axis=0))) + 1
@@ -107,6 +112,21 @@ def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]
             f" ({int(bad.sum())} of {bad.size} by more than 6 standard deviations)."
         )
     return out
+
+
+def _singular(estimate: Estimate) -> list[str]:
+    """Where most poses are singular, small errors move the platform far and nothing is linear."""
+    machine = estimate.machine
+    poses = estimate.state.T_base_platform[estimate.configurations]
+    c = closure(machine.layout, machine.values, machine.inverse(poses), poses)
+    weak = singularity(machine.layout, machine.values, c.by_pose) < NEAR_SINGULAR
+    if weak.mean() < MOSTLY:
+        return []
+    return [
+        f"The machine is near a singular pose in {int(weak.sum())} of {weak.size} configurations:"
+        " there its readings hardly say where the platform is, and these deviations cannot be"
+        " trusted. Photograph it in other poses, or check the drawing."
+    ]
 
 
 def _left_open(

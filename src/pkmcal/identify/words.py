@@ -17,9 +17,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.problem import Estimate
+from pkmcal.identify.words_advice import advice_on
 from pkmcal.identify.words_effect import platform_by_parameters
 from pkmcal.identify.words_families import Circumstances, Family, circumstances, families
-from pkmcal.identify.words_advice import advice_on
 from pkmcal.identify.words_text import naming, said_of
 from pkmcal.mechanisms import Machine
 
@@ -29,11 +29,14 @@ if TYPE_CHECKING:
     from pkmcal.identify.problem import Measurements
     from pkmcal.observe.edges import EdgeSet
 
-INSIDE = 0.99
-"""Share of a change (squared) that lies in the open space for it to explain part of that space:
-null directions are exact but for the estimate's noise, and their frames' rounding."""
-INSIDE_WEAK = 0.9
-"""Same for what the data know less than the drawing, where nothing is exact."""
+INSIDE = (0.999, 0.95)
+"""Shares of a change (squared) that lie in the open space for it to explain part of that space:
+first what fits exactly, since much looks alike once frames are taken out, then what fits in all
+but name. The space is that of the estimate, whose poses' noise bends what would be exact."""
+HARDLY = 1 / 3
+"""Information below which a direction counts as not told: the data then decide less than a tenth
+of its variance. Poses that only shift seem to turn by their noise, so directions that nothing fixes
+come out with a trace of information."""
 NEW = 0.1
 """Sine of the angle to what is said already below which a change says nothing new."""
 MOVES = 0.01
@@ -65,9 +68,10 @@ class Sentence:
 class Findings:
     """What the data tell and do not tell: the test, its words, and the paper's conditions.
 
-    told : rank and spectrum. unidentified : what no amount of such data fixes. weak : what the
-    drawing knows better. by_drawing : how far (m, as ``Sentence.moves_platform``) the platform
-    moves when all parameters are as wrong as the drawing's tolerances let expect.
+    told : rank and spectrum. unidentified : what such data do not tell, of ``told.unidentified``
+    and of what they know ``HARDLY``. weak : what the drawing knows better. by_drawing : how far
+    (m, as ``Sentence.moves_platform``) the platform moves when all parameters are as wrong as the
+    drawing's tolerances let expect.
     """
 
     told: Identifiability
@@ -78,18 +82,24 @@ class Findings:
 
 
 class _Part(NamedTuple):
-    """Families with one text: the space (k, P) of changes that they explain, scaled, their own
-    numbers (k, m) for it, and how many of the k nobody said before."""
+    """Families with one text.
+
+    space : (k, P) changes that they explain, scaled. coefficients : (k, m) the family's own numbers
+    for them; own : (k, P) what these change, scaled, which differs from ``space`` by frames.
+    new : how many of the k nobody said before.
+    """
 
     families: tuple[Family, ...]
     space: Array
     coefficients: Array
+    own: Array
     new: int
 
 
 class _Open(NamedTuple):
     """What is left open, in units of the drawing's deviations: rows (n, P) orthonormal, their
-    covariance (n, n) as the estimate leaves it, frames (P, g) orthonormal, unit (P,)."""
+    covariance (n, n) as the estimate leaves it, frames (P, g) orthonormal, unit (P,).
+    """
 
     rows: Array
     covariance: Array
@@ -109,17 +119,23 @@ def explain(
     """
     machine, table = estimate.machine, estimate.machine.parameters
     poses = estimate.state.T_base_platform[estimate.configurations]
-    known = np.array([d.information for d in told.weak])
-    weak = vectors(told.weak, machine)
     effect = platform_by_parameters(machine, poses)
     drawing = effect @ (table.free_matrix() * table.tolerances_free())
-    return Findings(
-        told,
-        describe(machine, seen, vectors(told.unidentified, machine), poses),
-        describe(machine, seen, weak, poses, information=known),
-        float(np.linalg.norm(drawing)),
-        conditions,
-    )
+    lost = (*told.unidentified, *(d for d in told.weak if d.information < HARDLY))
+    weak = tuple(d for d in told.weak if d.information >= HARDLY)
+
+    def said(directions: tuple[Direction, ...], weak: bool) -> tuple[Sentence, ...]:
+        null = vectors(directions, machine)
+        return describe(machine, seen, null, poses, _information(directions, told), weak=weak)
+
+    by_drawing = float(np.linalg.norm(drawing))
+    return Findings(told, said(lost, False), said(weak, True), by_drawing, conditions)
+
+
+def _information(directions: tuple[Direction, ...], told: Identifiability) -> Array:
+    """What the data know of each direction, 0 where it is rounding only."""
+    gone = {id(d) for d in told.unidentified}
+    return np.array([0.0 if id(d) in gone else d.information for d in directions])
 
 
 def vectors(directions: tuple[Direction, ...], machine: Machine) -> Array:
@@ -151,21 +167,23 @@ def describe(
     null: Array,
     T_base_platform: Array,
     information: Array | None = None,
+    *,
+    weak: bool = False,
 ) -> tuple[Sentence, ...]:
     """Sentences for a space of changes that the data do not see.
 
     machine : at the estimate. seen : (S, L) legs that each station sees. null : (n, P) changes of
     all parameters in their units, any basis. T_base_platform : (K, 4, 4) the session's poses.
-    information : (n,) for changes that the data do see, yet less than the drawing knows them:
-    their singular values in units of the tolerance; the words then say so.
+    information : (n,) singular values of what the data know of each after all, in units of the
+    tolerance; 0 where absent. weak : say that the drawing knows them better, not that they are
+    free.
     """
-    weak = information is not None
     space = _open(machine, null, information)
     if len(space.rows) == 0:
         return ()
     around = circumstances(machine, seen, T_base_platform)
     effect = platform_by_parameters(machine, T_base_platform) * space.unit
-    parts = _merged(_explained(around, space, INSIDE_WEAK if weak else INSIDE))
+    parts = _merged(_explained(around, space))
     sentences = [_sentence(around, space, part, effect, weak) for part in parts]
     return _few(sentences)
 
@@ -202,22 +220,24 @@ def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
     return vt[s > least * max(float(s[0]), 1e-300)]
 
 
-def _explained(around: Circumstances, space: _Open, inside: float) -> list[_Part]:
+def _explained(around: Circumstances, space: _Open) -> list[_Part]:
     """Families that lie in the open space, each with what it says anew."""
     parts: list[_Part] = []
     done = np.zeros((0, space.rows.shape[1]))
-    for family in families(around):
+    known = list(families(around))
+    for family, inside in [*((f, share) for share in INSIDE for f in known[:-1]), (known[-1], 0.0)]:
         if len(done) == len(space.rows):
             break
         found = _within(family, space, inside)
-        new = found - (found @ done.T) @ done
-        new = _directions(new)
+        new = _directions(found - (found @ done.T) @ done)
         if len(new) == 0:
             continue
         if family.kind == "rest":
             found = new
         done = _orthonormal(np.concatenate([done, new]))
-        parts.append(_Part((family,), found, _coefficients(family, space, found), len(new)))
+        numbers = _coefficients(family, space, found)
+        own = numbers @ family.columns.T / space.unit
+        parts.append(_Part((family,), found, numbers, own, len(new)))
     return parts
 
 
@@ -267,9 +287,9 @@ def _merged(parts: list[_Part]) -> list[_Part]:
             out[key] = part
             continue
         old = out[key]
-        space = np.concatenate([old.space, part.space])
-        numbers = np.concatenate([old.coefficients, part.coefficients])
-        out[key] = _Part(old.families + part.families, space, numbers, old.new + part.new)
+        pairs = zip(old[1:4], part[1:4], strict=True)
+        space, numbers, own = (np.concatenate(pair) for pair in pairs)
+        out[key] = _Part(old.families + part.families, space, numbers, own, old.new + part.new)
     return list(out.values())
 
 
@@ -282,7 +302,7 @@ def _sentence(
     moved = float(np.sqrt(np.trace(moved @ (mixed @ space.covariance @ mixed.T) @ moved.T)))
     table = around.machine.parameters
     matters = moved > MOVES * float(table.tolerance[around.at.base].mean())
-    size = np.linalg.norm(found, axis=0)
+    size = np.linalg.norm(part.own, axis=0)
     order = np.argsort(-np.round(size, 6), kind="stable")
     names = tuple(table.names[k] for k in order[: int(np.sum(size > 0.15 * size.max()))])
     text = said_of(around, part.families, part.coefficients, names, weak)

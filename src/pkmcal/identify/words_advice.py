@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.geometry.rigid import rotation_vector
-from pkmcal.identify.words_families import Circumstances, Family
+from pkmcal.identify.words_families import AXES, Circumstances, Family
 from pkmcal.identify.words_text import named
 
 TURNED = 0.02
@@ -50,8 +50,8 @@ def advice_on(
 def _tying(around: Circumstances, legs: list[int]) -> str:
     """How to tie a group of legs to the others."""
     others = [j for j in range(around.seen.shape[1]) if j not in legs]
-    with_group = around.seen[around.seen[:, legs].any(axis=1)].any(axis=0)
-    apart = [j for j in others if not with_group[j]]
+    with_group = np.flatnonzero(around.seen[around.seen[:, legs].any(axis=1)].any(axis=0))
+    apart = [j for j in others if j not in with_group]
     shown = named(apart or others)
     camera = f"Add a station that sees {named(legs)} together with {shown}"
     board = "let a board fixed to the base be seen with the legs (observe: [legs, board], board:"
@@ -81,8 +81,17 @@ def _holding(names: tuple[str, ...], weak: bool) -> str:
 
 
 def _fixing(names: tuple[str, ...]) -> str:
-    """The line of the mechanism file that takes parameters out."""
-    said = [f'"{name}"' for name in names[:MOST_FIXED]]
-    if len(names) > MOST_FIXED:
-        return f"fixed: [{', '.join(said)}, …] in the mechanism file"
-    return f"fixed: [{', '.join(said)}] in the mechanism file"
+    """The line of the mechanism file that takes parameters out.
+
+    An axis is held as a whole, and a centre is said as a whole where all of it is meant.
+    """
+    entries = list(dict.fromkeys(_entry(name, names) for name in names))
+    more = ", …" if len(entries) > MOST_FIXED else ""
+    said = ", ".join(f'"{name}"' for name in entries[:MOST_FIXED])
+    return f"fixed: [{said}{more}] in the mechanism file"
+
+
+def _entry(name: str, names: tuple[str, ...]) -> str:
+    whole, _, component = name.rpartition(".")
+    every = component in AXES and all(f"{whole}.{c}" in names for c in AXES)
+    return whole if every or ".axis." in name else name

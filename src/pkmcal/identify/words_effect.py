@@ -15,6 +15,9 @@ SAMPLES = 40
 """Poses around the session's: what a session's few poses hide, others show."""
 TURN, SHIFT = 0.2, 0.12
 """How far they reach: rad, and share of the legs' mean length."""
+AS_REGULAR = 0.7
+"""Part of the session's own distance from a singular pose that the others keep: near one, any
+error counts manifold, and nobody works there."""
 SEED = 4
 
 
@@ -63,5 +66,7 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
     start = perturb(start, step @ layout.motion @ layout.motion.T)
     # constant legs and joints with axes leave the samples fewer ways: brought back onto them
     found = on_manifold(layout, machine.values, start)
-    poses = np.concatenate([T_base_platform, found.T_base_platform[found.converged]])
+    own = on_manifold(layout, machine.values, T_base_platform).singularity
+    kept = found.converged & (found.singularity >= AS_REGULAR * float(np.median(own)))
+    poses = np.concatenate([T_base_platform, found.T_base_platform[kept]])
     return machine.inverse(poses), poses

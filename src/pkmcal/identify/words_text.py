@@ -212,8 +212,8 @@ def _relation(told: _Told) -> str:
     """How the group is seen with the other legs."""
     seen, legs = told.around.seen, list(told.legs)
     others = [j for j in range(seen.shape[1]) if j not in legs]
-    with_group = seen[seen[:, legs].any(axis=1)].any(axis=0)
-    bridging = [j for j in others if with_group[j]]
+    with_group = np.flatnonzero(seen[seen[:, legs].any(axis=1)].any(axis=0))
+    bridging = [j for j in others if j in with_group]
     verb = "are" if told.several else "is"
     if not bridging:
         return f"{told.whose} {verb} never seen together with the others"

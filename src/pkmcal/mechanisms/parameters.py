@@ -17,6 +17,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 
 
+EVERY = "legs[*]"
 PARALLEL = 1e-9
 """Axes whose components differ by less are one direction in the drawing."""
 
@@ -25,10 +26,12 @@ PARALLEL = 1e-9
 class ParameterTable:
     """Every parameter of a machine, in one order.
 
-    names, units, kinds : P entries; ``kinds`` is the tolerance's name: center, offset, radius, axis.
+    names, units, kinds : P entries; ``kinds`` is the tolerance's name: center, offset, radius, axis,
+    arm, angle.
     drawing, tolerance : (P,) drawing values and their standard deviations.
     fixed : names that keep their drawing value.
-    tied : groups of names that change by the same amount.
+    tied : groups of names that change by the same amount. opposed : for each group, the names that
+    change by its opposite.
     """
 
     names: tuple[str, ...]
@@ -38,6 +41,7 @@ class ParameterTable:
     tolerance: Array
     fixed: tuple[str, ...] = ()
     tied: tuple[tuple[str, ...], ...] = ()
+    opposed: tuple[tuple[str, ...], ...] = ()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -59,47 +63,78 @@ class ParameterTable:
     ) -> ParameterTable:
         """The same table with other fixed and tied parameters; all names are checked.
 
-        ``legs[1].base.axis`` and ``legs[1].base.center`` mean all their components. Of an axis
-        single components cannot be held: it is one direction.
+        ``legs[1].base.axis`` and ``legs[1].base.center`` mean all their components, ``legs[*]``
+        all legs that have the rest, and a name after ``-`` in a tie changes by the opposite. Of an
+        axis a single component can be held where the drawing has it at zero: the axis then turns
+        square to it. Otherwise it is one direction.
         """
-        fixed = tuple(name for entry in fixed for name in self._members(entry))
+        fixed = tuple(n for entry in fixed for e in self._of_all(entry) for n in self._members(e))
         groups = [part for group in tied for part in self._together(group)]
-        return replace(self, fixed=fixed, tied=tuple(groups))
+        return replace(
+            self,
+            fixed=fixed,
+            tied=tuple(tuple(name for name, _ in part) for part in groups),
+            opposed=tuple(tuple(name for name, sign in part if sign < 0) for part in groups),
+        )
+
+    def _of_all(self, entry: str) -> tuple[str, ...]:
+        """The entries that one with ``legs[*]`` stands for."""
+        if EVERY not in entry:
+            return (entry,)
+        first, _, rest = entry.partition(EVERY)
+        legs = dict.fromkeys(n[: n.index("]") + 1] for n in self.names)
+        every = [f"{leg}{rest}" for leg in legs if self._whole(f"{leg}{rest}")]
+        if first or not every:
+            self.index(entry)  # says what a name looks like
+        return tuple(every)
+
+    def _whole(self, entry: str) -> tuple[str, ...]:
+        """The names that an entry stands for, empty where it is none's."""
+        return tuple(n for n in self.names if n == entry or n.startswith(f"{entry}."))
 
     def _members(self, entry: str) -> tuple[str, ...]:
         """The names that an entry under ``fixed`` means."""
-        whole = tuple(n for n in self.names if n.startswith(f"{entry}."))
-        if whole:
+        whole = self._whole(entry)
+        if len(whole) > 1:
             return whole
         k = self.index(entry)
-        if self.kinds[k] == "axis":
+        if self.kinds[k] == "axis" and abs(self.drawing[k]) > PARALLEL:
             raise InputError(
                 what=f"{entry} cannot be held alone: an axis is one direction",
                 expected=f"the whole axis, {entry.rpartition('.')[0]!r}",
             )
         return (entry,)
 
-    def _together(self, group: tuple[str, ...]) -> list[tuple[str, ...]]:
-        """The ties that a group means: of whole centres or axes, component by component."""
-        members = [self._members(entry) for entry in group]
+    def _together(self, group: tuple[str, ...]) -> list[list[tuple[str, int]]]:
+        """The ties that a group means, names with signs: of whole centres or axes, component by
+        component.
+        """
+        entries = [
+            (e, -1 if entry.startswith("-") else 1)
+            for entry in group
+            for e in self._of_all(entry.removeprefix("-"))
+        ]
+        members = [[(name, sign) for name in self._members(e)] for e, sign in entries]
         if len({len(m) for m in members}) > 1:
             raise InputError(
                 what="a whole centre or axis is tied to a single number",
                 found=", ".join(group),
                 expected="entries of one kind",
             )
-        ties = list(zip(*members, strict=True))
-        if self.kinds[self.index(members[0][0])] == "axis":
+        ties = [list(tie) for tie in zip(*members, strict=True)]
+        if self.kinds[self.index(members[0][0][0])] == "axis":
             self._check_parallel(group, members)
         return ties
 
-    def _check_parallel(self, group: tuple[str, ...], members: list[tuple[str, ...]]) -> None:
-        axes = np.array([[self.drawing[self.index(n)] for n in m] for m in members])
-        if np.abs(axes - axes[0]).max() > PARALLEL:
+    def _check_parallel(
+        self, group: tuple[str, ...], members: list[list[tuple[str, int]]]
+    ) -> None:
+        axes = np.array([[s * self.drawing[self.index(n)] for n, s in m] for m in members])
+        if axes.shape[1] != 3 or np.abs(axes - axes[0]).max() > PARALLEL:
             raise InputError(
                 what="axes that differ in the drawing are tied",
                 found=", ".join(group),
-                expected="axes with the same direction in their bodies' frames",
+                expected="whole axes with the same direction in their bodies' frames",
             )
 
     @cached_property
@@ -109,32 +144,53 @@ class ParameterTable:
 
     @cached_property
     def _free(self) -> Array:
-        owner = self._owners()
-        held = {owner[self.index(name)] for name in self.fixed}
-        plain = [k for k in np.unique(owner) if k not in held and self.kinds[k] != "axis"]
-        matrix = (owner[:, None] == np.array(plain, dtype=int)[None, :]).astype(float)
+        owner, sign = self._owners()
+        fixed = [self.index(name) for name in self.fixed]
+        still = {owner[k] for k in fixed if self.kinds[k] != "axis"}
+        plain = [k for k in np.unique(owner) if k not in still and self.kinds[k] != "axis"]
+        matrix = (owner[:, None] == np.array(plain, dtype=int)[None, :]) * sign[:, None]
         tangents = [
-            self._tangent(np.flatnonzero(owner == axis[0]))
+            self._tangent(np.flatnonzero(owner == axis[0]), sign, fixed)
             for axis in self.axes
-            if owner[axis[0]] == axis[0] and axis[0] not in held
+            if owner[axis[0]] == axis[0]
         ]
-        return np.concatenate([matrix, *tangents], axis=1)
+        return np.concatenate([matrix.astype(float), *tangents], axis=1)
 
-    def _owners(self) -> Integers:
-        """The first parameter that each one moves together with, (P,)."""
-        owner = np.arange(len(self))
-        for group in self.tied:
-            members = [self.index(name) for name in group]
-            joined = np.isin(owner, owner[members])  # a name in two ties makes one of them
-            owner[joined] = owner[members].min()
-        return owner
+    def _owners(self) -> tuple[Integers, Array]:
+        """The first parameter that each one moves together with, (P,), and the sign, (P,).
 
-    def _tangent(self, first: Integers) -> Array:
-        """Two columns (P, 2): turns of the axes whose x components stand at ``first``."""
-        basis = np.linalg.svd(self.drawing[first[0] : first[0] + 3][None])[2][1:].T
-        out = np.zeros((len(self), 2))
+        A name in two ties makes one of them.
+        """
+        owner, sign = np.arange(len(self)), np.ones(len(self))
+        opposed = self.opposed or ((),) * len(self.tied)
+        for group, against in zip(self.tied, opposed, strict=True):
+            members = np.array([self.index(name) for name in group])
+            own = np.array([-1.0 if name in against else 1.0 for name in group])
+            turn = {owner[k]: s * sign[k] for k, s in zip(members, own, strict=True)}
+            if any(turn[owner[k]] != s * sign[k] for k, s in zip(members, own, strict=True)):
+                raise InputError(
+                    what="a parameter is tied to its own opposite", found=", ".join(group)
+                )
+            first = min(turn)
+            for root, flip in turn.items():
+                joined = owner == root
+                sign[joined] *= flip * turn[first]
+                owner[joined] = first
+        return owner, sign
+
+    def _tangent(self, first: Integers, sign: Array, fixed: list[int]) -> Array:
+        """Columns (P, 0 to 2): turns of the axes whose x components stand at ``first``.
+
+        Components that are held leave only the turn that is square to them.
+        """
+        axis = self.drawing[first[0] : first[0] + 3]
+        held = [np.eye(3)[i] for k in first for i in range(3) if k + i in fixed]
+        span = np.array([axis, *held])
+        rank = int(np.linalg.matrix_rank(span, tol=PARALLEL))
+        basis = np.linalg.svd(span)[2][rank:].T
+        out = np.zeros((len(self), basis.shape[1]))
         for k in first:
-            out[k : k + 3] = basis
+            out[k : k + 3] = sign[k] * basis
         return out
 
     def free_matrix(self) -> Array:
@@ -189,7 +245,9 @@ class ParameterTable:
             return values
         out = np.array(values, dtype=float)
         axis = out[..., self.axes]
-        out[..., self.axes] = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+        size = np.linalg.norm(axis, axis=-1, keepdims=True)
+        # a unit axis stays what it is, to the last digit
+        out[..., self.axes] = axis / np.where(np.abs(size - 1) < 1e-15, 1.0, size)
         return out
 
     def of_kind(self, kind: str) -> Integers:

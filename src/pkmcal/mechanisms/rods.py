@@ -38,20 +38,23 @@ class PassiveLength(Schema):
 
 
 def rod_kind(value: Any) -> str:
-    """Which of the three a ``length`` in the file is, told apart so that errors name its fields."""
+    """Which of the three a ``length`` in the file is, told apart so that errors name its fields.
+
+    Tags are no keys of a file, or an error's place would be taken for the key.
+    """
     if isinstance(value, Schema):
         value = value.model_dump()
     if not isinstance(value, dict):
-        return "actuated"
+        return "actuated rod"
     if value.get("passive"):
-        return "passive"
-    return "constant" if value.get("actuated") is False else "actuated"
+        return "passive rod"
+    return "constant rod" if value.get("actuated") is False else "actuated rod"
 
 
 Rod = Annotated[
-    Annotated[ActuatedLength, Tag("actuated")]
-    | Annotated[ConstantLength, Tag("constant")]
-    | Annotated[PassiveLength, Tag("passive")],
+    Annotated[ActuatedLength, Tag("actuated rod")]
+    | Annotated[ConstantLength, Tag("constant rod")]
+    | Annotated[PassiveLength, Tag("passive rod")],
     Discriminator(rod_kind),
 ]
 

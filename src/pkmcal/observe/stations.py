@@ -9,10 +9,11 @@ shrinking; what remains is an error of a few pixels, from the drawing's errors.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import cross, dot, inverse, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
@@ -37,6 +38,8 @@ another configuration, station or order of legs 0.36 to 0.6."""
 BY_CHANCE = 0.5
 """Share of the score by chance that recognised legs stay below. Photographs that are all texture
 score 0.3 anywhere; photographs of a machine score 0.2 where chance has 0.9."""
+FIRST_DAMPING = 1e-3
+"""Of a step, relative to the normal equations' diagonal."""
 LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
 
@@ -147,41 +150,84 @@ def score(
     return np.sum(cost.mean(axis=-1) * weight, axis=(1, 2)) / np.sum(weight, axis=(1, 2))
 
 
+class _Look(NamedTuple):
+    """The picture under predicted edges, (H, n): distance found and whether in the image; the
+    distance's derivatives by the camera frame's motion (H, n, 6).
+    """
+
+    found: Array
+    inside: Booleans
+    jac: Array
+
+    def weight(self, reach: float) -> Array:
+        """Geman-McClure: what is further than the reach is another edge."""
+        return np.where(self.inside, (1 + (self.found / reach) ** 2) ** -2.0, 0.0)
+
+    def cost(self, reach: float) -> Array:
+        """What the weights minimise, (H,): 0 to 1 an edge point, and 1 outside the image."""
+        part = (self.found / reach) ** 2
+        return np.where(self.inside, part / (1 + part), 1.0).mean(axis=-1)
+
+    def where(self, better: Booleans, other: _Look) -> _Look:
+        """This look at some of the hypotheses, the other one at the rest."""
+        keep = better[:, None]
+        return _Look(
+            np.where(keep, self.found, other.found),
+            np.where(keep, self.inside, other.inside),
+            np.where(keep[..., None], self.jac, other.jac),
+        )
+
+
 def _descend(
     view: View, candidates: Array, photographs: Integers, samples: int, reaches: tuple[float, ...]
 ) -> Array:
-    """Gauss-Newton on the distances, candidates (H, 4, 4) side by side, one step a reach."""
-    number = np.arange(len(view.joints))[photographs][:, None, None]
+    """Levenberg-Marquardt on the distances, candidates (H, 4, 4) side by side, a step a reach.
+
+    Upright legs hardly say where their camera stands; undamped, steps there go astray.
+    """
+    look = _look(view, candidates, photographs, samples)
+    damping = np.full(len(candidates), FIRST_DAMPING)
     for reach in reaches:
-        legs = legs_in_camera(
-            view.machine, candidates[:, None], view.poses[photographs], view.joints[photographs]
-        )
-        points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
-        direction = direction_of(points.outward)
-        step = points.outward * view.tables.scale
-        found, inside = view.tables.look_smooth(direction, points.pixel, number)
-        ahead, _ = view.tables.look_smooth(direction, points.pixel + step, number)
-        behind, _ = view.tables.look_smooth(direction, points.pixel - step, number)
-        slope = np.clip((ahead - behind) / 2, -1, 1)
-        # Geman-McClure: what is further than the reach is another edge
-        weight = np.where(inside & points.valid, (1 + (found / reach) ** 2) ** -2.0, 0.0)
-        # the pixel moves outward by across . (omega x P + tau) for a motion of the camera frame
-        motion = np.concatenate([cross(points.point, points.across), points.across], axis=-1)
-        jac = np.where(weight[..., None] > 0, slope[..., None] * motion / view.tables.scale, 0.0)
-        candidates = _step(candidates, jac, np.where(weight > 0, found, 0.0), weight)
+        trial = _step(candidates, look, reach, damping)
+        seen = _look(view, trial, photographs, samples)
+        better = seen.cost(reach) < look.cost(reach)
+        candidates = np.where(better[:, None, None], trial, candidates)
+        look = seen.where(better, look)
+        damping = np.where(better, 0.3, 10.0) * damping
     return candidates
 
 
-def _step(candidates: Array, jac: Array, value: Array, weight: Array) -> Array:
-    """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4)."""
-    count = len(candidates)
-    flat = jac.reshape(count, -1, 6)
-    weighted = np.swapaxes(flat * weight.reshape(count, -1, 1), -1, -2)
-    normal = weighted @ flat
+def _look(view: View, candidates: Array, photographs: Integers, samples: int) -> _Look:
+    """Distances under the edges predicted from poses (H, 4, 4)."""
+    number = np.arange(len(view.joints))[photographs][:, None, None]
+    legs = legs_in_camera(
+        view.machine, candidates[:, None], view.poses[photographs], view.joints[photographs]
+    )
+    points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
+    direction = direction_of(points.outward)
+    step = points.outward * view.tables.scale
+    found, inside = view.tables.look_smooth(direction, points.pixel, number)
+    ahead, _ = view.tables.look_smooth(direction, points.pixel + step, number)
+    behind, _ = view.tables.look_smooth(direction, points.pixel - step, number)
+    slope = np.clip((ahead - behind) / 2, -1, 1)
+    inside = inside & points.valid
+    # the pixel moves outward by across . (omega x P + tau) for a motion of the camera frame
+    motion = np.concatenate([cross(points.point, points.across), points.across], axis=-1)
+    jac = np.where(inside[..., None], slope[..., None] * motion / view.tables.scale, 0.0)
+    flat = (len(candidates), -1)
+    return _Look(
+        np.where(inside, found, 0.0).reshape(flat), inside.reshape(flat), jac.reshape(*flat, 6)
+    )
+
+
+def _step(candidates: Array, look: _Look, reach: float, damping: Array) -> Array:
+    """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4); damping (H,)."""
+    weighted = np.swapaxes(look.jac * look.weight(reach)[..., None], -1, -2)
+    normal = weighted @ look.jac
     diagonal = np.einsum("hii->hi", normal) + 1e-12
-    normal = normal + 1e-3 * diagonal[..., None] * np.eye(6)
-    step = -np.linalg.solve(normal, weighted @ value.reshape(count, -1, 1))[..., 0]
+    normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
+    step = -np.linalg.solve(normal, weighted @ look.found[..., None])[..., 0]
     step = np.clip(step, -0.1, 0.1)  # further, the tables' slopes say nothing
     # turn about the camera: R <- Exp(omega) R, t <- Exp(omega) t + tau
-    turned = pose(rotation(step[:, :3]), np.zeros((count, 3))) @ candidates
-    return perturb(turned, np.concatenate([np.zeros((count, 3)), step[:, 3:]], axis=-1))
+    turned = pose(rotation(step[:, :3]), np.zeros((len(step), 3))) @ candidates
+    return perturb(turned, np.concatenate([np.zeros((len(step), 3)), step[:, 3:]], axis=-1))

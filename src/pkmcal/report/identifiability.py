@@ -15,7 +15,9 @@ from pkmcal.report.parameters import in_words
 from pkmcal.report.wording import brief, count, joined
 
 FLOOR = 1e-3
-"""Information below which a bar has no height: the drawing knows a thousand times more."""
+"""Information below which a bar is a stub only: the drawing knows a thousand times more."""
+STUB = 0.06
+"""Height of such a bar, in decades: seen, and not mistaken for a value."""
 MOST_NAMES = 6
 
 
@@ -76,7 +78,7 @@ def _spectrum(findings: Findings) -> BarChart | None:
     if values.size == 0:
         return None
     decades = math.log10(1 / FLOOR)
-    heights = np.maximum(np.log10(np.maximum(values, FLOOR)) + decades, 0.0)
+    heights = np.maximum(np.log10(np.maximum(values, FLOOR)) + decades, STUB)
     high = 1.06 * max(float(heights.max()), decades + 1)
     bars = tuple(
         Bar(str(k + 1), _tip(k, value, findings.told.rank), float(height), quiet=value >= 1)
@@ -84,7 +86,7 @@ def _spectrum(findings: Findings) -> BarChart | None:
     )
     tops = range(math.floor(high) + 1)
     ticks = tuple((float(t), _power(t - round(decades))) for t in tops)
-    places = sorted({0, len(bars) - 1} | set(range(9, len(bars) - 2, 10)))
+    places = sorted({0, len(bars) - 1} | set(range(9, len(bars) - 4, 10)))
     return BarChart(
         title="How well each direction is known",
         unit="directions of the parameters, best known first",

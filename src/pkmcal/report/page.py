@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.identify.centres import free_of_gauge, joint_centres
+from pkmcal.arrays import Array
+from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.observe.edges import Observation
 from pkmcal.report import (
@@ -65,15 +66,7 @@ def report_views(
     camera = residuals.camera_numbers(session)
     covariance = free_of_gauge(estimate)
     centres = joint_centres(session.machine, machine, covariance)
-    tool = toolpoint.tool_point(
-        session.machine,
-        machine,
-        covariance,
-        session.joints,
-        estimate.state.T_base_platform,
-        np.flatnonzero(estimate.configurations),
-        centres,
-    )
+    tool = _tool_point(session, estimate, covariance, centres)
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     groups = parameters.parameter_groups(session.machine, estimate)
     drawn = scene.scene_of(session, estimate, centres)
@@ -85,7 +78,9 @@ def report_views(
         "views": scene.views(drawn),
         "figure": figure.figure_of(drawn),
         "groups": groups,
-        "unidentified": parameters.unidentified(groups, estimate, findings),
+        "unidentified": parameters.bound_together(estimate)
+        if findings
+        else parameters.unidentified(groups, estimate),
         "told": findings and identifiability.section(findings, machine.parameters),
         "pictures": pictures.pictures(session, edges, estimate, shifts, centres),
         "residuals": residuals.residual_charts(session, edges, estimate, shifts),
@@ -94,3 +89,17 @@ def report_views(
         "settings": provenance.settings(session, estimate),
         "versions": provenance.versions(),
     }
+
+
+def _tool_point(
+    session: Session, estimate: Estimate, covariance: Array, centres: tuple[Centres, ...]
+) -> toolpoint.ToolPoint:
+    return toolpoint.tool_point(
+        session.machine,
+        estimate.machine,
+        covariance,
+        session.joints,
+        estimate.state.T_base_platform,
+        np.flatnonzero(estimate.configurations),
+        centres,
+    )

@@ -137,9 +137,13 @@ def unidentified(
         out = _by_kind(groups, estimate)
     else:
         out = [f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak)]
-    names = estimate.machine.parameters.names
-    out += [_pair_text(names[i], names[j], rho) for i, j, rho in tight_pairs(estimate.covariance)]
-    return tuple(out)
+    return (*out, *bound_together(estimate))
+
+
+def bound_together(estimate: Estimate) -> tuple[str, ...]:
+    """Sentences on pairs that can hardly be told apart."""
+    names, pairs = estimate.machine.parameters.names, tight_pairs(estimate.covariance)
+    return tuple(_pair_text(names[i], names[j], rho) for i, j, rho in pairs)
 
 
 def _by_kind(groups: tuple[Group, ...], estimate: Estimate) -> list[str]:

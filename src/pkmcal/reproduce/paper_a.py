@@ -168,8 +168,8 @@ def _remarks(s: Study, narrow: Study, figures: list[Compared]) -> tuple[str, ...
     z = np.char.endswith(np.array(thirty(study_machine()).names), "z")
     depth = 1e3 * float(narrow.mean_error[PRINTED][z].mean())
     out = [
-        f"The paper's {mm(AFTER[0], 2)} mm is not what its four steps give as printed. They keep"
-        f" the drawing's depth: with drawing errors within ± 2 mm their mean error in z is"
+        f"The paper's {mm(AFTER[0], 2)} mm is not what its four steps give here as printed. They"
+        f" keep the drawing's depth: with drawing errors within ± 2 mm their mean error in z is"
         f" {depth:.2f} mm, the paper's “1 mm”, and the end-effector is then"
         f" {mm(narrow.accuracy[PRINTED].displacement, 1)} mm off.",
         f"The paper's 1 mm before calibration asks for drawing errors with a standard deviation of"

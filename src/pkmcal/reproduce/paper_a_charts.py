@@ -36,7 +36,7 @@ def figure_4(
             "name": LABELS[method],
             "x": list(names),
             "y": _mm(mean_error[method]),
-            "marker": {"color": colour},
+            "marker": _bar_style(method, colour),
             "hovertemplate": "%{x}: %{y:.3f} mm",
         }
         for method, colour in COLOURS.items()
@@ -67,6 +67,13 @@ def figure_4(
         "hovertemplate": "%{x}: %{y:.1f} mm",
     }
     return {"data": [*bars, before, line], "layout": _figure_4_layout(), "config": {}}
+
+
+def _bar_style(method: str, colour: str) -> dict[str, Any]:
+    """Filled, but for the bound, which is no estimate."""
+    if method != BOUND:
+        return {"color": colour}
+    return {"color": "rgba(0,0,0,0)", "line": {"color": colour, "width": 1.2}}
 
 
 def _mm(values: Array) -> list[float]:
@@ -121,7 +128,14 @@ def _figure_4_layout() -> dict[str, Any]:
             "x": 0,
             "traceorder": "normal",
         },
-        "xaxis": {**AXIS, "tickangle": -60, "anchor": "y", "showgrid": False, "fixedrange": True},
+        "xaxis": {
+            **AXIS,
+            "tickangle": -60,
+            "anchor": "y",
+            "showgrid": False,
+            "fixedrange": True,
+            "range": [-0.7, 29.7],
+        },
         "yaxis": {**error_axis, "fixedrange": True},
         "yaxis2": {**value_axis, "fixedrange": True},
         "shapes": [band],
@@ -136,7 +150,7 @@ def by_poses(
 ) -> dict[str, Any]:
     """End-effector (mm, with its standard error) by poses a station, on logarithmic axes."""
     poses = sorted(found)
-    first = poses[0]
+    last = poses[-1]
     ours = {
         "type": "scatter",
         "mode": "lines+markers",
@@ -152,7 +166,7 @@ def by_poses(
         _series(
             "as N to the power of −½",
             poses,
-            [found[first][0] * (first / n) ** 0.5 for n in poses],
+            [bound[last] * (last / n) ** 0.5 for n in poses],
             "--quiet",
             "lines",
             "dash",

@@ -50,6 +50,7 @@ TOLERANCE, OPEN_TOLERANCE = 0.25, 0.35
 """Relative difference from the prototype that fails: its cameras stood elsewhere, which moves the
 bound by a tenth; for FOLLOWS_DRAWING the size of the drawing's errors is open as well."""
 BOUND_TOLERANCE = 1.05
+DEGREE = float(np.degrees(1.0))
 CHI2_TOLERANCE = 0.02
 """The noise of directions is not linear, 1e-3 rad, and moves chi2 by less."""
 
@@ -89,10 +90,9 @@ def compared(study: Study) -> list[Compared]:
             out.append(Compared(method, name, *ours, expected, 0.5e-3 if expected < 1 else 5e-3))
     for method, (move, turn) in PROTOTYPE_EFFECTOR.items():
         found, error = study.accuracy[method], study.error[method]
-        ours = (1e3 * found.displacement, 1e3 * error.displacement)
-        out.append(Compared(method, "displacement", *ours, move, _half_digit(move)))
-        ours = (float(np.degrees(v)) for v in (found.orientation, error.orientation))
-        out.append(Compared(method, "orientation", *ours, turn, _half_digit(turn)))
+        for name, expected, unit in (("displacement", move, 1e3), ("orientation", turn, DEGREE)):
+            ours = (unit * getattr(found, name), unit * getattr(error, name))
+            out.append(Compared(method, name, *ours, expected, _half_digit(expected)))
     return out
 
 

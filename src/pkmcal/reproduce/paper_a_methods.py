@@ -78,13 +78,9 @@ def joint(machine: Machine, problem: Problem, truth: Truth, start: Start) -> Bat
     """The joint estimate; poses start by forward kinematics from the readings."""
     home = np.broadcast_to(machine.home(), (1, 1, 4, 4))
     poses = forward(machine.layout, start.theta[:, None], truth.joints, home).T_base_platform
-    z = _free(machine, problem, start.theta)
+    z = machine.parameters.to_free(start.theta)
     state = BatchState(z, start.T_camera_base, poses, np.zeros((len(z), 1, 1)))
     return solve_batch(problem, state, robust=False, scale_noise=False)
-
-
-def _free(machine: Machine, problem: Problem, theta: Array) -> Array:
-    return (theta - machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
 
 
 def bound(machine: Machine, problem: Problem, truth: Truth) -> Array:
@@ -92,7 +88,7 @@ def bound(machine: Machine, problem: Problem, truth: Truth) -> Array:
 
     An efficient estimate's errors are this matrix times independent unit normals.
     """
-    z = _free(machine, problem, truth.theta)
+    z = machine.parameters.to_free(truth.theta)
     n = len(z)
     T = np.broadcast_to(truth.T_camera_base, (n, *truth.T_camera_base.shape))
     info = information(problem, BatchState(z, T, truth.T_base_platform, np.zeros((n, 1, 1))))
@@ -100,7 +96,8 @@ def bound(machine: Machine, problem: Problem, truth: Truth) -> Array:
     change = projector(machine, truth.theta, ThreeCentres())
     spread = problem.free - generators(machine.layout, truth.theta) @ change @ problem.free
     values, vectors = np.linalg.eigh(info.covariance[:, :nz, :nz])
-    return spread @ vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    return spread @ root @ np.swapaxes(vectors, -1, -2)  # the symmetric root is unique
 
 
 def evaluated(machine: Machine, theta: Array, truth: Truth, rng: np.random.Generator) -> Errors:

@@ -199,7 +199,7 @@ def _solve(chunk: _Chunk, truth: Truth) -> _Solved:
     problem = joint_problem(machine, chunk.settings, truth)
     start = Start(corrected, steps["corrected"].T_camera_base)
     if chunk.start_error is not None:
-        start = start_off_drawing(machine, truth, _start_error(chunk, problem))
+        start = start_off_drawing(machine, truth, _start_error(chunk))
     found = joint(machine, problem, truth, start)
     theta = {
         PRINTED: printed,
@@ -211,11 +211,12 @@ def _solve(chunk: _Chunk, truth: Truth) -> _Solved:
     return _Solved(theta, chi2, freedom, found.steps, time.thread_time() - began)
 
 
-def _start_error(chunk: _Chunk, problem: Problem) -> Array:
-    """Uniform errors (B, P) of the free parameters."""
-    free = problem.free
-    draws = chunk.generator(2).uniform(-1, 1, (chunk.runs, free.shape[0]))
-    return draws * (chunk.start_error or 0.0) @ free @ np.linalg.pinv(free)
+def _start_error(chunk: _Chunk) -> Array:
+    """Uniform errors (B, P) of the parameters that are not held."""
+    table = chunk.machine.parameters
+    free = np.any(table.free_matrix() != 0, axis=1)
+    draws = chunk.generator(2).uniform(-1, 1, (chunk.runs, len(table)))
+    return np.where(free, draws * (chunk.start_error or 0.0), 0.0)
 
 
 def _errors(chunk: _Chunk, truth: Truth, solved: _Solved) -> dict[str, Errors]:
@@ -259,7 +260,7 @@ def accuracy(machine: Machine, errors: Errors) -> tuple[Accuracy, Accuracy]:
     root_n = np.sqrt(max(len(errors.thirty), 1))
     squares = np.stack([np.mean(errors.thirty[:, g] ** 2, axis=1) for g in groups], axis=-1)
     rms = np.sqrt(squares.mean(axis=0))
-    rms_error = squares.std(axis=0) / root_n / (2 * rms)
+    rms_error = squares.std(axis=0) / root_n / (2 * np.maximum(rms, 1e-300))
     effector = errors.effector.mean(axis=0)
     effector_error = errors.effector.std(axis=0) / root_n
     return (

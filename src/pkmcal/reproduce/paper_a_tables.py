@@ -56,8 +56,8 @@ def _noise_cells(sigma: Array, places: int) -> tuple[str, ...]:
             f"{mm(x, places)} mm", f"{mm(z, places)} mm")  # fmt: skip
 
 
-def noise_part() -> Part:
-    """[A] Table 1 and how it enters."""
+def noise_part(measured: AxisNoise | None = None) -> Part:
+    """[A] Table 1 and how it enters. measured : see :func:`table_1`."""
     return Part(
         "noise",
         "Table 1",
@@ -71,7 +71,7 @@ def noise_part() -> Part:
             " as it is; the joint estimate takes it as the two edges that a leg around this axis"
             " would show, with the same noise.",
         ),
-        tables=(table_1(),),
+        tables=(table_1(measured),),
     )
 
 
@@ -219,7 +219,7 @@ def poses_part(studies: dict[int, Study]) -> Part:
                 mm(s.accuracy[JOINT].displacement, 4),
                 mm(s.error[JOINT].displacement, 4),
                 mm(s.accuracy[BOUND].displacement, 4),
-                f"{PROTOTYPE_POSES[poses]:g}",
+                number(PROTOTYPE_POSES[poses], 3),
             ),
         )
         for poses, s in studies.items()
@@ -229,8 +229,9 @@ def poses_part(studies: dict[int, Study]) -> Part:
         "poses",
         "More poses",
         (
-            "The same simulation with other numbers of poses a station. The joint estimate's error"
-            " falls as N to the power of −½, as independent measurements should let it.",
+            "The same simulation with other numbers of poses a station. Independent measurements"
+            " let errors fall as N to the power of −½; the first poses gain a little more, since"
+            " few poses leave some combinations of parameters weakly known.",
         ),
         (
             Plot(

@@ -8,6 +8,7 @@ a printed corner is right to a hundredth of a pixel.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, final
 
 import numpy as np
@@ -29,10 +30,14 @@ THICKNESS = 0.004
 """m."""
 BLACK = 0.06
 """Light that printed black sends back, as a share of white's."""
-SQUARES = (10, 8)
-"""Of the board made to measure: large squares are read from afar, and past legs."""
+SQUARES = (6, 5)
+"""Of the board made to measure: large squares are read from afar."""
 LOOKED_AT = 6
 """Configurations at which the places for a board are tried."""
+SLANTED = 0.6
+"""Cosine of the angle between normal and line of sight below which a board is read less well."""
+ASKEW = 0.25
+"""rad; by which a standing board leans, and turns, from the middle of the cameras."""
 LEAST_SEEN = 0.4
 """Share of a board's corners that every station has to see, on average."""
 
@@ -206,13 +211,14 @@ def place_board(
     joints: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """T_base_board (4, 4): on the base between the legs, or beside it, where it is seen best.
+    """T_base_board (4, 4): on the base, beside it or standing behind it, where it is seen best.
 
     T_camera_base : (S, 4, 4). T_base_platform (K, 4, 4) and joints (K, m) : configurations. The
     corners seen are counted past the machine's parts; the station that sees least decides.
     """
     discs = discs_of(machine)
-    places = _places(board, discs, rng)
+    eyes = inverse(T_camera_base)[:, :3, 3]
+    places = [*_lying(board, discs, rng), *_standing(board, discs, eyes, rng)]
     few = np.unique(np.linspace(0, len(joints) - 1, LOOKED_AT).astype(int))
     finish = Finish.from_noise(SmoothNoise.from_rng(rng))
     scenes = [machine_parts(machine, discs, finish, T_base_platform[k], joints[k]) for k in few]
@@ -236,7 +242,7 @@ def place_board(
     return places[best]
 
 
-def _places(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
+def _lying(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
     """Lying on the base disc, and beside it, turned as by hand; printed face to the platform."""
     low, high = board.points.min(axis=0), board.points.max(axis=0)
     up = discs.side
@@ -257,16 +263,40 @@ def _places(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]
     return out
 
 
+def _standing(board: Board, discs: Discs, eyes: Array, rng: np.random.Generator) -> list[Array]:
+    """Upright behind the machine, higher and higher, its face to the middle of the cameras."""
+    way = (eyes - discs.base).mean(axis=0)[:2]
+    if np.linalg.norm(way) < 0.4 * np.linalg.norm((eyes - discs.base)[:, :2], axis=1).mean():
+        return []  # cameras all round: none would see its back
+    way = np.append(way / np.linalg.norm(way), 0.0)
+    low, high = board.points.min(axis=0), board.points.max(axis=0)
+    out: list[Array] = []
+    for depth, aside, height in product(
+        (0.6, 1.2), (-1.2, -0.6, 0.0, 0.6, 1.2), np.arange(0.2, 2.6, 0.15)
+    ):
+        # x to the right of who looks at it, y down, z into it
+        right = np.cross([0.0, 0.0, 1.0], way)
+        flat = np.stack([right, [0.0, 0.0, -1.0], -way], axis=-1)
+        # seen straight on, a board hardly tells its tilt
+        slant = rotation(ASKEW * right) @ rotation(np.array([0.0, 0.0, ASKEW]))
+        rot = rotation(rng.normal(0, 0.05, 3)) @ slant @ flat
+        centre = discs.base + discs.base_radius * (aside * right - depth * way)
+        centre = centre + discs.side * height * discs.base_radius * np.array([0, 0, 1])
+        out.append(pose(rot, centre - rot @ ((low + high) / 2)))
+    return out
+
+
 def _share_seen(
     board: Board, T_camera_base: Array, parts: list[Part], camera: Camera, T_base_board: Array
 ) -> float:
-    """Share of the board's corners that a camera sees past a machine's parts."""
+    """Share of the board's corners that a camera sees past a machine's parts, less on a slant."""
     points = apply(T_base_board, board.points)
     pixels = camera.project(apply(T_camera_base, points))
     eye = inverse(T_camera_base)[:3, 3]
     rays = points - eye
     distance = np.linalg.norm(rays, axis=1)
     rays = (rays / distance[:, None]).T
-    front = T_base_board[:3, 2] @ rays > 0.2
+    facing = np.clip(T_base_board[:3, 2] @ rays / SLANTED, 0, 1)
     hit = np.min([part.shape.enter(eye, rays) for part in parts], axis=0)
-    return float(np.mean(camera.in_image(pixels, margin=6.0) & front & (hit > distance - 1e-4)))
+    seen = camera.in_image(pixels, margin=10.0) & (hit > distance - 1e-4)
+    return float(np.mean(seen * facing))

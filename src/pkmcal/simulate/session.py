@@ -78,7 +78,8 @@ class Studio:
         fixed: tuple[Part, ...] = ()
         if settings.board is not None and truth.T_base_board is not None:
             fixed = (board_part(settings.board, truth.T_base_board),)
-        return cls(truth, discs, Finish.from_noise(noise), room, views, settings.sensor, fixed)
+        finish = Finish.from_noise(noise, flat=truth.machine.document.motion == "planar")
+        return cls(truth, discs, finish, room, views, settings.sensor, fixed)
 
     def photograph(self, index: int) -> Integers:
         """The session's photograph number ``index``: 8 bits, (H, W)."""

@@ -11,11 +11,20 @@ from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, inverse, look_at, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 
 _PANORAMIC = np.deg2rad(95)
 """A camera that sees more than this off its axis sees all legs from their middle."""
 _NEAREST = np.deg2rad(35)
 """Half the angle under which the machine is seen at most; nearer, legs hide each other."""
+_TRIED = 24
+"""Places round the machine of which a single camera takes the best."""
+_CLEAR = 0.03
+"""Gap to another leg at home, in image widths, that keeps a leg free of it elsewhere."""
+_ARC = np.deg2rad(80)
+"""Between the first and the last camera that see the same face of a board."""
+_BESIDE = {False: 1.45, True: 1.6}
+"""Distance that leaves room for a board, in the machine's own, upright and flat."""
 
 Vector = tuple[float, float, float]
 
@@ -48,19 +57,51 @@ def default_stations(
 ) -> tuple[StationPose, ...]:
     """One place for each camera: evenly round the machine, not quite regular, as by hand.
 
-    on_base : high enough to look onto the base, past the platform, and with room beside it.
+    A camera that is alone goes where it sees most of every leg.
+    on_base : so that all see one board fixed to the base: to one side of a machine that stands,
+    round one that lies flat, and with room beside the machine.
     """
     a, b = joints_at_home(machine)
     start = rng.uniform(0, 2 * np.pi)
     poses: list[StationPose] = []
+    arc = on_base and not _is_flat(np.concatenate([a, b]))
     for k, camera in enumerate(cameras):
         half = view_angle(camera)
         if half > _PANORAMIC:
             poses.append(_inside(a, b, rng))
+        elif len(cameras) == 1 and not on_base:
+            poses.append(_clearest(machine, camera, min(half, _NEAREST), start, rng))
         else:
-            azimuth = start + 2 * np.pi * k / len(cameras) + np.deg2rad(rng.uniform(-8, 8))
+            turn = (
+                _ARC * (k / max(len(cameras) - 1, 1) - 0.5) if arc else 2 * np.pi * k / len(cameras)
+            )
+            azimuth = start + turn + np.deg2rad(rng.uniform(-8, 8))
             poses.append(_outside(a, b, min(half, _NEAREST), azimuth, rng, on_base))
     return tuple(poses)
+
+
+def _clearest(
+    machine: Machine, camera: Camera, half: float, start: float, rng: np.random.Generator
+) -> StationPose:
+    """The place on the ring from which the leg that is seen least is seen best."""
+    a, b = joints_at_home(machine)
+    azimuths = start + 2 * np.pi * np.arange(_TRIED) / _TRIED
+    poses = [_outside(a, b, half, azimuth, rng, False) for azimuth in azimuths]
+    tubes, home = tubes_of(machine), machine.home()[None]
+    T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
+    legs = legs_in_camera(machine, T_camera_base, home, machine.inverse(home))
+    points = edge_points(machine, camera, legs, tubes, 12)
+    # legs move: what comes near another one at home is behind it elsewhere
+    clear = _CLEAR * camera.image_size[0]
+    seen = unobstructed(machine, camera, legs, tubes, points, clear).mean(axis=-1)
+    share = np.stack([seen[:, tubes.leg == j].mean(axis=1) for j in np.unique(tubes.leg)])
+    return poses[int(np.argmax(share.min(axis=0)))]
+
+
+def _is_flat(points: Array) -> bool:
+    """Whether joints (n, 3) lie in about one level."""
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return bool(np.ptp(points[:, 2]) < 0.25 * np.linalg.norm(points - centre, axis=1).max())
 
 
 def view_angle(camera: Camera) -> float:
@@ -104,12 +145,10 @@ def _outside(
     points = np.concatenate([a, b])
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.linalg.norm(points - centre, axis=1).max())
-    flat = np.ptp(points[:, 2]) < 0.25 * radius
+    flat = _is_flat(points)
     elevation = np.deg2rad(rng.uniform(42, 55) if flat else rng.uniform(7, 17))
-    if on_base and not flat:
-        elevation += np.deg2rad(30)
     # more than the machine at home, because the platform moves and plates reach beyond joints
-    distance = (1.6 if on_base and flat else 1.18) * radius / np.sin(half)
+    distance = (_BESIDE[flat] if on_base else 1.18) * radius / np.sin(half)
     way = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
          np.sin(elevation)]

@@ -13,18 +13,26 @@ import importlib
 import pkgutil
 from abc import ABC, abstractmethod
 from functools import cache
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.files import Schema
+from pkmcal.geometry.rigid import apply, skew
 
 
 class ParameterKind(NamedTuple):
-    """One parameter of a part: path below the part, unit, and the drawing's tolerance for it."""
+    """One parameter of a part: path below the part, unit, and the drawing's tolerance for it.
+
+    Where the file may leave the field out, ``otherwise`` is its value, and it is no parameter of
+    a machine whose file does. Without a tolerance's name it is a constant of the drawing.
+    """
 
     path: str
     unit: str
     tolerance: str
+    otherwise: float = 0.0
 
 
 class CarriedPoint(NamedTuple):
@@ -41,34 +49,130 @@ class CarriedPoint(NamedTuple):
     by_parameters: Array
 
 
-class BaseCarrier(ABC):
+class Carrier(ABC):
+    """What both sides share: words in files, schema, parameters, and changes of the frames.
+
+    shared : fields that legs on one motor, or on one bar, have in common.
+
+    Frames change by E on base coordinates and F on platform coordinates, (..., 4, 4), see
+    :mod:`pkmcal.identify.gauge`.
+    """
+
+    joints: ClassVar[tuple[str, ...]]
+    schema: ClassVar[type[Schema]]
+    parameters: ClassVar[tuple[ParameterKind, ...]]
+    shared: ClassVar[tuple[str, ...]] = ()
+
+    @staticmethod
+    @abstractmethod
+    def moved(parameters: Array, e: Array, f: Array) -> Array:
+        """The parameters (..., n) told in the new frames, e and f (..., 4, 4)."""
+
+    @staticmethod
+    @abstractmethod
+    def by_frames(parameters: Array) -> Array:
+        """Their first-order change by E's and F's six numbers, (..., n, 12)."""
+
+    @staticmethod
+    @abstractmethod
+    def carried(parameters: Array, e: Array, f: Array) -> Array:
+        """Derivative (..., n, n) of :meth:`moved` by the parameters."""
+
+
+class BaseCarrier(Carrier):
     """Gives A, the limb's end on the base side, as a function of the joint reading.
 
     driven : the reading moves A; the rod then has a length of its own.
     """
 
     driven: ClassVar[bool] = False
-    joints: ClassVar[tuple[str, ...]]
-    schema: ClassVar[type[Schema]]
-    parameters: ClassVar[tuple[ParameterKind, ...]]
 
     @staticmethod
     @abstractmethod
     def point(parameters: Array, readings: Array) -> CarriedPoint:
         """A for parameters (..., n) and readings (...,) (m or rad)."""
 
+    @staticmethod
+    def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
+        """Readings (...,) that put A at a distance (...,) from B (..., 3), m.
 
-class PlatformCarrier(ABC):
-    """Gives B, the limb's end on the platform side, as a function of the platform's pose."""
+        Of two the one nearest to ``near`` (...,); NaN where B is out of reach.
+        """
+        del parameters, length, near
+        return np.full(point_b.shape[:-1], np.nan)
 
-    joints: ClassVar[tuple[str, ...]]
-    schema: ClassVar[type[Schema]]
-    parameters: ClassVar[tuple[ParameterKind, ...]]
+
+class PlatformCarrier(Carrier):
+    """Gives B, the limb's end on the platform side, as a function of the platform's pose.
+
+    turns : B also turns about a hinge, by an internal coordinate of the pose that no reading
+    knows; legs with the same ``bar`` in the file share it.
+    """
+
+    turns: ClassVar[bool] = False
 
     @staticmethod
     @abstractmethod
-    def point(parameters: Array, T_base_platform: Array) -> CarriedPoint:
-        """B for parameters (..., n) and poses (..., 4, 4)."""
+    def point(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> CarriedPoint:
+        """B for parameters (..., n), poses (..., 4, 4) and internal coordinates (...,), rad."""
+
+    @staticmethod
+    def by_internal(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> Array:
+        """Derivative (..., 3) of B by the internal coordinate."""
+        del internal
+        shape = np.broadcast_shapes(parameters.shape[:-1], T_base_platform.shape[:-2])
+        return np.zeros((*shape, 3))
+
+
+def vectors(name: str, unit: str, tolerance: str) -> tuple[ParameterKind, ...]:
+    """The three components of a field."""
+    return tuple(ParameterKind(f"{name}.{axis}", unit, tolerance) for axis in "xyz")
+
+
+def of_part(node: Any, kind: ParameterKind) -> float | None:
+    """What a part of a mechanism file says of a parameter, None where it is silent;
+    ``center.y`` is the second number of ``center``.
+    """
+    field, _, axis = kind.path.partition(".")
+    value = getattr(node, field)
+    if value is None:
+        return None
+    return float(value["xyz".index(axis)] if axis else value)
+
+
+def moved_point(p: Array, transform: Array) -> Array:
+    """A body's point (..., 3) in its new frame."""
+    return apply(transform, p)
+
+
+def moved_direction(d: Array, transform: Array) -> Array:
+    """A body's direction (..., 3) in its new frame."""
+    return (transform[..., :3, :3] @ d[..., None])[..., 0]
+
+
+def point_by_frame(p: Array) -> Array:
+    """Change (..., 3, 6) of a body's point by its frame's six numbers."""
+    eye = np.broadcast_to(np.eye(3), (*p.shape, 3))
+    return np.concatenate([-skew(p), eye], axis=-1)
+
+
+def direction_by_frame(d: Array) -> Array:
+    """Change (..., 3, 6) of a body's direction by its frame's six numbers."""
+    return np.concatenate([-skew(d), np.zeros((*d.shape, 3))], axis=-1)
+
+
+def turned_blocks(n: int, *blocks: tuple[int, Array]) -> Array:
+    """Identity (..., n, n) but for 3x3 turns of a transform (..., 4, 4) at the given rows."""
+    shape = np.broadcast_shapes(*(t.shape[:-2] for _, t in blocks))
+    out = np.zeros((*shape, n, n))
+    out[...] = np.eye(n)
+    for at, transform in blocks:
+        out[..., at : at + 3, at : at + 3] = transform[..., :3, :3]
+    return out
 
 
 @cache

@@ -10,11 +10,14 @@ from pkmcal.arrays import Array
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
     CarriedPoint,
-    ParameterKind,
+    moved_point,
+    point_by_frame,
+    turned_blocks,
+    vectors,
 )
 from pkmcal.mechanisms.joints import JointDocument
 
-CENTER = tuple(ParameterKind(f"center.{axis}", "m", "center") for axis in "xyz")
+CENTER = vectors("center", "m", "center")
 
 
 @final
@@ -33,3 +36,21 @@ class FixedPoint(BaseCarrier):
         return CarriedPoint(
             value, np.zeros((*shape, 3)), np.broadcast_to(np.eye(3), (*shape, 3, 3))
         )
+
+    @staticmethod
+    def moved(parameters: Array, e: Array, f: Array) -> Array:
+        """The centre moves with the base frame."""
+        del f
+        return moved_point(parameters, e)
+
+    @staticmethod
+    def by_frames(parameters: Array) -> Array:
+        """E's columns alone."""
+        own = point_by_frame(parameters)
+        return np.concatenate([own, np.zeros_like(own)], axis=-1)
+
+    @staticmethod
+    def carried(parameters: Array, e: Array, f: Array) -> Array:
+        """A turn."""
+        del parameters, f
+        return turned_blocks(3, (0, e))

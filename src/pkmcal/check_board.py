@@ -1,0 +1,99 @@
+"""The board in a session's photographs, as `pkmcal check` reports it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pkmcal.arrays import Integers
+from pkmcal.boards import Boards, StationBoard, board_of, station_board
+from pkmcal.errors import InputError
+from pkmcal.findings import Finding, Level, wrong
+from pkmcal.session import Session
+
+POOR = 0.5
+"""px rms from which the corners are worse than any sharp photograph of a flat board has them."""
+
+
+@dataclass(frozen=True)
+class BoardCheck:
+    """The board in one station's photographs.
+
+    found : photographs that show it. corners : mean number in these, of ``corners_of``. rms : px
+    off their predicted places. scatter : px by which a board on the base wanders from photograph
+    to photograph; nan where it need not stand still, or is seen once. distance : m.
+    """
+
+    found: int
+    corners: float
+    corners_of: int
+    rms: float
+    scatter: float
+    distance: float
+
+
+@dataclass(frozen=True)
+class BoardsCheck:
+    """All stations' boards, by the station's number, and what is to be said of them."""
+
+    boards: Boards = field(default_factory=Boards)
+    checks: Mapping[int, BoardCheck] = field(default_factory=dict[int, BoardCheck])
+    findings: tuple[Finding, ...] = ()
+
+
+def check_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> BoardsCheck:
+    """Look for the board in every station that observes it, nothing raised.
+
+    images : all decoded photographs by the station's number.
+    """
+    findings: list[Finding] = []
+    try:
+        board = board_of(session)
+    except InputError as error:
+        return BoardsCheck(findings=(wrong(error),))
+    if board is None:
+        return BoardsCheck()
+    found: dict[int, StationBoard] = {}
+    for number, station in enumerate(session.stations):
+        if "board" not in station.observe:
+            continue
+        try:
+            found[number] = station_board(session, board, number, images[number])
+        except InputError as error:
+            findings.append(wrong(error, station.name))
+    checks = {number: _summary(one) for number, one in found.items()}
+    for number, check in checks.items():
+        findings += _doubts(session, number, check)
+    return BoardsCheck(Boards(found, session.board_body), checks, tuple(findings))
+
+
+def _summary(one: StationBoard) -> BoardCheck:
+    seen, stood = one.seen, one.stood
+    return BoardCheck(
+        found=len(seen.shown),
+        corners=float(seen.views.seen.sum(axis=1).mean()),
+        corners_of=len(seen.board.points),
+        rms=float(np.median(seen.rms)),
+        scatter=stood.scatter if stood else float("nan"),
+        distance=float(np.median(np.linalg.norm(seen.poses.T_camera_board[:, :3, 3], axis=-1))),
+    )
+
+
+def _doubts(session: Session, number: int, check: BoardCheck) -> list[Finding]:
+    station = session.stations[number]
+    texts: list[tuple[Level, str]] = []
+    if check.rms > POOR:
+        text = (
+            f"The board's corners lie {check.rms:.2g} px off their places, rms; a flat board, a"
+            " sharp photograph and the right camera file leave a tenth of a pixel."
+        )
+        texts.append((Level.DOUBTFUL, text))
+    if session.board_body == "base" and check.found == 1 and len(station.photographs) > 1:
+        text = (
+            "Only one photograph shows the board on the base, so nobody can tell whether it, or"
+            " the camera, stood still."
+        )
+        texts.append((Level.NOTE, text))
+    return [Finding(level, f"{station.name}: {text}", station.name) for level, text in texts]

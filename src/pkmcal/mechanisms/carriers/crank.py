@@ -1,0 +1,202 @@
+"""A crank on the base, turned by a motor: A is the end of its arm (H4, delta, 6-RUS)."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, NamedTuple, final
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from pkmcal.arrays import Array
+from pkmcal.files import Schema
+from pkmcal.geometry.rigid import cross, dot
+from pkmcal.mechanisms.carriers.contract import (
+    BaseCarrier,
+    CarriedPoint,
+    ParameterKind,
+    direction_by_frame,
+    moved_direction,
+    moved_point,
+    point_by_frame,
+    turned_blocks,
+    vectors,
+)
+from pkmcal.mechanisms.joints import Direction, Interval
+
+UP = np.array([0.0, 0.0, 1.0])
+ZERO = tuple(ParameterKind(f"zero.{axis}", "1", "", np.nan) for axis in "xyz")
+
+
+class CrankDocument(Schema):
+    """``{joint: crank, center: [x, y, z], axis: [x, y, z], arm: 0.26}``: m, rad, base frame."""
+
+    joint: Literal["crank"]
+    center: Annotated[
+        tuple[float, float, float],
+        Field(description="a point [x, y, z] on the crank's axis, metres, base frame"),
+    ]
+    axis: Annotated[
+        Direction, Field(description="the direction [x, y, z] that the crank turns about")
+    ]
+    arm: Annotated[float, Field(gt=0, description="the arm's length in metres")]
+    angle: float = 0.0
+    zero: Direction | None = None
+    along: float | None = None
+    radial: float | None = None
+    motor: Annotated[int, Field(ge=1)] | None = None
+    range: Interval | None = None
+
+
+class _Frame(NamedTuple):
+    """A crank's own axes: unit axis v, e0 and side = v x e0, (..., 3) each; twist (..., 3), the
+    turn of e0 about v by a change of v; n : by a change of ``zero`` it turns side / n.
+    """
+
+    v: Array
+    e0: Array
+    side: Array
+    twist: Array
+    n: Array
+    drawn: Array
+
+
+@final
+class Crank(BaseCarrier):
+    """``A = center + along v + radial e0 + arm (cos Q e0 + sin Q v x e0)``, Q = reading + angle.
+
+    v is the unit axis. e0 is the file's ``zero`` made square to v, or the horizontal ``v x z``
+    where the file has none; [C] eq. 1 and 4 then, with Q = q - q0. ``radial`` moves the axis
+    out along e0 and ``along`` the arm along the axis.
+    """
+
+    driven: ClassVar = True
+    joints: ClassVar = ("crank",)
+    schema: ClassVar = CrankDocument
+    shared: ClassVar = ("center", "axis", "radial")
+    parameters: ClassVar = (
+        *vectors("center", "m", "center"),
+        *vectors("axis", "1", "axis"),
+        ParameterKind("arm", "m", "arm"),
+        ParameterKind("angle", "rad", "angle"),
+        ParameterKind("along", "m", "center"),
+        ParameterKind("radial", "m", "center"),
+        *ZERO,
+    )
+
+    @staticmethod
+    def point(parameters: Array, readings: Array) -> CarriedPoint:
+        """A, its derivatives by reading and parameters."""
+        frame = _frame(parameters)
+        v, e0, side = frame.v, frame.e0, frame.side
+        arm, angle, along, radial = (parameters[..., k, None] for k in range(6, 10))
+        turn = readings[..., None] + angle
+        c, s = np.cos(turn), np.sin(turn)
+        out, ahead = c * e0 + s * side, c * side - s * e0
+        value = parameters[..., :3] + along * v + radial * e0 + arm * out
+        by_reading = arm * ahead
+        shape = value.shape
+        # the frame turns by the twist about v, and v itself pulls e0 and side after it
+        swing = radial * side + by_reading
+        pull = radial * e0 + arm * out
+        by_v = along[..., None] * np.eye(3) + _outer(swing, frame.twist) - _outer(v, pull)
+        size = np.sqrt(dot(parameters[..., 3:6], parameters[..., 3:6]))[..., None, None]
+        by_axis = (by_v - (by_v @ v[..., None]) * v[..., None, :]) / size
+        # zero's part along v changes nothing, the rest turns the crank
+        zero = _outer(swing, side / frame.n * frame.drawn)
+        columns = [np.eye(3), by_axis, out, by_reading, v, e0, zero]
+        full = [
+            np.broadcast_to(x if x.shape[-2:-1] == (3,) else x[..., None], (*shape, k))
+            for x, k in zip(columns[:2], (3, 3), strict=True)
+        ]
+        full += [np.broadcast_to(x[..., None], (*shape, 1)) for x in columns[2:6]]
+        full.append(np.broadcast_to(zero, (*shape, 3)))
+        return CarriedPoint(
+            value, np.broadcast_to(by_reading, shape), np.concatenate(full, axis=-1)
+        )
+
+    @staticmethod
+    def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
+        """Errata, Model 31: ``Q = atan2(s, p) -+ acos(g / |(p, s)|)``, d = B - center,
+        p = d . e0, s = d . (v x e0), g = (|d|^2 + arm^2 - length^2) / (2 arm).
+        """
+        frame = _frame(parameters)
+        arm, angle, along, radial = (parameters[..., k] for k in range(6, 10))
+        foot = along[..., None] * frame.v + radial[..., None] * frame.e0
+        d = point_b - parameters[..., :3] - foot
+        p, s = dot(d, frame.e0), dot(d, frame.side)
+        reach = np.sqrt(p * p + s * s)
+        share = (dot(d, d) + arm**2 - length**2) / (2 * arm * np.where(reach > 0, reach, np.nan))
+        half = np.arccos(np.where(np.abs(share) <= 1, share, np.nan))
+        both = np.stack([np.arctan2(s, p) + half, np.arctan2(s, p) - half]) - angle
+        apart = (both - near + np.pi) % (2 * np.pi) - np.pi
+        first, second = apart
+        return near + np.where(np.abs(first) <= np.abs(second), first, second)
+
+    @staticmethod
+    def moved(parameters: Array, e: Array, f: Array) -> Array:
+        """Centre and axis move with the base frame; ``zero`` and the vertical stay, so that the
+        angle takes up what e0 turns against them.
+        """
+        del f
+        out = np.array(np.broadcast_to(parameters, (*_lead(parameters, e), parameters.shape[-1])))
+        out[..., :3] = moved_point(parameters[..., :3], e)
+        out[..., 3:6] = moved_direction(parameters[..., 3:6], e)
+        carried, now = moved_direction(_frame(parameters).e0, e), _frame(out)
+        # radial goes along e0, so its turn is a shift of the centre
+        out[..., :3] += parameters[..., 9, None] * (carried - now.e0)
+        out[..., 7] += np.arctan2(dot(carried, now.side), dot(carried, now.e0))
+        return out
+
+    @staticmethod
+    def by_frames(parameters: Array) -> Array:
+        """E's columns; the angle turns by ``v - v x twist``."""
+        frame = _frame(parameters)
+        out = np.zeros((*parameters.shape, 12))
+        out[..., :3, :6] = point_by_frame(parameters[..., :3])
+        out[..., 3:6, :6] = direction_by_frame(parameters[..., 3:6])
+        turn = frame.v - cross(frame.v, frame.twist)
+        out[..., 7, :3] = turn
+        out[..., :3, :3] += parameters[..., 9, None, None] * _outer(frame.side, turn)
+        return out
+
+    @staticmethod
+    def carried(parameters: Array, e: Array, f: Array) -> Array:
+        """Turns, and how much more an error of the axis twists e0 here than there."""
+        after = _frame(Crank.moved(parameters, e, f))
+        before = _frame(parameters)
+        out = turned_blocks(parameters.shape[-1], (0, e), (3, e))
+        size = np.sqrt(dot(parameters[..., 3:6], parameters[..., 3:6]))[..., None]
+        back = np.swapaxes(e[..., :3, :3], -1, -2)
+        by_axis = (before.twist - moved_direction(after.twist, _padded(back))) / size
+        out = np.array(np.broadcast_to(out, (*by_axis.shape[:-1], *out.shape[-2:])))
+        out[..., 7, 3:6] = by_axis
+        return out
+
+
+def _frame(parameters: Array) -> _Frame:
+    """The crank's own axes and how they change with its parameters."""
+    axis, zero = parameters[..., 3:6], parameters[..., 10:13]
+    drawn = np.isfinite(zero[..., :1])
+    zero = np.where(drawn, zero, UP)
+    v = axis / np.sqrt(dot(axis, axis))[..., None]
+    high = dot(zero, v)[..., None]
+    raw = np.where(drawn, zero - high * v, cross(v, zero))
+    n = np.sqrt(dot(raw, raw))[..., None]
+    e0 = raw / n
+    side = cross(v, e0)
+    twist = np.where(drawn, -high * side, cross(UP, side)) / n
+    return _Frame(v, e0, side, twist, n, drawn)
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return a[..., :, None] * b[..., None, :]
+
+
+def _lead(parameters: Array, transform: Array) -> tuple[int, ...]:
+    return np.broadcast_shapes(parameters.shape[:-1], transform.shape[:-2])
+
+
+def _padded(rot: Array) -> Array:
+    out = np.zeros((*rot.shape[:-2], 4, 4))
+    out[..., :3, :3] = rot
+    return out

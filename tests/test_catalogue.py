@@ -1,0 +1,234 @@
+"""Every machine of the catalogue: an independent closure, and a calibration from nothing but data.
+
+Machines are enumerated from the folder; loading, kinematics and files there and back are tested
+for each of them in test_kinematics and test_mechanisms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pkmcal
+from pkmcal.cameras import camera_models
+from pkmcal.geometry.rigid import perturb
+from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.gauge import apply, default_gauge
+from pkmcal.identify.problem import Measurements, State
+from pkmcal.mechanisms import catalogue, kinematics, load_mechanism
+from pkmcal.mechanisms.limbs import closure, dense
+from pkmcal.simulate import (
+    EdgeNoise,
+    Settings,
+    draw_truth,
+    load_truth,
+    simulate_edges,
+    simulate_session,
+    true_machine,
+)
+from pkmcal.simulate.configurations import draw_configurations
+
+NAMES = sorted(catalogue())
+
+
+@pytest.fixture(params=NAMES, scope="module")
+def machine(request):
+    return load_mechanism(request.param)
+
+
+def test_the_catalogue_holds_what_paper_a_is_about():
+    assert set(NAMES) >= {
+        "3-rpr", "3-upu", "gough-stewart", "3-rps", "6-spu-passive", "constant-legs"
+    }  # fmt: skip
+    assert {load_mechanism(name).document.motion for name in NAMES} >= {"planar", "spatial"}
+
+
+# The closure, written a second time from the file's fields alone, for complex numbers
+
+
+def oracle(machine, theta, readings, rot, t):
+    """Rows of the closure as docs/files.md states them; every argument may be complex."""
+    value = dict(zip(machine.parameters.names, theta, strict=True))
+    lengths, angles = [], []
+    reading = iter(readings)
+    for j, leg in enumerate(machine.document.legs, start=1):
+        a, b = (
+            np.array([value[f"legs[{j}].{side}.center.{c}"] for c in "xyz"])
+            for side in ("base", "platform")
+        )
+        line = rot @ b + t - a
+        fields = leg.length.model_dump()
+        if fields.get("actuated") is True:
+            rod = next(reading) + value[f"legs[{j}].length.offset"]
+        elif not fields.get("passive"):
+            rod = value[f"legs[{j}].length.constant"]
+        if not fields.get("passive"):
+            lengths.append(np.sqrt(line @ line) - rod)
+        if machine.document.motion == "spatial":
+            angles += angle_rows(leg, j, value, rot, line)
+    return np.array(lengths + angles)
+
+
+def angle_rows(leg, j, value, rot, line):
+    """[A] eq. 7 on either side; the torsion of a universal-universal leg (errata)."""
+
+    def axis(side):
+        v = np.array([value[f"legs[{j}].{side}.axis.{c}"] for c in "xyz"])
+        return v / np.sqrt(v @ v)
+
+    rows = []
+    if leg.base.joint == "revolute":
+        rows.append(line @ axis("base"))
+    if leg.platform.joint == "revolute":
+        rows.append(line @ (rot @ axis("platform")))
+    if {leg.base.joint, leg.platform.joint} == {"universal"} and leg.base.axis and leg.platform.axis:
+        rows.append(line @ np.cross(axis("base"), rot @ axis("platform")))
+    return rows
+
+
+def complex_steps(function, count):
+    """Derivatives (E, count) of function(delta (count,)) at zero, exact to rounding."""
+    return np.stack([function(1e-30j * by).imag / 1e-30 for by in np.eye(count)], axis=-1)
+
+
+def assert_as_the_oracle(machine, readings, T):
+    theta, layout = machine.values, machine.layout
+    rot, t = T[:3, :3], T[:3, 3]
+    c = closure(layout, theta, readings, T)
+    close = {"rtol": 1e-13, "atol": 1e-14}
+    np.testing.assert_allclose(c.value, oracle(machine, theta, readings, rot, t), **close)
+
+    def by_pose(d):
+        turn = np.array([[0, -d[2], d[1]], [d[2], 0, -d[0]], [-d[1], d[0], 0]])
+        return oracle(machine, theta, readings, rot + turn @ rot, t + d[3:])
+
+    np.testing.assert_allclose(c.by_pose, complex_steps(by_pose, 6), **close)
+    by_theta = complex_steps(lambda d: oracle(machine, theta + d, readings, rot, t), len(theta))
+    np.testing.assert_allclose(dense(c, len(theta)), by_theta, **close)
+    by_reading = complex_steps(
+        lambda d: oracle(machine, theta, readings + d, rot, t), machine.n_joints
+    )
+    found = np.zeros(by_reading.shape)
+    found[layout.driven_rows, np.arange(machine.n_joints)] = c.by_reading[layout.driven_rows]
+    np.testing.assert_allclose(found, by_reading, **close)
+
+
+def wide_poses(machine, count, seed, wide=1.0):
+    """Poses about home, as far as none of them closes the machine."""
+    spread = np.repeat([1.5, 0.2], 3) * wide
+    motion = machine.layout.motion
+    steps = np.random.default_rng(seed).uniform(-1, 1, (count, 6)) * spread
+    return perturb(machine.home(), steps @ motion @ motion.T)
+
+
+def test_jacobians_at_home(machine):
+    home = machine.home()
+    assert_as_the_oracle(machine, machine.inverse(home), home)
+
+
+def test_jacobians_at_random(machine):
+    """Machines, readings and poses that need not close: a solver goes there, too."""
+    rng = np.random.default_rng(0)
+    for T in wide_poses(machine, 5, 1):
+        changed = machine.with_values(machine.values + 0.02 * rng.normal(size=len(machine.values)))
+        readings = machine.inverse(T) + 0.02 * rng.normal(size=machine.n_joints)
+        assert_as_the_oracle(changed, readings, T)
+
+
+def test_jacobians_near_singular_poses(machine):
+    poses = wide_poses(machine, 20_000, 2)
+    c = closure(machine.layout, machine.values, machine.inverse(poses), poses)
+    size = kinematics.singularity(machine.layout, machine.values, c.by_pose)
+    assert size.min() < 0.01
+    for k in np.argsort(size)[:5]:
+        assert_as_the_oracle(machine, machine.inverse(poses[k]), poses[k])
+
+
+# Kinematics of machines as they are built
+
+
+def test_built_machines_move_as_drawn(machine):
+    """Errors of the drawing's size leave usable configurations, closed and in the assembly."""
+    for seed in range(3):
+        built = true_machine(machine, 1.0, np.random.default_rng(seed))
+        assert load_values_back(built)
+        poses, joints = draw_configurations(built, 40, 0.5, np.random.default_rng(seed))
+        error = closure(built.layout, built.values, joints, poses).value
+        assert np.abs(error).max() < 1e-11
+        found = built.forward(joints)
+        np.testing.assert_allclose(found, poses, atol=1e-10)
+        moved = kinematics.on_manifold(built.layout, built.values, poses)
+        np.testing.assert_allclose(moved.T_base_platform, poses, atol=1e-10)
+
+
+def load_values_back(built):
+    """A built machine is one that a file could hold: in its plane, with axes of length one."""
+    from pathlib import Path
+
+    from pkmcal.files import parse_yaml, validate
+    from pkmcal.mechanisms import MechanismDocument, machine_from_document, mechanism_text
+
+    text = mechanism_text(built)
+    document = validate(parse_yaml(text, Path("built.yaml")), MechanismDocument)
+    return np.array_equal(machine_from_document(document).values, built.values)
+
+
+def test_a_3_upu_turns_by_what_its_axes_are_off():
+    """0.3 degrees between the axes of a leg turn the platform by as much; none, not at all."""
+    drawing = load_mechanism("3-upu")
+    poses, _ = draw_configurations(drawing, 40, 0.5, np.random.default_rng(0))
+    np.testing.assert_allclose(poses[:, :3, :3], np.broadcast_to(np.eye(3), (len(poses), 3, 3)), atol=1e-9)
+    built = true_machine(drawing, 1.0, np.random.default_rng(0))
+    between = np.arccos(np.sum(built.base_axes() * built.platform_axes(), axis=1))
+    assert np.all((np.degrees(between) > 0.05) & (np.degrees(between) < 1.5))
+    poses, _ = draw_configurations(built, 40, 0.5, np.random.default_rng(0))
+    turn = np.degrees(np.arccos((np.trace(poses[:, :3, :3], axis1=1, axis2=2) - 1) / 2))
+    assert 0.1 < np.median(turn) < 3
+
+
+# Calibration
+
+CAMERA = camera_models()["pinhole"](
+    (1024, 768), np.array([902.0, 903.0, 514.0, 381.0, -0.11, 0.09, 4e-4, -3e-4, 0.0])
+)
+
+
+def simulated(machine, seed, stations=1):
+    """Truth and measurements of a session without photographs."""
+    truth = draw_truth(machine, (CAMERA,) * stations, Settings(stations=stations), seed)
+    edges, readings = simulate_edges(
+        truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
+        np.random.default_rng(seed), photographs=truth.photographs,
+    )  # fmt: skip
+    zeros = np.zeros(stations, dtype=int)
+    return truth, Measurements(edges, readings, 3e-6, stations, zeros)
+
+
+def whitened(drawing, estimate, truth):
+    """Errors over their deviations, independent ones, in the estimate's frames."""
+    table = drawing.parameters
+    shift = np.zeros_like(estimate.state.edge_shift)
+    told = State(truth.machine.values, truth.T_camera_base, truth.T_base_platform, shift)
+    true = apply(drawing, told, default_gauge(drawing)).theta
+    error = table.unit_axes(estimate.machine.values) - table.unit_axes(true)
+    scale = np.sqrt(np.diag(estimate.covariance))
+    known = scale > 1e-9
+    c = estimate.covariance[np.ix_(known, known)] / np.outer(scale[known], scale[known])
+    values, vectors = np.linalg.eigh(c)
+    keep = values > 1e-6
+    return (vectors.T @ (error[known] / scale[known]))[keep] / np.sqrt(values[keep])
+
+
+def test_a_simulated_session_calibrates(machine):
+    """Errors are as large as the covariance says, over five machines that differ as drawn."""
+    z = []
+    for seed in range(5):
+        truth, measurements = simulated(machine, seed)
+        rough = np.stack([pose.T_camera_base() for pose in truth.rough])
+        start = start_state(machine, measurements, rough)
+        found = bundle(machine, measurements, start)
+        z.append(whitened(machine, found, truth))
+    z = np.concatenate(z)
+    assert np.mean(z**2) == pytest.approx(1, abs=4 * np.sqrt(2 / z.size))

@@ -1,0 +1,225 @@
+"""Where the data do not allow a step, a sentence that names the legs; [A]'s counts beside it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.errors import ResultError
+from pkmcal.identify import four_step_checks as checks
+from pkmcal.identify.conditions import Condition, conditions
+from pkmcal.identify.four_step import four_step
+from pkmcal.identify.four_step_model import legs_of
+from pkmcal.mechanisms import load_mechanism
+from test_four_step_machines import (
+    THREE_BY_THREE,
+    THREE_BY_TWO,
+    make_scene,
+    noisy,
+    seen_by,
+)
+
+
+def refused(scene, measurements, *words, **options) -> ResultError:
+    with pytest.raises(ResultError) as caught:
+        four_step(scene.drawing, measurements, **options)
+    for word in words:
+        assert word in str(caught.value)
+    assert caught.value.next_step
+    return caught.value
+
+
+@pytest.fixture(scope="module")
+def hexapod():
+    return make_scene("gough-stewart", np.random.default_rng(1), 24)
+
+
+def test_no_edge_at_all(hexapod):
+    none = hexapod.select(np.zeros(len(hexapod.measurements.edges), dtype=bool))
+    refused(hexapod, none, "no edge")
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "3-rpr", "6-spu-passive"])
+def test_a_leg_that_no_station_sees(name):
+    scene = make_scene(name, np.random.default_rng(2), 12)
+    last = scene.drawing.n_legs
+    part = scene.select(scene.measurements.edges.leg != last - 1)
+    refused(scene, part, f"leg {last} of {last} is seen by no station")
+
+
+def test_a_leg_seen_in_one_direction_only(hexapod):
+    edges = hexapod.measurements.edges
+    part = hexapod.select((edges.leg != 2) | (edges.configuration == 5))
+    refused(hexapod, part, "leg 3 of 6 is seen by no station")
+
+
+def test_a_station_that_sees_two_legs(hexapod):
+    edges = hexapod.measurements.edges
+    part = hexapod.select((edges.station != 1) | (edges.leg < 2))
+    refused(hexapod, part, "station 2 sees too few legs", "2 base centres (legs 1 and 2)")
+
+
+def test_stations_that_share_no_or_two_legs(hexapod):
+    """Three cameras with three legs each: all of them fixed by their legs, none by the others."""
+    three = np.array([[0, 1, 2], [3, 4, 5], [3, 4, 5]])
+    error = refused(hexapod, hexapod.select(seen_by(hexapod, three)), "share too few legs")
+    assert "legs 1, 2 and 3 can move against those of legs 4, 5 and 6" in str(error)
+    assert "station 2 sees legs 4, 5 and 6" in str(error)
+    assert "calibration board" in str(error)
+    refused(hexapod, hexapod.select(seen_by(hexapod, THREE_BY_THREE)), "share too few legs")
+    two = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [0, 1, 4, 5]])
+    refused(hexapod, hexapod.select(seen_by(hexapod, two)), "legs 3 and 4", "legs 5 and 6")
+
+
+def test_one_station_that_sees_four_legs_of_six(hexapod):
+    edges = hexapod.measurements.edges
+    part = hexapod.select((edges.station == 0) & (edges.leg < 4))
+    refused(hexapod, replace(part, n_stations=1, camera_of_station=np.zeros(1, int)), "leg 5 of 6")
+
+
+def test_too_few_legs_at_once(hexapod):
+    """Every leg is seen often, but never three of them in one configuration."""
+    edges = hexapod.measurements.edges
+    pair = edges.configuration % 3
+    part = hexapod.select((edges.leg // 2) == pair)
+    refused(hexapod, part, "no configuration shows enough legs", "2 at most", "three or more")
+
+
+def test_legs_that_are_never_seen_together(hexapod):
+    """Two halves of the platform, each by three legs at once: their places stay free."""
+    edges = hexapod.measurements.edges
+    part = hexapod.select((edges.leg // 3) == edges.configuration % 2)
+    refused(
+        hexapod,
+        part,
+        "platform joints of legs 1, 2 and 3 can move against those of legs 4, 5 and 6",
+    )
+    with_bridge = hexapod.select(
+        ((edges.leg // 3) == edges.configuration % 2) | (edges.configuration > 15)
+    )
+    four_step(hexapod.drawing, with_bridge)
+
+
+def test_photographs_of_one_configuration_by_several_stations_are_at_once(hexapod):
+    """The printed form, which looks at each photograph alone, refuses what the corrected takes."""
+    rng = np.random.default_rng(3)
+    scene = make_scene("gough-stewart", rng, 24)
+    keep = seen_by(scene, THREE_BY_TWO)
+    part = scene.select(keep)
+    guess = scene.truth.T_camera_base
+    found = four_step(scene.drawing, part, T_camera_base_guess=guess)
+    np.testing.assert_allclose(found.theta, scene.truth.theta, atol=1e-8)
+    with pytest.raises(ResultError, match="no configuration shows enough legs"):
+        four_step(scene.drawing, part, T_camera_base_guess=guess, form="printed")
+
+
+def test_a_passive_leg_without_three_others():
+    scene = make_scene("6-spu-passive", np.random.default_rng(4), 12)
+    edges = scene.measurements.edges
+    alone = edges.configuration % 2 == 0
+    part = scene.select(np.where(alone, edges.leg == 6, edges.leg < 6))
+    refused(scene, part, "passive leg 7's platform joint", "seen in 0 configurations")
+
+
+def test_a_passive_leg_that_does_not_turn():
+    """Heave with a leg in the middle: its joints could lie anywhere along it."""
+    drawing = load_mechanism("6-spu-passive")
+    low, high = drawing.joint_ranges.T
+    heave = low + (high - low) * np.linspace(0.2, 0.8, 24)[:, None]
+    rng = np.random.default_rng(5)
+    scene = make_scene(drawing, rng, joints=heave)
+    refused(scene, noisy(scene.measurements, rng), "leg 7 of 7")
+
+
+def test_lengths_that_the_distances_do_not_tell():
+    """A platform that only shifts with parallel legs: a common length is free (errata)."""
+    scene = make_scene("constant-legs", np.random.default_rng(6), 12)
+    legs = legs_of(scene.drawing)
+    # a parallelogram: all legs alike in every configuration, platform and base congruent
+    rng = np.random.default_rng(7)
+    u = np.array([0.0, 0, 1]) + 0.3 * rng.normal(size=(12, 3))
+    u = u / np.linalg.norm(u, axis=-1, keepdims=True)
+    from pkmcal.identify.four_step_axes import Axes
+
+    k = np.arange(12)
+    u = np.broadcast_to(u[None, :, None], (1, 12, 6, 3)).copy()
+    axes = Axes(0 * k, k, np.ones((12, 6), dtype=bool), u, 0 * u, np.zeros((1, 12, 6)))
+    with pytest.raises(ResultError, match="do not tell the lengths of legs 1, 2, 3, 4, 5 and 6"):
+        checks.lengths_are_fixed(
+            scene.drawing,
+            axes,
+            np.ones(1, dtype=bool),
+            legs.base[None],
+            np.eye(4)[None, None],
+            legs.rod[None] + 0.4,
+        )
+
+
+def test_a_length_that_collapsed_is_told():
+    drawing = load_mechanism("constant-legs")
+    legs = legs_of(drawing)
+    q0 = np.where(np.arange(6) == 2, 0.001, legs.rod)[None]
+    with pytest.raises(ResultError, match="leg 3 of constant length shrank"):
+        checks._not_collapsed(legs, q0[0])
+    checks._not_collapsed(legs, legs.rod)
+
+
+# the paper's counts ------------------------------------------------------------------------
+
+
+def by_equation(name, seen) -> dict[str, Condition]:
+    found = conditions(load_mechanism(name), np.asarray(seen, dtype=bool))
+    return {c.equation: c for c in found}
+
+
+def test_counts_of_the_papers_own_example():
+    """[A] 4.1: three stations, four legs each, are sufficient by (12)."""
+    seen = np.zeros((3, 6), dtype=bool)
+    for s in range(3):
+        seen[s, [(2 * s + k) % 6 for k in range(4)]] = True
+    found = by_equation("gough-stewart", seen)
+    assert (found["[A] 11, 12"].needed, found["[A] 11, 12"].available) == (12, 18)
+    assert (found["[A] 15"].needed, found["[A] 15"].available) == (6, 18)
+    assert (found["[A] 17"].needed, found["[A] 17"].available) == (12, 18)
+    assert all(c.met for c in found.values())
+    seen[:, 3:] = False
+    found = by_equation("gough-stewart", seen)
+    assert not found["[A] 3.3"].met and "legs 4, 5 and 6" in found["[A] 3.3"].text
+    assert (found["[A] 11, 12"].available, found["[A] 11, 12"].met) == (7, False)
+
+
+def test_counts_of_a_planar_machine():
+    """(10) corrected: 1 + 2 (n - 2) = 3 for three legs, where the paper prints 4."""
+    found = by_equation("3-rpr", [[1, 1, 1]])
+    assert (found["[A] 10, 12"].needed, found["[A] 10, 12"].available) == (3, 3)
+    assert (found["[A] 17"].needed, found["[A] 17"].available) == (3, 3)
+    assert all(c.met for c in found.values())
+    assert not by_equation("3-rpr", [[1, 1, 0], [0, 1, 1]])["[A] 10, 12"].met
+
+
+def test_counts_with_revolute_axes():
+    """(11): 3 + 2 r of three centres and axes; (12): 3 + 3 + 6 products of one station."""
+    found = by_equation("3-rps", [[1, 1, 1]])["[A] 11, 12"]
+    assert (found.needed, found.available, found.met) == (9, 12, True)
+    found = by_equation("3-rps", [[1, 1, 0], [0, 1, 1]])["[A] 11, 12"]
+    assert (found.needed, found.available, found.met) == (9, 2 * (1 + 1 + 2), False)
+
+
+def test_counts_of_a_passive_leg():
+    found = by_equation("6-spu-passive", [[1, 1, 1, 1, 1, 1, 1]])
+    assert (found["[A] 15"].needed, found["[A] 17"].needed) == (6, 12)
+    assert (found["[A] 19"].needed, found["[A] 19"].available) == (3, 6)
+    found = by_equation("6-spu-passive", [[1, 1, 1, 1, 1, 1, 0], [1, 1, 0, 0, 0, 0, 1]])
+    assert (found["[A] 19"].available, found["[A] 19"].met) == (2, False)
+    assert "passive leg 7" in found["[A] 19"].text
+
+
+def test_counts_are_necessary_at_most(hexapod):
+    """Errata, A 12: enough equations by the count, and the stations still share too few legs."""
+    two = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [0, 1, 4, 5]])
+    seen = np.zeros((3, 6), dtype=bool)
+    seen[np.arange(3)[:, None], two] = True
+    assert all(c.met for c in conditions(hexapod.drawing, seen))
+    refused(hexapod, hexapod.select(seen_by(hexapod, two)), "share too few legs")

@@ -1,0 +1,117 @@
+"""The report's section on what the data can tell: rank, sentences, counts, what was fixed."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.identify.conditions import conditions
+from pkmcal.identify.words import explain, seen_legs
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.report.identifiability import STUB, section
+from pkmcal.report.page import report_html
+from test_report_case import Verdict, make_case
+from test_report_page import Found
+from test_words import heaved, make, told_of
+
+
+def findings_of(scene, *views):
+    told, seen, _ = told_of(scene, *views)
+    machine = scene.machine.with_values(scene.theta[0])
+    estimate = replace(
+        make_estimate_stub(), machine=machine, state=scene.state(),
+        configurations=np.ones(len(scene.poses[0]), bool),
+    )  # fmt: skip
+    return explain(told, estimate, seen, conditions(machine, seen))
+
+
+def make_estimate_stub():
+    from pkmcal.identify.problem import Estimate, Statistics
+
+    none = np.zeros(0)
+    statistics = Statistics(0, 0, 0, 0, 0, 0, 0, 0, 0, "", 1.0)
+    empty = load_mechanism("gough-stewart")
+    return Estimate(
+        empty, make("gough-stewart", n=1).state(), none, none, none, none, none, none, none, none,
+        statistics, "",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def apart():
+    scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart")))
+    return findings_of(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    return make_case(tmp_path_factory.mktemp("session"))
+
+
+def test_the_section_stands_on_the_page(case, apart):
+    page = report_html(
+        case.session, case.observation, case.estimate, Verdict(True, "Fine."), findings=apart
+    )
+    text = " ".join(Found(page).text.split())
+    assert "The data fix 34 of 42 directions (54 free values less 12 that only place" in text
+    assert "8 directions no amount of such data would fix" in text
+    for sentence in (*apart.unidentified, *apart.weak):
+        assert sentence.text in text
+        assert sentence.advice in text
+    assert "The rank above is the test." in text
+    for condition in apart.conditions:
+        assert condition.text in text
+    assert 'href="#identifiability"' in page
+    assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
+
+
+def test_without_findings_there_is_no_section(case):
+    page = report_html(case.session, case.observation, case.estimate, Verdict(True, "Fine."))
+    assert "identifiability" not in page
+    assert "What the photographs could not decide" in page
+
+
+def test_a_whole_session_has_nothing_to_list():
+    view = section(findings_of(make("gough-stewart")), load_mechanism("gough-stewart").parameters)
+    assert (view.rank, view.possible) == (42, 42)
+    assert view.headline.endswith("Each is known better from the data than from the drawing.")
+    assert view.unidentified == view.weak == ()
+    assert (view.fixed, view.tied) == ("", "")
+
+
+def test_the_spectrum_shows_lost_directions_as_stubs(apart):
+    view = section(apart, load_mechanism("gough-stewart").parameters)
+    assert view.spectrum is not None
+    bars = view.spectrum.bars
+    assert len(bars) == 42
+    assert [bar.value > STUB for bar in bars] == [True] * 34 + [False] * 8
+    assert bars[-1].tip == "Direction 42: the data say nothing"
+    assert not bars[-1].quiet
+    assert bars[0].quiet
+    assert "times better than the drawing" in bars[0].tip
+    # the line where data and drawing know as much is the tick that says 1
+    assert (view.spectrum.curve[0][1], "1") in view.spectrum.ticks
+
+
+def test_what_was_held_is_said_with_its_reason(apart):
+    table = load_mechanism("gough-stewart").parameters.with_roles(
+        ("legs[1].base.center", "legs[2].length.offset"),
+        (("legs[3].length.offset", "legs[4].length.offset"),),
+    )
+    view = section(apart, table)
+    assert view.fixed.startswith(
+        "Leg 1 base centre x, leg 1 base centre y, leg 1 base centre z and"
+    )
+    assert "under fixed, so the drawing's value counts as exact" in view.fixed
+    assert (
+        view.tied == "Changes together, as one value: leg 3 length offset and leg 4 length offset."
+    )
+
+
+def test_seen_legs_leaves_out_what_was_given_up():
+    edges = make("gough-stewart", n=1).measurements(np.random.default_rng(0)).edges
+    weights = np.where(edges.leg == 2, 0.1, 1.0)
+    assert seen_legs(edges, weights, 3, 7).tolist() == [[j not in (2, 6) for j in range(7)]] * 3

@@ -1,0 +1,239 @@
+"""``pkmcal reproduce``: what it shows, writes and refuses, and when it says that it failed."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.commands.reproduce import Paper
+from pkmcal.identify.axis_measurements import AxisNoise
+from pkmcal.report.reproduction import reproduction_html
+from pkmcal.reproduce import Options, reproduce
+from pkmcal.reproduce import paper_a_expected as expected
+from pkmcal.reproduce.paper_a_simulation import Settings
+from pkmcal.reproduce.paper_a_study import BOUND, JOINT, METHODS, PRINTED, study
+from pkmcal.reproduce.paper_a_tables import table_1
+from test_report_page import Found, browse
+
+RUNS = 25
+
+
+@pytest.fixture(scope="module")
+def short():
+    return study(runs=RUNS)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return reproduce("a", Options(runs=RUNS))
+
+
+@pytest.fixture(scope="module")
+def page(found):
+    return reproduction_html(found)
+
+
+# ------------------------------------------------------------------ the command
+
+
+def test_the_command(tmp_path):
+    out = tmp_path / "pages"
+    done = run("reproduce", "a", "--runs", RUNS, "-o", out, "--json")
+    result = done.json
+    assert (done.code, done.err) == (result["exit_code"], "") == (0, "")
+    assert {path.name for path in out.iterdir()} == {"paper-a.html", "paper-a.json"}
+    assert result["files"] == [str(out / name) for name in ("paper-a.html", "paper-a.json")]
+    a = result["papers"]["a"]
+    assert a == json.loads((out / "paper-a.json").read_text())
+    assert (a["runs"], a["seed"], a["converged"]) == (RUNS, 0, RUNS)
+    assert set(a["methods"]) == set(METHODS)
+    joint = a["methods"][JOINT]
+    assert 5e-5 < joint["found"]["displacement"] < 1.4e-4
+    assert joint["standard_error"]["displacement"] < 2e-5
+    assert len(a["mean_error"][JOINT]) == 30
+    assert a["seconds"]["cpu"] > 0
+
+
+def test_in_words(tmp_path, monkeypatch, found):
+    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda _paper, _options: found)
+    done = run("reproduce", "-o", tmp_path)
+    assert done.code == 0
+    assert max(map(len, done.out.replace(str(tmp_path), "").splitlines())) <= 80
+    text = " ".join(done.out.split())
+    for said in ("Table 1", "0.05 rad", "0.05°", "Mean |error|", "End-effector", "RMSE, mm",
+                 "Four steps as printed", "independent prototype", "Cramér-Rao bound",
+                 f"{RUNS} of {RUNS}, expected all", "paper-a.html open it"):  # fmt: skip
+        assert said.lower() in text.lower(), said
+    assert "…" not in done.out
+
+
+def test_another_seed_draws_anew():
+    first, again, other = (study(runs=3, seed=seed).accuracy[JOINT] for seed in (1, 1, 2))
+    assert first == again != other
+
+
+def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch, found):
+    bad = replace(found.checks[1], passed=False)
+    failed = replace(found, checks=(found.checks[0], bad))
+    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda _paper, _options: failed)
+    done = run("reproduce", "-o", tmp_path)
+    assert done.code == 1
+    assert "✗ " + bad.sentence[:40] in done.out
+    assert run("reproduce", "-o", tmp_path, "--json").json["papers"]["a"]["passed"] is False
+    page = (tmp_path / "paper-a.html").read_text()
+    assert "Not reproduced" in page
+    assert Found(page).text.count(bad.sentence) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(("z",), "'z' is not"), (("--runs", "1"), "--runs"), (("--runs", "many"), "--runs")],
+)
+def test_refuses(words, said, tmp_path):
+    done = run("reproduce", *words, "-o", tmp_path / "out")
+    assert done.code == 2
+    assert said in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda *_: pytest.fail("worked"))
+    (tmp_path / "file").touch()
+    done = run("reproduce", "-o", tmp_path / "file" / "out")
+    assert done.code == 2
+    assert "outputs cannot go here" in done.err
+
+
+def test_every_paper_of_the_command_has_its_module():
+    from importlib import import_module
+
+    for paper in Paper:
+        assert callable(import_module(f"pkmcal.reproduce.paper_{paper.value}").reproduce)
+
+
+# ------------------------------------------------------------------ what is expected
+
+
+def test_every_figure_of_the_prototype_is_compared(short):
+    figures = expected.compared(short)
+    assert len(figures) == 4 * 5 + 3 * 2
+    assert all(f.error >= 0 and f.rounding > 0 for f in figures)
+    assert all(f.tolerable for f in figures)
+    by_name = {(f.method, f.quantity): f for f in figures}
+    assert by_name[JOINT, "displacement"].expected == 0.091
+    assert by_name[JOINT, "displacement"].rounding == pytest.approx(0.0005)
+    assert by_name[PRINTED, "base_z"].rounding == pytest.approx(0.005)
+    assert by_name[BOUND, "base_z"].found == pytest.approx(0.060, abs=0.002)
+
+
+def test_what_differs_and_what_fails():
+    """Beyond the Monte-Carlo error is told; beyond what the setting explains fails."""
+    figure = expected.Compared(JOINT, "offset", 0.0600, 0.0010, 0.060, 0.0005)
+    assert not figure.differs
+    assert figure._replace(found=0.0640).differs
+    assert figure._replace(found=0.0640).tolerable
+    assert not figure._replace(found=0.0780).tolerable
+    # what follows the drawing's error may differ more, nothing else
+    depth = expected.Compared(PRINTED, "base_z", 2.3, 0.01, 1.79, 0.005)
+    assert depth.tolerable
+    assert not depth._replace(quantity="base_xy").tolerable
+
+
+def checks_of(s):
+    return expected.checks(s, expected.compared(s))
+
+
+def test_checks_pass_and_each_can_fail(short):
+    assert all(check.passed for check in checks_of(short))
+
+    def of_joint(**changes):
+        return replace(
+            short, accuracy={**short.accuracy, JOINT: short.accuracy[JOINT]._replace(**changes)}
+        )
+
+    worse = {name: 1.5 * getattr(short.accuracy[JOINT], name) for name in expected.GROUPS}
+    broken = [
+        replace(short, converged=RUNS - 1),
+        of_joint(displacement=1.2e-4),
+        of_joint(orientation=np.radians(0.019)),
+        of_joint(**worse),
+        replace(short, chi2_per_dof=short.chi2_per_dof + 0.1),
+        of_joint(offset=0.12e-3),
+    ]
+    for place, spoilt in enumerate(broken):
+        assert not checks_of(spoilt)[place].passed, place
+        assert checks_of(short)[place].passed
+
+
+def test_noise_larger_than_table_1_is_not_a_reproduction():
+    """Angles three times as noisy: the end-effector and the prototype's figures are missed."""
+    noise = AxisNoise(psi=3 * AxisNoise().psi, theta=3 * AxisNoise().theta)
+    spoilt = study(runs=RUNS, settings=Settings(noise=noise))
+    failed = [check.what for check in checks_of(spoilt) if not check.passed]
+    assert any("displacement" in what for what in failed)
+    assert "figures of the independent prototype" in failed
+
+
+# ------------------------------------------------------------------ the page
+
+
+def test_table_1_with_and_without_a_measurement():
+    plain, measured = table_1(), table_1(AxisNoise(np.radians(0.004), np.radians(0.03), images=1))
+    assert len(measured.rows) == len(plain.rows) + 1
+    assert plain.rows[2].cells == ("0.029°", "0.035°", "0.029 mm", "0.058 mm")
+    assert measured.rows[-1].cells[:2] == ("0.0040°", "0.0300°")
+    assert all(len(row.cells) == len(plain.columns) - 1 for row in measured.rows)
+
+
+def test_the_figure_has_thirty_parameters_and_every_method(found):
+    figure = next(plot for part in found.parts for plot in part.plots)
+    bars = [trace for trace in figure.figure["data"] if trace["type"] == "bar"]
+    assert [len(trace["x"]) for trace in bars] == [30] * 4
+    joint = next(trace for trace in bars if trace["name"] == "joint estimate")
+    assert max(joint["y"]) < 0.08  # mm
+    printed = next(trace for trace in bars if trace["name"] == "four steps as printed")
+    worst = [name for name, value in zip(printed["x"], printed["y"], strict=True) if value > 0.5]
+    assert len(worst) == 6
+    assert all(name.endswith("z") for name in worst)
+
+
+def test_tables_are_whole(found):
+    for part in found.parts:
+        for table in part.tables:
+            assert all(len(row.cells) + 1 == len(table.columns) for row in table.rows), table.title
+
+
+def test_the_page_asks_for_nothing_outside(page):
+    assert not re.search(r"https?:|//[a-z]+\.|@import|url\(", page)
+    assert "default-src 'none'" in page
+    assert len(page) < 5e6
+    assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_page_runs_in_a_browser(page, tmp_path, width):
+    document, console = browse(page, tmp_path, width)
+    root = Found(document).tags[0][1]
+    assert root["data-errors"] == ""
+    assert root["data-overhang"] == "0"
+    assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
+    plots = [a for _, a in Found(document).tags if "data-figure" in a]
+    assert len(plots) == 1
+    assert all(a.get("data-drawn") == "yes" for a in plots)
+
+
+@pytest.mark.slow
+def test_more_poses():
+    """--long: as the square root of the poses, and as the prototype."""
+    found = reproduce("a", Options(runs=60, long=True))
+    by_poses = found.numbers["by_poses"]
+    for poses, wanted in expected.PROTOTYPE_POSES.items():
+        ours = 1e3 * by_poses[poses]["found"]["displacement"]
+        error = 1e3 * by_poses[poses]["standard_error"]["displacement"]
+        assert ours == pytest.approx(wanted, abs=3 * error), poses
+    assert len([plot for part in found.parts for plot in part.plots]) == 2

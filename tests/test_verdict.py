@@ -1,0 +1,159 @@
+"""Whether a result may be used: what data leave open counts where it moves the platform."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.files import json_text
+from pkmcal.identify.bundle import bundle, what_data_tell
+from pkmcal.identify.conditions import conditions
+from pkmcal.identify.verdict import LEFT_OPEN, judge
+from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.observe.edges import Observation
+from pkmcal.report.parameters import parameter_groups, unidentified
+from pkmcal.result_document import identifiability_of
+from test_words import heaved, make, moved
+
+
+def judged(scene, *views):
+    """Estimate, findings and verdict of a scene with noise, each station seeing some legs."""
+    machine, rng = scene.machine, np.random.default_rng(4)
+    measurements = scene.measurements(rng)
+    if views:
+        edges = measurements.edges
+        keep = [leg + 1 in views[s] for s, leg in zip(edges.station, edges.leg, strict=True)]
+        measurements = replace(measurements, edges=edges.select(np.array(keep)))
+    start = replace(scene.state(), theta=machine.values)
+    estimate = bundle(machine, measurements, start)
+    edges = measurements.edges
+    observation = Observation(
+        edges, (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
+    )
+    told = what_data_tell(measurements, estimate)
+    seen = seen_legs(edges, estimate.edge_weights, measurements.n_stations, machine.n_legs)
+    findings = explain(told, estimate, seen, conditions(machine, seen))
+    return observation, estimate, findings, judge(observation, estimate, told=told)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return judged(make("gough-stewart"))
+
+
+@pytest.fixture(scope="module")
+def apart():
+    poses = moved(load_mechanism("gough-stewart"), np.random.default_rng(1), 10, turn=0.0)
+    scene = make("gough-stewart", poses=poses)
+    return judged(scene, (1, 3, 4, 6), (1, 3, 4, 6), (2, 5))
+
+
+def test_a_whole_session_may_be_used(whole):
+    _, _, findings, verdict = whole
+    assert verdict.usable
+    assert findings.told.unidentified == ()
+    assert verdict.warnings == ()
+
+
+def test_stations_apart_are_refused_with_words_and_advice(apart):
+    _, _, findings, verdict = apart
+    assert not verdict.usable
+    # the poses' noise turns the platform a little, so that the rank is full but for a trace
+    assert findings.told.weak[-1].information < 0.05
+    assert findings.unidentified[0].dimensions == 3
+    reason = next(r for r in verdict.reasons if r.startswith("Legs 2 and 5 are never seen"))
+    assert "Within the drawing's tolerances this moves the platform by" in reason
+    assert "Add a station that sees legs 2 and 5 together with" in reason
+    assert "observe: [legs, board]" in reason
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "3-rpr", "3-rps"])
+def test_one_configuration_is_refused(name):
+    scene = make(name, n=1, n_stations=3)
+    _, _, findings, verdict = judged(scene)
+    assert findings.told.unidentified
+    assert not verdict.usable
+    assert any("Photograph more configurations" in r for r in verdict.reasons)
+
+
+def test_heave_alone_is_said():
+    scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart"), 12))
+    _, _, _, verdict = judged(scene)
+    said = " ".join(verdict.reasons + verdict.warnings)
+    assert "How far apart the legs stand and how thick their tubes are" in said
+    assert "Turn the platform in some configurations" in said
+
+
+def test_what_does_not_move_the_platform_is_a_warning():
+    """A passive leg in no photograph: its own values are free, the platform is not."""
+    scene = make("6-spu-passive")
+    observation, estimate, findings, verdict = judged(scene, *[(1, 2, 3, 4, 5, 6)] * 3)
+    assert verdict.usable, verdict.reasons
+    assert any(w.startswith("Leg 7 is in no photograph") for w in verdict.warnings)
+    assert not judge(observation, estimate).usable  # without the test, shares alone refuse it
+    assert judge(observation, estimate, findings=findings) == verdict
+
+
+def test_axes_that_nothing_shows_do_not_refuse_a_3_upu():
+    machine = load_mechanism("3-upu")
+    poses = moved(machine, np.random.default_rng(1), 15, turn=0.0)
+    observation, estimate, findings, verdict = judged(make("3-upu", poses=poses, errors=0.2))
+    assert verdict.usable, verdict.reasons
+    assert not judge(observation, estimate).usable
+    turns = [s for s in (*findings.unidentified, *findings.weak) if "common direction" in s.text]
+    assert sum(s.dimensions for s in turns) == 6
+
+
+def sentence(moves, *names, matters=True):
+    return Sentence("It is open.", "Do something.", names, 1, moves, matters)
+
+
+def test_the_share_of_the_drawings_error_decides(whole):
+    observation, estimate, findings, _ = whole
+    least = LEFT_OPEN * findings.by_drawing
+
+    def verdict(*open_):
+        return judge(observation, estimate, findings=replace(findings, unidentified=open_))
+
+    below, above = verdict(sentence(0.9 * least)), verdict(sentence(1.1 * least))
+    assert below.usable
+    assert below.warnings == ("It is open. Do something.",)
+    assert not above.usable
+    assert above.reasons == ("It is open. Do something.",)
+    assert above.warnings == ()
+    # many small ones add up, and each that is large enough is named
+    assert len(verdict(*[sentence(0.6 * least, str(k)) for k in range(4)]).reasons) == 4
+    assert verdict(*[sentence(50 * least, str(k), matters=False) for k in range(4)]).usable
+
+
+def test_what_the_drawing_knows_better_counts_where_a_value_is_undecided(whole):
+    observation, estimate, findings, _ = whole
+    name = "legs[3].length.offset"
+    weak = replace(findings, weak=(sentence(findings.by_drawing, name),))
+    assert judge(observation, estimate, findings=weak).usable
+    share = estimate.data_share.copy()
+    share[estimate.machine.parameters.index(name)] = 0.3
+    undecided = replace(estimate, data_share=share)
+    assert not judge(observation, undecided, findings=weak).usable
+
+
+def test_what_is_not_identified_stands_in_the_file(apart):
+    _, estimate, findings, _ = apart
+    document = identifiability_of(findings)
+    assert document is not None
+    assert document["rank"] + len(findings.told.unidentified) == (
+        document["n_parameters"] - document["n_frames"]
+    )
+    first = document["unidentified"][0]
+    assert {"text", "advice", "moves_platform", "parameters"} <= set(first)
+    assert set(first["parameters"]) <= set(estimate.machine.parameters.names)
+    assert {"equation", "needed", "available", "met", "text"} == set(document["conditions"][0])
+    assert "never seen together" in json_text(document)
+    assert identifiability_of(None) is None
+    groups = parameter_groups(load_mechanism("gough-stewart"), estimate)
+    said = unidentified(groups, estimate, findings)
+    assert said[0] == f"{first['text']} {first['advice']}"
+    assert isinstance(findings, Findings)

@@ -1,0 +1,387 @@
+"""What data leave open, in words: the right sentence for what a session lacks."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from pkmcal.geometry.rigid import perturb
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.gauge import default_gauge, freedoms, generators
+from pkmcal.identify.words import MOST, describe, joined_by_boards, seen_legs, vectors
+from pkmcal.identify.words_effect import platform_by_parameters, pose_by_parameters
+from pkmcal.identify.words_families import circumstances, families, groups, hanging_together
+from pkmcal.mechanisms import kinematics, load_mechanism
+from pkmcal.mechanisms.limbs import limb_ends
+from test_identify_scene import Scene, _edges, _index, stations
+
+
+def moved(machine, rng, n, turn=0.2, shift=0.04):
+    """Poses about home along the machine's motion."""
+    step = np.concatenate(
+        [turn * rng.uniform(-1, 1, (n, 3)), shift * rng.uniform(-1, 1, (n, 3))], -1
+    )
+    return perturb(machine.home(), step @ machine.layout.motion @ machine.layout.motion.T)
+
+
+def heaved(machine, n=8):
+    poses = np.tile(machine.home(), (n, 1, 1))
+    poses[:, 2, 3] += np.linspace(-0.04, 0.04, n)
+    return poses
+
+
+def make(name, *, poses=None, n=12, n_stations=3, errors=1.0, seed=3) -> Scene:
+    """A machine with errors, seen whole by cameras around it."""
+    rng = np.random.default_rng(seed)
+    machine = load_mechanism(name)
+    table = machine.parameters
+    draw = table.tolerances_free() * rng.normal(size=table.free_matrix().shape[1])
+    theta = table.drawing + errors * table.free_matrix() @ draw
+    poses = moved(machine, rng, n) if poses is None else poses
+    found = kinematics.on_manifold(machine.layout, theta, poses)
+    poses = found.T_base_platform[found.converged]
+    joints = machine.with_values(theta).inverse(poses)[None]
+    ends = limb_ends(machine.layout, theta[None, None], joints, poses[None])
+    index = _index(rng, machine, len(poses), n_stations, 1.0)
+    normal, middle = _edges(machine, theta[None], stations(n_stations), ends, index)
+    covariance = np.zeros((index.shape[1], 2, 2))
+    covariance[:, [0, 1], [0, 1]] = (np.array([0.05, 0.2]) / 889) ** 2
+    shift = np.tile([-1 / 889, 0.0], (index.shape[1], 1))
+    return Scene(
+        machine, theta[None], stations(n_stations), poses[None], joints, np.zeros(1), index,
+        normal, covariance, shift, middle,
+    )  # fmt: skip
+
+
+def told_of(scene: Scene, *views):
+    """Rank test and sentences where each station sees some legs only (numbers from 1)."""
+    machine = scene.machine.with_values(scene.theta[0])
+    measurements = scene.measurements(np.random.default_rng(0), noise=0.0)
+    if views:
+        visible = np.zeros((len(views), machine.n_legs), bool)
+        for s, view in enumerate(views):
+            visible[s, np.array(view) - 1] = True
+        edges = measurements.edges
+        keep = visible[edges.station, edges.leg]
+        measurements = type(measurements)(
+            edges.select(keep), measurements.joints, measurements.joint_noise,
+            measurements.n_stations, measurements.camera_of_station,
+        )  # fmt: skip
+    assembled = assemble(scene.machine, measurements, default_gauge(scene.machine))
+    state = batch_of(scene.machine, assembled, scene.state())
+    told = identifiability(assembled.problem, scene.machine, state)
+    edges = measurements.edges
+    seen = seen_legs(edges, np.ones(len(edges)), measurements.n_stations, machine.n_legs)
+    null = vectors(told.unidentified, machine)
+    return told, seen, describe(machine, seen, null, scene.poses[0])
+
+
+# ------------------------------------------------------------------ whole sessions and poor ones
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "3-rpr", "3-rps", "6-spu-passive"])
+def test_a_whole_session_leaves_nothing_open(name):
+    told, _, sentences = told_of(make(name))
+    assert told.unidentified == ()
+    assert sentences == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "legs"),
+    [("gough-stewart", "Legs 1 to 6"), ("3-rpr", "Legs 1 to 3"), ("3-rps", "Legs 1 to 3")],
+)
+def test_one_configuration_lets_every_leg_slide_along_itself(name, legs):
+    told, _, sentences = told_of(make(name, n=1, n_stations=2))
+    slide = next(s for s in sentences if "grow and shift along itself" in s.text)
+    assert slide.text.startswith(f"{legs} keep nearly one direction each")
+    assert slide.dimensions == 2 * load_mechanism(name).n_legs
+    assert "more configurations" in slide.advice
+    assert sum(s.dimensions for s in sentences) == len(told.unidentified)
+    assert any(s.matters for s in sentences)
+
+
+def test_heave_alone_leaves_the_depth_of_all_legs():
+    machine = load_mechanism("gough-stewart")
+    told, _, sentences = told_of(make("gough-stewart", poses=heaved(machine)))
+    assert len(told.unidentified) == 1
+    assert len(sentences) == 1
+    assert sentences[0].text.startswith(
+        "How far apart the legs stand and how thick their tubes are"
+    )
+    assert sentences[0].advice.startswith("Turn the platform in some configurations")
+
+
+def test_stations_without_shared_legs_are_said():
+    poses = moved(load_mechanism("gough-stewart"), np.random.default_rng(1), 8, turn=0.0)
+    scene = make("gough-stewart", poses=poses)
+    told, _, sentences = told_of(scene, [1, 3, 4, 6], [1, 3, 4, 6], [2, 5])
+    group = sentences[0]
+    assert group.text.startswith(
+        "Legs 2 and 5 are never seen together with the others: legs 2 and 5 as a whole can shift"
+        " in all directions against the others."
+    )
+    assert group.dimensions == 3
+    assert group.matters
+    assert group.advice.startswith("Add a station that sees legs 2 and 5 together with legs 1, 3,")
+    assert "board: {fixed_to: base}" in group.advice
+    assert sum(s.dimensions for s in sentences) == len(told.unidentified)
+
+
+def test_heave_with_stations_apart_also_turns_one_group():
+    scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart")))
+    _, _, sentences = told_of(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
+    assert "legs 4 to 6 as a whole can shift in all directions and turn about z" in (
+        sentences[0].text
+    )
+    assert sentences[0].dimensions == 4
+    assert any(s.text.startswith("The tubes' radii of legs 1 to 3 and the di") for s in sentences)
+
+
+def test_platform_turns_join_stations_that_share_no_leg():
+    told, _, sentences = told_of(make("gough-stewart", n_stations=2), [1, 2, 3], [4, 5, 6])
+    assert told.unidentified == ()
+    assert sentences == ()
+
+
+def test_a_leg_nobody_sees_stands_on_its_readings():
+    scene = make("gough-stewart", n=4)
+    without = [1, 2, 4, 5, 6]
+    told, _, sentences = told_of(scene, without, without, without)
+    assert [s.text.split(";")[0] for s in sentences] == ["Leg 3 is in no photograph"]
+    assert sentences[0].dimensions == len(told.unidentified) == 5
+    assert sentences[0].matters
+    assert sentences[0].advice.startswith("Photograph leg 3")
+    assert all(name.startswith("legs[3]") for name in sentences[0].parameters)
+
+
+def test_a_passive_leg_nobody_sees_moves_nothing():
+    told, _, sentences = told_of(make("6-spu-passive"), *[[1, 2, 3, 4, 5, 6]] * 3)
+    assert len(sentences) == 1
+    assert sentences[0].text == (
+        "Leg 7 is in no photograph, so that nothing tells where its joints are."
+        " This does not move the platform."
+    )
+    assert not sentences[0].matters
+    assert sentences[0].dimensions == len(told.unidentified) == 8
+
+
+def test_common_turns_of_parallel_axes_move_nothing():
+    """The 3-UPU as drawn: six of twelve axis directions cannot be seen (errata)."""
+    machine = load_mechanism("3-upu")
+    poses = moved(machine, np.random.default_rng(1), 15, turn=0.0)
+    _, _, sentences = told_of(make("3-upu", poses=poses, errors=0.0))
+    turn = sentences[0]
+    assert turn.text.startswith(
+        "The common direction of both universal axes of each of legs 1 to 3 is free"
+    )
+    assert turn.dimensions == 6
+    assert not turn.matters
+    assert turn.moves_platform < 1e-9
+    assert all(".axis." in name for name in turn.parameters)
+    assert "does not move the platform" in turn.text
+
+
+# ------------------------------------------------------------------ from arrays alone
+
+
+def hexapod():
+    machine = load_mechanism("gough-stewart")
+    return machine, moved(machine, np.random.default_rng(2), 10)
+
+
+def unit(machine, change):
+    """A change (P,) by name, in units of m."""
+    out = np.zeros(len(machine.parameters))
+    for name, value in change.items():
+        out[machine.parameters.index(name)] = value
+    return out
+
+
+def seen_from(*views, legs=6):
+    out = np.zeros((len(views), legs), bool)
+    for s, view in enumerate(views):
+        out[s, np.array(view) - 1] = True
+    return out
+
+
+def test_a_hinge_is_found_through_the_joints_it_goes_through():
+    machine, poses = hexapod()
+    # in one plane a turn of some joints is a lift of others, and that is as true
+    heights = {f"legs[{j}].base.center.z": h for j, h in enumerate((0, 60, -50, 40, 70, -30), 1)}
+    machine = machine.with_values(machine.values + 1e-3 * unit(machine, heights))
+    centres = machine.base_centers()
+    axis = centres[3] - centres[0]
+    axis = axis / np.linalg.norm(axis)
+    change = np.zeros(len(machine.parameters))
+    for leg in (1, 4):
+        row = machine.parameters.index(f"legs[{leg + 1}].base.center.x")
+        change[row : row + 3] = np.cross(axis, centres[leg] - centres[0])
+    seen = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
+    (sentence,) = describe(machine, seen, change[None], poses)
+    assert sentence.text.startswith(
+        "Of the others, only legs 1 and 4 are ever seen together with legs 2 and 5: the base joints"
+        " of legs 2 and 5 can turn about the axis through joints 1 and 4 against the others."
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"legs[3].length.offset": 1.0}, "The offset of leg 3 is free."),
+        ({"legs[2].base.center.z": 1.0}, "The base joint of leg 2 is free along z."),
+        ({"legs[5].tubes[1].radius": 1.0}, "The tubes' radii of leg 5 are free."),
+        (
+            {f"legs[{j}].length.offset": 1.0 for j in range(1, 7)},
+            "The common part of the offsets of legs 1 to 6 is free.",
+        ),
+        (
+            {"legs[1].base.center.z": 1.0, "legs[2].base.center.z": -1.0,
+             "legs[3].base.center.z": 0.6, "legs[5].base.center.z": 1.1},
+            "The heights (z) of the base joints are free against each other in one way.",
+        ),
+        (
+            {"legs[1].base.center.x": 1.0, "legs[4].length.offset": 0.7,
+             "legs[6].platform.center.y": -0.8},
+            "A combination of x of leg 1's base joint, leg 4's offset, y of leg 6's",
+        ),
+    ],
+)  # fmt: skip
+def test_single_changes_have_their_names(change, text):
+    machine, poses = hexapod()
+    seen = np.ones((2, 6), bool)
+    (sentence,) = describe(machine, seen, unit(machine, change)[None], poses)
+    assert sentence.text.startswith(text)
+
+
+def test_a_leg_growing_into_its_base_is_found():
+    machine, poses = hexapod()
+    around = circumstances(machine, np.ones((1, 6), bool), poses[:1])
+    row = machine.parameters.index("legs[3].base.center.x")
+    change = unit(machine, {"legs[3].length.offset": 1.0})
+    change[row : row + 3] = -around.along_base[2]
+    (sentence,) = describe(machine, np.ones((1, 6), bool), change[None], poses[:1])
+    assert "it can grow while its base joint moves back along it" in sentence.text
+
+
+def test_any_basis_of_the_space_gives_the_same_words():
+    scene = make("gough-stewart", poses=heaved(load_mechanism("gough-stewart")))
+    told, seen, expected = told_of(scene, [1, 2, 3], [4, 5, 6], [4, 5, 6])
+    machine = scene.machine.with_values(scene.theta[0])
+    null = vectors(told.unidentified, machine)
+    mix = np.random.default_rng(5).normal(size=(len(null), len(null)))
+    again = describe(machine, seen, mix @ null, scene.poses[0])
+    assert [s.text for s in again] == [s.text for s in expected]
+
+
+def test_frames_are_no_finding():
+    machine, poses = hexapod()
+    frames = (generators(machine.layout, machine.values) @ freedoms(machine)).T
+    change = unit(machine, {"legs[3].length.offset": 1e-3})
+    mixed = change + 0.02 * frames[4] - 0.01 * frames[7]
+    (sentence,) = describe(machine, np.ones((1, 6), bool), mixed[None], poses)
+    assert sentence.text.startswith("The offset of leg 3 is free.")
+    assert describe(machine, np.ones((1, 6), bool), frames[:0], poses) == ()
+
+
+def test_many_open_directions_stay_readable():
+    machine, poses = hexapod()
+    rng = np.random.default_rng(1)
+    null = rng.normal(size=(25, len(machine.parameters))) * machine.parameters.tolerance
+    sentences = describe(machine, np.ones((1, 6), bool), null, poses)
+    assert 0 < len(sentences) <= MOST
+    assert sum(s.dimensions for s in sentences) == 25
+
+
+def test_what_the_drawing_knows_better_is_not_called_free():
+    machine, poses = hexapod()
+    null = unit(machine, {"legs[3].length.offset": 1.0})[None]
+    seen = np.ones((1, 6), bool)
+    (weak,) = describe(machine, seen, null, poses, information=np.array([0.5]), weak=True)
+    (open_,) = describe(machine, seen, null, poses)
+    assert weak.text.startswith("The offset of leg 3 is known from the drawing only.")
+    assert "smaller tolerances" in weak.advice
+    assert weak.moves_platform == pytest.approx(open_.moves_platform / np.sqrt(1.25))
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "3-upu"])
+def test_what_is_said_about_fixed_can_be_written_there(name):
+    _, _, sentences = told_of(make(name, n=1, n_stations=2))
+    table = load_mechanism(name).parameters
+    for sentence in sentences:
+        entries = re.findall(r'"(legs[^"]+)"', sentence.advice)
+        assert entries
+        assert len(table.with_roles(tuple(entries)).fixed) >= len(entries)
+
+
+# ------------------------------------------------------------------ parts
+
+
+def test_pose_derivatives_agree_with_the_forward_kinematics():
+    for name in ("gough-stewart", "3-rps", "3-upu"):
+        scene = make(name, n=3)
+        machine = scene.machine.with_values(scene.theta[0])
+        free, step = machine.parameters.free_matrix(), 1e-6
+        jacobian = pose_by_parameters(machine, scene.joints[0], scene.poses[0]) @ free
+        for k in range(0, free.shape[1], 5):
+            there = machine.with_values(machine.values + step * free[:, k])
+            found = there.forward_result(scene.joints[0], scene.poses[0]).T_base_platform
+            shift = (found - scene.poses[0])[:, :3, 3] / step
+            np.testing.assert_allclose(shift, jacobian[:, 3:, k], atol=2e-5)
+
+
+def test_frames_do_not_move_the_platform_and_offsets_do():
+    machine, poses = hexapod()
+    effect = platform_by_parameters(machine, poses)
+    frames = generators(machine.layout, machine.values) @ freedoms(machine)
+    assert np.abs(effect @ frames).max() < 1e-9
+    assert np.linalg.norm(effect @ unit(machine, {"legs[3].length.offset": 1.0})) > 0.05
+    radii = machine.parameters.of_kind("radius")
+    assert np.abs(effect[:, radii]).max() == 0
+
+
+def test_one_pose_does_not_hide_what_others_show():
+    """All of a single pose's change could be laid on the frames; the poses around it cannot."""
+    machine, poses = hexapod()
+    one = platform_by_parameters(machine, poses[:1])
+    change = unit(machine, {"legs[3].length.offset": 1.0})
+    assert np.linalg.norm(one @ change) > 0.05
+
+
+def test_groups_follow_what_stations_share():
+    seen = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
+    assert (1, 4) in groups(seen)
+    assert (2, 5) in groups(seen)
+    assert [tuple(np.flatnonzero(g)) for g in hanging_together(seen)] == [tuple(range(6))]
+    apart = seen_from([1, 2], [3, 4], [4, 5], [6])
+    parts = {tuple(np.flatnonzero(g).tolist()) for g in hanging_together(apart)}
+    assert parts == {(0, 1), (2, 3, 4), (5,)}
+
+
+def test_a_board_on_the_base_joins_stations():
+    from pkmcal.identify.problem import Measurements, Mount
+    from pkmcal.observe.poses import PoseSet
+
+    edges = make("gough-stewart", n=1).measurements(np.random.default_rng(0)).edges
+    poses = PoseSet(
+        np.array([0, 2, 1]), np.zeros(3, int), np.array([0, 0, 1]), np.zeros((3, 4, 4)),
+        np.zeros((3, 6, 6)),
+    )  # fmt: skip
+    mounts = (Mount("board", "base"), Mount("tool", "platform"))
+    measured = Measurements(
+        edges, np.zeros((1, 6)), 1e-6, 3, np.zeros(3, int), poses=poses, mounts=mounts
+    )
+    seen = joined_by_boards(seen_from([1], [2], [3]), measured)
+    assert [np.flatnonzero(row).tolist() for row in seen] == [[0, 2], [1], [0, 2]]
+
+
+def test_families_are_changes_of_this_machine():
+    for name in ("gough-stewart", "3-upu", "3-rpr", "6-spu-passive"):
+        machine = load_mechanism(name)
+        seen = np.ones((2, machine.n_legs), bool)
+        seen[1, 0] = False
+        for family in families(circumstances(machine, seen, machine.home()[None])):
+            assert family.columns.shape[0] == len(machine.parameters)
+            assert np.isfinite(family.columns).all()
