@@ -212,12 +212,15 @@ def whitened(drawing, estimate, truth):
     shift = np.zeros_like(estimate.state.edge_shift)
     told = State(truth.machine.values, truth.T_camera_base, truth.T_base_platform, shift)
     true = apply(drawing, told, default_gauge(drawing)).theta
-    error = table.unit_axes(estimate.machine.values) - table.unit_axes(true)
-    scale = np.sqrt(np.diag(estimate.covariance))
+    # turns of an axis: along it, its components change by squares of small angles only
+    error = table.to_free(estimate.machine.values) - table.to_free(true)
+    to_free = np.linalg.pinv(table.free_matrix())
+    covariance = to_free @ estimate.covariance @ to_free.T
+    scale = np.sqrt(np.diag(covariance))
     known = scale > 1e-9
-    c = estimate.covariance[np.ix_(known, known)] / np.outer(scale[known], scale[known])
+    c = covariance[np.ix_(known, known)] / np.outer(scale[known], scale[known])
     values, vectors = np.linalg.eigh(c)
-    keep = values > 1e-6
+    keep = values > 1e-6  # frames are held in combinations of several centres
     return (vectors.T @ (error[known] / scale[known]))[keep] / np.sqrt(values[keep])
 
 

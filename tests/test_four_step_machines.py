@@ -267,6 +267,27 @@ def test_revolute_axes_on_the_platform(tmp_path):
     assert_same(four_step(scene.drawing, scene.measurements), scene.truth)
 
 
+@pytest.mark.parametrize("name", ["3-rpr", "3-rps", "3-spr"])
+def test_a_passive_leg_on_machines_with_axes(name, tmp_path):
+    """A fourth leg that nobody drives, on a machine of three."""
+    fourth = (
+        "  - base: {joint: spherical, center: [0.05, 0.02, 0.0]}\n"
+        "    platform: {joint: universal, center: [0.02, -0.05, 0.0]}\n"
+        "    length: {passive: true}\n"
+        "    tubes: [{radius: 0.01, from: 0.02, to: 0.2}]\ntolerance:"
+    )
+    if name == "3-rpr":
+        fourth = fourth.replace("0.02, 0.0]", "0.02, 0.1]").replace("-0.05, 0.0]", "-0.05, 0.1]")
+        fourth = fourth.replace("spherical", "revolute").replace("universal", "revolute")
+    text = catalogue()["3-rpr" if name == "3-rpr" else "3-rps"].read_text()
+    if name == "3-spr":
+        three_spr(tmp_path)
+        text = (tmp_path / "machine.yaml").read_text()
+    drawing = machine_from(text.replace("tolerance:", fourth), tmp_path)
+    scene = make_scene(drawing, np.random.default_rng(15), 24)
+    assert_same(four_step(scene.drawing, scene.measurements), scene.truth)
+
+
 def test_a_planar_machine_whose_legs_and_frames_stand_at_different_heights(tmp_path):
     drawing = variant(
         "3-rpr",

@@ -116,12 +116,12 @@ def test_truth_is_found_without_noise(name):
     )
     truth = apply(session.drawing, session.state(), default_gauge(session.drawing))
     error = found.machine.values - session.drawing.parameters.unit_axes(truth.theta)
-    known = found.data_share > 0.9
     sigma = np.sqrt(np.diag(found.covariance))
-    moving = known & (sigma > 1e-9)
-    assert moving.sum() > 0.5 * len(error)
-    # a ten-thousandth of a pixel's tenth: micrometres at most, where photographs leave tens of them
-    assert np.abs(error[moving]).max() < 5e-6
+    # micrometres where photographs leave tens of them; the drawing pulls on what they do not tell
+    assert np.all(np.abs(error) < 1e-5 + 4 * sigma)
+    told = found.data_share > 0.9
+    assert told.sum() > 0.5 * len(error)
+    assert np.median(np.abs(error[told])) < 3e-6
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -15,6 +15,7 @@ from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.report.reproduction import reproduction_html
 from pkmcal.reproduce import Options, reproduce
 from pkmcal.reproduce import paper_a_expected as expected
+from pkmcal.reproduce.paper_a_photographs import MeasuredNoise
 from pkmcal.reproduce.paper_a_simulation import Settings
 from pkmcal.reproduce.paper_a_study import BOUND, JOINT, METHODS, PRINTED, study
 from pkmcal.reproduce.paper_a_tables import table_1
@@ -183,11 +184,23 @@ def test_noise_larger_than_table_1_is_not_a_reproduction():
 
 
 def test_table_1_with_and_without_a_measurement():
-    plain, measured = table_1(), table_1(AxisNoise(np.radians(0.004), np.radians(0.03), images=1))
-    assert len(measured.rows) == len(plain.rows) + 1
+    middle, bound = AxisNoise(0.002, 0.02, 2e-4, 2e-3, 1), AxisNoise(0.01, 0.05, 1e-3, 5e-3, 1)
+    plain, more = table_1(), table_1(MeasuredNoise(middle, bound, 0.03))
+    assert len(more.rows) == len(plain.rows) + 2
     assert plain.rows[2].cells == ("0.029°", "0.035°", "0.029 mm", "0.058 mm")
-    assert measured.rows[-1].cells[:2] == ("0.0040°", "0.0300°")
-    assert all(len(row.cells) == len(plain.columns) - 1 for row in measured.rows)
+    assert more.rows[-2].cells == ("0.11°", "1.15°", "0.20 mm", "2.00 mm")
+    assert all(len(row.cells) == len(more.columns) - 1 for row in more.rows)
+
+
+@pytest.mark.slow
+def test_table_1_on_photographs():
+    """Edges to a few hundredths of a pixel; depth from the width of a leg, so far worse."""
+    found = reproduce("a", Options(runs=3, photographs=True)).numbers["table_1_measured"]
+    assert 0.01 < found["edge_px"] < 0.08
+    middle, worst = found["median"], found["worst"]
+    assert all(middle[name] <= worst[name] for name in middle)
+    assert middle["theta"] > 2 * middle["psi"]
+    assert middle["z"] > 3 * middle["x"]
 
 
 def test_the_figure_has_thirty_parameters_and_every_method(found):

@@ -77,7 +77,11 @@ def test_a_session(folder):
     assert session.warnings == ()
     assert session.board is None
     (front,) = session.stations
-    assert (front.name, front.observe, front.camera_file) == ("front", "legs", "cameras/front.yaml")
+    assert (front.name, front.observe, front.camera_file) == (
+        "front",
+        ("legs",),
+        "cameras/front.yaml",
+    )
     assert front.camera.image_size == (8, 6)
     assert [photo.configuration for photo in front.photographs] == [0, 1, 2]
     assert front.photographs[2].path == folder / "images/front/0002.png"
@@ -171,7 +175,10 @@ def test_a_board(folder):
     assert session.board == folder / "board.yaml"
     assert session.warnings == ("session.yaml, line 2, board: no station observes the board.",)
     change(folder, "session.yaml", "observe: legs", "observe: board")
-    assert load_session(folder).warnings == ()
+    session = load_session(folder)
+    assert session.warnings == ()
+    assert session.board_body == "platform"
+    assert session.document["board"] == {"file": "board.yaml", "fixed_to": "platform"}
 
 
 def test_a_reading_slightly_out_of_range_is_a_warning(folder):
@@ -206,7 +213,9 @@ EDITS = [
      ["line 6, stations.front.camrea: this key is not known; found camrea, expected camera ("]),
     ("session.yaml", "    camera: cameras/front.yaml\n", "",
      ["line 5, stations.front.camera: this is missing", "for example cameras/front.yaml"]),
-    ("session.yaml", "observe: legs", "observe: leg", ["line 8", "found 'leg', expected 'legs'"]),
+    ("session.yaml", "observe: legs", "observe: leg",
+     ["line 8, stations.front.observe: no station can observe this",
+      "found 'leg', expected legs"]),
     ("session.yaml", "3.0e-6", "0", ["line 3, joints.noise", "found 0, expected a number above 0"]),
     ("session.yaml", "noise: 3.0e-6", "noise: 3 um", ["joints.noise", "'3 um', expected a number"]),
     ("session.yaml", ", noise: 3.0e-6", "", ["joints.noise: this is missing", "in metres or rad"]),

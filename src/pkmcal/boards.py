@@ -15,13 +15,17 @@ from pkmcal.observe.boards import Board, Detection, load_board
 from pkmcal.observe.edges import Rejection
 from pkmcal.observe.poses import PoseSet, concatenate_poses
 from pkmcal.observe.standing import Standing, standing
-from pkmcal.observe.targets import BoardViews, board_views, detect_in, moving_poses
+from pkmcal.observe.targets import BoardViews, board_views, detect_again, detect_in, moving_poses
 from pkmcal.photographs import label_of
 from pkmcal.session import Session
 from pkmcal.session_schema import Body
 
 MOUNT = 0
 """A session has one board, so one mount."""
+ENOUGH = 4
+"""Photographs in which a chessboard that stands still is looked for by slow ways."""
+EXAMINED = 2
+"""Photographs that are examined for another board."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +116,13 @@ def station_board(
     station = session.stations[number]
     labels = [label_of(session.folder, photo.path) for photo in station.photographs]
     moves = session.board_body == "platform"
-    detections = detect_in(images, board, labels, thorough=moves)
+    detections = detect_in(images, board, labels)
+    nowhere = not any(detection.found for detection in detections)
+    if nowhere:
+        _check_another(session, board, number, detections)
+    # A board that moves says something new in every photograph; a still one is seen enough.
+    most = len(images) if moves else ENOUGH if nowhere else 0
+    detections = detect_again(images, board, detections, most)
     if not any(detection.found for detection in detections):
         raise _nowhere(session, board, number, detections)
     rows = np.array([photo.configuration for photo in station.photographs])
@@ -128,15 +138,24 @@ def station_board(
     return StationBoard(seen, stood)
 
 
+def _check_another(
+    session: Session, board: Board, number: int, detections: Sequence[Detection]
+) -> None:
+    """Raise `InputError` where photographs in which the board is not found show another one."""
+    station = session.stations[number]
+    few = np.unique(np.linspace(0, len(detections) - 1, EXAMINED).astype(int))
+    paths = [station.photographs[k].path for k in few]
+    try:
+        check_boards(paths, [detections[k] for k in few], board)
+    except InputError as error:
+        raise error.located(f"session.yaml, stations.{station.name}") from None
+
+
 def _nowhere(
     session: Session, board: Board, number: int, detections: Sequence[Detection]
 ) -> InputError:
-    """Why none of a station's photographs shows the board."""
+    """The error about a board that none of a station's photographs shows."""
     station = session.stations[number]
-    try:
-        check_boards([photo.path for photo in station.photographs], detections, board)
-    except InputError as error:
-        return error
     return InputError(
         f"the board is in none of the photographs of station {station.name}",
         where=detections[0].name,

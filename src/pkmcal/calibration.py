@@ -31,6 +31,7 @@ from pkmcal.identify.words import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.edges import EdgeSet, Observation, Rejection, concatenate
+from pkmcal.observe.repeats import combined
 from pkmcal.recognition import (
     WORKERS,
     boards_of,
@@ -247,7 +248,7 @@ def _each(
     look: Callable[[legs.Photographs], legs.StationEdges],
 ) -> list[legs.StationEdges]:
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(look, photographs))
+        return [combined(seen) for seen in pool.map(look, photographs)]
 
 
 def _edges(looks: list[legs.StationEdges]) -> EdgeSet:

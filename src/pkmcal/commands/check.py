@@ -37,6 +37,10 @@ KINEMATICS = (
 
 def check(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")],
+    repeat: Annotated[
+        bool,
+        typer.Option("--repeat", help="Measure the accuracy by repeated photographs as well."),
+    ] = False,
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
@@ -45,11 +49,23 @@ def check(
 
     with console.progress() as told:
         found = check_session(session, seed=seed, progress=told)
+    study = None
+    if repeat and found.exit_code < 2:
+        from pkmcal.repeatability import study_repeats
+
+        with console.progress() as told:
+            study = study_repeats(session, seed=seed, progress=told)
+    exit_code = max(found.exit_code, study.exit_code if study else 0)
     if as_json:
-        console.print_json(found.as_dict())
-    else:
-        tell(console.out(), found)
-    return found.exit_code
+        told_of_repeats = {"repeats": study and study.as_dict()} if repeat else {}
+        console.print_json({**found.as_dict(), "exit_code": exit_code, **told_of_repeats})
+        return exit_code
+    tell(console.out(), found)
+    if study:
+        from pkmcal.commands.repeats import tell_repeats
+
+        tell_repeats(console.out(), study)
+    return exit_code
 
 
 def tell(out: Console, found: SessionCheck) -> None:

@@ -89,10 +89,9 @@ def _make_room(out: Path) -> None:
 def _simulate(session: Path, fast: bool, told: console.Progress) -> None:
     from dataclasses import replace
 
-    from pkmcal.commands.simulate import camera_of_size
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.simulate import simulate_session
-    from pkmcal.simulate.demo import MECHANISM, SEED, SETTINGS, demo_camera
+    from pkmcal.simulate.demo import MECHANISM, SEED, SETTINGS, camera_of_size, demo_camera
 
     settings = replace(SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else SETTINGS
     camera = camera_of_size(FAST_SIZE) if fast else demo_camera()

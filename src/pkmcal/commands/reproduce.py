@@ -38,6 +38,9 @@ def reproduce(
     long: Annotated[
         bool, typer.Option("--long", help="Accuracy by number of poses too; a minute.")
     ] = False,
+    photographs: Annotated[
+        bool, typer.Option("--photographs", help="Measure Table 1 on rendered photographs.")
+    ] = False,
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="DIR", help="Where the pages go.")
     ] = Path("reproduction"),
@@ -51,7 +54,8 @@ def reproduce(
     check_writable(out)
     wanted = list(dict.fromkeys(papers or list(Paper)))
     with console.progress(as_json) as told:
-        found = [computed(paper.value, Options(runs, seed, long, told)) for paper in wanted]
+        options = Options(runs, seed, long, photographs, told)
+        found = [computed(paper.value, options) for paper in wanted]
     files = save(found, out)
     code = 0 if all(one.passed for one in found) else 1
     if as_json:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import re
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from pkmcal.commands import console
 from pkmcal.errors import InputError
-
-if TYPE_CHECKING:
-    from pkmcal.cameras import Camera
 
 SMALLEST, LARGEST = 64, 8192
 """Pixels along a side: below, no leg is wide enough to have edges; above, no memory is enough."""
@@ -37,6 +34,9 @@ def simulate(
     shared: Annotated[
         bool, typer.Option("--shared", help="The same configurations from all places.")
     ] = False,
+    repeats: Annotated[
+        int, typer.Option(metavar="N", min=1, max=100, help="Photographs of each configuration.")
+    ] = 1,
     tolerance: Annotated[
         float,
         typer.Option(metavar="X", min=0, help="True values' deviation, in tolerances."),
@@ -60,6 +60,7 @@ def simulate(
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.simulate import Sensor, Settings, board_for, simulate_session
+    from pkmcal.simulate.demo import camera_of_size
 
     if not 0 < joint_noise < 1:
         raise InputError(
@@ -76,12 +77,13 @@ def simulate(
         joint_noise=joint_noise,
         sensor=Sensor(blur=blur, read_noise=noise),
         board=board_for(machine) if board else None,
+        repeats=repeats,
     )
     with console.progress() as told:
         truth = simulate_session(
             folder, machine, eye, settings, seed=seed, progress=console.counted(told)
         )
-    count = len(truth.photographs)
+    count = len(truth.photographs) * truth.repeats
     if as_json:
         console.print_json(
             {"folder": str(folder), "photographs": count, "stations": truth.stations, "seed": seed}
@@ -114,20 +116,3 @@ def parsed_size(text: str) -> tuple[int, int]:
             expected=f"width x height, each {SMALLEST} to {LARGEST}, such as 800x600",
         )
     return size
-
-
-def camera_of_size(size: tuple[int, int]) -> Camera:
-    """The demonstration's camera with the same lens and another number of pixels."""
-    from pkmcal.cameras import camera_models
-    from pkmcal.simulate.demo import demo_camera
-
-    camera = demo_camera()
-    width, height = camera.image_size
-    scale = size[0] / width
-    parameters = camera.parameters.copy()
-    parameters[:2] *= scale
-    middle = ((width - 1) / 2, (height - 1) / 2)
-    for axis in (0, 1):
-        off = (parameters[2 + axis] - middle[axis]) * scale
-        parameters[2 + axis] = (size[axis] - 1) / 2 + off
-    return camera_models()[camera.model](size, parameters)

@@ -254,13 +254,24 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
         state.T_base_platform[assembled.seen][None],
         np.concatenate([state.edge_shift[:, None], intrinsics], axis=1)[None],
         state.T_mount[None],
+        _internal(machine, state)[assembled.seen][None],
     )
+
+
+def _internal(machine: Machine, state: State) -> Array:
+    """The state's internal coordinates (K, n), zero where it has none."""
+    shape = (len(state.T_base_platform), machine.layout.n_internal)
+    return state.internal if state.internal.shape == shape else np.zeros(shape)
 
 
 def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
     """The first run of a batch as a state; unseen configurations keep the start's pose."""
     poses = start.T_base_platform.copy()
     poses[assembled.seen] = batch.T_base_platform[0]
+    internal = np.zeros((len(poses), batch.internal.shape[-1]))
+    if start.internal.shape == internal.shape:
+        internal[:] = start.internal
+    internal[assembled.seen] = batch.internal[0]
     return State(
         assembled.problem.theta(batch)[0],
         batch.T_camera_base[0],
@@ -269,4 +280,5 @@ def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
         batch.optics[0, :, 1:],
         batch.T_mount[0],
         assembled.problem.pose_blocks.on_platform,
+        internal,
     )

@@ -50,7 +50,8 @@ class Data:
 @dataclass(frozen=True)
 class BatchState:
     """Unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
-    T_base_platform (B, K, 4, 4), optics (B, C, w), T_mount (B, M, 4, 4) of boards.
+    T_base_platform (B, K, 4, 4), optics (B, C, w), T_mount (B, M, 4, 4) of boards,
+    internal (B, K, n) of articulated platforms.
     """
 
     z: Array
@@ -58,8 +59,12 @@ class BatchState:
     T_base_platform: Array
     optics: Array
     T_mount: Array = field(default_factory=lambda: np.zeros((0, 0, 4, 4)))
+    internal: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
     def __post_init__(self) -> None:
-        """Runs without boards get none each, so that all fields select alike."""
+        """Runs without boards or hinges get none each, so that all fields select alike."""
         if len(self.T_mount) != len(self.z):
             object.__setattr__(self, "T_mount", np.zeros((len(self.z), 0, 4, 4)))
+        if len(self.internal) != len(self.z):
+            none = np.zeros((*self.T_base_platform.shape[:2], 0))
+            object.__setattr__(self, "internal", none)

@@ -155,7 +155,8 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
     Readings, not seen directions: the latter lead into local minima (errata, B).
     T_camera_base_guess : (S, 4, 4).
     """
-    poses = machine.forward_result(measurements.joints).T_base_platform
+    found = machine.forward_result(measurements.joints)
+    poses = found.T_base_platform
     n_cameras = int(np.max(measurements.camera_of_station)) + 1
     stations = np.asarray(T_camera_base_guess)
     return State(
@@ -165,6 +166,7 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
         np.zeros(n_cameras),
         T_mount=start_mounts(measurements, stations, poses),
         on_platform=measurements.on_platform,
+        internal=found.internal,
     )
 
 
@@ -238,10 +240,10 @@ def _with_unseen_poses(
     unseen = ~assembled.seen
     if not unseen.any():
         return state
-    poses = state.T_base_platform.copy()
+    poses, internal = state.T_base_platform.copy(), state.internal.copy()
     found = machine.forward_result(measurements.joints[unseen], poses[unseen])
-    poses[unseen] = found.T_base_platform
-    return replace(state, T_base_platform=poses)
+    poses[unseen], internal[unseen] = found.T_base_platform, found.internal
+    return replace(state, T_base_platform=poses, internal=internal)
 
 
 def _joint_residuals(
@@ -250,7 +252,7 @@ def _joint_residuals(
     """Closures in standard deviations of a reading, (K, m); zero where no pose was fitted."""
     rows = result.info.linear.value[0, :, result.problem.closure_rows]
     out = np.zeros(measurements.joints.shape)
-    out[assembled.seen] = rows[:, result.problem.layout.driven_rows]
+    out[assembled.seen] = result.problem.joint_rows(rows[None], result.solution.state)[0]
     return out
 
 

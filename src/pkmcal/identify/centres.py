@@ -84,7 +84,7 @@ def laid_over(source: Array, target: Array) -> Array:
 
 
 def _ends(machine: Machine) -> LimbEnds:
-    return limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), np.eye(4))
+    return limb_ends(machine.layout, machine.values, machine.middle_readings(), np.eye(4))
 
 
 def _spread(by: Array, index: Integers, covariance: Array) -> Array:

@@ -269,7 +269,8 @@ def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Ar
     out = np.tile(axes, (len(centres), 1, 1))
     if np.isnan(axes).all() or isinstance(default_gauge(machine), BestFit):
         return out
-    rot = laid(np.broadcast_to(drawn, centres.shape), centres, np.ones(centres.shape[:2]))
+    known = np.isfinite(centres[..., 0]).astype(float)
+    rot = laid(np.broadcast_to(drawn, centres.shape), np.nan_to_num(centres), known)
     return (rot[:, None, :3, :3] @ out[..., None])[..., 0]
 
 
@@ -290,7 +291,7 @@ def four_step(
     Raises ResultError where the data do not allow a step, with [A]'s condition in words.
     """
     edges = measurements.edges
-    checks.there_are_edges(len(edges))
+    checks.can_be_tried(machine, len(edges))
     found_linear = linear.centres(machine, measurements, "robust", rng)
     if form == "corrected":
         edges = through_centres(machine, edges, found_linear.centres)
@@ -305,6 +306,7 @@ def four_step(
     checks.platform_can_be_found(machine, axes, usable, form)
     steps = solve(machine, axes, a_camera, found, form, views)
     checks.lengths_are_fixed(machine, axes, usable, steps.base, steps.T_camera_base, steps.offsets)
+    checks.passive_legs_are_fixed(machine, steps.platform)
     stations = steps.T_camera_base[0]
     if T_camera_base_guess is not None:
         stations = np.where(usable[:, None, None], stations, T_camera_base_guess)

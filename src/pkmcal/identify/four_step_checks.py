@@ -20,6 +20,8 @@ from pkmcal.identify.four_step_model import Legs, legs_of
 from pkmcal.identify.four_step_offsets import COLLAPSED, deviations
 from pkmcal.identify.registration import fixes_pose, loose
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.carriers.fixed import FixedPoint
+from pkmcal.mechanisms.carriers.rigid import RigidPlatform
 
 FLAT = 1e-3
 """Singular value of the distances' derivatives by the offsets, of 1 a photograph at most, below
@@ -29,9 +31,18 @@ VAGUE = 0.1
 BUNDLE = "use the joint method (bundle)"
 
 
-def there_are_edges(count: int) -> None:
-    """The steps work on legs alone; a board does not replace them."""
-    if not count:
+def can_be_tried(machine: Machine, edges: int) -> None:
+    """[A] is about legs with a joint fixed to each body, and its steps about pictures of them."""
+    base, platform = machine.layout.base, machine.layout.platform
+    if any(g.carrier is not FixedPoint for g in base) or any(
+        g.carrier is not RigidPlatform for g in platform
+    ):
+        raise ResultError(
+            what="the four steps are for legs with one joint on the base and one on the platform",
+            found=f"mechanism {machine.name!r} with joints that move on cranks, slides or bars",
+            next_step=BUNDLE,
+        )
+    if not edges:
         raise ResultError(
             what="the four steps need photographs of the legs, and no edge of one was measured",
             next_step=f"photograph the legs, or {BUNDLE} with a board on the platform",

@@ -17,7 +17,6 @@ from typing import Protocol
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
 from pkmcal.identify.problem import State
 from pkmcal.mechanisms import Machine
@@ -120,12 +119,13 @@ def generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -
 
     drawing : (P,) where directions stay on the tangent planes of the drawing's.
     """
-    out = np.zeros((*theta.shape, 12))
-    for body, (index, axes) in enumerate(zip(centre_index(layout), layout.turning, strict=True)):
+    out = np.zeros((*theta.shape[:-1], theta.shape[-1] + 1, 12))
+    for group in (*layout.base, *layout.platform):
+        # what the file is silent about lands in the last row
+        out[..., group.index, :] = group.carrier.by_frames(group.of(theta))
+    out = out[..., :-1, :]
+    for body, axes in enumerate(layout.turning):
         at = slice(6 * body, 6 * body + 3)
-        to = slice(6 * body + 3, 6 * body + 6)
-        out[..., index, at] = -skew(theta[..., index])
-        out[..., index, to] = np.eye(3)
         out[..., axes, at] = -skew(theta[..., axes])
         if drawing is not None:
             along = drawing[axes][..., None, :] @ out[..., axes, at]
@@ -181,6 +181,8 @@ def _respecting_motion(motion: Array) -> Array:
     if motion.shape[1] == 6:
         return np.eye(12)
     both = np.concatenate([np.eye(6), np.eye(6)])
+    if motion[5].any() and motion[2].any():  # schoenflies: each frame shifted and turned about z
+        return np.eye(12)[:, [2, 3, 4, 5, 8, 9, 10, 11]]
     if motion[:3].any():  # planar: each frame in the plane, and both together along its normal
         return np.concatenate([np.eye(12)[:, [2, 3, 4, 8, 9, 10]], both[:, [5]]], axis=1)
     # translation: each frame's origin, and both frames turned together
@@ -265,14 +267,17 @@ def moved_mounts(T_mount: Array, on_platform: Booleans, e: Array, f: Array) -> A
 
 
 def moved_centres(layout: LimbLayout, theta: Array, e: Array, f: Array) -> Array:
-    """Parameters (..., P) with centres moved by E (..., 4, 4) on the base, F on the platform.
+    """Parameters (..., P) in frames moved by E (..., 4, 4) on the base, F on the platform.
 
-    Directions turn with their body.
+    Centres move and directions turn with their body; what a carrier has besides follows.
     """
-    out = theta.copy()
-    for transform, index, axes in zip((e, f), centre_index(layout), layout.turning, strict=True):
-        out[..., index] = move(transform[..., None, :, :], theta[..., index])
-        out[..., axes] = (transform[..., None, :3, :3] @ theta[..., axes, None])[..., 0]
+    e, f = e[..., None, :, :], f[..., None, :, :]
+    out = np.concatenate([theta, np.zeros((*theta.shape[:-1], 1))], axis=-1)
+    for group in (*layout.base, *layout.platform):
+        out[..., group.index] = group.carrier.moved(group.of(theta), e, f)
+    out = out[..., :-1]
+    for transform, axes in zip((e, f), layout.turning, strict=True):
+        out[..., axes] = (transform[..., :3, :3] @ theta[..., axes, None])[..., 0]
     return out
 
 
@@ -284,14 +289,23 @@ def carried_errors(layout: LimbLayout, before: State, e: Array, f: Array) -> Arr
     """
     n_par, n_stations = before.theta.size, len(before.T_camera_base)
     out = np.eye(n_par + 6 * n_stations)
-    for transform, index, axes in zip((e, f), centre_index(layout), layout.turning, strict=True):
-        turning = np.concatenate([index, axes])
-        out[turning[:, :, None], turning[:, None, :]] = transform[:3, :3]
+    for transform, axes in zip((e, f), layout.turning, strict=True):
+        out[axes[:, :, None], axes[:, None, :]] = transform[:3, :3]
+    out[:n_par, :n_par] = _carried_parameters(layout, before.theta, e, f, out[:n_par, :n_par])
     arm = before.T_camera_base[:, :3, :3] @ e[:3, :3].T @ e[:3, 3]
     for s in range(n_stations):
         at = n_par + 6 * s
         out[at + 3 : at + 6, at : at + 3] = skew(arm[s])
     return out
+
+
+def _carried_parameters(layout: LimbLayout, theta: Array, e: Array, f: Array, out: Array) -> Array:
+    """Errors (P, P) of the carriers' parameters before a frame change to those after."""
+    out = np.pad(out, ((0, 1), (0, 1)))  # the last takes what the file is silent about
+    for group in (*layout.base, *layout.platform):
+        by = group.carrier.carried(group.of(theta), e[None], f[None])
+        out[group.index[:, :, None], group.index[:, None, :]] = by
+    return out[:-1, :-1]
 
 
 def transformation(machine: Machine, state: State, gauge: Gauge) -> Array:

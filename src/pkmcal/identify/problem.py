@@ -58,7 +58,7 @@ class State:
     edge_shift : (C,) px outward, per camera. intrinsics : (C, r) change of each camera's from
     ``Measurements.intrinsics_at``, in the same units; r = 0 where they are held.
     T_mount : (M, 4, 4) boards in the frame of what they are fixed to, T_base_board or
-    T_platform_board by ``on_platform`` (M,).
+    T_platform_board by ``on_platform`` (M,). internal : (K, n) hinges of an articulated platform.
     """
 
     theta: Array
@@ -68,6 +68,7 @@ class State:
     intrinsics: Array = field(default_factory=lambda: np.zeros((0, 0)))
     T_mount: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     on_platform: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ Rows of a configuration are its edges, two each, then its limbs' closures, then 
 - edge: ``L^-1 (basis^T n_predicted + shift * s)`` with L the Cholesky factor of the edge's
   covariance. The measured normal is the true one moved by ``basis @ (shift * s)`` when all
   edge points lie s px outward, and ``basis^T n_measured = 0``; hence the plus sign.
-- closure: ``c / (|dc/dq| sigma_q)``, [B] eq. 4; what no reading enters (rods of constant
-  length, joints' axes) is taken as perfect and held to :data:`PERFECT`.
+- closure: ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5 whitened; what no reading enters (rods
+  of constant length, joints' axes) is taken as perfect and held to :data:`PERFECT`.
 
 Rows on shared unknowns: ``(theta - drawing) / tolerance``, the edge shift's prior, the gauge.
 
@@ -135,7 +135,7 @@ class Problem:
             poses = self._poses(state)
             value.append(poses.value.reshape(*poses.value.shape[:2], -1))
             by_shared.append(self._pose_by_shared(poses))
-            own = poses.by_own @ self.layout.motion
+            own = self._to_own(poses.by_own)
             by_own.append(own.reshape(*own.shape[:2], -1, own.shape[-1]))
         return self._linear(
             state,
@@ -172,7 +172,8 @@ class Problem:
         z = shared[:, :nz] - (by_frames @ y)[..., 0]
         camera = shared[:, nz : nz + ns].reshape(-1, self.n_stations, 6)
         camera = camera - (station_generators(state.T_camera_base) @ y[:, None])[..., 0]
-        pose = own @ self.layout.motion.T
+        own = own @ self.layout.own_motion.T
+        pose, internal = own[..., :6], own[..., 6:]
         pose = pose - (pose_generators(state.T_base_platform) @ y[:, None])[..., 0]
         m = self._mounts_at
         mount = shared[:, m:].reshape(*state.T_mount.shape[:2], 6)
@@ -183,6 +184,7 @@ class Problem:
             perturb(state.T_base_platform, pose),
             state.optics + shared[:, nz + ns : m].reshape(state.optics.shape),
             perturb(state.T_mount, mount - (by_frame @ y[:, None])[..., 0]),
+            state.internal + internal,
         )
         return self._in_frames(inner, y[..., 0])
 
@@ -197,6 +199,7 @@ class Problem:
             e[:, None] @ state.T_base_platform @ inverse(f)[:, None],
             state.optics,
             moved_mounts(state.T_mount, self.pose_blocks.on_platform, e, f),
+            state.internal,
         )
 
     def select(self, runs: Integers) -> Problem:
@@ -259,7 +262,8 @@ class Problem:
 
     def _closure(self, state: BatchState) -> Closure:
         theta = self.theta(state)[:, None, :]
-        return closure(self.layout, theta, self.data.joints, state.T_base_platform)
+        internal = state.internal if self.layout.n_internal else None
+        return closure(self.layout, theta, self.data.joints, state.T_base_platform, internal)
 
     def _prior_rows(self, state: BatchState) -> Array:
         nz = self.free.shape[1]
@@ -283,7 +287,7 @@ class Problem:
     def _project(self, vectors: Array) -> Array:
         """basis^T v, whitened and weighted: (B, K, G, g, 3, n) -> (B, K, G, 2g, n)."""
         flat = np.swapaxes(self.data.basis, -1, -2) @ vectors
-        flat = flat.reshape(*flat.shape[:3], -1, flat.shape[-1])
+        flat = flat.reshape(*flat.shape[:3], 2 * flat.shape[3], flat.shape[-1])
         return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ flat)
 
     def _optics_columns(self) -> Array:
@@ -294,7 +298,7 @@ class Problem:
         optics = state.optics[:, self.blocks.camera, :, None]
         rows = (self._project(n[..., None]) + self._optics_columns() @ optics)[..., 0]
         unused = np.broadcast_to((self.data.weight == 0)[..., None], rows.shape)
-        return np.where(unused, 0.0, rows).reshape(*rows.shape[:2], -1)
+        return np.where(unused, 0.0, rows).reshape(*rows.shape[:2], self.n_edge_rows)
 
     def _rows_in_use(self, shape: tuple[int, ...]) -> Booleans:
         """Rows that are not padding and not weighted away, (B, K, r)."""
@@ -306,13 +310,53 @@ class Problem:
         return used
 
     def _closure_rows(self, c: Closure) -> Array:
-        return c.value / self._closure_sigma(c)
+        return self._by_noise(c, c.value[..., None])[..., 0]
+
+    def _by_noise(self, c: Closure, rows: Array) -> Array:
+        """Rows (B, K, E, n) of the closure in standard deviations; the noise's own derivative is
+        multiplied by c = 0.
+
+        Rods on one motor share its reading's noise: with slopes g of the motor's rows their
+        covariance is ``sigma^2 g g^T + PERFECT^2``, whitened in closed form.
+        """
+        if not self.layout.shares_motors:
+            return rows / self._closure_sigma(c)[..., None]
+        for motor in range(self.layout.n_readings):
+            slope = np.where(self.layout.row_motor == motor, c.by_reading, 0.0)
+            size = np.sqrt(np.sum(slope**2, axis=-1, keepdims=True))
+            unit = slope / size
+            less = 1 - PERFECT / np.hypot(PERFECT, self.joint_noise * size)
+            part = unit[..., None, :] @ rows
+            rows = rows - (less * unit)[..., None] * part
+        return rows / PERFECT
+
+    def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
+        """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""
+        if not self.layout.shares_motors:
+            rows = self.layout.driven_rows
+            order = np.argsort(self.layout.row_motor[rows], kind="stable")
+            return c_rows[..., rows[order]]
+        slope = self._closure(state).by_reading[..., None]
+        slope = slope * (self.layout.row_motor[:, None] == np.arange(self.layout.n_readings))
+        unit = slope / np.sqrt(np.sum(slope**2, axis=-2, keepdims=True))
+        return (np.swapaxes(unit, -1, -2) @ c_rows[..., None])[..., 0]
 
     def _closure_sigma(self, c: Closure) -> Array:
-        """Standard deviation of each closure; its own derivative is multiplied by c = 0."""
+        """Standard deviation of each closure where every motor moves one rod.
+
+        A crank in line with its rod does not move it, so no closure is sharper than a perfect one;
+        a rod that is read always moves with its reading.
+        """
         read = np.zeros(self.layout.n_equations, dtype=bool)
         read[self.layout.driven_rows] = True
-        return np.where(read, np.abs(c.by_reading) * self.joint_noise, PERFECT)
+        own = np.append(self.layout.rod_reads[self.layout.closing], self._no_angles)
+        sigma = np.abs(c.by_reading) * self.joint_noise
+        sigma = np.where(own, sigma, np.maximum(sigma, PERFECT))
+        return np.where(read, sigma, PERFECT)
+
+    @property
+    def _no_angles(self) -> Booleans:
+        return np.zeros(len(self.layout.angles), dtype=bool)
 
     def _edge_by_shared(
         self, state: BatchState, c: Closure, e: Ends, by_a: Array, by_b: Array
@@ -345,15 +389,26 @@ class Problem:
         """Edge and closure rows by the platform's motion, (B, K, r, d)."""
         rot = state.T_camera_base[:, self.blocks.station, :3, :3]
         legs, k = self.blocks.leg, np.arange(len(self.blocks.leg))[:, None]
-        edges = by_b @ (rot @ c.ends.b_by_pose[:, k, legs])
-        edges = edges.reshape(*edges.shape[:2], edges.shape[2] * edges.shape[3], 6)
-        closures = c.by_pose / self._closure_sigma(c)[..., None]
-        return np.concatenate([edges, closures], axis=-2) @ self.layout.motion
+        by_own = self._to_own(c.ends.b_by_pose, c.ends.b_by_internal)
+        edges = by_b @ (rot @ by_own[:, k, legs])
+        edges = edges.reshape(*edges.shape[:2], self.n_edge_rows, edges.shape[-1])
+        return np.concatenate([edges, self._by_noise(c, self.layout.by_own(c))], axis=-2)
+
+    def _to_own(self, by_pose: Array, by_internal: Array | None = None) -> Array:
+        """Derivatives (..., 6) by the pose, and (..., n) by what is internal, as those by the
+        configuration's own unknowns, (..., d + n).
+        """
+        out = by_pose @ self.layout.motion
+        if not self.layout.n_internal:
+            return out
+        if by_internal is None:
+            by_internal = np.zeros((*out.shape[:-1], self.layout.n_internal))
+        return np.concatenate([out, by_internal], axis=-1)
 
     def _closure_by_shared(self, c: Closure) -> Array:
         """Closure rows by the shared unknowns, (B, K, E, na)."""
-        by_theta = (c.by_theta / self._closure_sigma(c)[..., None])[..., None, :]
-        free = self._to_free([(c.index[None], by_theta)])[..., 0, :]
+        free = self._to_free([(c.index[None], c.by_theta[..., None, :])])[..., 0, :]
+        free = self._by_noise(c, free)
         rest = np.zeros((*free.shape[:-1], self.n_shared - free.shape[-1]))
         return np.concatenate([free, rest], axis=-1)
 
@@ -390,4 +445,4 @@ def _one_hot(values: Array, index: Integers, n: int) -> Array:
     out = np.zeros((*values.shape[:-1], n, values.shape[-1]))
     place = index[None, :, :, None, None, None]
     np.put_along_axis(out, place, values[..., None, :], axis=-2)
-    return out.reshape(*values.shape[:-1], -1)
+    return out.reshape(*values.shape[:-1], n * values.shape[-1])

@@ -10,6 +10,8 @@ from pkmcal.errors import InputError
 from pkmcal.files import listed
 from pkmcal.files.yaml_files import field_path
 from pkmcal.mechanisms.joints import equations
+from pkmcal.mechanisms.carriers.contract import platform_carriers
+from pkmcal.mechanisms.driven_checks import check_driven
 from pkmcal.mechanisms.limbs import MOTIONS
 from pkmcal.mechanisms.rods import PassiveLength
 from pkmcal.mechanisms.schema import Leg, MechanismDocument
@@ -33,6 +35,7 @@ def check_drawing(document: MechanismDocument, where: Where | None = None) -> No
             _check_plane(document, j, leg, place)
         if document.motion == "translation":
             _check_parallel(j, leg, place)
+    check_driven(document, place)
     _check_equations(document, place)
 
 
@@ -54,10 +57,12 @@ def _check_axis(document: MechanismDocument, j: int, side: str, place: Where) ->
 
 
 def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: Where) -> None:
-    """A planar machine's legs lie in planes z = const, their axes along z."""
+    """A planar machine's legs lie in planes z = const, their axes along z, guides across it."""
     for side in ("base", "platform"):
         axis = getattr(getattr(leg, side), "axis", None)
-        if axis is not None and np.hypot(axis[0], axis[1]) > IN_PLANE:
+        if getattr(leg, side).joint == "slider":
+            _check_guide(j, leg, place)
+        elif axis is not None and np.hypot(axis[0], axis[1]) > IN_PLANE:
             raise InputError(
                 f"leg {j + 1} of a planar machine turns about an axis that is not the plane's",
                 where=place("legs", j, side, "axis"),
@@ -78,6 +83,15 @@ def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: Where) ->
             found=f"its platform joint {gap * 1e3:+.4g} mm above its base joint",
             expected="the same height (z) for both ends of a leg, at the home pose",
             next_step="Draw the leg in its plane, or write motion: spatial",
+        )
+
+
+def _check_guide(j: int, leg: Leg, place: Where) -> None:
+    if abs(leg.base.axis[2]) > IN_PLANE:
+        raise InputError(
+            f"the slider of leg {j + 1} leaves the plane of a planar machine",
+            where=place("legs", j, "base", "axis"),
+            expected="[x, y, 0]: a planar machine moves in the base frame's x-y plane",
         )
 
 
@@ -106,12 +120,19 @@ def _check_parallel(j: int, leg: Leg, place: Where) -> None:
         )
 
 
+def _hinges(document: MechanismDocument) -> int:
+    """Bars that turn on their own."""
+    carriers = platform_carriers()
+    nodes = [leg.platform for leg in document.legs]
+    return len({node.bar for node in nodes if carriers[node.joint].turns})
+
+
 def _check_equations(document: MechanismDocument, place: Where) -> None:
     passive = [
         j + 1 for j, leg in enumerate(document.legs) if isinstance(leg.length, PassiveLength)
     ]
     count = len(document.legs) - len(passive) + len(equations(document))
-    freedoms = MOTIONS[document.motion].shape[1]
+    freedoms = MOTIONS[document.motion].shape[1] + _hinges(document)
     if count >= freedoms:
         return
     why = ""
@@ -123,6 +144,7 @@ def _check_equations(document: MechanismDocument, place: Where) -> None:
         f"the legs do not hold the platform: {count} equations for {freedoms} freedoms{why}",
         where=place("legs"),
         expected="one equation a leg with a length, one a revolute joint, one a pair of universal "
-        f"joints with axes; {freedoms} for motion: {document.motion}",
+        f"joints with axes; {freedoms} for motion: {document.motion}"
+        f"{' and its hinged bars' if _hinges(document) else ''}",
         next_step="Add legs or axes, or correct motion",
     )

@@ -43,6 +43,16 @@ def _direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
 Direction = Annotated[tuple[float, float, float], AfterValidator(_direction)]
 
 
+def _rising(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] < value[1]:
+        raise ValueError("should be two increasing readings [min, max]")
+    return value
+
+
+Interval = Annotated[tuple[float, float], AfterValidator(_rising)]
+"""Smallest and largest reading of a motor."""
+
+
 class JointDocument(Schema):
     """``{joint: revolute, center: [x, y, z], axis: [x, y, z]}``: metres, the body's frame."""
 

@@ -7,6 +7,7 @@ batch of machines is one call: leading axes of parameters, readings and poses br
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,14 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.angles import AngleLayout, angle_layout, angle_rows
-from pkmcal.mechanisms.carriers.contract import CarriedPoint, base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.contract import (
+    CarriedPoint,
+    ParameterKind,
+    base_carriers,
+    of_part,
+    platform_carriers,
+)
+from pkmcal.mechanisms.motors import middles, motor_columns
 from pkmcal.mechanisms.rods import ActuatedLength, PassiveLength
 from pkmcal.mechanisms.schema import MechanismDocument
 
@@ -23,12 +31,22 @@ from pkmcal.mechanisms.schema import MechanismDocument
 class CarrierGroup:
     """The legs that one carrier kind serves.
 
-    legs : (g,) leg numbers from 0. index : (g, n) their parameters' positions.
+    legs : (g,) leg numbers from 0. index : (g, n) their parameters' positions, P where the file is
+    silent; there ``constants`` (g, n) has the value.
     """
 
     carrier: Any
     legs: Integers
     index: Integers
+    constants: Array
+    silent: Booleans
+
+    def of(self, theta: Array) -> Array:
+        """The group's parameters (..., g, n) out of all, (..., P)."""
+        if not self.silent.any():
+            return theta[..., self.index]
+        known = theta[..., np.where(self.silent, 0, self.index)]
+        return np.where(self.silent, self.constants, known)
 
 
 @dataclass(frozen=True)
@@ -38,7 +56,8 @@ class LimbLayout:
     base, platform : groups of legs by carrier.
     rod : (L,) position of each rod's offset or constant length, -1 for a passive rod.
     closing : (L,) legs whose length is an equation; all but the passive ones.
-    actuated : (L,) the reading's column, -1 for a leg without.
+    actuated : (L,) the reading's column, -1 for a leg without; middle : (L,) its mid-range.
+    internal : (L,) the column of the platform carrier's internal coordinate, -1 without.
     rod_reads : (L,) whether the reading is the rod's own length (and not the carrier's motion).
     base_axis, platform_axis : (L, 3) positions of the axes' parameters, -1 where none is one.
     angles : the axes' equations. turning : positions (n, 3) of all directions among the
@@ -53,6 +72,8 @@ class LimbLayout:
     rod: Integers
     closing: Booleans
     actuated: Integers
+    middle: Array
+    internal: Integers
     rod_reads: Booleans
     base_axis: Integers
     platform_axis: Integers
@@ -72,6 +93,43 @@ class LimbLayout:
         """Rows of the closure that belong to legs with a reading, in the legs' order."""
         return np.flatnonzero(self.actuated[self.closing] >= 0)
 
+    @cached_property
+    def n_readings(self) -> int:
+        """Readings of a configuration, m."""
+        return int(self.actuated.max(initial=-1)) + 1
+
+    @cached_property
+    def n_internal(self) -> int:
+        """Internal coordinates of a pose."""
+        return int(self.internal.max(initial=-1)) + 1
+
+    @cached_property
+    def row_motor(self) -> Integers:
+        """The reading's column that enters each row of the closure, (E,), -1 where none."""
+        angles = np.full(len(self.angles), -1)
+        return np.concatenate([self.actuated[self.closing], angles])
+
+    @cached_property
+    def shares_motors(self) -> bool:
+        """Whether a reading enters several rows."""
+        return self.driven_rows.size > self.n_readings
+
+    @cached_property
+    def own_motion(self) -> Array:
+        """(6 + n, d + n): the pose's directions, then its internal coordinates."""
+        n, d = self.n_internal, self.motion.shape[1]
+        out = np.eye(6 + n, d + n)
+        out[:6, :d], out[6:, d:] = self.motion, np.eye(n)
+        out[:6, d:], out[6:, :d] = 0.0, 0.0
+        return out
+
+    def by_own(self, rows: Closure) -> Array:
+        """Rows (..., E, d + n) by the pose's own freedoms, internal coordinates last."""
+        by_pose = rows.by_pose @ self.motion
+        if not self.n_internal:
+            return by_pose
+        return np.concatenate([by_pose, rows.by_internal], axis=-1)
+
 
 @dataclass(frozen=True)
 class LimbEnds:
@@ -81,6 +139,7 @@ class LimbEnds:
     a_index, b_index : (L, n) parameters that each end depends on, P where there are fewer.
     a_by, b_by : (..., L, 3, n) derivatives by those parameters.
     a_by_reading : (..., L, 3); b_by_pose : (..., L, 3, 6). n_parameters : P.
+    b_by_internal : (..., L, 3, n) by the pose's internal coordinates.
     """
 
     a: Array
@@ -92,6 +151,7 @@ class LimbEnds:
     a_by_reading: Array
     b_by_pose: Array
     n_parameters: int
+    b_by_internal: Array
 
 
 @dataclass(frozen=True)
@@ -99,7 +159,8 @@ class Closure:
     """The closure's rows, (..., E): lengths of the legs that close, then the axes' equations.
 
     value : m. u : (..., L, 3) unit directions from A to B of all legs. distance : (..., L) m.
-    by_pose : (..., E, 6). by_reading : (..., E) by the leg's own reading, zero where it has none.
+    by_pose : (..., E, 6). by_internal : (..., E, n), n = 0 for a rigid platform.
+    by_reading : (..., E) by the leg's own reading, zero where it has none.
     index, by_theta : (E, n) parameters that each row depends on, P where there is none, and the
     derivatives (..., E, n) by them.
     """
@@ -108,6 +169,7 @@ class Closure:
     u: Array
     distance: Array
     by_pose: Array
+    by_internal: Array
     by_reading: Array
     index: Integers
     by_theta: Array
@@ -118,6 +180,7 @@ MOTIONS: dict[str, Array] = {
     "spatial": np.eye(6),
     "planar": np.eye(6)[:, [2, 3, 4]],
     "translation": np.eye(6)[:, 3:],
+    "schoenflies": np.eye(6)[:, 2:],
 }
 """Columns: the directions (omega, tau) in which the platform can move, base frame."""
 
@@ -127,7 +190,6 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
     legs = document.legs
     carriers = base_carriers()
     reads = np.array([isinstance(leg.length, ActuatedLength) for leg in legs])
-    driven = reads | np.array([carriers[leg.base.joint].driven for leg in legs])
     closing = np.array([not isinstance(leg.length, PassiveLength) for leg in legs])
     base_axis, platform_axis = (_axis_index(document, s, positions) for s in ("base", "platform"))
     return LimbLayout(
@@ -136,7 +198,9 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         platform=_groups(document, "platform", platform_carriers(), positions),
         rod=np.array([_rod_index(j, leg.length, positions) for j, leg in enumerate(legs)]),
         closing=closing,
-        actuated=np.where(driven, np.cumsum(driven) - 1, -1),
+        actuated=motor_columns(document),
+        middle=middles(document),
+        internal=_internal(document),
         rod_reads=reads,
         base_axis=base_axis,
         platform_axis=platform_axis,
@@ -176,33 +240,49 @@ def _rod_index(leg: int, length: Any, positions: dict[str, int]) -> int:
 def _groups(
     document: MechanismDocument, side: str, carriers: dict[str, Any], positions: dict[str, int]
 ) -> tuple[CarrierGroup, ...]:
-    kinds = [carriers[getattr(leg, side).joint] for leg in document.legs]
+    nodes = [getattr(leg, side) for leg in document.legs]
+    kinds = [carriers[node.joint] for node in nodes]
     groups: list[CarrierGroup] = []
     for kind in dict.fromkeys(kinds):
         legs = np.flatnonzero([k is kind for k in kinds])
-        index = [
-            [positions[f"legs[{j + 1}].{side}.{p.path}"] for p in kind.parameters] for j in legs
-        ]
-        groups.append(CarrierGroup(kind, legs, np.array(index, dtype=int)))
+        names = [[f"legs[{j + 1}].{side}.{p.path}" for p in kind.parameters] for j in legs]
+        index = np.array([[positions.get(n, len(positions)) for n in row] for row in names])
+        constants = np.array([[_constant(nodes[j], p) for p in kind.parameters] for j in legs])
+        groups.append(CarrierGroup(kind, legs, index, constants, index == len(positions)))
     return tuple(groups)
 
 
-def limb_ends(layout: LimbLayout, theta: Array, readings: Array, poses: Array) -> LimbEnds:
+def _constant(node: Any, kind: ParameterKind) -> float:
+    value = of_part(node, kind)
+    return kind.otherwise if value is None else value
+
+
+def _internal(document: MechanismDocument) -> Integers:
+    """The column of each leg's internal coordinate, by its bar; -1 without."""
+    carriers = platform_carriers()
+    nodes = [leg.platform for leg in document.legs]
+    bars = [node.bar if carriers[node.joint].turns else None for node in nodes]
+    known = sorted({bar for bar in bars if bar is not None})
+    return np.array([-1 if bar is None else known.index(bar) for bar in bars], dtype=int)
+
+
+def limb_ends(
+    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array | None = None
+) -> LimbEnds:
     """Both ends of every limb.
 
     theta : (..., P). readings : (..., m). poses : T_base_platform (..., 4, 4).
+    internal : (..., n) the poses' internal coordinates; zero where they are not given.
     """
     q = leg_readings(layout, readings)
     a, a_index = _gather(
-        layout,
-        layout.base,
-        [g.carrier.point(theta[..., g.index], q[..., g.legs]) for g in layout.base],
+        layout, layout.base, [g.carrier.point(g.of(theta), q[..., g.legs]) for g in layout.base]
     )
-    b, b_index = _gather(
-        layout,
-        layout.platform,
-        [g.carrier.point(theta[..., g.index], poses[..., None, :, :]) for g in layout.platform],
-    )
+    points: list[CarriedPoint] = []
+    for g in layout.platform:
+        phi = internal[..., layout.internal[g.legs]] if _turned(g, internal) else None
+        points.append(g.carrier.point(g.of(theta), poses[..., None, :, :], phi))
+    b, b_index = _gather(layout, layout.platform, points)
     return LimbEnds(
         a.value,
         b.value,
@@ -213,7 +293,26 @@ def limb_ends(layout: LimbLayout, theta: Array, readings: Array, poses: Array) -
         a.by_motion,
         b.by_motion,
         layout.n_parameters,
+        _by_internal(layout, theta, poses, internal, b.value.shape),
     )
+
+
+def _turned(group: CarrierGroup, internal: Array | None) -> bool:
+    return internal is not None and group.carrier.turns
+
+
+def _by_internal(
+    layout: LimbLayout, theta: Array, poses: Array, internal: Array | None, shape: tuple[int, ...]
+) -> Array:
+    """Derivatives (..., L, 3, n) of the platform's ends by the internal coordinates."""
+    out = np.zeros((*shape, layout.n_internal))
+    for g in layout.platform if layout.n_internal else ():
+        if g.carrier.turns:
+            column = layout.internal[g.legs]
+            phi = internal[..., column] if internal is not None else None
+            by = g.carrier.by_internal(g.of(theta), poses[..., None, :, :], phi)
+            out[..., g.legs, :, column] = np.moveaxis(by, -2, 0)
+    return out
 
 
 def leg_readings(layout: LimbLayout, readings: Array) -> Array:
@@ -252,12 +351,15 @@ def _gather(
     return CarriedPoint(value, by_motion, by_parameters), index
 
 
-def closure(layout: LimbLayout, theta: Array, readings: Array, poses: Array) -> Closure:
-    """The closure's residuals and their exact derivatives; [B] eq. 4, [A] eq. 7 and 13.
+def closure(
+    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array | None = None
+) -> Closure:
+    """The closure's residuals and their exact derivatives; [B] eq. 4, [A] eq. 7 and 13, [C] eq. 4.
 
     theta : (..., P). readings : (..., m). poses : T_base_platform (..., 4, 4).
+    internal : (..., n) the poses' internal coordinates; zero where they are not given.
     """
-    ends = limb_ends(layout, theta, readings, poses)
+    ends = limb_ends(layout, theta, readings, poses, internal)
     d = ends.b - ends.a
     distance = np.sqrt(dot(d, d))
     u = d / distance[..., None]
@@ -282,6 +384,7 @@ def _length_rows(
         u=u,
         distance=distance,
         by_pose=along(u, ends.b_by_pose),
+        by_internal=along(u, ends.b_by_internal),
         by_reading=-dot(u, ends.a_by_reading) - layout.rod_reads,
         index=np.concatenate([ends.a_index, ends.b_index, rod], axis=1),
         by_theta=np.concatenate(by_theta, axis=-1),
@@ -294,6 +397,7 @@ def _length_rows(
         rows,
         value=rows.value[..., keep],
         by_pose=rows.by_pose[..., keep, :],
+        by_internal=rows.by_internal[..., keep, :],
         by_reading=rows.by_reading[..., keep],
         index=rows.index[keep],
         by_theta=rows.by_theta[..., keep, :],
@@ -334,6 +438,7 @@ def _angle_closure(
         lengths,
         value=rows.value,
         by_pose=by_pose,
+        by_internal=along(w, ends.b_by_internal[..., leg, :, :]),
         by_reading=-dot(w, ends.a_by_reading[..., leg, :]),
         index=np.concatenate(index, axis=1),
         by_theta=np.concatenate(by_theta, axis=-1),
@@ -354,6 +459,7 @@ def _joined(lengths: Closure, angles: Closure) -> Closure:
         lengths,
         value=_stacked(lengths.value[..., None], angles.value[..., None])[..., 0],
         by_pose=_stacked(lengths.by_pose, angles.by_pose),
+        by_internal=_stacked(lengths.by_internal, angles.by_internal),
         by_reading=_stacked(lengths.by_reading[..., None], angles.by_reading[..., None])[..., 0],
         index=np.concatenate(index),
         by_theta=_stacked(*by_theta),

@@ -12,13 +12,20 @@ from pkmcal.arrays import Array
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import kinematics
-from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.contract import (
+    ParameterKind,
+    base_carriers,
+    of_part,
+    platform_carriers,
+)
 from pkmcal.mechanisms.drawing_checks import check_drawing
 from pkmcal.mechanisms.joints import AXIS, axes_in_use
-from pkmcal.mechanisms.limbs import LimbLayout, layout_of
+from pkmcal.mechanisms.limbs import LimbLayout, layout_of, limb_ends
+from pkmcal.mechanisms.motors import motor_ranges
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.mechanisms.rods import CONSTANT, OFFSET, ActuatedLength, PassiveLength
 from pkmcal.mechanisms.schema import MechanismDocument
+from pkmcal.mechanisms.ties import built_in_fixed, built_in_ties
 
 
 @dataclass(frozen=True)
@@ -47,34 +54,33 @@ class Machine:
 
     @property
     def n_joints(self) -> int:
-        """Number of readings in a configuration: one an actuated limb."""
-        return int(np.sum(self.layout.actuated >= 0))
+        """Number of readings in a configuration: one a motor, be it a rod's, a crank's or a
+        slider's.
+        """
+        return self.layout.n_readings
 
     @property
     def joint_ranges(self) -> Array:
-        """Smallest and largest reading by the file, (m, 2) m; NaN where the file is silent.
+        """Smallest and largest reading by the file, (m, 2) m or rad; NaN where it is silent.
 
-        ``range`` bounds the leg's length, so the drawing's offset is taken off.
+        A rod's ``range`` bounds its length, so the drawing's offset is taken off.
         """
-        lengths = [leg.length for leg in self.document.legs]
-        return np.array(
-            [
-                np.subtract(length.range or (np.nan, np.nan), length.offset)
-                for length in lengths
-                if isinstance(length, ActuatedLength)
-            ]
-        ).reshape(-1, 2)
+        return motor_ranges(self.document)
 
     def with_values(self, values: Array) -> Machine:
         """The same machine with other parameter values (P,)."""
         return replace(self, values=np.array(values, dtype=float))
 
     def base_centers(self) -> Array:
-        """Joint centres on the base, (L, 3) m, base frame; zero readings for moving carriers."""
+        """Limbs' ends on the base side, (L, 3) m, base frame: joint centres, or, where a crank
+        or slider moves them, where they are at mid-range.
+        """
         return self._ends()[0]
 
     def platform_centers(self) -> Array:
-        """Joint centres on the platform, (L, 3) m, platform frame."""
+        """Joint centres on the platform, (L, 3) m, platform frame; of an articulated one, with
+        both frames parallel and no hinge turned.
+        """
         return self._ends()[1]
 
     def base_axes(self) -> Array:
@@ -115,7 +121,11 @@ class Machine:
         return found.T_base_platform[good[0]]
 
     def inverse(self, T_base_platform: Array) -> Array:
-        """Readings (n, m) at platform poses (n, 4, 4)."""
+        """Readings (n, m) at platform poses (n, 4, 4), m or rad.
+
+        Of a crank's or slider's two solutions the one nearest to mid-range; NaN where a limb cannot
+        reach. An articulated platform's hinges turn as they must.
+        """
         poses = _checked(T_base_platform, (4, 4), "T_base_platform")
         return kinematics.inverse(self.layout, self.values, poses)
 
@@ -148,9 +158,15 @@ class Machine:
         readings = _checked(joints, (self.n_joints,), "joints")
         return kinematics.assembly_modes(self.layout, self.values, readings, rng)
 
+    def middle_readings(self) -> Array:
+        """Readings (m,) at mid-range, zero where the file gives no range."""
+        return np.nan_to_num(self.joint_ranges.mean(axis=1))
+
     def to_document(self) -> dict[str, Any]:
         """The mechanism file's fields with the present values."""
         out = self.document.model_dump(by_alias=True, exclude_none=True, mode="json")
+        if not self.document.models:
+            del out["models"]
         values = self.parameters.unit_axes(self.values)
         for name, value in zip(self.parameters.names, values, strict=True):
             _assign(out, name, float(value))
@@ -161,9 +177,7 @@ class Machine:
         return axes.reshape(-1, 3)
 
     def _ends(self) -> tuple[Array, Array]:
-        from pkmcal.mechanisms.limbs import limb_ends
-
-        ends = limb_ends(self.layout, self.values, np.zeros(self.n_joints), np.eye(4))
+        ends = limb_ends(self.layout, self.values, self.middle_readings(), np.eye(4))
         return np.array(ends.a), np.array(ends.b)
 
 
@@ -178,23 +192,16 @@ def machine_from_document(
     check_drawing(document, where)
     rows = list(_parameter_rows(document))
     names = [row[0] for row in rows]
+    ties = (*document.tied, *built_in_ties(document))
     table = ParameterTable(
         names=tuple(names),
         units=tuple(row[1] for row in rows),
         kinds=tuple(row[2] for row in rows),
         drawing=np.array([row[3] for row in rows]),
         tolerance=np.array([getattr(document.tolerance, row[2]) for row in rows]),
-    ).with_roles(document.fixed, (*document.tied, *_heights(document)))
+    ).with_roles((*document.fixed, *built_in_fixed(document)), ties)
     positions = {name: k for k, name in enumerate(names)}
     return Machine(document, table, layout_of(document, positions), table.drawing.copy())
-
-
-def _heights(document: MechanismDocument) -> tuple[tuple[str, str], ...]:
-    """Ties of a planar machine: a leg stays in its plane, so both ends have one height."""
-    if document.motion != "planar":
-        return ()
-    legs = range(1, len(document.legs) + 1)
-    return tuple((f"legs[{j}].base.center.z", f"legs[{j}].platform.center.z") for j in legs)
 
 
 def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator of plain rows
@@ -205,20 +212,20 @@ def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator 
         for side, carriers in (("base", base_carriers()), ("platform", platform_carriers())):
             node = getattr(leg, side)
             kinds = carriers[node.joint].parameters + (AXIS if (j, side) in axes else ())
-            for kind in kinds:
-                yield f"{path}.{side}.{kind.path}", *kind[1:], _value(node, kind.path)
+            yield from _rows_of(f"{path}.{side}", node, kinds)
         if not isinstance(leg.length, PassiveLength):
             kind = OFFSET if isinstance(leg.length, ActuatedLength) else CONSTANT
-            yield f"{path}.length.{kind.path}", *kind[1:], _value(leg.length, kind.path)
+            yield from _rows_of(f"{path}.length", leg.length, (kind,))
         for t, tube in enumerate(leg.tubes, start=1):
             yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius
 
 
-def _value(node: Any, path: str) -> float:
-    """A field's value; ``center.y`` is the second number of ``center``."""
-    field, _, axis = path.partition(".")
-    value = getattr(node, field)
-    return float(value["xyz".index(axis)] if axis else value)
+def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]):  # noqa: ANN202 - as above
+    """Rows of one part: what its file gives, and not what is a constant."""
+    for kind in kinds:
+        value = of_part(node, kind)
+        if kind.tolerance and value is not None:
+            yield f"{path}.{kind.path}", kind.unit, kind.tolerance, value
 
 
 def _assign(document: dict[str, Any], name: str, value: float) -> None:

@@ -6,12 +6,14 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 from pydantic import AfterValidator, Field
+from pydantic_core import PydanticKnownError
 
 from pkmcal.files import Schema
 from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.parameters import EVERY
 from pkmcal.mechanisms.rods import ActuatedLength, Rod
 
-Motion = Literal["spatial", "planar", "translation"]
+Motion = Literal["spatial", "planar", "translation", "schoenflies"]
 
 
 def _one_of(schemas: Iterable[type[Schema]], key: str) -> Any:
@@ -53,12 +55,14 @@ class Leg(Schema):
 
 
 class Tolerance(Schema):
-    """Standard deviations of the drawing's values, metres; of axes, radians."""
+    """Standard deviations of the drawing's values, metres; of axes and angles, radians."""
 
     center: Annotated[float, Field(gt=0)] = 0.002
     offset: Annotated[float, Field(gt=0)] = 0.002
     radius: Annotated[float, Field(gt=0)] = 0.0001
     axis: Annotated[float, Field(gt=0, lt=1)] = 0.005
+    arm: Annotated[float, Field(gt=0)] = 0.001
+    angle: Annotated[float, Field(gt=0, lt=1)] = 0.02
 
 
 class Home(Schema):
@@ -71,9 +75,34 @@ class Home(Schema):
 def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
     if len(legs) < 2:
         raise ValueError("a parallel machine has at least two legs")
-    if not any(isinstance(leg.length, ActuatedLength) for leg in legs):
+    carriers = base_carriers()
+    if not any(isinstance(x.length, ActuatedLength) or carriers[x.base.joint].driven for x in legs):
         raise ValueError("a machine has at least one leg with actuated: true")
     return legs
+
+
+def _several(group: tuple[str, ...]) -> tuple[str, ...]:
+    """A tie has two members at least; one that stands for all legs counts as several."""
+    if len(group) < 2 and not any(EVERY in entry for entry in group):
+        counts = {"field_type": "Tuple", "min_length": 2, "actual_length": len(group)}
+        raise PydanticKnownError("too_short", counts)
+    return group
+
+
+Ties = tuple[Annotated[tuple[str, ...], AfterValidator(_several)], ...]
+
+
+class Model(Schema):
+    """What a machine's model holds and ties, or the other file that describes it."""
+
+    fixed: tuple[str, ...] = ()
+    tied: Ties = ()
+    mechanism: str | None = None
+
+    def model_post_init(self, _context: Any) -> None:
+        """Another file has roles of its own."""
+        if self.mechanism is not None and (self.fixed or self.tied):
+            raise ValueError("a model with 'mechanism' takes 'fixed' and 'tied' from that file")
 
 
 class MechanismDocument(Schema):
@@ -85,4 +114,5 @@ class MechanismDocument(Schema):
     tolerance: Tolerance = Tolerance()
     home: Home | None = None
     fixed: tuple[str, ...] = ()
-    tied: tuple[Annotated[tuple[str, ...], Field(min_length=2)], ...] = ()
+    tied: Ties = ()
+    models: dict[str, Model] = Field(default_factory=dict)

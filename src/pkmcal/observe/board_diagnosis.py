@@ -27,6 +27,13 @@ LOOKED_AT = 3
 NEIGHBOURS = 2
 """Counts each way by which a description of a chessboard is tried wrong."""
 MOST_SQUARES = 16
+WIDEST = 512
+"""px; photographs are reduced to this width to try many counts of a chessboard on them: each try
+takes a quarter of a second there, a second and more at full size."""
+FAMILY = 1000
+"""Markers in the largest dictionary of a family, whose first ones are the smaller dictionaries."""
+NO_SIZE = 9999
+"""Of a dictionary that is alone."""
 
 
 def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board) -> None:
@@ -85,8 +92,8 @@ def other_board(image: Integers, board: Board, part: bool) -> str | None:
     part : whether a part of a described chessboard is another one, or badly seen.
     """
     if board.type == "chessboard":
-        found = _other_chessboard(image, board.counts, part)
-        return found or _other_markers(image, "")
+        # Markers first: they are looked for once, chessboards for every count.
+        return _other_markers(image, "") or _other_chessboard(image, board.counts, part)
     name = board.document["dictionary"]
     if board.type == "charuco":
         best = _other_charuco(image, board)
@@ -125,6 +132,7 @@ def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> s
     else:
         span = range(-NEIGHBOURS, NEIGHBOURS + 1)
         candidates = [(counts[0] + a, counts[1] + b) for a, b in product(span, span)]
+    image = _reduced(image)
     # The largest first: a smaller grid is found inside a larger one.
     for candidate in sorted(candidates, key=lambda c: -c[0] * c[1]):
         if min(candidate) < 3 or candidate in (counts, counts[::-1]):
@@ -134,6 +142,17 @@ def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> s
         if _all_corners(image, candidate):
             return _chess(candidate)
     return None
+
+
+def _reduced(image: Integers) -> Integers:
+    """The photograph, not wider than WIDEST."""
+    import cv2
+
+    scale = WIDEST / image.shape[1]
+    if scale >= 1:
+        return image
+    small: Any = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return small
 
 
 def _all_corners(image: Integers, counts: tuple[int, int]) -> bool:
@@ -188,16 +207,24 @@ def _found(
 
 def _other_markers(image: Integers, mine: str) -> str | None:
     """The dictionary whose markers the photograph shows; the smallest that has them all."""
-    counts = {name: len(detect_markers(image, name)[0]) for name in dictionaries()}
-    best = max(counts.values(), default=0)
-    if best < 4 or counts.get(mine, 0) > 0.7 * best:
+    # DICT_4X4_50 is the first 50 markers of DICT_4X4_1000: one search finds either's.
+    wanted = [n for n in dictionaries() if _size_of(n) in (FAMILY, NO_SIZE) or n == mine]
+    # some names differ by a capital only
+    names = list({name.lower(): name for name in wanted}.values())
+    ids = {name: detect_markers(image, name)[0] for name in names}
+    best = max(names, key=lambda name: len(ids[name]))
+    count = len(ids[best])
+    if count < 4 or (mine in ids and len(ids[mine]) > 0.7 * count):
         return None
-    names = [name for name in counts if counts[name] >= 0.9 * best]
-    names.sort(key=lambda name: (_size_of(name), name))
-    return f"{best} markers of {names[0]}"
+    if _size_of(best) == NO_SIZE:
+        return f"{count} markers of {best}"
+    family = best.rpartition("_")[0]
+    sizes = [_size_of(n) for n in dictionaries() if n.rpartition("_")[0] == family]
+    size = min(size for size in sizes if size > np.quantile(ids[best], 0.9))
+    return f"{count} markers of {family}_{size}"
 
 
 def _size_of(name: str) -> int:
     """Markers in a dictionary by its name, DICT_5X5_100; those without a number come last."""
     last = name.rpartition("_")[2]
-    return int(last) if last.isdigit() else 9999
+    return int(last) if last.isdigit() else NO_SIZE

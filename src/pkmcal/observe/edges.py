@@ -46,6 +46,13 @@ class EdgeSet:
         if len(self.by_intrinsics) != len(self.station):
             object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 2, 0)))
 
+    @classmethod
+    def empty(cls) -> EdgeSet:
+        """No edge, for sessions of boards alone."""
+        none = np.zeros(0, dtype=int)
+        shapes = ((3,), (3, 2), (2, 2), (2,), (2,))
+        return cls(none, none, none, none, none, *(np.zeros((0, *shape)) for shape in shapes))
+
     def __len__(self) -> int:
         return len(self.station)
 

@@ -79,18 +79,31 @@ class BoardViews:
 
 
 def detect_in(
-    images: Sequence[Integers], board: Board, names: Sequence[str], thorough: bool
+    images: Sequence[Integers], board: Board, names: Sequence[str]
 ) -> tuple[Detection, ...]:
-    """The board's corners in photographs; thorough : where not found, by every way there is."""
+    """The board's corners in photographs, by the first way of finding it."""
     with ThreadPoolExecutor(THREADS) as pool:
-        found = list(pool.map(lambda i, n: detect_board(i, board, n, quick=True), images, names))
-        # Only a chessboard has a second way, which takes seconds.
-        if board.type == "chessboard" and (thorough or not any(d.found for d in found)):
-            missed = [k for k, detection in enumerate(found) if not detection.found]
-            again = pool.map(lambda k: detect_board(images[k], board, found[k].name), missed)
-            for k, detection in zip(missed, again, strict=True):
-                found[k] = detection
-    return tuple(found)
+        return tuple(pool.map(lambda i, n: detect_board(i, board, n, quick=True), images, names))
+
+
+def detect_again(
+    images: Sequence[Integers], board: Board, found: Sequence[Detection], most: int
+) -> tuple[Detection, ...]:
+    """Where the board was not found, every way is tried, on `most` photographs spread over these.
+
+    Only a chessboard has more than one way, and it takes seconds.
+    """
+    missed = [k for k, detection in enumerate(found) if not detection.found]
+    if board.type != "chessboard" or not missed or most < 1:
+        return tuple(found)
+    places = np.unique(np.linspace(0, len(missed) - 1, min(most, len(missed))).astype(int))
+    chosen = [missed[k] for k in places]
+    out = list(found)
+    with ThreadPoolExecutor(THREADS) as pool:
+        again = pool.map(lambda k: detect_board(images[k], board, found[k].name), chosen)
+        for k, detection in zip(chosen, again, strict=True):
+            out[k] = detection
+    return tuple(out)
 
 
 def board_views(

@@ -19,12 +19,14 @@ def _silent(_text: str, _share: float) -> None:
 @dataclass(frozen=True)
 class Options:
     """What a person may choose. runs : of the Monte-Carlo simulation. long : also what takes
-    minutes. told : called with the step in words and the share done.
+    minutes. photographs : also what is measured on rendered photographs. told : called with
+    the step in words and the share done.
     """
 
     runs: int = 100
     seed: int = 0
     long: bool = False
+    photographs: bool = False
     told: Callable[[str, float], None] = _silent
 
 

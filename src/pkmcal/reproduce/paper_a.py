@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.report.headline import Headline
 from pkmcal.report.reproduction import Reproduction
 from pkmcal.report.wording import brief, joined, number
@@ -49,6 +50,9 @@ from pkmcal.reproduce.paper_a_tables import (
     poses_part,
 )
 
+if TYPE_CHECKING:
+    from pkmcal.reproduce.paper_a_photographs import MeasuredNoise
+
 CITED = (
     "P. Renaud, N. Andreff, G. Gogu, P. Martinet: On vision-based kinematic calibration of n-leg"
     " parallel mechanisms, IFAC, 2002; sections 4.2 and 4.3."
@@ -62,18 +66,24 @@ QUANTITIES = {**dict(zip(GROUPS, GROUP_NAMES, strict=True)), "displacement": "di
 
 def reproduce(options: Options) -> Reproduction:
     """The whole reproduction."""
-    share = 0.2 if options.long else 0.5
-    found = study(options.runs, seed=options.seed, told=_within(options, 0.0, share))
+    measured, done = None, 0.0
+    if options.photographs:
+        from pkmcal.reproduce.paper_a_photographs import measured_noise
+
+        done = 0.6
+        measured = measured_noise(options.seed, _within(options, 0.0, done))
+    share = (1 - done) * (0.1 if options.long else 0.5)
+    found = study(options.runs, seed=options.seed, told=_within(options, done, done + share))
     narrow = study(
         options.runs,
         Settings(drawing_error=NARROW),
         options.seed,
-        told=_within(options, share, 2 * share),
+        told=_within(options, done + share, done + 2 * share),
     )
-    by_number = _by_number(options, found, 2 * share) if options.long else {}
+    by_number = _by_number(options, found, done + 2 * share) if options.long else {}
     figures = compared(found)
     parts = [
-        noise_part(),
+        noise_part(measured),
         figure_part(found),
         effector_part(found, narrow),
         group_part(found),
@@ -89,7 +99,7 @@ def reproduce(options: Options) -> Reproduction:
         checks=checks(found, figures),
         remarks=_remarks(found, narrow, figures),
         parts=tuple(parts),
-        numbers=_numbers(found, narrow, figures, by_number, options),
+        numbers={**_numbers(found, narrow, figures, by_number, options), **_noise(measured)},
     )
 
 
@@ -221,7 +231,6 @@ def _numbers(
         "converged": s.converged,
         "chi2_per_dof": float(s.chi2_per_dof.mean()),
         "seconds": {"wall": s.wall, "cpu": s.cpu, "threads": s.threads},
-        "table_1": dict(zip(("psi", "theta", "x", "z"), TABLE_1.sigma().tolist(), strict=True)),
         "paper": {
             "mean_error": MEAN_ERRORS,
             "before": dict(zip(("displacement", "orientation"), BEFORE, strict=True)),
@@ -236,6 +245,22 @@ def _numbers(
         ],
         "by_poses": {n: _method_numbers(other, JOINT) for n, other in by_number.items()},
     }
+
+
+def _noise(measured: MeasuredNoise | None) -> dict[str, Any]:
+    """[A] Table 1 of one image and, where it was measured, ours."""
+
+    def told(noise: AxisNoise) -> dict[str, float]:
+        return dict(zip(("psi", "theta", "x", "z"), noise.sigma().tolist(), strict=True))
+
+    out: dict[str, Any] = {"table_1": told(TABLE_1)}
+    if measured is not None:
+        out["table_1_measured"] = {
+            "median": told(measured.middle),
+            "worst": told(measured.bound),
+            "edge_px": measured.edge,
+        }
+    return out
 
 
 def _method_numbers(s: Study, method: str) -> dict[str, Any]:

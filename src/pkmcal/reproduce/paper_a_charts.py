@@ -21,7 +21,12 @@ LABELS = {
 COLOURS = {PRINTED: "--quiet", CORRECTED: "--drawing", JOINT: "--calibrated", BOUND: "--ink"}
 RANGE = (0.005, 5.0)
 """mm that the logarithmic axis of errors holds."""
-FONT = {"color": "--ink", "family": "system-ui, sans-serif", "size": 12}
+LOOKS = {
+    "paper_bgcolor": "--card",
+    "plot_bgcolor": "rgba(0,0,0,0)",
+    "font": {"color": "--ink", "family": "system-ui, sans-serif", "size": 12},
+    "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
+}
 AXIS = {"color": "--muted", "gridcolor": "--rule", "zerolinecolor": "--rule", "linecolor": "--rule"}
 TICKS = [0.01, 0.03, 0.1, 0.3, 1, 3]
 
@@ -41,12 +46,21 @@ def figure_4(
         }
         for method, colour in COLOURS.items()
     ]
-    before = {
+    return {
+        "data": [*bars, _before(names, mean_error[DRAWING]), _true_values(names, values)],
+        "layout": _figure_4_layout(),
+        "config": {},
+    }
+
+
+def _before(names: tuple[str, ...], errors: Array) -> dict[str, Any]:
+    """The drawing's errors, a dash across each parameter's bars."""
+    return {
         "type": "scatter",
         "mode": "markers",
         "name": LABELS[DRAWING],
         "x": list(names),
-        "y": _mm(mean_error[DRAWING]),
+        "y": _mm(errors),
         "marker": {
             "symbol": "line-ew-open",
             "size": 22,
@@ -55,7 +69,10 @@ def figure_4(
         },
         "hovertemplate": "%{x}: %{y:.3f} mm",
     }
-    line = {
+
+
+def _true_values(names: tuple[str, ...], values: Array) -> dict[str, Any]:
+    return {
         "type": "scatter",
         "mode": "lines+markers",
         "name": "true value",
@@ -66,7 +83,6 @@ def figure_4(
         "marker": {"size": 5, "color": "--leg3"},
         "hovertemplate": "%{x}: %{y:.1f} mm",
     }
-    return {"data": [*bars, before, line], "layout": _figure_4_layout(), "config": {}}
 
 
 def _bar_style(method: str, colour: str) -> dict[str, Any]:
@@ -80,8 +96,8 @@ def _mm(values: Array) -> list[float]:
     return np.round(1e3 * values, 4).tolist()
 
 
-def _figure_4_layout() -> dict[str, Any]:
-    low, high = (float(np.log10(v)) for v in RANGE)
+def _papers_band() -> tuple[dict[str, Any], dict[str, Any]]:
+    """The range of errors that the paper reports: a shape and its label."""
     band = {
         "type": "rect",
         "xref": "paper",
@@ -103,6 +119,12 @@ def _figure_4_layout() -> dict[str, Any]:
         "showarrow": False,
         "font": {"size": 11, "color": "--muted"},
     }
+    return band, said
+
+
+def _figure_4_layout() -> dict[str, Any]:
+    low, high = (float(np.log10(v)) for v in RANGE)
+    band, said = _papers_band()
     error_axis = {
         **AXIS,
         "type": "log",
@@ -113,14 +135,11 @@ def _figure_4_layout() -> dict[str, Any]:
     }
     value_axis = {**AXIS, "domain": [0.76, 1.0], "title": {"text": "true value, mm"}}
     return {
-        "paper_bgcolor": "--card",
-        "plot_bgcolor": "rgba(0,0,0,0)",
-        "font": FONT,
+        **LOOKS,
         "margin": {"l": 64, "r": 8, "t": 34, "b": 46},
         "barmode": "group",
         "bargap": 0.22,
         "bargroupgap": 0,
-        "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
         "legend": {
             "orientation": "h",
             "y": 1.0,
@@ -161,32 +180,19 @@ def by_poses(
         "line": {"color": "--calibrated"},
         "marker": {"color": "--calibrated", "size": 8},
     }
+    falling = [bound[last] * (last / n) ** 0.5 for n in poses]
+    limit = [bound[n] for n in poses]
     others = [
-        _series("Cramér-Rao bound", poses, [bound[n] for n in poses], "--ink", "lines", "dot"),
-        _series(
-            "as N to the power of −½",
-            poses,
-            [bound[last] * (last / n) ** 0.5 for n in poses],
-            "--quiet",
-            "lines",
-            "dash",
-        ),
-        _series(
-            "independent prototype",
-            list(prototype),
-            list(prototype.values()),
-            "--drawing",
-            "markers",
-        ),
-    ]
+        _series("Cramér-Rao bound", poses, limit, "--ink", "lines", "dot"),
+        _series("as N to the power of −½", poses, falling, "--quiet", "lines", "dash"),
+        _series("independent prototype", [*prototype], [*prototype.values()], "--drawing",
+                "markers"),
+    ]  # fmt: skip
     axis = {**AXIS, "type": "log", "fixedrange": True}
     layout = {
-        "paper_bgcolor": "--card",
-        "plot_bgcolor": "rgba(0,0,0,0)",
-        "font": FONT,
+        **LOOKS,
         "margin": {"l": 64, "r": 12, "t": 8, "b": 48},
         "legend": {"x": 1, "xanchor": "right", "y": 1, "bgcolor": "rgba(0,0,0,0)"},
-        "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
         "xaxis": {**axis, "tickvals": poses, "title": {"text": "poses a station, N"}},
         "yaxis": {**axis, "tickvals": TICKS, "title": {"text": "displacement, mm"}},
     }

@@ -155,15 +155,27 @@ def study(
         told("Bound and end-effector", 0.7)
         errors = _mapped(pool, _errors, chunks, truths, solved)
         told("", 1.0)
-    together = {name: _joined([e[name] for e in errors]) for name in METHODS}
-    pairs = {name: accuracy(machine, found) for name, found in together.items()}
+    return _together(machine, settings, solved, errors, wall, threads)
+
+
+def _together(
+    machine: Machine,
+    settings: Settings,
+    solved: list[_Solved],
+    errors: list[dict[str, Errors]],
+    wall: float,
+    threads: int,
+) -> Study:
+    """All chunks as one study."""
+    joined = {name: _joined([e[name] for e in errors]) for name in METHODS}
+    pairs = {name: accuracy(machine, found) for name, found in joined.items()}
     chi2 = np.concatenate([part.chi2 for part in solved])
     return Study(
-        runs=runs,
+        runs=len(chi2),
         settings=settings,
         accuracy={name: pair[0] for name, pair in pairs.items()},
         error={name: pair[1] for name, pair in pairs.items()},
-        mean_error={name: _mean_error(name, found) for name, found in together.items()},
+        mean_error={name: _mean_error(name, found) for name, found in joined.items()},
         chi2_per_dof=chi2,
         freedom=solved[0].freedom,
         steps=np.concatenate([part.steps for part in solved]),

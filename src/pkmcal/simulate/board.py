@@ -18,7 +18,6 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError
 from pkmcal.geometry.rigid import apply, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
 from pkmcal.observe.board_finders import dictionary, marker_bits
 from pkmcal.observe.boards import Board, board_from_document
 from pkmcal.simulate.casting import Part
@@ -32,6 +31,8 @@ BLACK = 0.06
 """Light that printed black sends back, as a share of white's."""
 SQUARES = (6, 5)
 """Of the board made to measure: large squares are read from afar."""
+SIZE = 1.4
+"""Diagonal of that board with its margin, in radii of the base."""
 LOOKED_AT = 6
 """Configurations at which the places for a board are tried."""
 SLANTED = 0.6
@@ -176,12 +177,9 @@ def board_part(board: Board, T_base_board: Array) -> Part:
 
 
 def board_for(machine: Machine) -> Board:
-    """A ChArUco board that lies between the machine's base joints."""
-    discs = discs_of(machine)
-    ends = limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), np.eye(4))
-    clear = np.linalg.norm((np.array(ends.a) - discs.base)[:, :2], axis=1).min()
-    # its white margin reaches almost to the joints
-    square = round(0.85 * 2 * float(clear) / float(np.hypot(SQUARES[0] + 1, SQUARES[1] + 1)), 3)
+    """A ChArUco board in proportion to the machine, its diagonal SIZE radii of the base."""
+    diagonal = SIZE * discs_of(machine).base_radius
+    square = round(diagonal / float(np.hypot(SQUARES[0] + 1, SQUARES[1] + 1)), 3)
     return board_from_fields(
         {
             "type": "charuco",

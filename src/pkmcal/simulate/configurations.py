@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.errors import GeometryError
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import dot, perturb
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.kinematics import singularity
+from pkmcal.mechanisms.kinematics import on_manifold, singularity
 from pkmcal.mechanisms.limbs import closure, limb_ends
 from pkmcal.simulate.stations import joints_at_home
 
@@ -35,7 +35,9 @@ def draw_configurations(
         found = int(np.count_nonzero(keep))
         if found >= count:
             return poses[keep], joints[keep]
-    raise GeometryError(
+        if attempt and not found:  # a thousand in vain: more would only keep the user waiting
+            break
+    raise InputError(
         what=f"mechanism {machine.name!r} has too few usable configurations in its joint ranges",
         found=f"{found} of {tried} tried",
         expected=f"{count}",
@@ -80,13 +82,17 @@ def _candidates(
 
 
 def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:
-    """Poses near home, for machines whose file gives no ranges: 15 degrees, an eighth of size."""
+    """Poses near home, for machines whose file gives no ranges: 15 degrees, an eighth of size.
+
+    Only those that constant rods and joints' axes allow.
+    """
     a, b = joints_at_home(machine)
     size = float(np.linalg.norm(np.concatenate([a, b]) - a.mean(axis=0), axis=1).max())
     scale = np.array([0.26, 0.26, 0.26, *np.full(3, 0.125 * size)])
     motion = machine.layout.motion
     delta = rng.uniform(-1, 1, (n, 6)) * scale @ motion @ motion.T
-    return perturb(machine.home(), delta)
+    found = on_manifold(machine.layout, machine.values, perturb(machine.home(), delta))
+    return found.T_base_platform[found.converged]
 
 
 def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Integers
+from pkmcal.arrays import Array, Integers
 from pkmcal.cameras import Camera
-from pkmcal.errors import InputError
+from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import csv_text, staged_folder, yaml_text
+from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.simulate.board import board_part
 from pkmcal.simulate.casting import Part
@@ -81,16 +82,36 @@ class Studio:
         finish = Finish.from_noise(noise, flat=truth.machine.document.motion == "planar")
         return cls(truth, discs, finish, room, views, settings.sensor, fixed)
 
-    def photograph(self, index: int) -> Integers:
-        """The session's photograph number ``index``: 8 bits, (H, W)."""
+    def photographs(self, index: int, shake: tuple[float, float] = (0.0, 0.0)) -> list[Integers]:
+        """The repeats (8 bits, (H, W)) of the session's photograph number ``index``.
+
+        A camera that stands still receives the same light each time, and only the noise differs;
+        shake : standard deviations of its motion, m and rad.
+        """
+        seeds = stream(self.truth.seed, "photographs").spawn(len(self.truth.photographs))[index]
+        children = (seeds, *seeds.spawn(self.truth.repeats - 1))
+        rngs = [np.random.default_rng(child) for child in children]
+        still = self.truth.T_camera_base[self.truth.photographs[index, 0]]
+        if not any(shake):
+            light = self._light(index, still, rngs[0])
+            return [photograph(light, self.sensor, rng) for rng in rngs]
+        moved = [_shaken(shake, rng) @ still for rng in rngs]
+        lights = [self._light(index, T, rng) for T, rng in zip(moved, rngs, strict=True)]
+        return [photograph(x, self.sensor, rng) for x, rng in zip(lights, rngs, strict=True)]
+
+    def _light(self, index: int, T_camera_base: Array, rng: np.random.Generator) -> Array:
+        """Light (H, W) on a camera at a pose, of photograph number ``index``."""
         station, k = self.truth.photographs[index]
         poses, joints = self.truth.T_base_platform, self.truth.joints
-        seeds = stream(self.truth.seed, "photographs").spawn(len(self.truth.photographs))
-        rng = np.random.default_rng(seeds[index])
         parts = machine_parts(self.truth.machine, self.discs, self.finish, poses[k], joints[k])
         scene = self.room.with_machine([*parts, *self.fixed])
-        light = render(scene, self.views[station], self.truth.T_camera_base[station], rng)
-        return photograph(light, self.sensor, rng)
+        return render(scene, self.views[station], T_camera_base, rng)
+
+
+def _shaken(shake: tuple[float, float], rng: np.random.Generator) -> Array:
+    """Motion (4, 4) of a camera about its own place; shake : standard deviations, m and rad."""
+    turn, move = rng.standard_normal((2, 3))
+    return pose(rotation(shake[1] * turn), shake[0] * move)
 
 
 def _cameras(camera: Camera | Sequence[Camera], settings: Settings) -> tuple[Camera, ...]:
@@ -120,6 +141,12 @@ def _check(folder: Path, drawing: Machine) -> None:
             what=f"mechanism {drawing.name!r} has no tubes, so its photographs would show no legs",
             expected="tubes: [{radius: ..., from: ..., to: ...}] on its legs",
         )
+    try:
+        drawing.home()
+    except GeometryError as error:  # the drawing is the user's: it is at fault
+        raise InputError(
+            error.what, found=error.found, expected=error.expected, next_step=error.next_step
+        ) from None
 
 
 def _write_texts(
@@ -152,6 +179,7 @@ def _session_document(
     settings: Settings, truth: Truth, camera_files: dict[str, str]
 ) -> dict[str, Any]:
     board = settings.board is not None
+    name_of = "{configuration}" + _repeat_part(settings, "{repeat}")
     return {
         "pkmcal": 1,
         "mechanism": "mechanism.yaml",
@@ -159,7 +187,7 @@ def _session_document(
         "stations": {
             name: {
                 "camera": camera_files[name],
-                "images": f"images/{name}/{{configuration}}.png",
+                "images": f"images/{name}/{name_of}.png",
                 "observe": ["legs", "board"] if board else "legs",
                 "pose": {
                     "position": list(pose.position),
@@ -187,24 +215,31 @@ def _write_photographs(
         (stage / "images" / name).mkdir(parents=True)
     total = len(truth.photographs)
     with ThreadPoolExecutor(max(1, workers)) as pool:
-        jobs = [pool.submit(_write_one, stage, studio, k) for k in range(total)]
+        jobs = [pool.submit(_write_one, stage, studio, settings, k) for k in range(total)]
         try:
             for done, job in enumerate(as_completed(jobs), start=1):
                 job.result()
                 if progress is not None:
-                    progress(done, total)
+                    progress(done * truth.repeats, total * truth.repeats)
         finally:
             for job in jobs:
                 job.cancel()
 
 
-def _write_one(stage: Path, studio: Studio, index: int) -> None:
+def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> None:
     import cv2
 
     truth = studio.truth
     station, k = truth.photographs[index]
-    ok, data = cv2.imencode(".png", studio.photograph(index))
-    if not ok:
-        raise OSError(f"photograph {index} could not be encoded as PNG")
-    path = stage / "images" / truth.stations[station] / f"{truth.configurations[k]}.png"
-    path.write_bytes(data.tobytes())
+    folder = stage / "images" / truth.stations[station]
+    for repeat, picture in enumerate(studio.photographs(index, settings.shake)):
+        ok, data = cv2.imencode(".png", picture)
+        if not ok:
+            raise OSError(f"photograph {index} could not be encoded as PNG")
+        name = f"{truth.configurations[k]}{_repeat_part(settings, str(repeat + 1))}.png"
+        (folder / name).write_bytes(data.tobytes())
+
+
+def _repeat_part(settings: Settings, text: str) -> str:
+    """What stands after the configuration in a photograph's name."""
+    return f"_{text}" if settings.repeats > 1 else ""

@@ -39,7 +39,9 @@ class Settings:
     tolerance : true values differ from the drawing by this many times its tolerances.
     joint_noise : standard deviation of a reading, m. rough_position, rough_angle : by how much
     the session's station poses are off, m and rad. extreme : share of configurations with legs
-    near the ends of their ranges. board : fixed to the base, seen by every station.
+    near the ends of their ranges. board : fixed to the base, seen by every station. repeats :
+    photographs of each configuration from each station, with sensor noise of their own. shake :
+    standard deviations (m, rad) by which the camera moves between them.
     """
 
     stations: int | tuple[StationPose, ...] = 3
@@ -52,6 +54,8 @@ class Settings:
     extreme: float = 0.5
     sensor: Sensor = field(default_factory=Sensor)
     board: Board | None = None
+    repeats: int = 1
+    shake: tuple[float, float] = (0.0, 0.0)
 
     @property
     def n_stations(self) -> int:
@@ -67,7 +71,7 @@ class Truth:
     T_camera_base : (S, 4, 4). rough : poses written into the session.
     T_base_platform : (K, 4, 4). joints : (K, m) exact readings. readings : (K, m) with noise.
     photographs : (M, 2) station and configuration of each photograph. seed : of everything.
-    T_base_board : (4, 4) of the board, where there is one.
+    T_base_board : (4, 4) of the board, where there is one. repeats : photographs of each pair.
     """
 
     machine: Machine
@@ -81,6 +85,7 @@ class Truth:
     photographs: Integers
     seed: int
     T_base_board: Array | None = None
+    repeats: int = 1
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
@@ -139,6 +144,7 @@ def draw_truth(
         else place_board(
             machine, settings.board, cameras, T_camera_base, T_base_platform, joints, rngs["board"]
         ),
+        repeats=settings.repeats,
     )
 
 
@@ -194,7 +200,8 @@ def truth_document(truth: Truth) -> dict[str, Any]:
 
     ``parameters`` are the true values by name; ``stations`` hold 4x4 ``T_camera_base``;
     ``configurations`` hold 4x4 ``T_base_platform`` and the exact readings ``joints``;
-    ``photographs`` are pairs of names. No estimator reads this file.
+    ``photographs`` are pairs of names, each taken ``repeats`` times (once where absent). No
+    estimator reads this file.
     """
     names = truth.machine.parameters.names
     return {
@@ -218,6 +225,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
             [truth.stations[s], truth.configurations[k]] for s, k in truth.photographs.tolist()
         ],
         **({} if truth.T_base_board is None else {"T_base_board": truth.T_base_board.tolist()}),
+        **({"repeats": truth.repeats} if truth.repeats > 1 else {}),
     }
 
 
@@ -248,6 +256,7 @@ def load_truth(folder: Path | str, drawing: Machine) -> Truth:
         ),
         seed=data["seed"],
         T_base_board=np.array(data["T_base_board"]) if "T_base_board" in data else None,
+        repeats=data.get("repeats", 1),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, ClassVar, Literal, NamedTuple, final
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.files import Schema
@@ -99,20 +99,14 @@ class Crank(BaseCarrier):
         swing = radial * side + by_reading
         pull = radial * e0 + arm * out
         by_v = along[..., None] * np.eye(3) + _outer(swing, frame.twist) - _outer(v, pull)
-        size = np.sqrt(dot(parameters[..., 3:6], parameters[..., 3:6]))[..., None, None]
-        by_axis = (by_v - (by_v @ v[..., None]) * v[..., None, :]) / size
-        # zero's part along v changes nothing, the rest turns the crank
-        zero = _outer(swing, side / frame.n * frame.drawn)
-        columns = [np.eye(3), by_axis, out, by_reading, v, e0, zero]
-        full = [
-            np.broadcast_to(x if x.shape[-2:-1] == (3,) else x[..., None], (*shape, k))
-            for x, k in zip(columns[:2], (3, 3), strict=True)
-        ]
-        full += [np.broadcast_to(x[..., None], (*shape, 1)) for x in columns[2:6]]
-        full.append(np.broadcast_to(zero, (*shape, 3)))
-        return CarriedPoint(
-            value, np.broadcast_to(by_reading, shape), np.concatenate(full, axis=-1)
-        )
+        by_zero = _outer(swing, side * frame.drawn / frame.n)
+        by_parameters = np.zeros((*value.shape, 13))
+        by_parameters[..., :3] = np.eye(3)
+        by_parameters[..., 3:6] = _by_axis(by_v, v, parameters)
+        for k, column in enumerate((out, by_reading, v, e0), start=6):
+            by_parameters[..., k] = column
+        by_parameters[..., 10:] = by_zero
+        return CarriedPoint(value, by_reading, by_parameters)
 
     @staticmethod
     def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
@@ -162,14 +156,16 @@ class Crank(BaseCarrier):
     @staticmethod
     def carried(parameters: Array, e: Array, f: Array) -> Array:
         """Turns, and how much more an error of the axis twists e0 here than there."""
-        after = _frame(Crank.moved(parameters, e, f))
-        before = _frame(parameters)
-        out = turned_blocks(parameters.shape[-1], (0, e), (3, e))
-        size = np.sqrt(dot(parameters[..., 3:6], parameters[..., 3:6]))[..., None]
-        back = np.swapaxes(e[..., :3, :3], -1, -2)
-        by_axis = (before.twist - moved_direction(after.twist, _padded(back))) / size
-        out = np.array(np.broadcast_to(out, (*by_axis.shape[:-1], *out.shape[-2:])))
-        out[..., 7, 3:6] = by_axis
+        before, after = _frame(parameters), _frame(Crank.moved(parameters, e, f))
+        rot = e[..., :3, :3]
+        n = parameters.shape[-1]
+        out = np.array(np.broadcast_to(turned_blocks(n, (0, e), (3, e)), (*_lead(parameters, e), n, n)))
+        twist = before.twist[..., None, :] - after.twist[..., None, :] @ rot
+        out[..., 7:8, 3:6] = _by_axis(twist, before.v, parameters)
+        lag = rot @ _turn_of_e0(before) - _turn_of_e0(after) @ rot
+        lag = parameters[..., 9, None, None] * lag
+        out[..., :3, 3:6] = _by_axis(lag, before.v, parameters)
+        out[..., :3, 9] = moved_direction(before.e0, e) - after.e0
         return out
 
 
@@ -196,7 +192,12 @@ def _lead(parameters: Array, transform: Array) -> tuple[int, ...]:
     return np.broadcast_shapes(parameters.shape[:-1], transform.shape[:-2])
 
 
-def _padded(rot: Array) -> Array:
-    out = np.zeros((*rot.shape[:-2], 4, 4))
-    out[..., :3, :3] = rot
-    return out
+def _turn_of_e0(frame: _Frame) -> Array:
+    """Change (..., 3, 3) of e0 by v."""
+    return _outer(frame.side, frame.twist) - _outer(frame.v, frame.e0)
+
+
+def _by_axis(by_v: Array, v: Array, parameters: Array) -> Array:
+    """Derivatives (..., k, 3) by the unit axis, as those by the file's axis of any length."""
+    size = np.sqrt(dot(parameters[..., 3:6], parameters[..., 3:6]))[..., None, None]
+    return (by_v - (by_v @ v[..., None]) * v[..., None, :]) / size

@@ -1,0 +1,192 @@
+"""The H4's nacelle: two side bars, hinged on a centre bar that turns ([C] fig. 3).
+
+Where the forearms are ideal parallelograms the side bars keep their direction: ``bar``. Where
+each rod counts on its own they turn a little, freely about their hinges: ``hinged-bar``.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal, final
+
+import numpy as np
+from pydantic import Field
+
+from pkmcal.arrays import Array
+from pkmcal.files import Schema
+from pkmcal.geometry.rigid import cross, dot, skew
+from pkmcal.mechanisms.carriers.contract import (
+    CarriedPoint,
+    PlatformCarrier,
+    direction_by_frame,
+    moved_direction,
+    moved_point,
+    point_by_frame,
+    turned_blocks,
+    vectors,
+)
+from pkmcal.mechanisms.carriers.rigid import by_pose
+from pkmcal.mechanisms.joints import Direction
+
+BarNumber = Annotated[int, Field(ge=1, description="the number of the side bar, from 1")]
+Point = Annotated[tuple[float, float, float], Field(description="a point [x, y, z] in metres")]
+
+
+class BarDocument(Schema):
+    """``{joint: bar, center: [0, 0.06, 0], hinge: [0.06, 0, 0], bar: 1}``: metres."""
+
+    joint: Literal["bar"]
+    center: Point
+    hinge: Point
+    bar: BarNumber
+
+
+class HingedBarDocument(Schema):
+    """``{joint: hinged-bar, center: [...], hinge: [...], axis: [0, 0, 1], bar: 1}``: metres."""
+
+    joint: Literal["hinged-bar"]
+    center: Point
+    hinge: Point
+    axis: Annotated[Direction, Field(description="the direction [x, y, z] of the hinge")]
+    bar: BarNumber
+
+
+@final
+class Bar(PlatformCarrier):
+    """``B = t + R hinge + center``: the hinge turns with the platform, the bar does not.
+
+    hinge : platform frame. center : the joint from the hinge, along the base frame's axes.
+    [C] fig. 3: hinge (s h, 0, 0), center (0, t d, 0).
+    """
+
+    joints: ClassVar = ("bar",)
+    schema: ClassVar = BarDocument
+    shared: ClassVar = ("hinge",)
+    parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("hinge", "m", "center"))
+
+    @staticmethod
+    def point(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> CarriedPoint:
+        """B, its derivatives by pose and parameters."""
+        del internal
+        rot = T_base_platform[..., :3, :3]
+        turned = (rot @ parameters[..., 3:, None])[..., 0]
+        value = turned + T_base_platform[..., :3, 3] + parameters[..., :3]
+        by_parameters = np.zeros((*value.shape, 6))
+        by_parameters[..., :3], by_parameters[..., 3:] = np.eye(3), rot
+        return CarriedPoint(value, by_pose(turned), by_parameters)
+
+    @staticmethod
+    def moved(parameters: Array, e: Array, f: Array) -> Array:
+        """The bar turns with the base frame, the hinge moves with the platform frame."""
+        parts = moved_direction(parameters[..., :3], e), moved_point(parameters[..., 3:], f)
+        return np.concatenate(parts, axis=-1)
+
+    @staticmethod
+    def by_frames(parameters: Array) -> Array:
+        """E's columns for the bar, F's for the hinge."""
+        bar = direction_by_frame(parameters[..., :3])
+        hinge = point_by_frame(parameters[..., 3:])
+        none = np.zeros_like(bar)
+        return np.concatenate(
+            [np.concatenate([bar, none], axis=-1), np.concatenate([none, hinge], axis=-1)], axis=-2
+        )
+
+    @staticmethod
+    def carried(parameters: Array, e: Array, f: Array) -> Array:
+        """Turns."""
+        del parameters
+        return turned_blocks(6, (0, e), (3, f))
+
+
+@final
+class HingedBar(PlatformCarrier):
+    """``B = t + R (hinge + Exp(phi w) center)``, w the hinge's unit axis, all in the platform
+    frame; phi is the bar's internal coordinate (errata, [C] "Rods").
+    """
+
+    turns: ClassVar = True
+    joints: ClassVar = ("hinged-bar",)
+    schema: ClassVar = HingedBarDocument
+    shared: ClassVar = ("hinge", "axis")
+    parameters: ClassVar = (
+        *vectors("center", "m", "center"),
+        *vectors("hinge", "m", "center"),
+        *vectors("axis", "1", "axis"),
+    )
+
+    @staticmethod
+    def point(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> CarriedPoint:
+        """B, its derivatives by pose and parameters."""
+        rot = T_base_platform[..., :3, :3]
+        center, axis = parameters[..., :3], parameters[..., 6:]
+        size = np.sqrt(dot(axis, axis))[..., None]
+        w = axis / size
+        cos, sin = _cos_sin(internal)
+        high = dot(w, center)[..., None]
+        side = cross(w, center)
+        swung = cos * center + sin * side + (1 - cos) * high * w
+        arm = (rot @ (parameters[..., 3:6] + swung)[..., None])[..., 0]
+        value = arm + T_base_platform[..., :3, 3]
+        eye = np.eye(3)
+        outer = w[..., :, None] * w[..., None, :]
+        c, s = cos[..., None], sin[..., None]
+        by_center = c * eye + s * skew(w) + (1 - c) * outer
+        by_w = -s * skew(center)
+        by_w = by_w + (1 - c) * (high[..., None] * eye + w[..., :, None] * center[..., None, :])
+        by_axis = by_w @ (eye - outer) / size[..., None]
+        by_parameters = np.zeros((*value.shape, 9))
+        by_parameters[..., :3] = rot @ by_center
+        by_parameters[..., 3:6] = rot
+        by_parameters[..., 6:] = rot @ by_axis
+        return CarriedPoint(value, by_pose(arm), by_parameters)
+
+    @staticmethod
+    def by_internal(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> Array:
+        """``R (w x Exp(phi w) center)``."""
+        center, axis = parameters[..., :3], parameters[..., 6:]
+        w = axis / np.sqrt(dot(axis, axis))[..., None]
+        cos, sin = _cos_sin(internal)
+        side = cross(w, center)
+        ahead = cos * side + sin * cross(w, side)
+        return (T_base_platform[..., :3, :3] @ ahead[..., None])[..., 0]
+
+    @staticmethod
+    def moved(parameters: Array, e: Array, f: Array) -> Array:
+        """All is the platform's."""
+        del e
+        parts = (
+            moved_direction(parameters[..., :3], f),
+            moved_point(parameters[..., 3:6], f),
+            moved_direction(parameters[..., 6:], f),
+        )
+        return np.concatenate(parts, axis=-1)
+
+    @staticmethod
+    def by_frames(parameters: Array) -> Array:
+        """F's columns alone."""
+        own = np.concatenate(
+            [
+                direction_by_frame(parameters[..., :3]),
+                point_by_frame(parameters[..., 3:6]),
+                direction_by_frame(parameters[..., 6:]),
+            ],
+            axis=-2,
+        )
+        return np.concatenate([np.zeros_like(own), own], axis=-1)
+
+    @staticmethod
+    def carried(parameters: Array, e: Array, f: Array) -> Array:
+        """Turns."""
+        del parameters, e
+        return turned_blocks(9, (0, f), (3, f), (6, f))
+
+
+def _cos_sin(internal: Array | None) -> tuple[Array, Array]:
+    phi = np.zeros(1) if internal is None else internal[..., None]
+    return np.cos(phi), np.sin(phi)
+

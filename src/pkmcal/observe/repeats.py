@@ -1,0 +1,268 @@
+"""Repeated photographs of a configuration: one edge of several, with the noise that they show.
+
+[A] 4.2 measures the noise by repeats. A photograph's own profiles tell how well an edge agrees
+with its model; what differs from one photograph to the next (sensor noise, vibration, air, light)
+only repeats tell. What they have in common, such as shading, does not average out. So with n
+repeats, of which each has the stated covariance C and scatters with the covariance S about their
+mean,
+
+    covariance of the mean = (the part of C that repeats have in common) + S / n.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.cylinders import tangent_basis
+from pkmcal.geometry.rigid import dot
+from pkmcal.observe.edges import EdgeSet, Rejection
+from pkmcal.observe.legs import StationEdges
+
+PRIOR = 10.0
+"""Degrees of freedom that the wider group's scatter counts for in a narrower one's: an edge of few
+repeats has the scatter of its leg's, a leg of few configurations its station's."""
+FAR = 5.0
+"""Standard deviations of a repeat from the others beyond which it is not one of them."""
+HARMLESS = 1.0
+"""Stated standard deviations within which a repeat stays, however well the others agree."""
+
+MAJORITY = 0.5
+"""Share of a configuration's repeats of which more must show an edge: those that show now and then
+are faint, and lie a pixel off as easily as not."""
+
+_RARE = "seen in only {} of {} repeats"
+_OUT = "a repeat lies {:.1f} standard deviations from the others, which are used without it"
+_DISPUTED = "its repeats lie up to {:.1f} standard deviations off, and no majority agrees"
+
+
+@dataclass(frozen=True)
+class Groups:
+    """N things in G groups.
+
+    first : (G,) one thing of each. member : (N,) the group of each thing. count : (G,) their size.
+    """
+
+    first: Integers
+    member: Integers
+    count: Integers
+
+    def total(self, values: Array) -> Array:
+        """Sums (G, ...) of values (N, ...) by group."""
+        out = np.zeros((len(self.first), *values.shape[1:]))
+        np.add.at(out, self.member, values)
+        return out
+
+    def mean(self, values: Array) -> Array:
+        """Means (G, ...) of values (N, ...) by group."""
+        return self.total(values) / self.count.reshape(-1, *[1] * (values.ndim - 1))
+
+    def median(self, values: Array) -> Array:
+        """Medians (G, n) of values (N, n) by group, each component by itself."""
+        start = np.cumsum(self.count) - self.count
+        low, high = start + (self.count - 1) // 2, start + self.count // 2
+        order = np.stack([np.lexsort((column, self.member)) for column in values.T], axis=1)
+        ordered = np.take_along_axis(values, order, axis=0)
+        return (ordered[low] + ordered[high]) / 2
+
+    def exchanged(self, rng: np.random.Generator) -> Integers:
+        """Positions (N,) of the things with those of each group exchanged at random."""
+        inside = np.argsort(self.member, kind="stable")
+        out = np.empty_like(inside)
+        out[inside] = np.lexsort((rng.random(len(inside)), self.member))
+        return out
+
+
+def groups_of(*keys: Integers) -> Groups:
+    """Groups of things whose keys, each (N,), are the same."""
+    _, first, member, count = np.unique(
+        np.stack(keys, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    return Groups(first, member.reshape(-1), count)
+
+
+def same_edges(edges: EdgeSet) -> Groups:
+    """Repeats of one edge: the same station, configuration, leg, tube and side."""
+    return groups_of(edges.station, edges.configuration, edges.leg, edges.tube, edges.side)
+
+
+def combined(look: StationEdges) -> StationEdges:
+    """One edge for all repeats of it, at their mean; a look without repeats as it is."""
+    groups = same_edges(look.edges)
+    if len(groups.first) == len(look.edges):
+        return look
+    odd = odd_ones(look.edges, groups)
+    keep = ~odd.any
+    edges = look.edges.select(keep)
+    groups = same_edges(edges)
+    number = np.full(len(keep), -1)
+    number[keep] = groups.member
+    point_edge = number[look.point_edge]
+    said = (*look.rejected, *_rejections(look.edges, odd))
+    return replace(
+        look,
+        edges=mean_edges(edges, groups),
+        rejected=tuple(dict.fromkeys(said)),  # what is hidden is so in every repeat
+        points=look.points[point_edge >= 0],
+        point_edge=point_edge[point_edge >= 0],
+    )
+
+
+def mean_edges(edges: EdgeSet, groups: Groups) -> EdgeSet:
+    """The mean edge (G,) of each group of repeats, with the noise that the repeats show."""
+    normal = groups.mean(edges.normal)
+    normal /= np.sqrt(dot(normal, normal))[:, None]
+    stated = groups.mean(edges.covariance)
+    return replace(
+        edges.select(groups.first),
+        normal=normal,
+        # repeats lie milliradians apart: the coordinates of one serve for all
+        basis=tangent_basis(normal, edges.basis[groups.first, :, 0]),
+        covariance=mean_covariance(stated, repeat_scatter(edges, groups), groups.count),
+        shift=groups.mean(edges.shift),
+        span=groups.mean(edges.span),
+        by_intrinsics=groups.mean(edges.by_intrinsics),
+    )
+
+
+def mean_covariance(stated: Array, scatter: Array, count: Integers) -> Array:
+    """Covariance (G, 2, 2) of the mean of ``count`` (G,) repeats, from those of a single one.
+
+    Along each principal axis of the scatter S in units of the stated C, S = s C: sensor noise is
+    in C, for it roughens profiles as well, and 1 - s of C remains common; where s > 1, C cannot
+    have held it (a shaken camera leaves crisp profiles), and all of C remains. Between, where it
+    may be either, s of C remains, so that a half is the least.
+    """
+    root = np.linalg.cholesky(stated)
+    back = np.linalg.inv(root)
+    share, axes = np.linalg.eigh(back @ scatter @ np.swapaxes(back, -1, -2))
+    share = np.maximum(share, 0.0)
+    common = np.maximum(1.0 - share, np.minimum(share, 1.0))
+    parts = root @ axes * np.sqrt(common + share / count[:, None])[:, None, :]
+    return parts @ np.swapaxes(parts, -1, -2)
+
+
+def deviations(edges: EdgeSet, groups: Groups) -> Array:
+    """Turn (N, 2), rad, of each edge from the first of its group, in that one's tangent basis."""
+    reference = groups.first[groups.member]
+    turn = edges.normal - edges.normal[reference]
+    return (turn[:, None, :] @ edges.basis[reference])[:, 0]
+
+
+def pixel_units(edges: EdgeSet) -> Array:
+    """Turns (N, 2), rad, of a shift by a pixel, and of a tilt by as much over the edge's length.
+
+    The tilt up to a factor, the leg's distance. So edges scatter alike whatever their length.
+    """
+    pixel = np.sqrt(dot(edges.shift, edges.shift))
+    length = np.maximum(edges.span[:, 1] - edges.span[:, 0], 1e-3)
+    return np.stack([pixel, pixel / length], axis=1)
+
+
+def repeat_scatter(edges: EdgeSet, groups: Groups) -> Array:
+    """Covariance (G, 2, 2), rad^2, of a single repeat of each edge, from the repeats alone.
+
+    An edge's own scatter, drawn towards that of its leg's same edge in all configurations, and
+    that towards its station's, by their degrees of freedom.
+    """
+    unit = groups.mean(pixel_units(edges))
+    turn = deviations(edges, groups)
+    turn = (turn - groups.mean(turn)[groups.member]) / unit[groups.member]
+    squares = groups.total(turn[:, :, None] * turn[:, None, :])
+    freedom, first = groups.count - 1.0, edges.select(groups.first)
+    levels = (
+        groups_of(first.station),
+        groups_of(first.station, first.leg, first.tube, first.side),
+        groups_of(np.arange(len(first))),
+    )
+    scatter, prior = np.zeros_like(squares), 0.0
+    for level in levels:
+        total, number = level.total(squares), level.total(np.asarray(freedom))
+        weight = np.maximum(number + prior, 1.0)[level.member]
+        scatter = (total[level.member] + prior * scatter) / weight[:, None, None]
+        prior = PRIOR
+    return scatter * unit[:, :, None] * unit[:, None, :]
+
+
+@dataclass(frozen=True)
+class OddOnes:
+    """Repeats that are left out, all (N,).
+
+    off : stated standard deviations from the middle of the repeats. out : far from a majority that
+    agrees. disputed : one of repeats without such a majority. rare : of an edge that shows in few
+    of the repeats, of which ``most`` show others.
+    """
+
+    off: Array
+    out: Booleans
+    disputed: Booleans
+    rare: Booleans
+    most: Integers
+
+    @property
+    def any(self) -> Booleans:
+        """Whether a repeat is left out, for whatever reason."""
+        return self.out | self.disputed | self.rare
+
+
+def odd_ones(edges: EdgeSet, groups: Groups) -> OddOnes:
+    """Repeats of one station that lie further from the median of theirs than noise explains."""
+    turn, unit = deviations(edges, groups), pixel_units(edges)
+    away = np.abs(turn - groups.median(turn)[groups.member])
+    stated = np.sqrt(edges.covariance[:, [0, 1], [0, 1]])
+    far = (away > FAR * _typical_spread(turn / unit, groups) * unit) & (away > HARMLESS * stated)
+    far = far.any(axis=1)
+    count = groups.count[groups.member]
+    photos = groups_of(edges.station, edges.configuration)
+    most = np.zeros(len(photos.first), dtype=int)
+    np.maximum.at(most, photos.member, count)
+    most = most[photos.member]
+    rare = count <= MAJORITY * most
+    disputed = (groups.total((~far).astype(float))[groups.member] <= MAJORITY * count) & ~rare
+    # a lone photograph is its own majority
+    rare &= most > 1
+    return OddOnes((away / stated).max(axis=1), far & ~disputed & ~rare, disputed, rare, most)
+
+
+def _typical_spread(turn: Array, groups: Groups) -> Array:
+    """Standard deviation (2,) of a repeat of a typical edge, not moved by a few bad ones.
+
+    The median over edges of their variances, which lies below the mean (Wilson-Hilferty).
+    """
+    several = groups.count > 1
+    freedom = np.maximum(groups.count - 1.0, 1.0)[:, None]
+    away = turn - groups.mean(turn)[groups.member]
+    square = groups.total(away * away) / freedom
+    if not several.any():
+        return np.full(2, np.inf)
+    return np.sqrt(np.median((square / (1 - 2 / (9 * freedom)) ** 3)[several], axis=0))
+
+
+def _rejections(edges: EdgeSet, odd: OddOnes) -> list[Rejection]:
+    """What was left out and why: each repeat that is out, each other edge once."""
+    out = [_rejection(edges, k, _OUT.format(odd.off[k])) for k in np.flatnonzero(odd.out).tolist()]
+    for kind in (odd.disputed, odd.rare):
+        rows = np.flatnonzero(kind)
+        groups = same_edges(edges.select(rows)) if rows.size else None
+        if groups is None:
+            continue
+        apart = np.zeros(len(groups.first))
+        np.maximum.at(apart, groups.member, odd.off[rows])
+        for k, count, far in zip(rows[groups.first].tolist(), groups.count, apart, strict=True):
+            said = _RARE.format(count, odd.most[k]) if kind is odd.rare else _DISPUTED.format(far)
+            out.append(_rejection(edges, k, said))
+    return out
+
+
+def _rejection(edges: EdgeSet, k: int, reason: str) -> Rejection:
+    """The edge at k, left out for a reason."""
+    return Rejection(
+        station=int(edges.station[k]),
+        configuration=int(edges.configuration[k]),
+        leg=int(edges.leg[k]),
+        tube=int(edges.tube[k]),
+        side=int(edges.side[k]),
+        reason=reason,
+    )

@@ -1,0 +1,301 @@
+"""A session whose stations are joined by a board on the base: rendered, checked, calibrated."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.boards import Boards, StationBoard, find_boards
+from pkmcal.check import Level, check_session
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import apply, inverse, pose, pose_difference, rotation
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.recognition import boards_of, check_observable, found_stations, read_photographs
+from pkmcal.session import load_session
+from pkmcal.simulate import board_for, load_truth
+from pkmcal.simulate.board import SIZE, Print, board_from_fields
+from pkmcal.simulate.scene import discs_of
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Two stations of four configurations each, by the command; nobody writes into it."""
+    folder = tmp_path_factory.mktemp("board") / "session"
+    done = run("simulate", folder, "--board", "--stations", "2", "--configurations", "4")
+    assert done.code == 0
+    return folder
+
+
+@pytest.fixture
+def folder(rendered, tmp_path):
+    """A copy to spoil, without the truth."""
+    shutil.copytree(rendered, tmp_path / "session")
+    (tmp_path / "session" / "truth.json").unlink()
+    return tmp_path / "session"
+
+
+@pytest.fixture(scope="module")
+def found(rendered):
+    """The session, its photographs and the boards in them."""
+    session = load_session(rendered)
+    photographs = read_photographs(session)
+    return session, photographs, boards_of(session, photographs)
+
+
+def changed(folder, old, new):
+    path = folder / "session.yaml"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def without_pose(folder, station):
+    """Remove a station's pose by hand."""
+    path = folder / "session.yaml"
+    head, rest = path.read_text().split(f"  {station}:")
+    start = rest.index("    pose:")
+    end = rest.index("      up:")
+    end = rest.index("\n", end) + 1
+    path.write_text(f"{head}  {station}:" + rest[:start] + rest[end:])
+
+
+# the renderer's boards
+
+
+def test_rendered_corners_are_true_to_two_hundredths_of_a_pixel(rendered, found):
+    session, _, boards = found
+    truth = load_truth(rendered, session.machine)
+    for number, station in boards.stations.items():
+        T_camera_board = truth.T_camera_base[number] @ truth.T_base_board
+        camera = session.stations[number].camera
+        there = camera.project(apply(T_camera_board, station.seen.board.points))
+        off = (station.seen.views.pixels - there)[station.seen.poses.weight > 0.5]
+        assert len(off) > 30
+        assert np.sqrt(np.mean(off**2)) < 0.02
+        assert np.all(np.abs(off.mean(axis=0)) < 0.005)
+
+
+def test_poses_from_rendered_photographs(rendered, found):
+    session, _, boards = found
+    truth = load_truth(rendered, session.machine)
+    poses = boards.poses
+    assert poses.station.tolist() == [0, 1]
+    T = truth.T_camera_base[poses.station] @ truth.T_base_board
+    error = pose_difference(poses.T_station_target, T)
+    z2 = np.sum(np.einsum("nij,nj->ni", poses.whiten, error) ** 2, axis=1)
+    assert np.all(z2 < 24)  # six squares each; one in two thousand
+    assert np.all(np.abs(error[:, :3]) < 2e-3)
+    assert np.all(np.abs(error[:, 3:]) < 5e-4)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"type": "charuco", "squares": [6, 5], "square": 0.03, "marker": 0.022,
+         "dictionary": "DICT_4X4_50"},
+        {"type": "charuco", "squares": [5, 6], "square": 0.03, "marker": 0.022,
+         "dictionary": "DICT_5X5_100", "legacy": True},
+        {"type": "chessboard", "corners": [6, 5], "square": 0.03},
+        {"type": "aruco_grid", "markers": [4, 3], "marker": 0.03, "gap": 0.01, "first_id": 5,
+         "dictionary": "DICT_APRILTAG_36h11"},
+    ],
+)  # fmt: skip
+def test_prints_are_what_the_detectors_look_for(fields):
+    """The print drawn straight on, half a millimetre a pixel, is found whole and in its place."""
+    from pkmcal.observe.boards import detect_board
+
+    board = board_from_fields(fields)
+    printed = Print.of(board)
+    step, margin = 0.0005, 0.02
+    x = np.arange(printed.x[0] - margin, printed.x[-1] + margin, step)
+    y = np.arange(printed.y[0] - margin, printed.y[-1] + margin, step)
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    dark = printed.dark_at(grid[..., 0].ravel(), grid[..., 1].ravel()).reshape(grid.shape[:2])
+    image = cv2.GaussianBlur(np.where(dark, 20, 220).astype(np.uint8), (0, 0), 0.7)
+    seen = detect_board(image, board)
+    assert len(seen.ids) == len(board.points)
+    places = seen.pixels * step + [x[0], y[0]]
+    # cells are drawn by their pixels' centres, so to half a pixel
+    np.testing.assert_allclose(places, board.points[seen.ids, :2], atol=0.6 * step)
+
+
+def test_a_board_is_made_in_proportion_to_the_machine():
+    machine = load_mechanism("gough-stewart")
+    board = board_for(machine)
+    size = np.hypot(*(np.array(board.document["squares"]) + 1)) * board.document["square"]
+    assert size == pytest.approx(SIZE * discs_of(machine).base_radius, rel=0.02)
+
+
+# stations through the board
+
+
+def test_a_station_without_a_pose_is_found_through_the_board(rendered, folder):
+    without_pose(folder, "station2")
+    session = load_session(folder)
+    assert session.stations[1].T_camera_base is None
+    check_observable(session)
+    photographs = read_photographs(session)
+    boards = boards_of(session, photographs)
+    T = found_stations(session, photographs, np.random.default_rng(0), boards)
+    truth = load_truth(rendered, session.machine)
+    error = pose_difference(inverse(T), inverse(truth.T_camera_base))
+    # as near as the search comes from a pose by hand; the estimate's start need not be nearer
+    assert np.all(np.linalg.norm(error[:, 3:], axis=1) < 0.06)
+    assert np.all(np.linalg.norm(error[:, :3], axis=1) < np.deg2rad(3))
+
+
+def test_no_pose_at_all(folder):
+    without_pose(folder, "station1")
+    without_pose(folder, "station2")
+    with pytest.raises(InputError, match="no rough pose") as caught:
+        check_observable(load_session(folder))
+    assert "one pose is enough" in caught.value.next_step
+
+
+def test_poses_joined_are_exact(found):
+    """T_camera_base = T_camera_board T_board_other T_other_base."""
+    _, _, boards = found
+    rng = np.random.default_rng(1)
+    T_base_board = pose(rotation(rng.normal(size=3)), rng.normal(size=3))
+    T = [s.stood.T_camera_board @ inverse(T_base_board) for s in boards.stations.values()]
+    first = boards.joined([None, T[1]])[0]
+    np.testing.assert_allclose(first, T[0], atol=1e-12)
+    given = [np.eye(4), T[1]]
+    assert all(a is b for a, b in zip(boards.joined(given), given, strict=True))
+    assert boards.joined([None, None]) == [None, None]
+    assert Boards().joined([None, T[1]])[0] is None
+
+
+def test_a_station_whose_pose_by_hand_is_wrong_is_found_all_the_same(folder):
+    path = folder / "session.yaml"
+    text = path.read_text()
+    start = text.index("      position:", text.index("  station2:"))
+    path.write_text(
+        text[:start] + "      position: [0.9, 0.9, 1.1]" + text[text.index("\n", start) :]
+    )
+    session = load_session(folder)
+    photographs = read_photographs(session)
+    boards = boards_of(session, photographs)
+    T = found_stations(session, photographs, np.random.default_rng(0), boards)
+    assert np.linalg.norm(inverse(T[1])[:3, 3] - [0.9, 0.9, 1.1]) > 0.3
+    with pytest.raises(InputError, match="not recognised in the photographs of station2"):
+        found_stations(session, photographs, np.random.default_rng(0), Boards())
+
+
+# the commands
+
+
+def test_check_reports_the_board(folder):
+    checked = check_session(folder)
+    assert not [finding for finding in checked.findings if finding.station]
+    for station in checked.stations:
+        assert station.board is not None
+        assert station.board.found == 4
+        assert station.board.corners > 10
+        assert station.board.corners_of == 20
+        assert station.board.rms < 0.03
+        assert station.board.scatter < 0.03
+        assert 0.5 < station.board.distance < 3
+    shown = run("check", folder).out
+    assert "4 of 4" in shown
+    assert "Wander" in shown
+    assert json.loads(run("check", folder, "--json").out)["stations"][0]["board"]["found"] == 4
+
+
+def test_check_of_a_session_without_a_board_says_nothing_of_one(demo):
+    assert "Wander" not in run("check", demo.session).out
+
+
+def test_calibrating_with_the_board(folder):
+    from pkmcal.calibration import calibrate
+
+    result = calibrate(folder)
+    assert len(result.measurements.poses) == 2
+    assert [(m.name, m.body) for m in result.measurements.mounts] == [("board", "base")]
+    assert result.estimate.state.T_mount.shape == (1, 4, 4)
+    assert len(result.boards.stations) == 2
+
+
+def shifted(folder, station, first):
+    """Photographs of a station from the first on, moved by two pixels."""
+    for path in sorted((folder / "images" / station).iterdir())[first:]:
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert cv2.imwrite(str(path), np.roll(picture, 2, axis=1))
+
+
+def test_a_camera_that_moved(folder):
+    shifted(folder, "station1", 2)
+    checked = check_session(folder)
+    assert checked.exit_code == 2
+    (text,) = [f.text for f in checked.findings if f.level is Level.WRONG]
+    assert text.startswith(
+        "images/station1/0002.png: the board, or the camera, moved after images/station1/0001.png;"
+        " found the board 2.0 px away"
+    )
+    assert run("calibrate", folder).err == f"Error: {text}\n"
+
+
+def test_a_photograph_that_disagrees_is_told(folder):
+    shifted(folder, "station1", 3)
+    session = load_session(folder)
+    boards = boards_of(session, read_photographs(session))
+    assert [r.reason for r in boards.rejected] == [
+        "the board stands 2.0 px from where the other photographs show it"
+    ]
+
+
+def test_another_board_than_described(folder):
+    path = folder / "board.yaml"
+    path.write_text(path.read_text().replace("DICT_4X4_50", "DICT_5X5_50"))
+    session = load_session(folder)
+    with pytest.raises(InputError, match="another board than the one described") as caught:
+        boards_of(session, read_photographs(session))
+    assert caught.value.where == "session.yaml, stations.station1: 0000.png"
+    assert "markers of DICT_4X4_50" in caught.value.found
+
+
+def test_a_board_that_is_nowhere(found):
+    session, photographs, _ = found
+    images = {p.station: [np.full_like(i, 90) for i in p.images] for p in photographs}
+    with pytest.raises(
+        InputError, match="in none of the photographs of station station1"
+    ) as caught:
+        find_boards(session, images)
+    assert caught.value.where == "images/station1/0000.png"
+
+
+def test_one_photograph_of_a_board_is_noted(folder, found):
+    """Three of four photographs show grey where the board was."""
+    board = found[2].stations[0]
+    corners = np.nanmean(board.seen.views.pixels[0], axis=0)
+    for path in sorted((folder / "images" / "station1").iterdir())[1:]:
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        x, y = (int(v) for v in corners)
+        picture[max(y - 90, 0) : y + 90, max(x - 90, 0) : x + 90] = 60
+        assert cv2.imwrite(str(path), picture)
+    checked = check_session(folder)
+    assert any("Only one photograph shows the board" in f.text for f in checked.findings)
+
+
+def test_boards_on_the_platform_are_refused(folder):
+    changed(folder, "fixed_to: base", "fixed_to: platform")
+    with pytest.raises(InputError, match="boards on the platform are not observed yet") as caught:
+        check_observable(load_session(folder))
+    assert caught.value.found == "observe: legs and board"
+    assert "fixed_to: base" in caught.value.next_step
+
+
+def test_a_board_on_the_platform_gives_a_measurement_a_photograph(found):
+    """What a session with such a board will use; here it does not move, which nobody asks."""
+    session, photographs, _ = found
+    moving = replace(session, board_body="platform")
+    boards = find_boards(moving, {p.station: p.images for p in photographs})
+    assert len(boards.poses) == 8
+    assert boards.poses.configuration.tolist() == [0, 1, 2, 3, 4, 5, 6, 7]
+    assert all(isinstance(s, StationBoard) and s.stood is None for s in boards.stations.values())

@@ -1,0 +1,426 @@
+"""Repeated photographs: one edge of several, their scatter as noise, and [A] Table 1 from them."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.calibration import calibrate
+from pkmcal.commands.comparison import compare
+from pkmcal.geometry.cylinders import tangent_basis
+from pkmcal.geometry.rigid import dot, look_at, perturb
+from pkmcal.identify.axis_measurements import to_coordinates
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.observe.edges import concatenate
+from pkmcal.observe.legs import StationEdges
+from pkmcal.observe.motions import Cylinders, axis_coordinates, by_ends, fit_motions
+from pkmcal.observe.predict import legs_in_camera
+from pkmcal.observe.repeats import (
+    combined,
+    groups_of,
+    mean_covariance,
+    mean_edges,
+    pixel_units,
+    repeat_scatter,
+    same_edges,
+)
+from pkmcal.repeatability import _Look, _station_row
+from pkmcal.session import load_session
+from pkmcal.simulate import EdgeNoise, Settings, load_truth, simulate_edges, simulate_session
+from pkmcal.simulate.configurations import draw_configurations
+from pkmcal.simulate.demo import camera_of_size
+
+CAMERA = camera_of_size((640, 480))
+STATION = look_at(np.array([0.1, -0.9, 0.25]), np.array([0.0, 0.0, 0.2]), np.array([0, 0, 1.0]))
+
+
+@pytest.fixture(scope="module")
+def machine():
+    return load_mechanism("gough-stewart")
+
+
+@pytest.fixture(scope="module")
+def poses(machine):
+    return draw_configurations(machine, 40, 0.5, np.random.default_rng(1))[0]
+
+
+def edges_of(machine, poses, T_camera_base=STATION, shift=0.1):
+    """All edges of a station; those of one seed differ only by what the machine does."""
+    noise = EdgeNoise(shift=shift, tilt=shift)
+    rng = np.random.default_rng(3)
+    return simulate_edges(machine, T_camera_base[None], CAMERA, poses, noise, rng)[0]
+
+
+def turned(edges, turn):
+    """Edges whose normals are turned by (N, 2) rad in their tangent bases."""
+    normal = edges.normal + (edges.basis @ turn[..., None])[..., 0]
+    normal /= np.sqrt(dot(normal, normal))[:, None]
+    return replace(edges, normal=normal, basis=tangent_basis(normal, edges.basis[..., 0]))
+
+
+def repeated(edges, n, pixels, rng):
+    """n repeats of every edge, each with its own noise of (shift, tilt) in pixel units."""
+    scale = pixel_units(edges) * pixels
+    return concatenate(
+        [turned(edges, scale * rng.standard_normal((len(edges), 2))) for _ in range(n)]
+    )
+
+
+def look_of(edges):
+    """A look at one station with one point an edge, which stands for the edge's number."""
+    number = np.arange(len(edges))
+    points = np.stack([number, number], axis=1).astype(float)
+    return StationEdges(edges, (), points, number, 0.7, 0.1)
+
+
+def keys(edges):
+    return np.stack([edges.configuration, edges.leg, edges.tube, edges.side], axis=1)
+
+
+# groups
+
+
+def test_medians_and_exchanges_stay_inside_their_group():
+    rng = np.random.default_rng(0)
+    key, values = rng.integers(0, 9, 200), rng.standard_normal((200, 3))
+    groups = groups_of(key)
+    medians = groups.median(values)
+    for k, name in enumerate(np.unique(key)):
+        assert np.allclose(medians[k], np.median(values[key == name], axis=0))
+    exchanged = groups.exchanged(rng)
+    assert sorted(exchanged) == list(range(200))
+    assert np.array_equal(key[exchanged], key)
+    assert np.mean(exchanged == np.arange(200)) < 0.2
+
+
+# one edge of several
+
+
+def test_a_look_without_repeats_is_left_as_it_is(machine, poses):
+    look = look_of(edges_of(machine, poses[:3]))
+    assert combined(look) is look
+
+
+def test_repeats_become_one_edge_at_their_mean_and_keep_their_points(machine, poses):
+    edges = edges_of(machine, poses[:6])
+    look = look_of(repeated(edges, 5, 0.02, np.random.default_rng(0)))
+    one = combined(look)
+    assert np.array_equal(keys(one.edges), keys(edges.select(same_edges(edges).first)))
+    assert not one.rejected
+    number = one.points[:, 0].astype(int)
+    assert np.array_equal(number, np.arange(len(look.edges)))
+    assert np.array_equal(keys(one.edges)[one.point_edge], keys(look.edges)[number])
+    assert np.allclose(dot(one.edges.normal, one.edges.normal), 1)
+    cross = np.einsum("nij,ni->nj", one.edges.basis, one.edges.normal)
+    assert np.abs(cross).max() < 1e-12
+    off = np.einsum("nij,ni->nj", edges.basis, one.edges.normal - edges.normal)
+    off /= pixel_units(edges) * 0.02 / np.sqrt(5)
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=0.08)
+
+
+def test_the_scatter_is_measured_by_leg(machine, poses):
+    edges = edges_of(machine, poses)
+    pixels = np.where(edges.leg == 2, 0.3, 0.05)[:, None]
+    many = repeated(edges, 4, pixels, np.random.default_rng(0))
+    groups = same_edges(many)
+    found = np.sqrt(repeat_scatter(many, groups)[:, [0, 1], [0, 1]])
+    found /= pixel_units(edges.select(same_edges(edges).first))
+    leg = many.leg[groups.first]
+    assert np.sqrt(np.mean(found[leg == 2] ** 2)) == pytest.approx(0.3, rel=0.06)
+    assert np.sqrt(np.mean(found[(leg != 2)] ** 2)) == pytest.approx(0.05, rel=0.06)
+
+
+@pytest.mark.parametrize("count", [1, 3, 10])
+@pytest.mark.parametrize(("share", "inside"), [(0.1, True), (0.4, True), (3.0, False)])
+def test_errors_agree_with_their_deviations_for_any_number_of_repeats(
+    machine, poses, count, share, inside
+):
+    """Shading stays in every repeat. Scatter in the stated covariance: sensor noise; beside it:
+    a shaken camera. Single photographs of three configurations stand beside the repeats."""
+    exact = edges_of(machine, poses, shift=1e-9)
+    pixels = 0.1 * np.sqrt([1 - share if inside else 1.0, share])
+    rng = np.random.default_rng(5)
+    shaded = turned(exact, pixel_units(exact) * pixels[0] * rng.standard_normal((len(exact), 2)))
+    many = repeated(shaded, max(count, 3), pixels[1], rng)
+    if count == 1:  # the scatter is known from other configurations
+        first = np.arange(len(many)) < len(exact)
+        many = many.select(first | (many.configuration < 10))
+    unit = pixel_units(many) * 0.1
+    many = replace(many, covariance=np.eye(2) * unit[:, :, None] ** 2)
+    groups = same_edges(many)
+    one = mean_edges(many, groups)
+    exact = exact.select(same_edges(exact).first)
+    counted = groups.count == count
+    error = np.einsum("nij,ni->nj", one.basis, one.normal - exact.normal)[counted]
+    white = np.linalg.solve(np.linalg.cholesky(one.covariance[counted]), error[..., None])
+    assert np.sqrt(np.mean(white**2)) == pytest.approx(1, abs=0.05)
+
+
+def test_between_noise_and_motion_half_of_the_stated_variance_is_the_least():
+    share = np.geomspace(1e-3, 1e3, 200)
+    scatter = share[:, None, None] * np.eye(2)
+    stated = np.broadcast_to(np.eye(2), scatter.shape)
+    endless = mean_covariance(stated, scatter, np.full(200, 10**9))[:, 0, 0]
+    assert endless.min() == pytest.approx(0.5, abs=0.02)
+    assert endless[-1] == pytest.approx(1, abs=1e-5)
+    single = mean_covariance(stated, scatter, np.ones(200))[:, 0, 0]
+    assert (single >= np.maximum(share, 1) - 1e-9).all()
+
+
+def spoiled(many, rows, pixels):
+    turn = np.zeros((len(many), 2))
+    turn[rows, 0] = pixels * pixel_units(many)[rows, 0]
+    return turned(many, turn)
+
+
+def test_a_bad_repeat_is_left_out_and_told(machine, poses):
+    edges = edges_of(machine, poses[:6])
+    many = repeated(edges, 5, 0.02, np.random.default_rng(0))
+    good, bad = combined(look_of(many)), combined(look_of(spoiled(many, [7], 1.0)))
+    (told,) = bad.rejected
+    assert (told.configuration, told.leg, told.tube, told.side) == tuple(keys(many)[7])
+    assert told.reason.startswith("a repeat lies 9.")
+    assert told.reason.endswith("standard deviations from the others, which are used without it")
+    assert 7 not in bad.points[:, 0]
+    assert len(bad.points) == len(many) - 1
+    off = np.linalg.norm(good.edges.normal - bad.edges.normal, axis=1)
+    assert off.max() < 0.02 * pixel_units(edges)[:, 0].max()
+
+
+def test_repeats_without_a_majority_are_left_out(machine, poses):
+    edges = edges_of(machine, poses[:6])
+    many = repeated(edges, 2, 0.02, np.random.default_rng(0))
+    one = combined(look_of(spoiled(many, [7], 1.0)))
+    (told,) = one.rejected
+    assert told.reason.startswith("its repeats lie up to 4.9 ")
+    assert told.reason.endswith("standard deviations off, and no majority agrees")
+    assert len(one.edges) == len(edges) - 1
+    assert len(one.points) == len(many) - 2
+
+
+def test_an_edge_that_shows_now_and_then_is_left_out(machine, poses):
+    edges = edges_of(machine, poses[:6])
+    many = repeated(edges, 4, 0.02, np.random.default_rng(0))
+    late = np.arange(len(many)) >= 2 * len(edges)
+    one = combined(look_of(many.select(~((keys(many) == keys(many)[7]).all(axis=1) & late))))
+    (told,) = one.rejected
+    assert told.reason == "seen in only 2 of 4 repeats"
+    assert len(one.edges) == len(edges) - 1
+
+
+# what moves
+
+
+def test_axis_coordinates_are_the_derivatives_of_the_papers():
+    rng = np.random.default_rng(0)
+    a = rng.uniform(-0.2, 0.2, (50, 3)) + np.array([0, 0, 1.0])
+    b = a + rng.uniform(-0.3, 0.3, (50, 3)) + np.array([0, -0.5, 0])
+    motion = 1e-6 * rng.standard_normal((50, 6))
+    ahead, back = (to_coordinates(a + s * motion[:, :3], b + s * motion[:, 3:]) for s in (1, -1))
+    assert np.allclose(axis_coordinates(motion, a, b), (ahead - back) / 2, rtol=0, atol=1e-12)
+
+
+def test_a_leg_level_in_the_image_has_directions_only():
+    a, b = np.array([[-0.2, 0.1, 1.0]]), np.array([[0.2, 0.1, 1.1]])
+    change = axis_coordinates(np.full((1, 6), 1e-6) * np.arange(6), a, b)
+    assert np.isfinite(change[:, :2]).all()
+    assert np.isnan(change[:, 2:]).all()
+
+
+def cylinders_of(machine, poses, edges):
+    legs = legs_in_camera(machine, STATION, poses, machine.inverse(poses))
+    radii = machine.radii()
+    radius = np.array([radii[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)])
+    return Cylinders(
+        legs.a[edges.configuration, edges.leg], legs.b[edges.configuration, edges.leg], radius
+    )
+
+
+def test_a_fitted_axis_is_where_the_leg_went(machine, poses):
+    poses = poses[:6]
+    both_poses = poses, perturb(poses, np.full(6, 1e-5))
+    edges, moved = (edges_of(machine, p, shift=1e-9) for p in both_poses)
+    cylinders, other = (cylinders_of(machine, p, edges) for p in both_poses)
+    assert np.array_equal(keys(edges), keys(moved))
+    turn = np.einsum("nij,ni->nj", edges.basis, moved.normal - edges.normal)
+    groups = groups_of(edges.configuration, edges.leg)
+    whiten = np.broadcast_to(np.eye(2), (len(edges), 2, 2))
+    fit = fit_motions(turn, by_ends(edges, edges.basis, cylinders), whiten, groups)
+    sides = groups.total(edges.side[:, None] == np.array([0, 1]))
+    both = (sides > 0).all(axis=1)
+    first = groups.first
+    found = axis_coordinates(fit.motion, cylinders.a[first], cylinders.b[first])[both]
+    true = to_coordinates(other.a[first], other.b[first])
+    true = (true - to_coordinates(cylinders.a[first], cylinders.b[first]))[both]
+    known = np.isfinite(found).all(axis=1)
+    assert known.sum() > 20
+    assert np.abs(found - true)[known].max() < 0.05 * np.abs(true[known]).max()
+
+
+def motion_look(machine, poses, edges, rng):
+    """A look at 6 repeats of all configurations; edges(repeat) gives those of one."""
+    sets = [edges(r) for r in range(6)]
+    common = set.intersection(*({tuple(k) for k in keys(e)} for e in sets))
+    sets = [e.select(np.array([tuple(k) in common for k in keys(e)])) for e in sets]
+    many = concatenate([repeated(e, 1, 0.02, rng) for e in sets])
+    photo = np.repeat(np.arange(6), len(sets[0])) * len(poses) + many.configuration
+    same = same_edges(many)
+    reference = same.first[same.member]
+    turn = np.einsum("nij,ni->nj", many.basis[reference], many.normal - many.normal[reference])
+    turn -= same.mean(turn)[same.member]
+    cylinders = cylinders_of(machine, poses, many)
+    return _Look(0, many, photo, cylinders, same, turn, many.basis[reference], 0)
+
+
+def shaken_machine(machine, rng):
+    """A machine whose legs' joints moved by a fifth of a millimetre, each by itself."""
+    values = machine.values.copy()
+    centres = machine.parameters.of_kind("center")
+    values[centres] += 2e-4 * rng.standard_normal(values[centres].shape)
+    return machine.with_values(values)
+
+
+@pytest.mark.parametrize("cause", ["noise", "camera", "platform", "legs"])
+def test_what_moves_between_repeats_is_recognised(machine, poses, cause):
+    poses, rng = poses[:5], np.random.default_rng(7)
+    twist = np.repeat([5e-4, 5e-5], 3)
+
+    def edges(_repeat):
+        if cause == "camera":
+            moved = perturb(np.eye(4), twist * rng.standard_normal(6))
+            return edges_of(machine, poses, moved @ STATION)
+        if cause == "platform":
+            return edges_of(machine, perturb(poses, 3e-4 * rng.standard_normal((5, 6))))
+        if cause == "legs":
+            return edges_of(shaken_machine(machine, rng), poses)
+        return edges_of(machine, poses)
+
+    found = _station_row(motion_look(machine, poses, edges, rng), "front")
+    assert found.cause == cause
+    if cause == "noise":
+        assert abs(found.camera) < 0.05
+        assert abs(found.platform) < 0.05
+        assert abs(found.legs) < 0.1
+        assert found.shift == pytest.approx(0.02, rel=0.1)
+        assert found.promised == pytest.approx(0.2, rel=0.5)
+    else:
+        assert getattr(found, cause) > 0.5
+
+
+# whole sessions
+
+
+def simulated(folder, repeats, shake=(0.0, 0.0), stations=2):
+    settings = Settings(stations=stations, configurations=4, repeats=repeats, shake=shake)
+    drawing = load_mechanism("gough-stewart")
+    simulate_session(folder, drawing, camera_of_size((480, 360)), settings, seed=5)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def repeats(tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp("repeats") / "session", 4)
+
+
+def test_the_first_repeat_is_the_photograph_of_a_session_without(repeats, tmp_path):
+    single = simulated(tmp_path / "session", 1)
+    for path in sorted((single / "images" / "station1").iterdir()):
+        first = repeats / "images" / "station1" / f"{path.stem}_1.png"
+        second = repeats / "images" / "station1" / f"{path.stem}_2.png"
+        assert path.read_bytes() == first.read_bytes()
+        assert path.read_bytes() != second.read_bytes()
+    assert "repeat" not in (single / "session.yaml").read_text()
+    assert "repeats" not in (single / "truth.json").read_text()
+    assert load_truth(repeats, load_session(repeats).machine).repeats == 4
+    assert len(load_session(repeats).stations[0].photographs) == 16
+
+
+def test_repeats_do_not_promise_more_than_they_hold(repeats, tmp_path):
+    """The standard deviations of one photograph's calibration, hardly less with four: what
+    differs from the truth is shading, the same in all of them."""
+    single = tmp_path / "session"
+    shutil.copytree(repeats, single)
+    for path in single.glob("images/*/*_[234].png"):
+        path.unlink()
+    one, four = calibrate(single), calibrate(repeats)
+    sigma = [np.sqrt(np.diag(c.estimate.covariance)) for c in (one, four)]
+    known = sigma[0] > 1e-9
+    assert 0.7 < np.median(sigma[1][known] / sigma[0][known]) < 1.1
+    result = compare(four, repeats)
+    assert result.within / result.count > 0.85
+    edges = four.observation.edges
+    assert len(same_edges(edges).first) == len(edges)
+    assert four.observation.point_edge.max() < len(edges)
+
+
+def test_check_repeat_gives_table_1(repeats):
+    told = run("check", repeats, "--repeat")
+    assert told.code == run("check", repeats).code
+    assert "upper bound" in told.out
+    row = next(line for line in told.out.splitlines() if line.startswith("[A] Table 1"))
+    assert row.split()[3:] == ["0.05°", "0.06°", "0.05", "mm", "0.1", "mm"]
+    assert "neither the camera nor the machine moves: sensor noise" in " ".join(told.out.split())
+    assert "more repeats will hardly help" in " ".join(told.out.split())
+
+
+def test_check_repeat_as_json(repeats):
+    plain, told = run("check", repeats, "--json").json, run("check", repeats, "--repeat", "--json")
+    found = told.json["repeats"]
+    assert "repeats" not in plain
+    assert {k: v for k, v in told.json.items() if k != "repeats"} == plain
+    assert found["paper"]["psi"] == pytest.approx(np.radians(0.05))
+    legs = found["legs"]
+    assert {(row["station"], row["leg"]) for row in legs} == {
+        (f"station{s}", leg) for s in (1, 2) for leg in range(1, 7)
+    }
+    for name in ("psi", "theta", "x", "z", "shift", "tilt"):
+        known = [row[name] for row in legs if row[name] is not None]
+        assert found["bound"][name] == max(known)
+    # a pixel's noise of a few grey levels' share: hundredths of a pixel an edge
+    assert 0.005 < found["middle"]["shift"] < 0.08
+    assert all(0 < row["promised"] < 1 for row in legs)
+    assert [s["cause"] for s in found["stations"]] == ["noise", "noise"]
+
+
+def test_a_shaken_camera_is_told(tmp_path):
+    folder = simulated(tmp_path / "session", 3, (3e-5, 5e-4), stations=1)
+    told = run("check", folder, "--repeat", "--json")
+    assert told.code == 1
+    (station,) = told.json["repeats"]["stations"]
+    assert station["cause"] == "camera"
+    assert station["camera"] > 0.7
+    assert station["promised"] > 1
+    text = told.json["repeats"]["findings"][0]["text"]
+    assert "as if the camera moved: fix the camera" in text
+
+
+def test_check_repeat_without_repeats_says_what_to_write(demo):
+    told = run("check", demo.session, "--repeat")
+    assert told.code == 2
+    assert "the session has no repeated photographs" in told.err
+    assert "images/station1/{configuration}_{repeat}.png" in told.err
+    assert "images/station1/0001_1.png" in told.err
+
+
+def test_check_repeat_of_a_broken_session_says_what_is_broken(session):
+    (session / "joints.csv").unlink()
+    told = run("check", session, "--repeat", "--json")
+    assert told.code == 2
+    assert told.json["repeats"] is None
+
+
+def test_points_on_an_edge_project_where_the_turn_says(machine, poses):
+    """Pixel units: a turn by one moves the edge's middle by about a pixel in the image."""
+    edges = edges_of(machine, poses[:2], shift=1e-9)
+    legs = legs_in_camera(machine, STATION, poses[:2], machine.inverse(poses[:2]))
+    a, u = (v[edges.configuration, edges.leg] for v in (legs.a, legs.u))
+    middle = a + edges.span.mean(axis=1)[:, None] * u
+    ray = middle / np.linalg.norm(middle, axis=1)[:, None]
+    moved = turned(edges, pixel_units(edges) * [1.0, 0.0])
+    offset = [np.arcsin(dot(e.normal, ray)) for e in (edges, moved)]
+    pixel = 1 / CAMERA.parameters[0]
+    assert np.allclose(np.abs(offset[1] - offset[0]), pixel, rtol=0.4)
