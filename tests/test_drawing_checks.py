@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 
 import pytest
-from conftest import run
 
+from conftest import run
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import catalogue, load_mechanism
 
@@ -15,8 +15,9 @@ PASSIVE = "length: {passive: true}"
 
 
 def drawn(folder, name, *changes):
-    """A catalogue machine's file with parts of its text replaced, each once."""
-    text = catalogue()[name].read_text()
+    """A catalogue machine's file without comments, parts of its text replaced, each once."""
+    lines = catalogue()[name].read_text().splitlines(keepends=True)
+    text = "".join(line for line in lines if not line.startswith("#"))
     for before, after in changes:
         assert before in text
         text = text.replace(before, after, 1)
@@ -35,38 +36,38 @@ FAULTS = {
     "a revolute joint without an axis": (
         "3-rps",
         [(", axis: [-1, 0, 0]", "")],
-        "m.yaml, line 8, legs[1].base: leg 1 has a revolute joint without an axis; expected axis: "
+        "m.yaml, line 4, legs[1].base: leg 1 has a revolute joint without an axis; expected axis: "
         "[x, y, z] in the base frame, the direction that it turns about.",
     ),
     "a spherical joint with one": (
         "3-rps",
         [("[0.0000, 0.1800, 0.0000]", "[0.0000, 0.1800, 0.0000], axis: [0, 0, 1]")],
-        "m.yaml, line 9, legs[1].platform.axis: leg 1 has a spherical joint with an axis; expected "
+        "m.yaml, line 5, legs[1].platform.axis: leg 1 has a spherical joint with an axis; expected "
         "no axis, or joint: universal or revolute.",
     ),
     "an axis of length zero": (
         "3-rps",
         [("axis: [-1, 0, 0]", "axis: [0, 0, 0]")],
-        "m.yaml, line 8, legs[1].base.axis: an axis of length zero is no direction; write one such "
+        "m.yaml, line 4, legs[1].base.axis: an axis of length zero is no direction; write one such "
         "as [0, 0, 1].",
     ),
     "an axis of two numbers": (
         "3-rps",
         [("axis: [-1, 0, 0]", "axis: [-1, 0]")],
-        "m.yaml, line 8, legs[1].base.axis: this has too few entries; found [-1, 0], expected 3 "
+        "m.yaml, line 4, legs[1].base.axis: this has too few entries; found [-1, 0], expected 3 "
         "entries.",
     ),
     "a planar machine's axis out of the normal": (
         "3-rpr",
         [("0.3200, 0.1000]", "0.3200, 0.1000], axis: [0, 0.75, 1]")],
-        "m.yaml, line 9, legs[1].base.axis: leg 1 of a planar machine turns about an axis that is "
+        "m.yaml, line 4, legs[1].base.axis: leg 1 of a planar machine turns about an axis that is "
         "not the plane's; found [0, 0.6, 0.8], expected [0, 0, 1]: a planar machine moves in the "
         "base frame's x-y plane.",
     ),
     "a planar machine's leg out of its plane": (
         "3-rpr",
         [("0.3200, 0.1000]", "0.3200, 0.1010]")],
-        "m.yaml, line 10, legs[1].platform.center: leg 1 of a planar machine leaves its plane; "
+        "m.yaml, line 5, legs[1].platform.center: leg 1 of a planar machine leaves its plane; "
         "found its platform joint -0.6667 mm above its base joint, expected the same height (z) "
         "for both ends of a leg, at the home pose. Draw the leg in its plane, or write motion: "
         "spatial.",
@@ -74,7 +75,7 @@ FAULTS = {
     "a planar machine's home out of the plane": (
         "3-rpr",
         [("legs:", "home: {position: [0, 0, 0.002]}\nlegs:")],
-        "m.yaml, line 11, legs[1].platform.center: leg 1 of a planar machine leaves its plane; "
+        "m.yaml, line 6, legs[1].platform.center: leg 1 of a planar machine leaves its plane; "
         "found its platform joint +2 mm above its base joint, expected the same height (z) for "
         "both ends of a leg, at the home pose. Draw the leg in its plane, or write motion: "
         "spatial.",
@@ -82,20 +83,20 @@ FAULTS = {
     "a planar machine's home turned": (
         "3-rpr",
         [("legs:", "home: {position: [0, 0, 0], rotation_vector: [0.01, 0, 0]}\nlegs:")],
-        "m.yaml, line 8, home.rotation_vector: the home pose of a planar machine is turned out of "
+        "m.yaml, line 3, home.rotation_vector: the home pose of a planar machine is turned out of "
         "its plane; expected [0, 0, angle].",
     ),
     "axes that would turn a translating platform": (
         "3-upu",
         [("motion: spatial", "motion: translation"), ("axis: [-1, 0, 0]", "axis: [-1, 0.01, 0]")],
-        "m.yaml, line 13, legs[1].platform.axis: the universal joints of leg 1 have axes that are "
+        "m.yaml, line 5, legs[1].platform.axis: the universal joints of leg 1 have axes that are "
         "not parallel, so they would turn the platform; expected the axis of its base joint. Write "
         "motion: spatial, and the turn will be computed.",
     ),
     "a passive leg that is needed": (
         "gough-stewart",
         [(ROD, PASSIVE)],
-        "m.yaml, line 4, legs: the legs do not hold the platform: 5 equations for 6 freedoms; leg "
+        "m.yaml, line 3, legs: the legs do not hold the platform: 5 equations for 6 freedoms; leg "
         "1, passive, holds nothing; expected one equation a leg with a length, one a revolute "
         "joint, one a pair of universal joints with axes; 6 for motion: spatial. Add legs or axes, "
         "or correct motion.",
@@ -103,7 +104,7 @@ FAULTS = {
     "two of them": (
         "gough-stewart",
         [(ROD, PASSIVE), (ROD, PASSIVE)],
-        "m.yaml, line 4, legs: the legs do not hold the platform: 4 equations for 6 freedoms; legs "
+        "m.yaml, line 3, legs: the legs do not hold the platform: 4 equations for 6 freedoms; legs "
         "1 and 2, passive, hold nothing; expected one equation a leg with a length, one a revolute "
         "joint, one a pair of universal joints with axes; 6 for motion: spatial. Add legs or axes, "
         "or correct motion.",
@@ -111,7 +112,7 @@ FAULTS = {
     "a universal axis left out": (
         "3-upu",
         [("0.0000], axis: [-1, 0, 0]", "0.0000]")],
-        "m.yaml, line 11, legs: the legs do not hold the platform: 5 equations for 6 freedoms; "
+        "m.yaml, line 3, legs: the legs do not hold the platform: 5 equations for 6 freedoms; "
         "expected one equation a leg with a length, one a revolute joint, one a pair of universal "
         "joints with axes; 6 for motion: spatial. Add legs or axes, or correct motion.",
     ),
@@ -149,7 +150,7 @@ FAULTS = {
     "a passive leg with a range": (
         "6-spu-passive",
         [("{passive: true}", "{passive: true, range: [0.3, 0.5]}")],
-        "m.yaml, line 33, legs[7].length.range: this key is not known; found range.",
+        "m.yaml, line 30, legs[7].length.range: this key is not known; found range.",
     ),
     "an offset of a leg that has none": (
         "6-spu-passive",
@@ -161,7 +162,7 @@ FAULTS = {
     "a strut shorter than nothing": (
         "constant-legs",
         [("constant: 0.415", "constant: -0.415")],
-        "m.yaml, line 17, legs[3].length.constant: this value cannot be used; found -0.415, "
+        "m.yaml, line 14, legs[3].length.constant: this value cannot be used; found -0.415, "
         "expected a number above 0.",
     ),
 }

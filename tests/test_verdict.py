@@ -87,12 +87,12 @@ def test_heave_alone_is_said():
     assert "Turn the platform in some configurations" in said
 
 
-def test_what_does_not_move_the_platform_is_a_warning():
+def test_what_does_not_move_the_platform_is_a_note():
     """A passive leg in no photograph: its own values are free, the platform is not."""
     scene = make("6-spu-passive")
     observation, estimate, findings, verdict = judged(scene, *[(1, 2, 3, 4, 5, 6)] * 3)
     assert verdict.usable, verdict.reasons
-    assert any(w.startswith("Leg 7 is in no photograph") for w in verdict.warnings)
+    assert any("leg 7 is in no photograph" in a for a in verdict.advice)
     assert not judge(observation, estimate).usable  # without the test, shares alone refuse it
     assert judge(observation, estimate, findings=findings) == verdict
 

@@ -40,7 +40,7 @@ from pkmcal.observe.repeats import (
     same_edges,
 )
 from pkmcal.recognition import read_photographs
-from pkmcal.session import Session, load_session
+from pkmcal.session import Session, Station, load_session
 
 SHARED = 0.3
 """Share of the scatter, above what chance explains, from which its cause is told."""
@@ -146,7 +146,8 @@ def study_repeats(
         session = load_session(session)
     require_repeats(session)
     calibration = calibrate(session, seed=seed, progress=progress)
-    looks = [_Look.of(calibration, photographs) for photographs in read_photographs(session)]
+    observed = [p for p in read_photographs(session) if _sees_legs(session.stations[p.station])]
+    looks = [_Look.of(calibration, photographs) for photographs in observed]
     looks = [look for look in looks if np.any(look.same.count > 1)]
     names = [station.name for station in session.stations]
     legs = tuple(row for look in looks for row in _leg_rows(look, names[look.station]))
@@ -156,10 +157,10 @@ def study_repeats(
 
 
 def require_repeats(session: Session) -> None:
-    """An InputError, with what to write, where no station has two photographs alike."""
+    """An InputError, with what to write, where no station that observes legs has repeats."""
     for station in session.stations:
         rows = [photo.configuration for photo in station.photographs]
-        if len(set(rows)) < len(rows):
+        if _sees_legs(station) and len(set(rows)) < len(rows):
             return
     name = session.stations[0].name
     raise InputError(
@@ -170,6 +171,10 @@ def require_repeats(session: Session) -> None:
         next_step="Photograph some configurations several times, moving nothing in between, and"
         f" name the photographs images/{name}/0001_1.png, images/{name}/0001_2.png and so on",
     )
+
+
+def _sees_legs(station: Station) -> bool:
+    return "legs" in station.observe
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import joint_centres
-from pkmcal.identify.gauge import ThreeCentres, apply
+from pkmcal.identify.gauge import apply, default_gauge
 from pkmcal.identify.problem import State
 from pkmcal.mechanisms import Machine
 from pkmcal.report.toolpoint import tool_point
@@ -93,10 +93,14 @@ def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
         T_base_platform=truth.T_base_platform,
         edge_shift=np.zeros_like(estimate.state.edge_shift),
     )
-    told = apply(calibration.session.machine, true, ThreeCentres())
-    sigma = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
+    drawing = calibration.session.machine
+    told, table = apply(drawing, true, default_gauge(drawing)), drawing.parameters
+    # an axis by its two turns: along itself it changes by squares of small angles only
+    error = table.to_free(estimate.machine.values) - table.to_free(told.theta)
+    to_free = np.linalg.pinv(table.free_matrix())
+    sigma = np.sqrt(np.maximum(np.diag(to_free @ estimate.covariance @ to_free.T), 0.0))
     known = sigma > 1e-9  # what defines the frames has no deviation
-    return np.abs(estimate.machine.values - told.theta)[known] / sigma[known]
+    return np.abs(error)[known] / sigma[known]
 
 
 def _rms(values: Array) -> float:

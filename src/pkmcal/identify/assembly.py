@@ -10,6 +10,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.identify.blocks import BatchState, Blocks, Data
 from pkmcal.identify.gauge import Gauge, frame_rows, freedoms
+from pkmcal.identify.hinges import exact_moves
 from pkmcal.identify.pose_rows import PoseBlocks, PoseData
 from pkmcal.identify.problem import Measurements, State
 from pkmcal.identify.residuals import SHIFT_SIGMA, Problem
@@ -76,7 +77,7 @@ def assemble(
         n_cameras=n_cameras,
         prior=prior,
         prior_target=target,
-        frames=freedoms(machine),
+        frames=exact_moves(machine),
         pose_blocks=_pose_blocks(measurements, pose_row, pose_place, shape[0]),
         pose_data=_pose_data(measurements, pose_row, pose_place, shape[0]),
     )

@@ -15,21 +15,29 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import ResultError
 from pkmcal.identify import robust as robust_weights
 from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
+from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.covariance import (
     Identifiability,
     Information,
     data_share,
-    edge_fit,
+    group_fit,
     identifiability,
     information,
     machine_covariance,
 )
-from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.mounts import start_mounts
 from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
 from pkmcal.identify.residuals import Problem
-from pkmcal.identify.solver import FIRST_DAMPING, RESTART_DAMPING, Solution, Stop, minimise
+from pkmcal.identify.robust import Both
+from pkmcal.identify.solver import (
+    FIRST_DAMPING,
+    RESTART_DAMPING,
+    Solution,
+    Stop,
+    eliminate,
+    minimise,
+)
 from pkmcal.mechanisms import Machine
 
 LEAST_SCALE = 1.0
@@ -44,8 +52,8 @@ class BatchResult:
     """The joint estimate of B runs.
 
     problem : with the weights in use, noise scale included. solution : states, cost, stops.
-    weight : (B, K, G) robust weights 0..1. noise_scale : (B,). steps : (B,).
-    info : rows and covariance at the solution.
+    weight, pose_weight : (B, K, G) robust weights 0..1 of edges and poses. noise_scale,
+    pose_scale : (B,). steps : (B,). info : rows and covariance at the solution.
     """
 
     problem: Problem
@@ -54,34 +62,50 @@ class BatchResult:
     noise_scale: Array
     steps: Integers
     info: Information
+    pose_weight: Array
+    pose_scale: Array
 
 
 def solve_batch(
-    problem: Problem, start: BatchState, *, robust: bool = True, scale_noise: bool = True
+    problem: Problem,
+    start: BatchState,
+    *,
+    robust: bool = True,
+    scale_noise: bool = True,
+    damping: float = FIRST_DAMPING,
 ) -> BatchResult:
-    """All runs of a problem from their starts; see :func:`bundle` for the options."""
+    """All runs of a problem from their starts; see :func:`bundle` for the options.
+
+    damping : the search's first; less where the start is near, as after the four steps.
+    """
     n_runs = start.z.shape[0]
-    present = np.broadcast_to(
-        problem.blocks.present.astype(float), (n_runs, *problem.blocks.present.shape)
-    )
-    fit = _Fit(problem, start, present, np.ones(n_runs), np.zeros(n_runs, dtype=int), ())
+    ones = Both(np.ones(n_runs), np.ones(n_runs))
+    fit = _Fit(problem, start, _all(problem, n_runs), ones, np.zeros(n_runs, dtype=int), ())
     if robust:
         found = robust_weights.anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
         scale = found.scale if scale_noise else fit.scale
         fit = fit._replace(state=found.state, weight=found.weight, scale=scale, steps=found.steps)
-    fit = _solved(problem, fit, RESTART_DAMPING if robust else FIRST_DAMPING)
+    fit = _solved(problem, fit, RESTART_DAMPING if robust else damping)
     for _ in range(ROUNDS if robust or scale_noise else 0):
         scale = _noise_scale(fit) if scale_noise else fit.scale
         weight = fit.weight
         if robust:
-            weight = robust_weights.final_weights(robust_weights.norms(problem, fit.state), scale)
-        change = np.abs(scale / fit.scale - 1).max()
-        if max(change, 0.1 * np.abs(weight - fit.weight).max()) < 1e-3:
+            weight = robust_weights.settled_weights(problem, fit.state, scale)
+        if _same(scale, fit.scale, weight, fit.weight):
             break
         fit = _solved(problem, fit._replace(weight=weight, scale=scale), RESTART_DAMPING)
     info = information(fit.problem, fit.state)
     solution = Solution(fit.state, info.cost(), fit.steps, fit.stop)
-    return BatchResult(fit.problem, solution, fit.weight, fit.scale, fit.steps, info)
+    return BatchResult(
+        fit.problem,
+        solution,
+        fit.weight.edges,
+        fit.scale.edges,
+        fit.steps,
+        info,
+        fit.weight.poses,
+        fit.scale.poses,
+    )
 
 
 class _Fit(NamedTuple):
@@ -89,29 +113,60 @@ class _Fit(NamedTuple):
 
     problem: Problem
     state: BatchState
-    weight: Array
-    scale: Array
+    weight: Both
+    scale: Both
     steps: Integers
     stop: tuple[Stop, ...]
 
 
+def _all(problem: Problem, n_runs: int) -> Both:
+    """Weights of 1 for all that is measured."""
+    present = (problem.blocks.present, problem.pose_blocks.present)
+    return Both(*(np.broadcast_to(p.astype(float), (n_runs, *p.shape)) for p in present))
+
+
+def _same(scale: Both, old_scale: Both, weight: Both, old_weight: Both) -> bool:
+    """Whether scales and weights have settled."""
+    change = [np.abs(new / old - 1).max() for new, old in zip(scale, old_scale, strict=True)]
+    change += [
+        0.1 * np.abs(new - old).max(initial=0.0)
+        for new, old in zip(weight, old_weight, strict=True)
+    ]
+    return max(change) < 1e-3
+
+
 def _solved(problem: Problem, fit: _Fit, damping: float) -> _Fit:
     """The problem solved with the fit's weights, from its state."""
-    used = problem.weighted(fit.weight / fit.scale[:, None, None] ** 2)
+    parts = zip(fit.weight, fit.scale, strict=True)
+    used = problem.weighted(*(weight / scale[:, None, None] ** 2 for weight, scale in parts))
     found = minimise(used, fit.state, damping=damping)
     steps = fit.steps + found.steps
     return fit._replace(problem=used, state=found.state, steps=steps, stop=found.stop)
 
 
-def _noise_scale(fit: _Fit) -> Array:
-    """Factor on the edges' stated noise that makes their chi2 equal its degrees of freedom, (B,).
+def _noise_scale(fit: _Fit) -> Both:
+    """Factors on the stated noise of edges, and of poses, that make their chi2 equal its degrees
+    of freedom, (B,) each.
 
-    The variance component of the edges' group with redundancies as weights; kept as it is
-    where fewer than five degrees of freedom remain to judge it.
+    The variance component of a group with redundancies as weights; kept as it is where fewer
+    than five degrees of freedom remain to judge it.
     """
-    chi2, freedom = edge_fit(fit.problem, fit.state, edge_count(fit.problem, fit.weight))
-    new = fit.scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
-    return np.where(freedom > 5, np.maximum(new, LEAST_SCALE), fit.scale)
+    problem = fit.problem
+    linear = problem.linearize(fit.state)
+    reduced = eliminate(linear, np.zeros(len(fit.steps)))
+    count = Both(edge_count(problem, fit.weight.edges), pose_count(problem, fit.weight.poses))
+    rows = slice(0, problem.n_edge_rows), problem.pose_rows
+    out = []
+    for part, number, scale in zip(rows, count, fit.scale, strict=True):
+        chi2, freedom = group_fit(linear, reduced, part, number)
+        new = scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
+        out.append(np.where(freedom > 5, np.maximum(new, LEAST_SCALE), scale))
+    return Both(*out)
+
+
+def pose_count(problem: Problem, weight: Array) -> Array:
+    """Residuals of poses in use, each counted by its robust weight, (B,)."""
+    return np.sum(weight * robust_weights.measured_rows(problem), axis=(1, 2))
 
 
 def edge_count(problem: Problem, weight: Array) -> Array:
@@ -134,8 +189,8 @@ def bundle(
     start : every unknown's first value, see :func:`start_state`.
     use_drawing : take the drawing's values as measurements with their tolerances; radii
         and edge shifts keep theirs in any case.
-    robust : let go of edges that do not fit. scale_noise : where the residuals
-        ask for it, enlarge the edges' stated noise by a common factor.
+    robust : let go of edges and poses that do not fit. scale_noise : where the residuals
+        ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each.
     gauge : frames of the result, three centres by default.
     Raises ResultError where the search cannot start or ends without an answer.
     """
@@ -181,8 +236,11 @@ def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiab
     weight = assembled.problem.data.weight.copy()
     weight[0, assembled.row, assembled.place] = estimate.edge_weights
     weight = weight / estimate.statistics.noise_scale**2
+    poses = assembled.problem.pose_data.weight.copy()
+    poses[0, assembled.pose_row, assembled.pose_place] = estimate.pose_weights
+    poses = poses / estimate.statistics.pose_scale**2
     state = batch_of(machine, assembled, estimate.state)
-    return identifiability(assembled.problem.weighted(weight), machine, state)
+    return identifiability(assembled.problem.weighted(weight, poses), machine, state)
 
 
 def _estimate(
@@ -202,6 +260,7 @@ def _estimate(
     identified = machine.with_values(state.theta)
     n_par = len(machine.parameters)
     stations = np.arange(6 * problem.n_stations).reshape(-1, 6) + n_par
+    mounts = np.arange(stations.size + n_par, len(full)).reshape(-1, 6)
     rows = problem.block_residuals(found)[0] / result.noise_scale[0]
     covariance = full[:n_par, :n_par]
     optics = _optics_covariance(result)
@@ -220,8 +279,16 @@ def _estimate(
         statistics=_statistics(result, assembled),
         gauge=gauge.name,
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ np.swapaxes(factor, -1, -2),
-        pose_residuals=problem.pose_residuals(found)[0, assembled.pose_row, assembled.pose_place],
+        pose_residuals=_pose_residuals(result, assembled),
+        pose_weights=result.pose_weight[0, assembled.pose_row, assembled.pose_place],
+        mount_covariance=full[mounts[:, :, None], mounts[:, None, :]],
     )
+
+
+def _pose_residuals(result: BatchResult, assembled: Assembled) -> Array:
+    """Whitened residuals (N, 6) of the poses, by their noise as scaled."""
+    rows = result.problem.pose_residuals(result.solution.state)[0]
+    return rows[assembled.pose_row, assembled.pose_place] / result.pose_scale[0]
 
 
 def _optics_covariance(result: BatchResult) -> Array:
@@ -259,29 +326,35 @@ def _joint_residuals(
 def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     problem, linear = result.problem, result.info.linear
     kinds = np.array(assembled.priors)
-    chi2_edges = float(np.sum(linear.value[0, :, : problem.n_edge_rows] ** 2))
-    closures = linear.value[0, :, problem.closure_rows]
-    chi2_joints = float(np.sum(closures**2))
-    chi2_poses = float(np.sum(linear.value[0, :, problem.pose_rows] ** 2))
-    n_poses = 6 * len(assembled.pose_row)
+    rows = slice(0, problem.n_edge_rows), problem.closure_rows, problem.pose_rows
+    chi2 = [float(np.sum(linear.value[0, :, part] ** 2)) for part in rows]
     chi2_drawing = float(np.sum(linear.shared_value[0, kinds != "gauge"] ** 2))
     n_edges = float(edge_count(problem, result.weight)[0])
-    n_joints = closures.size
+    n_poses = float(pose_count(problem, result.pose_weight)[0])
+    n_joints = linear.value[0, :, rows[1]].size
     n_drawing = int(np.sum(kinds != "gauge"))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))
     unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
+    freedom = [
+        float(group_fit(linear, result.info.reduced, part, np.array([float(number)]))[1][0])
+        for part, number in zip(rows, (n_edges, n_joints, n_poses), strict=True)
+    ]
     return Statistics(
-        chi2=chi2_edges + chi2_joints + chi2_poses + chi2_drawing,
+        chi2=sum(chi2) + chi2_drawing,
         dof=n_edges + n_joints + n_poses + n_drawing - unknowns,
-        chi2_edges=chi2_edges,
+        chi2_edges=chi2[0],
         n_edges=n_edges,
-        chi2_joints=chi2_joints,
+        chi2_joints=chi2[1],
         n_joints=n_joints,
         chi2_drawing=chi2_drawing,
         n_drawing=n_drawing,
         steps=int(result.steps[0]),
         stopped=result.solution.stop[0].value,
         noise_scale=float(result.noise_scale[0]),
-        chi2_poses=chi2_poses,
+        chi2_poses=chi2[2],
         n_poses=n_poses,
+        pose_scale=float(result.pose_scale[0]),
+        dof_edges=freedom[0],
+        dof_joints=freedom[1],
+        dof_poses=freedom[2],
     )

@@ -13,17 +13,19 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import skew
+from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.gauge import (
     Gauge,
     alignment,
     carried_errors,
     changed_frames,
-    freedoms,
     generators,
+    mount_generators,
     projector,
     transformation,
 )
-from pkmcal.identify.blocks import BatchState
+from pkmcal.identify.hinges import exact_moves, move_generators
 from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import Problem
 from pkmcal.identify.solver import Linear, Reduced, eliminate, reduced_normal, transposed
@@ -75,17 +77,15 @@ def information(problem: Problem, state: BatchState) -> Information:
     return Information(linear, reduced, half @ transposed(half))
 
 
-def edge_fit(problem: Problem, state: BatchState, count: Array) -> tuple[Array, Array]:
-    """The edges' chi2 and its degrees of freedom, count - tr(hat), (B,) each.
+def group_fit(linear: Linear, reduced: Reduced, group: slice, count: Array) -> tuple[Array, Array]:
+    """A group's chi2 and its degrees of freedom, count - tr(hat), (B,) each.
 
-    count : rows in use, (B,). The hat matrix splits into the own unknowns' part Q Q^T and the
-    shared unknowns' part tr(N^-1 N_edges); directions that nothing fixes have no part in it.
+    group : its rows in a configuration. count : rows in use, (B,). reduced : without damping. The
+    hat matrix splits into the own unknowns' part Q Q^T and the shared unknowns' part
+    tr(N^-1 N_group); directions that nothing fixes have no part in it.
     """
-    linear = problem.linearize(state)
-    reduced = eliminate(linear, np.zeros(len(count)))
-    n = problem.n_edge_rows
-    own = np.sum(reduced.q[:, :, :n] ** 2, axis=(1, 2, 3))
-    rows = reduced.rows[:, :, :n].reshape(len(count), -1, reduced.rows.shape[-1])
+    own = np.sum(reduced.q[:, :, group] ** 2, axis=(1, 2, 3))
+    rows = reduced.rows[:, :, group].reshape(len(count), -1, reduced.rows.shape[-1])
     normal = reduced_normal(linear, reduced)
     scale = np.sqrt(np.einsum("bii->bi", normal))
     scale = np.where(scale > 0, scale, 1.0)
@@ -93,36 +93,59 @@ def edge_fit(problem: Problem, state: BatchState, count: Array) -> tuple[Array, 
     known = values > UNKNOWN * values[:, -1:]
     rows = rows / scale[:, None, :] @ vectors
     shared = np.sum(rows**2 * np.where(known, 1 / np.abs(values), 0.0)[:, None], axis=(1, 2))
-    return np.sum(linear.value[:, :, :n] ** 2, axis=(1, 2)), count - own - shared
+    return np.sum(linear.value[:, :, group] ** 2, axis=(1, 2)), count - own - shared
 
 
 def machine_covariance(
     problem: Problem, machine: Machine, before: State, shared: Array, gauge: Gauge
 ) -> Array:
-    """Covariance (P + 6 S) of parameters and stations, told in the gauge.
+    """Covariance (P + 6 S + 6 M) of parameters, stations and mounts, told in the gauge.
 
     before : the solution as the solver left it. shared : (na, na) covariance there.
     """
     n_free, n_par = problem.free.shape[1], len(machine.parameters)
-    n_station = 6 * problem.n_stations
-    spread = np.zeros((n_par + n_station, n_free + n_station))
+    n_first, n_mount = 6 * problem.n_stations, 6 * problem.pose_blocks.n_mounts
+    kept = np.r_[: n_free + n_first, len(shared) - n_mount : len(shared)]
+    spread = np.zeros((n_par + n_first + n_mount, len(kept)))
     spread[:n_par, :n_free] = problem.free
-    spread[n_par:, n_free:] = np.eye(n_station)
+    spread[n_par:, n_free:] = np.eye(n_first + n_mount)
     e, f = alignment(machine, before, gauge)
     after = changed_frames(machine.layout, before, e, f)
-    spread = carried_errors(machine.layout, before, e, f) @ spread
-    spread = transformation(machine, after, gauge) @ spread
-    part = shared[: n_free + n_station, : n_free + n_station]
+    first = n_par + n_first
+    spread[:first] = carried_errors(machine.layout, before, e, f) @ spread[:first]
+    spread[first:] = _carried_mounts(before, e, f) @ spread[first:]
+    spread[first:] -= _moved_mounts(machine, after, gauge) @ spread[:n_par]
+    spread[:first] = transformation(machine, after, gauge) @ spread[:first]
     spread[:n_par] = _along_units(machine, after.theta, spread[:n_par])
-    out = spread @ part @ spread.T
+    out = spread @ shared[np.ix_(kept, kept)] @ spread.T
     # constrained and fixed coordinates are exactly known; the product leaves rounding there
     known = np.flatnonzero(np.diag(out)[:n_par] < 1e-18 * machine.parameters.tolerance**2)
     out[known, :], out[:, known] = 0.0, 0.0
     return 0.5 * (out + out.T)
 
 
+def _carried_mounts(before: State, e: Array, f: Array) -> Array:
+    """Errors (6M, 6M) of mounts before the frame changes to those after: turned with their body,
+    and moved by the turn about its new origin.
+    """
+    n = len(before.T_mount)
+    out = np.zeros((n, 6, n, 6))
+    for m, moving in enumerate(before.on_platform):
+        frame = f if moving else e
+        rot = frame[:3, :3]
+        out[m, :3, m, :3] = out[m, 3:, m, 3:] = rot
+        out[m, 3:, m, :3] = skew(frame[:3, 3]) @ rot
+    return out.reshape(6 * n, 6 * n)
+
+
+def _moved_mounts(machine: Machine, after: State, gauge: Gauge) -> Array:
+    """What restoring the gauge does to mounts, by the parameters' errors, (6M, P)."""
+    moved = mount_generators(after.T_mount, after.on_platform).reshape(-1, 12)
+    return moved @ projector(machine, after.theta, gauge)
+
+
 def _along_units(machine: Machine, theta: Array, rows: Array) -> Array:
-    """Rows (P, n) of errors of parameters, those of axes kept across the axis: their length is one."""
+    """Errors (P, n) of parameters, those of axes kept across the axis: their length is one."""
     for index in np.concatenate(machine.layout.turning):
         axis = theta[index] / np.linalg.norm(theta[index])
         rows[index] -= np.outer(axis, axis @ rows[index])
@@ -159,8 +182,8 @@ class Direction:
 class Identifiability:
     """What the data alone can tell of the machine, frames aside.
 
-    n_parameters : free ones. n_frames : freedoms of the frames. rank : directions the data fix.
-    unidentified : directions that no amount of such data fixes. weak : directions that the
+    n_parameters : free ones. n_frames : freedoms of the frames, and of hinges' beginnings.
+    rank : directions the data fix. unidentified : directions that no amount of such data fixes. weak : directions that the
     drawing knows better than the data.
     """
 
@@ -191,9 +214,10 @@ def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Id
     tolerance = table.tolerances_free()
     left = rows[:, :nz] * tolerance
     left = left - q @ (q.T @ left)
-    theta, frames = problem.theta(state)[0], freedoms(machine)
-    moved = np.linalg.lstsq(problem.free, generators(machine.layout, theta) @ frames, rcond=None)[0]
-    basis = np.linalg.qr(moved / tolerance[:, None], mode="complete")[0][:, frames.shape[1] :]
+    theta, moves = problem.theta(state)[0], exact_moves(machine)
+    moved = move_generators(machine.layout, theta) @ moves
+    moved = np.linalg.lstsq(problem.free, moved, rcond=None)[0]
+    basis = np.linalg.qr(moved / tolerance[:, None], mode="complete")[0][:, moves.shape[1] :]
     s, vt = _all_singular(left @ basis)
     directions = vt @ basis.T
     lost = s < RANK_TOLERANCE * s[0]
@@ -203,7 +227,7 @@ def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Id
     ]
     return Identifiability(
         n_parameters=nz,
-        n_frames=frames.shape[1],
+        n_frames=moves.shape[1],
         rank=int(np.sum(~lost)),
         unidentified=tuple(m for m, gone in zip(made, lost, strict=True) if gone),
         weak=tuple(m for m, gone in zip(made, lost, strict=True) if not gone and m.information < 1),

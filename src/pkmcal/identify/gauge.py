@@ -191,8 +191,7 @@ def _respecting_motion(motion: Array) -> Array:
 
 def default_gauge(machine: Machine) -> Gauge:
     """Three centres where three legs' joints make a triangle on both bodies, else the best fit."""
-    gauge = ThreeCentres()
-    legs = gauge.legs if max(gauge.legs) < machine.n_legs else (0, 1, 2)
+    legs = (0, 2, 4) if machine.n_legs > 4 else (0, 1, 2)
     if machine.n_legs < 3:
         return BestFit()
     for index in centre_index(machine.layout):
@@ -200,7 +199,7 @@ def default_gauge(machine: Machine) -> Gauge:
         sides = np.linalg.norm([p2 - p1, p3 - p1], axis=1)
         if np.linalg.norm(np.cross(p2 - p1, p3 - p1)) <= FLAT * sides.prod():
             return BestFit()
-    return gauge
+    return ThreeCentres(legs)
 
 
 def frame_rows(machine: Machine, gauge: Gauge) -> Array:

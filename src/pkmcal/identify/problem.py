@@ -79,7 +79,9 @@ class Statistics:
     chi2_edges, n_edges, chi2_joints, n_joints, chi2_drawing, n_drawing : by kind of residual.
     steps : solver steps. stopped : reason in words. noise_scale : factor by which the edges'
     stated standard deviations had to be enlarged (or shrunk) to agree with the residuals;
-    1 when they were taken as they are. chi2_poses, n_poses : of boards' poses, six each.
+    1 when they were taken as they are. chi2_poses, n_poses : of poses, six numbers of a full one;
+    pose_scale : the same factor of theirs. dof_edges, dof_joints, dof_poses : degrees of freedom
+    that each kind of residual has left; their sum and the drawing's is ``dof``.
     """
 
     chi2: float
@@ -94,7 +96,11 @@ class Statistics:
     stopped: str
     noise_scale: float
     chi2_poses: float = 0.0
-    n_poses: int = 0
+    n_poses: float = 0.0
+    pose_scale: float = 1.0
+    dof_edges: float = 0.0
+    dof_joints: float = 0.0
+    dof_poses: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -110,7 +116,8 @@ class Estimate:
     joint_residuals : (K, m) in standard deviations.
     data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
         data decide; near 0, the value is the drawing's.
-    pose_residuals : (N, 6) whitened, of the measured boards' poses.
+    pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
+    mount_covariance : (M, 6, 6) of (omega, tau), left perturbation of T_mount.
     configurations : (K,) True where the configuration was seen and its pose estimated.
     gauge : its name for people.
     """
@@ -129,3 +136,5 @@ class Estimate:
     gauge: str
     intrinsics_covariance: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    pose_weights: Array = field(default_factory=lambda: np.zeros(0))
+    mount_covariance: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))

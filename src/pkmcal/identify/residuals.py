@@ -26,13 +26,13 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import inverse, perturb, skew
 from pkmcal.identify.blocks import BatchState, Blocks, Data
 from pkmcal.identify.gauge import (
-    generators,
     mount_generators,
     moved_centres,
     moved_mounts,
     pose_generators,
     station_generators,
 )
+from pkmcal.identify.hinges import move_generators, slid
 from pkmcal.identify.pose_rows import PoseBlocks, PoseData, PoseRows, no_poses, pose_rows
 from pkmcal.identify.solver import Linear, Values
 from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, on_tangents
@@ -62,7 +62,8 @@ class Problem:
     layout, drawing (P,), free (P, nz) : the machine. blocks, data : the measurements.
     joint_noise : standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns (z, stations, optics) and prior_target : (c,).
-    frames : (12, g) frame changes that the model allows. pose_blocks, pose_data : of boards.
+    frames : (12 + 2n, g) frame and hinge changes that the model allows. pose_blocks, pose_data : of
+    boards.
     """
 
     layout: LimbLayout
@@ -166,10 +167,11 @@ class Problem:
         drawing's soft hold on the frames would be found along a curved valley.
         """
         nz, ns = self.free.shape[1], 6 * self.n_stations
-        by_frames = generators(self.layout, self.theta(state), self.drawing)
+        by_frames = move_generators(self.layout, self.theta(state), self.drawing)
         by_frames = np.linalg.pinv(self.free) @ by_frames
-        y = self.frames @ np.linalg.pinv(by_frames @ self.frames) @ shared[:, :nz, None]
-        z = shared[:, :nz] - (by_frames @ y)[..., 0]
+        moves = self.frames @ np.linalg.pinv(by_frames @ self.frames) @ shared[:, :nz, None]
+        z = shared[:, :nz] - (by_frames @ moves)[..., 0]
+        y, slides = moves[:, :12], moves[:, 12:, 0]
         camera = shared[:, nz : nz + ns].reshape(-1, self.n_stations, 6)
         camera = camera - (station_generators(state.T_camera_base) @ y[:, None])[..., 0]
         own = own @ self.layout.own_motion.T
@@ -184,14 +186,14 @@ class Problem:
             perturb(state.T_base_platform, pose),
             state.optics + shared[:, nz + ns : m].reshape(state.optics.shape),
             perturb(state.T_mount, mount - (by_frame @ y[:, None])[..., 0]),
-            state.internal + internal,
+            state.internal + internal + slides[:, None, 1::2],
         )
-        return self._in_frames(inner, y[..., 0])
+        return self._in_frames(inner, y[..., 0], slides)
 
-    def _in_frames(self, state: BatchState, y: Array) -> BatchState:
-        """The state after exact frame changes y (B, 12)."""
+    def _in_frames(self, state: BatchState, y: Array, slides: Array) -> BatchState:
+        """The state after exact frame changes y (B, 12) and hinge changes (B, 2n)."""
         e, f = perturb(np.eye(4), y[:, :6]), perturb(np.eye(4), y[:, 6:])
-        theta = moved_centres(self.layout, self.theta(state), e, f)
+        theta = moved_centres(self.layout, slid(self.layout, self.theta(state), slides), e, f)
         theta = on_tangents(self.layout, theta, self.drawing)
         return BatchState(
             (theta - self.drawing) @ np.linalg.pinv(self.free).T,
@@ -199,7 +201,7 @@ class Problem:
             e[:, None] @ state.T_base_platform @ inverse(f)[:, None],
             state.optics,
             moved_mounts(state.T_mount, self.pose_blocks.on_platform, e, f),
-            state.internal,
+            state.internal - slides[:, None, 1::2],
         )
 
     def select(self, runs: Integers) -> Problem:
@@ -223,9 +225,14 @@ class Problem:
             out[name][runs] = array
         return BatchState(**out)
 
-    def weighted(self, weight: Array) -> Problem:
-        """The same problem with other weights of the blocks, (B, K, G)."""
-        return replace(self, data=replace(self.data, weight=weight))
+    def weighted(self, weight: Array, poses: Array | None = None) -> Problem:
+        """The same problem with other weights of the edges' blocks, and of the boards' poses where
+        given, (B, K, G) each.
+        """
+        changed = replace(self, data=replace(self.data, weight=weight))
+        if poses is None:
+            return changed
+        return replace(changed, pose_data=replace(self.pose_data, weight=poses))
 
     def block_residuals(self, state: BatchState) -> Array:
         """Whitened residuals of the blocks without their weights, (B, K, G, 2g)."""
@@ -235,8 +242,9 @@ class Problem:
         return plain._edge_rows(state, n).reshape(*n.shape[:3], 2 * self.blocks.side.shape[-1])
 
     def pose_residuals(self, state: BatchState) -> Array:
-        """Whitened errors of the measured boards' poses, (B, K, G, 6)."""
-        return self._poses(state).value
+        """Whitened errors of the measured boards' poses without their weights, (B, K, G, 6)."""
+        present = self.pose_blocks.present[None].astype(float)
+        return self.weighted(self.data.weight, present)._poses(state).value
 
     def _poses(self, state: BatchState) -> PoseRows:
         return pose_rows(

@@ -1,9 +1,10 @@
-"""Edges that belong to something else: weights that let them go.
+"""Edges and poses that belong to something else: weights that let them go.
 
 A wrong edge (another leg's, a shadow's) is wrong as a whole, so the weight belongs to the whole
-edge and judges the Mahalanobis norm d of its two residuals. The search begins with a scale
-so wide that every edge counts and narrows it while the estimate settles (graduated
-non-convexity, Geman-McClure weights); it ends with weights that are 1 for all clean edges.
+edge and judges the Mahalanobis norm d of its two residuals; so does that of a board's pose, of its
+six. The search begins with a scale so wide that everything counts and narrows it while the
+estimate settles (graduated non-convexity, Geman-McClure weights); it ends with weights that are 1
+for all that is clean.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.residuals import Problem
 from pkmcal.identify.solver import FIRST_DAMPING, RESTART_DAMPING, minimise
@@ -20,17 +21,28 @@ from pkmcal.identify.solver import FIRST_DAMPING, RESTART_DAMPING, minimise
 FULL, NONE = 4.0, 6.5
 """Weights are 1 up to FULL and 0 from NONE standard deviations: of clean edges 3 in 10^4 lose
 part of their weight and none all of it, so efficiency on clean data is above 0.999."""
+TAIL = np.exp(-(FULL**2) / 2)
+"""That share: of two residuals' norms beyond FULL."""
+MEDIAN = float(np.sqrt(2 * np.log(2)))
+"""Of the norm of two residuals that are noise."""
 STAGES = 30
 WIDE = 4.0
 """Geman-McClure scale in units of the residuals' robust scale."""
+
+
+class Both(NamedTuple):
+    """A number for the edges and one for the poses, or an array for each of their blocks."""
+
+    edges: Array
+    poses: Array
 
 
 class Anneal(NamedTuple):
     """Where the annealing ended: state, weights (B, K, G), robust scale (B,), solver steps."""
 
     state: BatchState
-    weight: Array
-    scale: Array
+    weight: Both
+    scale: Both
     steps: int
 
 
@@ -44,13 +56,49 @@ def norms(problem: Problem, state: BatchState) -> Array:
     return np.where(problem.blocks.present, d, np.nan)
 
 
-def robust_scale(d: Array) -> Array:
-    """Factor by which the noise seems to differ from the stated one, from the median, (B,)."""
-    flat = np.sort(d.reshape(d.shape[0], -1), axis=1)  # NaN last
+def measured_rows(problem: Problem) -> Integers:
+    """How many of its six numbers each pose has, (K, G): a point has three, padding none."""
+    return np.any(problem.pose_data.whiten[0] != 0, axis=-1).sum(axis=-1)
+
+
+def pose_norms(problem: Problem, state: BatchState) -> Array:
+    """The same of the poses, scaled so that as many clean ones lie beyond FULL as of edges."""
+    d = np.sqrt(np.sum(problem.pose_residuals(state) ** 2, axis=-1))
+    return np.where(problem.pose_blocks.present, d * _pose_factor(problem), np.nan)
+
+
+def _pose_factor(problem: Problem) -> Array:
+    from scipy.special import chdtri
+
+    rows = np.maximum(measured_rows(problem), 1)
+    return FULL / np.sqrt(chdtri(rows, TAIL))
+
+
+def distances(problem: Problem, state: BatchState) -> Both:
+    """Both kinds of norms."""
+    return Both(norms(problem, state), pose_norms(problem, state))
+
+
+def robust_scale(d: Array, usual: Array | float = MEDIAN) -> Array:
+    """Factor by which the noise seems to differ from the stated one, from the median, (B,).
+
+    usual : the median of clean norms, by default of two residuals'.
+    """
+    flat = np.sort((d / usual).reshape(d.shape[0], -1), axis=1)  # NaN last
     count = np.sum(np.isfinite(flat), axis=1)
-    if not count.all():  # no edge at all: boards alone
+    if not count.all():  # nothing of this kind
         return np.ones(len(flat))
-    return flat[np.arange(len(flat)), count // 2] / np.sqrt(2 * np.log(2))
+    return flat[np.arange(len(flat)), count // 2]
+
+
+def scales(problem: Problem, d: Both, least: float) -> Both:
+    """Both kinds' factors, (B,) each, not below the least."""
+    from scipy.special import chdtri
+
+    rows = np.maximum(measured_rows(problem), 1)
+    usual = np.sqrt(chdtri(rows, 0.5)) * _pose_factor(problem)
+    both = robust_scale(d.edges), robust_scale(d.poses, usual)
+    return Both(*(np.maximum(scale, least) for scale in both))
 
 
 def final_weights(d: Array, scale: Array) -> Array:
@@ -59,26 +107,37 @@ def final_weights(d: Array, scale: Array) -> Array:
     return np.where(np.isfinite(d), 0.5 * (1 + np.cos(np.pi * x)), 0.0)
 
 
+def settled_weights(problem: Problem, state: BatchState, scale: Both) -> Both:
+    """Both kinds' weights at a state."""
+    d = distances(problem, state)
+    return Both(final_weights(d.edges, scale.edges), final_weights(d.poses, scale.poses))
+
+
 def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
-    """A state near the answer although many edges are wrong.
+    """A state near the answer although many edges, or poses, are wrong.
 
     least_scale : the robust scale is not believed below this (1: stated noise is a floor).
     """
     state, steps = start, 0
-    d = norms(problem, state)
-    cut = 4 * WIDE * np.maximum(robust_scale(d), least_scale)
+    d = distances(problem, state)
+    cut = [4 * WIDE * scale for scale in scales(problem, d, least_scale)]
     for _ in range(STAGES):
-        aim = WIDE * np.maximum(robust_scale(d), least_scale)
-        new_cut = np.minimum(cut, np.maximum(aim, cut / 4))
-        settled = np.all(new_cut > 0.8 * cut)
-        cut = new_cut
-        c2 = cut[:, None, None] ** 2
-        weight = np.where(np.isfinite(d), (c2 / (c2 + np.nan_to_num(d) ** 2)) ** 2, 0.0)
+        aim = [WIDE * scale for scale in scales(problem, d, least_scale)]
+        new = [np.minimum(c, np.maximum(a, c / 4)) for c, a in zip(cut, aim, strict=True)]
+        settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
+        cut = new
+        weight = Both(*(_soft(part, c) for part, c in zip(d, cut, strict=True)))
         damping = RESTART_DAMPING if steps else FIRST_DAMPING
-        found = minimise(problem.weighted(weight), state, max_steps=1, damping=damping)
+        found = minimise(problem.weighted(*weight), state, max_steps=1, damping=damping)
         state, steps = found.state, steps + 1
-        d = norms(problem, state)
+        d = distances(problem, state)
         if settled:
             break
-    scale = np.maximum(robust_scale(d), least_scale)
-    return Anneal(state, final_weights(d, scale), scale, steps)
+    scale = scales(problem, d, least_scale)
+    return Anneal(state, settled_weights(problem, state, scale), scale, steps)
+
+
+def _soft(d: Array, cut: Array) -> Array:
+    """Geman-McClure weights (B, K, G) with a scale (B,)."""
+    c2 = cut[:, None, None] ** 2
+    return np.where(np.isfinite(d), (c2 / (c2 + np.nan_to_num(d) ** 2)) ** 2, 0.0)

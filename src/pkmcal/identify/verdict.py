@@ -9,8 +9,10 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.covariance import Identifiability
+from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
+from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, singularity
 from pkmcal.mechanisms.limbs import closure
 from pkmcal.observe.edges import Observation
@@ -69,7 +71,8 @@ def judge(
     large, small = _left_open(estimate, findings) if findings else ((), ())
     left = _undecided_text(estimate) if findings is None else _said(large)
     reasons = tuple(_reasons(estimate, method, left))
-    warnings = tuple(_warnings(observation, estimate) + _said(small))
+    matter = tuple(s for s in small if s.matters)
+    warnings = tuple(_warnings(observation, estimate) + _said(matter))
     if reasons:
         headline = "This calibration should not be used."
     else:
@@ -79,7 +82,7 @@ def judge(
             f" and offsets to {_offset_sigma(estimate, covariance) * 1e3:.2g} mm"
             " (standard deviations)."
         )
-    return Verdict(not reasons, headline, reasons, warnings, tuple(_advice(estimate)))
+    return Verdict(not reasons, headline, reasons, warnings, tuple(_advice(estimate) + _harmless(small)))
 
 
 def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]:
@@ -148,6 +151,16 @@ def _left_open(
     return large, tuple(s for s in open_ if s not in large)
 
 
+def _harmless(sentences: tuple[Sentence, ...]) -> list[str]:
+    """One line about what is open and does no harm; the report has the sentences."""
+    count = sum(not s.matters for s in sentences)
+    if not count:
+        return []
+    what = sentences[[s.matters for s in sentences].index(False)].text.partition(".")[0]
+    more = f" ({count - 1} more in the report)" if count > 1 else ""
+    return [f"Open, without effect on the platform: {what[0].lower()}{what[1:]}{more}."]
+
+
 def _said(sentences: tuple[Sentence, ...]) -> list[str]:
     return [f"{s.text} {s.advice}" for s in sentences]
 
@@ -175,7 +188,7 @@ def _undecided(estimate: Estimate) -> list[str]:
 def _warnings(observation: Observation, estimate: Estimate) -> list[str]:
     out: list[str] = []
     table = estimate.machine.parameters
-    change = np.abs(estimate.machine.values - table.drawing) / table.tolerance
+    change = np.abs(_from_drawing(estimate.machine))
     far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR]
     if far:
         out.append(
@@ -196,6 +209,18 @@ def _warnings(observation: Observation, estimate: Estimate) -> list[str]:
             " profiles promise; all standard deviations are enlarged by as much."
         )
     return out
+
+
+def _from_drawing(machine: Machine) -> Array:
+    """Changes (P,) of the parameters in tolerances, in the frames that make them least.
+
+    Frames by three joints would put those joints' own errors on all others, axes above all.
+    """
+    table = machine.parameters
+    change = (machine.values - table.drawing) / table.tolerance
+    frames = generators(machine.layout, table.drawing) @ freedoms(machine)
+    frames = frames / table.tolerance[:, None]
+    return change - frames @ np.linalg.lstsq(frames, change, rcond=None)[0]
 
 
 def _advice(estimate: Estimate) -> list[str]:

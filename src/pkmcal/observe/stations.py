@@ -169,7 +169,7 @@ class _Look(NamedTuple):
         return np.where(self.inside, part / (1 + part), 1.0).mean(axis=-1)
 
     def where(self, better: Booleans, other: _Look) -> _Look:
-        """This look at some of the hypotheses, the other one at the rest."""
+        """Take some of the hypotheses from here, the rest from the other look."""
         keep = better[:, None]
         return _Look(
             np.where(keep, self.found, other.found),

@@ -13,6 +13,7 @@ from pkmcal.identify.covariance import information
 from pkmcal.identify.four_step import Form, FourSteps, centres_from_axes, solve
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
 from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.solver import RESTART_DAMPING
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.reproduce.paper_a_simulation import Settings, Truth, measured_axes
@@ -80,7 +81,7 @@ def joint(machine: Machine, problem: Problem, truth: Truth, start: Start) -> Bat
     poses = forward(machine.layout, start.theta[:, None], truth.joints, home).T_base_platform
     z = machine.parameters.to_free(start.theta)
     state = BatchState(z, start.T_camera_base, poses, np.zeros((len(z), 1, 1)))
-    return solve_batch(problem, state, robust=False, scale_noise=False)
+    return solve_batch(problem, state, robust=False, scale_noise=False, damping=RESTART_DAMPING)
 
 
 def bound(machine: Machine, problem: Problem, truth: Truth) -> Array:

@@ -94,7 +94,9 @@ class Finish:
         flat : the legs lie open to the lamps above, and white ones would be overexposed.
         """
         return cls(
-            paint=Material(0.42 if flat else 0.8, Clouds(noise, 0.012, 0.03), gloss=0.3, sharpness=40.0),
+            paint=Material(
+                0.42 if flat else 0.8, Clouds(noise, 0.012, 0.03), gloss=0.3, sharpness=40.0
+            ),
             steel=Material(0.38, Clouds(noise, 0.004, 0.05), gloss=0.45, brushed=True, mirror=0.3),
             joint=Material(0.035, gloss=0.45, sharpness=60.0, mirror=0.06),
             base=Material(0.16, Clouds(noise, 0.015, 0.25), gloss=0.05, sharpness=12.0),

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.files import Schema
-from pkmcal.geometry.rigid import cross, dot, skew
+from pkmcal.geometry.rigid import cross, dot, rotation, skew
 from pkmcal.mechanisms.carriers.contract import (
     CarriedPoint,
     PlatformCarrier,
@@ -184,6 +184,30 @@ class HingedBar(PlatformCarrier):
         """Turns."""
         del parameters, e
         return turned_blocks(9, (0, f), (3, f), (6, f))
+
+    @staticmethod
+    def slid(parameters: Array, shift: Array, turn: Array) -> Array:
+        """The same bar with its hinge's point moved along the axis and its joints told turned.
+
+        parameters (..., n), shift (...,) m, turn (...,) rad; internal coordinates become less by
+        the turn.
+        """
+        axis = parameters[..., 6:]
+        w = axis / np.sqrt(dot(axis, axis))[..., None]
+        along, out = shift[..., None] * w, parameters.copy()
+        swung = (rotation(turn[..., None] * w) @ parameters[..., :3, None])[..., 0]
+        out[..., :3], out[..., 3:6] = swung - along, parameters[..., 3:6] + along
+        return out
+
+    @staticmethod
+    def by_slide(parameters: Array) -> Array:
+        """First-order change (..., n, 2) by shift and turn."""
+        axis = parameters[..., 6:]
+        w = axis / np.sqrt(dot(axis, axis))[..., None]
+        out = np.zeros((*parameters.shape, 2))
+        out[..., :3, 0], out[..., 3:6, 0] = -w, w
+        out[..., :3, 1] = cross(w, parameters[..., :3])
+        return out
 
 
 def _cos_sin(internal: Array | None) -> tuple[Array, Array]:
