@@ -279,7 +279,9 @@ def _measurements(
     )
     if cameras is None:
         return measurements
-    return replace(measurements, intrinsics_factor=cameras.factor, intrinsics_at=cameras.at)
+    return replace(
+        measurements, intrinsics_factor=cameras.factor, intrinsics_at=cameras.at, shaded=True
+    )
 
 
 def _observation(looks: list[legs.StationEdges], boards: Boards, estimate: Estimate) -> Observation:

@@ -13,7 +13,7 @@ from pkmcal.identify.gauge import Gauge, frame_rows, freedoms
 from pkmcal.identify.hinges import exact_moves
 from pkmcal.identify.pose_rows import PoseBlocks, PoseData
 from pkmcal.identify.problem import Measurements, State
-from pkmcal.identify.residuals import SHIFT_SIGMA, Problem
+from pkmcal.identify.residuals import SHADING_SIGMA, SHIFT_SIGMA, Problem
 from pkmcal.mechanisms import Machine
 
 
@@ -49,6 +49,7 @@ def assemble(
     _check(machine, measurements)
     seen = seen_configurations(measurements)
     row, place = _places(edges.configuration, seen)
+    line = _lines(measurements)
     shape = (int(seen.sum()), int(place.max(initial=-1)) + 1)
     pose_row, pose_place = _pose_places(measurements, seen)
     n_cameras = int(measurements.camera_of_station.max()) + 1
@@ -61,11 +62,12 @@ def assemble(
         radius_prior,
         intrinsics=measurements.intrinsics_factor.shape[-1],
         n_mounts=len(measurements.mounts),
+        n_lines=int(line.max(initial=-1)) + 1,
     )
     if measurements.intrinsics_at.size:
         camera = np.array([kind == "camera" for kind in kinds])
         target[camera] = np.pad(-measurements.intrinsics_at, ((0, 0), (1, 0))).ravel()
-    blocks = _blocks(machine, measurements, row, place, shape)
+    blocks = _blocks(machine, measurements, row, place, shape, line)
     problem = Problem(
         layout=machine.layout,
         drawing=machine.parameters.drawing,
@@ -80,6 +82,7 @@ def assemble(
         frames=exact_moves(machine),
         pose_blocks=_pose_blocks(measurements, pose_row, pose_place, shape[0]),
         pose_data=_pose_data(measurements, pose_row, pose_place, shape[0]),
+        n_lines=int(line.max(initial=-1)) + 1,
     )
     return Assembled(problem, seen, row, place, pose_row, pose_place, kinds)
 
@@ -155,12 +158,22 @@ def _pose_data(measurements: Measurements, row: Integers, place: Integers, n_row
     return PoseData(target, whiten, weight)
 
 
+def _lines(measurements: Measurements) -> Integers:
+    """Number (N,) of each edge's line: its station, leg, tube and side; none if nothing is shaded."""
+    if not measurements.shaded:
+        return np.zeros(0, dtype=int)
+    e = measurements.edges
+    keys = np.stack([e.station, e.leg, e.tube, e.side], axis=1)
+    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+
+
 def _blocks(
     machine: Machine,
     measurements: Measurements,
     row: Integers,
     place: Integers,
     shape: tuple[int, int],
+    line: Integers,
 ) -> Blocks:
     edges = measurements.edges
     radius = np.array(
@@ -183,6 +196,7 @@ def _blocks(
         radius=tube_radius,
         side=spread(edges.side)[..., None],
         present=spread(np.ones(len(edges), dtype=int)).astype(bool),
+        line=spread(line) if len(line) else np.zeros((0, 0), dtype=int),
     )
 
 
@@ -214,6 +228,7 @@ def prior_rows(
     radius_prior: bool = True,
     intrinsics: int = 0,
     n_mounts: int = 0,
+    n_lines: int = 0,
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
@@ -223,7 +238,8 @@ def prior_rows(
     """
     table, free = machine.parameters, machine.parameters.free_matrix()
     nz = free.shape[1]
-    mounts_at = nz + 6 * n_stations + n_cameras * (1 + intrinsics)
+    lines_at = nz + 6 * n_stations + n_cameras * (1 + intrinsics)
+    mounts_at = lines_at + n_lines
     na = mounts_at + 6 * n_mounts
     first, tolerance = table.first_of_free(), table.tolerances_free()
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
@@ -232,8 +248,11 @@ def prior_rows(
     drawing[np.arange(len(drawing)), np.flatnonzero(held)] = 1 / tolerance[held]
     optics = np.zeros((n_cameras * (1 + intrinsics), na))
     sigma = np.tile([SHIFT_SIGMA] + [1.0] * intrinsics, n_cameras)
-    optics[:, nz + 6 * n_stations : mounts_at] = np.diag(1 / sigma)
-    rows, kinds = [drawing, optics], ["drawing"] * len(drawing) + ["camera"] * len(optics)
+    optics[:, nz + 6 * n_stations : lines_at] = np.diag(1 / sigma)
+    shading = np.zeros((n_lines, na))
+    shading[:, lines_at:mounts_at] = np.eye(n_lines) / SHADING_SIGMA
+    rows = [drawing, optics, shading]
+    kinds = ["drawing"] * len(drawing) + ["camera"] * len(optics) + ["shading"] * n_lines
     if not use_drawing and freedoms(machine).shape[1]:
         c = frame_rows(machine, gauge) @ free / float(np.mean(tolerance[~radius]))
         rows.append(np.concatenate([c, np.zeros((len(c), na - nz))], axis=1))
@@ -256,6 +275,7 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
         np.concatenate([state.edge_shift[:, None], intrinsics], axis=1)[None],
         state.T_mount[None],
         _internal(machine, state)[assembled.seen][None],
+        np.zeros((1, assembled.problem.n_lines)),
     )
 
 

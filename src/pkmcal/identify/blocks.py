@@ -19,7 +19,8 @@ class Blocks:
     """Where the edges are: K configurations of G blocks, padded; the same for all runs.
 
     leg, station, camera, radius : (K, G) leg, station, camera, position of the tube's radius.
-    side : (K, G, g). present : (K, G) False for padding.
+    side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
+    its station, whose edges are shaded alike in all photographs; empty where nothing is.
     """
 
     leg: Integers
@@ -28,6 +29,7 @@ class Blocks:
     radius: Integers
     side: Integers
     present: Booleans
+    line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Data:
 class BatchState:
     """Unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
     T_base_platform (B, K, 4, 4), optics (B, C, w), T_mount (B, M, 4, 4) of boards,
-    internal (B, K, n) of articulated platforms.
+    internal (B, K, n) of articulated platforms, shading (B, n) px, outward, of the lines.
     """
 
     z: Array
@@ -60,6 +62,7 @@ class BatchState:
     optics: Array
     T_mount: Array = field(default_factory=lambda: np.zeros((0, 0, 4, 4)))
     internal: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    shading: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         """Runs without boards or hinges get none each, so that all fields select alike."""
@@ -68,3 +71,5 @@ class BatchState:
         if len(self.internal) != len(self.z):
             none = np.zeros((*self.T_base_platform.shape[:2], 0))
             object.__setattr__(self, "internal", none)
+        if len(self.shading) != len(self.z):
+            object.__setattr__(self, "shading", np.zeros((len(self.z), 0)))

@@ -183,8 +183,8 @@ class Identifiability:
     """What the data alone can tell of the machine, frames aside.
 
     n_parameters : free ones. n_frames : freedoms of the frames, and of hinges' beginnings.
-    rank : directions the data fix. unidentified : directions that no amount of such data fixes. weak : directions that the
-    drawing knows better than the data.
+    rank : directions the data fix. unidentified : directions that no amount of such data fixes.
+    weak : directions that the drawing knows better than the data.
     """
 
     n_parameters: int
@@ -203,13 +203,16 @@ class Identifiability:
 def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Identifiability:
     """Rank of the data's own information, drawing left out; the problem's first run.
 
-    Poses, stations and edge shifts are eliminated, frames are taken out, and the columns are
+    Poses, stations, edge shifts and shading are eliminated, frames are taken out, and the columns are
     scaled by the drawing's tolerances.
     """
     linear = problem.linearize(state)
     rows = eliminate(linear, np.zeros(state.z.shape[0])).rows[0]
     table, nz = machine.parameters, problem.free.shape[1]
-    rows = rows.reshape(-1, rows.shape[-1])
+    # what is known beforehand of cameras and shading is no drawing: without it, a shift of every
+    # line by itself would hide the tubes' radii
+    beside = linear.shared_by[~linear.shared_by[:, :nz].any(axis=1)]
+    rows = np.concatenate([rows.reshape(-1, rows.shape[-1]), beside])
     q = _column_space(rows[:, nz:])
     tolerance = table.tolerances_free()
     left = rows[:, :nz] * tolerance

@@ -31,7 +31,8 @@ class Measurements:
     (C, n, r) square roots F of the cameras' intrinsics' covariances F F^T, where these are to be
     refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
     those units from the calibration's values. poses : of boards or targets, each on one of the
-    ``mounts``.
+    ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
+    gives edges in photographs.
     """
 
     edges: EdgeSet
@@ -43,6 +44,7 @@ class Measurements:
     intrinsics_at: Array = field(default_factory=lambda: np.zeros((1, 0)))
     poses: PoseSet = field(default_factory=PoseSet.empty)
     mounts: tuple[Mount, ...] = ()
+    shaded: bool = False
 
     @property
     def on_platform(self) -> Booleans:

@@ -40,6 +40,11 @@ from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, on_tangents
 PERFECT = 1e-6
 """Standard deviation (m) of closures without a reading: joints and rods without play. A third of
 a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
+SHADING_SIGMA = 0.03
+"""Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
+before any data. Path-traced photographs of a known machine show 0.02 (and are best fitted without
+it), our own renderer's 0.05; with 0.03 the deviations are right for both, at 3 to 5 % of their
+size."""
 SHIFT_SIGMA = 0.3
 """Standard deviation (px) of a camera's constant edge shift before any data: errata, B."""
 
@@ -63,7 +68,7 @@ class Problem:
     joint_noise : standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns (z, stations, optics) and prior_target : (c,).
     frames : (12 + 2n, g) frame and hinge changes that the model allows. pose_blocks, pose_data : of
-    boards.
+    boards. n_lines : tubes' sides at stations with a shading of their own.
     """
 
     layout: LimbLayout
@@ -79,6 +84,7 @@ class Problem:
     frames: Array
     pose_blocks: PoseBlocks = field(default_factory=no_poses)
     pose_data: PoseData = field(default_factory=PoseData)
+    n_lines: int = 0
 
     @property
     def n_shared(self) -> int:
@@ -87,7 +93,12 @@ class Problem:
 
     @property
     def _mounts_at(self) -> int:
-        """Where the mounts' unknowns begin: after z, stations and optics."""
+        """Where the mounts' unknowns begin: after z, stations, optics and shading."""
+        return self._lines_at + self.n_lines
+
+    @property
+    def _lines_at(self) -> int:
+        """Where the lines' shading begins: after z, stations and optics."""
         return self.free.shape[1] + 6 * self.n_stations + self.n_cameras * self.n_optics
 
     @property
@@ -177,16 +188,17 @@ class Problem:
         own = own @ self.layout.own_motion.T
         pose, internal = own[..., :6], own[..., 6:]
         pose = pose - (pose_generators(state.T_base_platform) @ y[:, None])[..., 0]
-        m = self._mounts_at
+        n, m = self._lines_at, self._mounts_at
         mount = shared[:, m:].reshape(*state.T_mount.shape[:2], 6)
         by_frame = mount_generators(state.T_mount, self.pose_blocks.on_platform)
         inner = BatchState(
             state.z + z,
             perturb(state.T_camera_base, camera),
             perturb(state.T_base_platform, pose),
-            state.optics + shared[:, nz + ns : m].reshape(state.optics.shape),
+            state.optics + shared[:, nz + ns : n].reshape(state.optics.shape),
             perturb(state.T_mount, mount - (by_frame @ y[:, None])[..., 0]),
             state.internal + internal + slides[:, None, 1::2],
+            state.shading + shared[:, n:m],
         )
         return self._in_frames(inner, y[..., 0], slides)
 
@@ -202,6 +214,7 @@ class Problem:
             state.optics,
             moved_mounts(state.T_mount, self.pose_blocks.on_platform, e, f),
             state.internal - slides[:, None, 1::2],
+            state.shading,
         )
 
     def select(self, runs: Integers) -> Problem:
@@ -262,7 +275,7 @@ class Problem:
         parts = [
             np.zeros((*shape, nz)),
             _one_hot(rows.by_station, self.pose_blocks.station, self.n_stations),
-            np.zeros((*shape, n_optics)),
+            np.zeros((*shape, n_optics + self.n_lines)),
             _one_hot(rows.by_mount, self.pose_blocks.mount, self.pose_blocks.n_mounts),
         ]
         out = np.concatenate(parts, axis=-1)
@@ -277,7 +290,8 @@ class Problem:
         nz = self.free.shape[1]
         x = np.zeros((state.z.shape[0], self.n_shared))
         x[:, :nz] = state.z
-        x[:, nz + 6 * self.n_stations : self._mounts_at] = state.optics.reshape(len(x), -1)
+        x[:, nz + 6 * self.n_stations : self._lines_at] = state.optics.reshape(len(x), -1)
+        x[:, self._lines_at : self._mounts_at] = state.shading
         return x @ self.prior.T - self.prior_target
 
     def _normals(self, state: BatchState, a: Array, b: Array) -> Ends:
@@ -304,7 +318,10 @@ class Problem:
 
     def _edge_rows(self, state: BatchState, n: Array) -> Array:
         optics = state.optics[:, self.blocks.camera, :, None]
-        rows = (self._project(n[..., None]) + self._optics_columns() @ optics)[..., 0]
+        columns = self._optics_columns()
+        rows = (self._project(n[..., None]) + columns @ optics)[..., 0]
+        if self.n_lines:  # a line's shading moves its edges as the camera's shift moves all
+            rows = rows + columns[..., 0] * state.shading[:, self.blocks.line, None]
         unused = np.broadcast_to((self.data.weight == 0)[..., None], rows.shape)
         return np.where(unused, 0.0, rows).reshape(*rows.shape[:2], self.n_edge_rows)
 
@@ -389,6 +406,8 @@ class Problem:
             _one_hot(by_station, self.blocks.station, self.n_stations),
             _one_hot(optics, self.blocks.camera, self.n_cameras),
         ]
+        if self.n_lines:
+            parts.append(_one_hot(optics[..., :1], self.blocks.line, self.n_lines))
         parts.append(np.zeros((*by_station.shape[:-1], 6 * self.pose_blocks.n_mounts)))
         out = np.concatenate(parts, axis=-1)
         return out.reshape(*out.shape[:2], out.shape[2] * out.shape[3], out.shape[-1])

@@ -31,6 +31,9 @@ STEP_TOLERANCE = 1e-7
 """A step that changes all fitted values together by less, in standard deviations, ends the
 search: a ten-millionth of what the noise does, and above the rounding of 1e-9 or so."""
 
+ROUNDING = 1e-13
+"""Of the cost, relative."""
+
 
 class Stop(Enum):
     """Why a search ended; the text is what the user reads."""
@@ -232,8 +235,9 @@ def _try(problem: LeastSquares, state: Any, damping: Array) -> tuple[Any, _Gain]
     )
     ratio = (cost - cost_trial) / np.maximum(descent - size2, 1e-300)
     small = np.sqrt(size2) < STEP_TOLERANCE * (1 + 1e-3 * np.sqrt(cost))
-    # a step near the end changes the cost by less than its rounding
-    accepted = cost_trial <= cost * (1 + 1e-13)
+    # a step near the end changes the cost by less than its rounding, and then it cannot be judged
+    small |= np.abs(descent - size2) < ROUNDING * cost
+    accepted = cost_trial <= cost * (1 + ROUNDING)
     next_damping = np.where(
         accepted, damping * np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2)), damping * 8
     )

@@ -82,7 +82,9 @@ def judge(
             f" and offsets to {_offset_sigma(estimate, covariance) * 1e3:.2g} mm"
             " (standard deviations)."
         )
-    return Verdict(not reasons, headline, reasons, warnings, tuple(_advice(estimate) + _harmless(small)))
+    return Verdict(
+        not reasons, headline, reasons, warnings, tuple(_advice(estimate) + _harmless(small))
+    )
 
 
 def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]:

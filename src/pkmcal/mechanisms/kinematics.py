@@ -17,6 +17,8 @@ from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, limb_ends, rod
 MAX_STEPS = 60
 CONVERGED = 1e-12
 """Closure error (m) below which a configuration is solved: 100 times rounding at 1 m."""
+SETTLING = 15
+"""Steps for a machine's second rods; a pose that they all allow takes four."""
 SETTLED = 1e-15
 """A step of readings (rad) and hinges below which nothing changes any more."""
 NEAR_SINGULAR = 0.02
@@ -96,10 +98,12 @@ def _settled(
     m = layout.n_readings
     pick = (layout.row_motor[:, None] == np.arange(m)).astype(float)
     x = np.concatenate([readings, internal], axis=-1)
-    for _ in range(MAX_STEPS):
+    for _ in range(SETTLING):
         c = closure(layout, theta, x[..., :m], poses, x[..., m:])
         jac = np.concatenate([c.by_reading[..., None] * pick, c.by_internal], axis=-1)
-        step = _damped_solve(np.nan_to_num(jac), np.nan_to_num(c.value), np.full(c.value.shape[:-1], 1e-14))
+        # what is out of reach is NaN and stays so
+        jac, value = np.nan_to_num(jac), np.nan_to_num(c.value)
+        step = _damped_solve(jac, value, np.full(value.shape[:-1], 1e-14))
         x = x - step
         if np.abs(step).max(initial=0.0) < SETTLED:
             break
@@ -148,7 +152,8 @@ def forward(
 def _result(
     layout: LimbLayout, theta: Array, poses: Array, internal: Array, value: Array, c: Closure
 ) -> ForwardResult:
-    error = np.abs(value).max(axis=-1, initial=0.0)
+    reached = np.isfinite(c.value).all(axis=-1)
+    error = np.where(reached, np.abs(value).max(axis=-1, initial=0.0), np.inf)
     least = _singularity(layout, theta, layout.by_own(c))
     return ForwardResult(poses, error < CONVERGED, error, least, internal)
 
@@ -178,7 +183,10 @@ def _singularity(layout: LimbLayout, theta: Array, by_own: Array) -> Array:
     turns = layout.own_motion[:3].any(axis=0)
     turns[layout.motion.shape[1] :] = True
     scale = np.where(turns, 1 / _radius(layout, theta)[..., None], 1.0)
-    return np.linalg.svd(by_own * scale[..., None, :], compute_uv=False)[..., -1]
+    scaled = by_own * scale[..., None, :]
+    known = np.isfinite(scaled).all(axis=(-1, -2))
+    least = np.linalg.svd(np.nan_to_num(scaled), compute_uv=False)[..., -1]
+    return np.where(known, least, np.nan)
 
 
 def _radius(layout: LimbLayout, theta: Array) -> Array:
@@ -230,16 +238,16 @@ def on_manifold(layout: LimbLayout, theta: Array, poses: Array) -> ForwardResult
     readings, phi = inverse_result(layout, theta, current)
     c = closure(layout, theta, readings, current, phi)
     free = layout.driven_rows.size < layout.n_equations or layout.shares_motors
-    value = _undriven(layout, c)[0]
     for _ in range(MAX_STEPS if free else 0):
         value, blind = _undriven(layout, c)
+        value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.by_pose @ layout.motion)
         if np.abs(value).max(initial=0.0) < CONVERGED * 1e-2:
             break
-        step = -np.linalg.pinv(blind @ c.by_pose @ layout.motion) @ value[..., None]
+        step = -np.linalg.pinv(by_pose) @ value[..., None]
         current = perturb(current, (layout.motion @ step)[..., 0])
         readings, phi = inverse_result(layout, theta, current)
         c = closure(layout, theta, readings, current, phi)
-    return _result(layout, theta, current, phi, value, c)
+    return _result(layout, theta, current, phi, _undriven(layout, c)[0], c)
 
 
 def _undriven(layout: LimbLayout, c: Closure) -> tuple[Array, Array]:
@@ -251,6 +259,7 @@ def _undriven(layout: LimbLayout, c: Closure) -> tuple[Array, Array]:
     if layout.shares_motors:
         pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
         moved = np.concatenate([c.by_reading[..., None] * pick, c.by_internal], axis=-1)
+        moved = np.nan_to_num(moved)
         q = np.linalg.qr(moved, mode="complete")[0]
         blind = np.swapaxes(q[..., moved.shape[-1] :], -1, -2)
     return (blind @ c.value[..., None])[..., 0], blind
