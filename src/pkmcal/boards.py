@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -13,9 +14,10 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.observe.board_diagnosis import check_boards
 from pkmcal.observe.boards import Board, Detection, load_board
 from pkmcal.observe.edges import Rejection
+from pkmcal.observe.pose_repeats import one_a_configuration
 from pkmcal.observe.poses import PoseSet, concatenate_poses
 from pkmcal.observe.standing import Standing, standing
-from pkmcal.observe.targets import BoardViews, board_views, detect_again, detect_in, moving_poses
+from pkmcal.observe.targets import BoardViews, board_views, detect_again, detect_in
 from pkmcal.photographs import label_of
 from pkmcal.session import Session
 from pkmcal.session_schema import Body
@@ -38,12 +40,16 @@ class StationBoard:
     @property
     def poses(self) -> PoseSet:
         """The measurements that it gives."""
-        return self.stood.poses(self.seen, MOUNT) if self.stood else moving_poses(self.seen, MOUNT)
+        return self._moving[0] if self.stood is None else self.stood.poses(self.seen, MOUNT)
 
     @property
     def rejected(self) -> tuple[Rejection, ...]:
         """Photographs whose board is not used."""
-        return self.seen.rejected + (self.stood.rejected if self.stood else ())
+        return self.seen.rejected + (self._moving[1] if self.stood is None else self.stood.rejected)
+
+    @cached_property
+    def _moving(self) -> tuple[PoseSet, tuple[Rejection, ...]]:
+        return one_a_configuration(self.seen, MOUNT)
 
 
 @dataclass(frozen=True)

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.boards import Boards, find_boards
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import listed
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import unrecognised
-from pkmcal.observe.images import decode_all
+from pkmcal.observe.images import decode, decode_all
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import StationPose, View, find_station
 from pkmcal.photographs import label_of
-from pkmcal.session import Session
+from pkmcal.session import Session, Station
 
 WORKERS = 2
 """Threads beside one another: decoding and array work release Python's lock."""
@@ -29,30 +32,25 @@ NOWHERE = StationPose(np.eye(4), score=1.0, chance=1.0)
 def check_observable(session: Session) -> None:
     """What the session's form allows but this observation cannot use."""
     on_base = session.board_body == "base"
-    for station in session.stations:
-        where = f"session.yaml, stations.{station.name}"
-        if "board" in station.observe and not on_base:
-            raise InputError(
-                "boards on the platform are not observed yet", where=where,
-                found=f"observe: {' and '.join(station.observe)}",
-                expected="observe: legs",
-                next_step="If the board is on the base, write board: {file: ..., fixed_to: base}",
-            )  # fmt: skip
     joining = [
         station.name
         for station in session.stations
         if "board" in station.observe and station.T_camera_base is not None
     ]
     for station in session.stations:
-        if station.T_camera_base is None and not (joining and "board" in station.observe):
+        # A board on the platform tells where the camera stands; one on the base, from another's.
+        told = "board" in station.observe and (joining or not on_base)
+        if station.T_camera_base is None and not told:
             raise InputError(
                 "the station has no rough pose",
                 where=f"session.yaml, stations.{station.name}",
                 expected="pose: {position: [x, y, z], look_at: [x, y, z], up: [0, 0, 1]}",
                 next_step="Measure by hand where the camera stands; 10 cm and 10 degrees will do."
-                " Of stations that see one board fixed to the base, one pose is enough",
+                " Of stations that see one board fixed to the base, one pose is enough; those that"
+                " see one on the platform need none",
             )
-    if not any(leg.tubes for leg in session.machine.document.legs):
+    seen = [station.name for station in session.stations if "legs" in station.observe]
+    if seen and not any(leg.tubes for leg in session.machine.document.legs):
         raise InputError(
             "no leg of the drawing has visible cylinders",
             where="mechanism.yaml, legs",
@@ -62,7 +60,7 @@ def check_observable(session: Session) -> None:
 
 
 def read_photographs(session: Session) -> list[legs.Photographs]:
-    """Every station's photographs, decoded and prepared for the search."""
+    """The photographs of stations that observe legs, decoded and prepared for the search."""
 
     def read(number: int) -> legs.Photographs:
         station = session.stations[number]
@@ -73,7 +71,12 @@ def read_photographs(session: Session) -> list[legs.Photographs]:
         return legs.photographs_of(number, station.camera, rows, session.joints, images)
 
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(read, range(len(session.stations))))
+        return list(pool.map(read, legs_stations(session)))
+
+
+def legs_stations(session: Session) -> list[int]:
+    """Numbers of the stations that observe legs."""
+    return [k for k, station in enumerate(session.stations) if "legs" in station.observe]
 
 
 def platform_poses(session: Session) -> Array:
@@ -123,11 +126,13 @@ def recognise(
     poses: Array,
     rngs: list[np.random.Generator],
     boards: Boards | None = None,
+    starts: Array | None = None,
 ) -> Recognition:
-    """Look for the machine in every station's photographs, nothing raised.
+    """Look for the machine in the photographs of every station that observes legs, nothing raised.
 
-    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one a station. boards : give
-    stations without a pose by hand a start, from the stations that were found.
+    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``photographs``.
+    boards : on the base, give stations without a pose by hand a start, from the stations that were
+    found. starts : (S, 4, 4) of all stations where more is known than by hand, NaN where nothing.
     """
     boards = boards or Boards()
     machine, tubes = session.machine, tubes_of(session.machine)
@@ -135,18 +140,25 @@ def recognise(
         View(machine, p.camera, tubes, p.joints, poses[p.configuration], p.tables)
         for p in photographs
     )
+    at = [p.station for p in photographs]
     by_hand = [station.T_camera_base for station in session.stations]
-    found = _searched(views, by_hand, rngs)
+    if starts is not None:
+        known = zip(by_hand, starts[: len(by_hand)], strict=True)
+        by_hand = [T if T is not None or np.isnan(start).any() else start for T, start in known]
+    found = _searched(views, [by_hand[s] for s in at], rngs)
     # Through the board a pose by hand would be off by its angle times the stations' distance, so
     # the rest are searched from where the search has ended with those that were found.
-    good = [pose.T_camera_base if pose and pose.good else None for pose in found]
+    good: list[Array | None] = [None] * len(by_hand)
+    for s, pose in zip(at, found, strict=True):
+        good[s] = pose.T_camera_base if pose and pose.good else None
     ahead = boards.joined(good)
-    retried = [T if known is None else None for T, known in zip(ahead, good, strict=True)]
+    retried = [ahead[s] if good[s] is None else None for s in at]
     again = _searched(views, retried, rngs)
     # Of a station that is not found, a start is told all the same.
+    through = boards.joined(by_hand)
     rough = [
-        second if pose and pose.good else first
-        for first, second, pose in zip(boards.joined(by_hand), retried, again, strict=True)
+        second if pose and pose.good else through[s]
+        for s, second, pose in zip(at, retried, again, strict=True)
     ]
     return Recognition(
         views,
@@ -181,7 +193,7 @@ def why_unrecognised(
 ) -> InputError:
     """The error about the stations that were not recognised; the usual mix-ups are tried."""
     return unrecognised(
-        [station.name for station in session.stations],
+        [session.stations[p.station].name for p in photographs],
         list(recognition.views),
         list(recognition.rough),
         list(recognition.found),
@@ -196,15 +208,52 @@ def found_stations(
     photographs: list[legs.Photographs],
     rng: np.random.Generator,
     boards: Boards | None = None,
+    starts: Array | None = None,
 ) -> Array:
-    """Poses T_camera_base (S, 4, 4) of all stations, or the reason why one is not recognised."""
+    """Poses T_camera_base (S, 4, 4) of the stations that observe legs, or the reason why one is not
+    recognised; of the rest as ``starts`` has them, NaN where it has none.
+    """
+    if starts is None:
+        starts = np.full((len(session.station_names), 4, 4), np.nan)
+    if not photographs:
+        return starts
     rngs = rng.spawn(len(photographs) + 1)
-    found = recognise(session, photographs, platform_poses(session), rngs[1:], boards)
+    found = recognise(session, photographs, platform_poses(session), rngs[1:], boards, starts)
     if not found.complete:
         raise why_unrecognised(session, photographs, found, rngs[0])
-    return np.stack([pose.T_camera_base for pose in found.found])
+    out = starts.copy()
+    out[[p.station for p in photographs]] = [pose.T_camera_base for pose in found.found]
+    return out
 
 
 def boards_of(session: Session, photographs: list[legs.Photographs]) -> Boards:
-    """The session's board in its photographs; see :func:`pkmcal.boards.find_boards`."""
-    return find_boards(session, {p.station: p.images for p in photographs})
+    """The session's board in its photographs; see :func:`pkmcal.boards.find_boards`.
+
+    Photographs that only show the board are decoded one by one, as they are looked at.
+    """
+    images: dict[int, Sequence[Integers]] = {p.station: p.images for p in photographs}
+    for number, station in enumerate(session.stations):
+        if number not in images:
+            images[number] = Pictures(session.folder, station)
+    return find_boards(session, images)
+
+
+class Pictures(Sequence[Integers]):
+    """A station's photographs, each decoded when it is looked at and not kept."""
+
+    def __init__(self, folder: Path, station: Station) -> None:
+        self._folder, self._station = folder, station
+
+    def __len__(self) -> int:
+        return len(self._station.photographs)
+
+    @overload
+    def __getitem__(self, index: int) -> Integers: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Integers]: ...
+    def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
+        """One photograph, grey levels (height, width)."""
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        path = self._station.photographs[index].path
+        return decode(path, self._station.camera.image_size, label_of(self._folder, path))

@@ -38,12 +38,16 @@ class CameraRefinement:
 
     def camera(self, file: str) -> Camera:
         """A camera with its intrinsics at the present place."""
-        number = self.files.index(file)
-        camera = self.calibrated[number]
+        camera = self.calibrated[self.files.index(file)]
         if not self.active:
             return camera
-        change = (self.factor[number] @ self.at[number])[: len(camera.parameters)]
+        change = self.change(file)[: len(camera.parameters)]
         return replace(camera, parameters=camera.parameters + change)
+
+    def change(self, file: str) -> Array:
+        """What the intrinsics have changed by so far, (n,), as wide as the widest camera's."""
+        number = self.files.index(file)
+        return self.factor[number] @ self.at[number]
 
     def moved(self, estimate: Estimate) -> CameraRefinement:
         """The refinement after an estimate."""
@@ -68,6 +72,12 @@ def refinement_of(session: Session, refine: bool) -> CameraRefinement:
     if not refine:
         held = np.zeros((len(files), 0, 0))
         return CameraRefinement(files, calibrated, held, np.zeros((len(files), 0)))
+    if not cameras:
+        raise InputError(
+            "no station has a camera whose intrinsics could be refined",
+            where="session.yaml, stations",
+            next_step="Leave --refine-camera out",
+        )
     roots = [_root(file, camera) for file, camera in cameras.items()]
     n, r = (max(root.shape[k] for root in roots) for k in (0, 1))
     factor = np.stack([np.pad(f, ((0, n - len(f)), (0, r - f.shape[1]))) for f in roots])

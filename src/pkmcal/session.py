@@ -29,8 +29,15 @@ from pkmcal.files import (
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.photographs import Photograph, find_photographs, photograph_header
+from pkmcal.pose_tables import PoseTable, read_poses
 from pkmcal.readings import check_readings
-from pkmcal.session_schema import Body, SessionDocument, StationDocument, Vector
+from pkmcal.session_schema import (
+    Body,
+    SessionDocument,
+    StationDocument,
+    TrackerStationDocument,
+    Vector,
+)
 
 __all__ = [
     "Photograph",
@@ -79,6 +86,9 @@ class Session:
     board_body : what the board is fixed to, base or platform.
     document : session.yaml with defaults, readings and found photographs written out.
     warnings : sentences about what is not wrong but should be known.
+    trackers : what measured without photographs; in numbers of stations they follow these.
+    model : the machine's model by its name in the mechanism file, None for the file's own.
+    mechanism : where the machine came from, for other models of it.
     """
 
     folder: Path
@@ -91,13 +101,28 @@ class Session:
     document: dict[str, Any]
     warnings: tuple[str, ...] = ()
     board_body: Body = "platform"
+    trackers: tuple[PoseTable, ...] = ()
+    model: str | None = None
+    mechanism: Path | str = ""
+
+    @property
+    def station_names(self) -> tuple[str, ...]:
+        """Names of all stations, trackers last, as measurements number them."""
+        return tuple(station.name for station in (*self.stations, *self.trackers))
+
+    def other_model(self, name: str | None) -> Machine:
+        """Another model of the same machine."""
+        return load_mechanism(self.mechanism, model=name)
 
 
-def load_session(folder: Path | str) -> Session:
-    """Read and check the session in `folder` (session.yaml itself may be named instead)."""
+def load_session(folder: Path | str, model: str | None = None) -> Session:
+    """Read and check the session in `folder` (session.yaml itself may be named instead).
+
+    model : one of the models that the mechanism file names.
+    """
     folder, document = _read(Path(folder))
     schema = validate(document, SessionDocument)
-    machine = _machine(folder, document, schema.mechanism)
+    machine, source = _machine(folder, document, schema.mechanism, model)
     joints_file = _existing(folder, document, schema.joints.file, ("joints", "file"))
     table = read_csv(joints_file, label=schema.joints.file)
     warnings = check_readings(table, machine.joint_ranges, schema.joints.noise)
@@ -105,10 +130,14 @@ def load_session(folder: Path | str) -> Session:
     warnings += _of_little_use(document, schema)
     stations = tuple(
         _station(folder, document, name, station, table.names)
-        for name, station in schema.stations.items()
+        for name, station in schema.cameras.items()
+    )
+    trackers = tuple(
+        _tracker(folder, document, name, station, table.names)
+        for name, station in schema.trackers.items()
     )
     _check_distinct(document, stations)
-    warnings += _unphotographed(table, stations)
+    warnings += _unphotographed(table, stations, trackers)
     return Session(
         folder=folder,
         machine=machine,
@@ -120,6 +149,9 @@ def load_session(folder: Path | str) -> Session:
         document=_resolved(folder, schema, table, stations),
         warnings=tuple(warnings),
         board_body=schema.board.fixed_to if schema.board else "platform",
+        trackers=trackers,
+        model=model,
+        mechanism=source,
     )
 
 
@@ -194,12 +226,15 @@ def _existing(folder: Path, document: Document, name: str, keys: Keys) -> Path:
     )
 
 
-def _machine(folder: Path, document: Document, source: str) -> Machine:
+def _machine(
+    folder: Path, document: Document, source: str, model: str | None
+) -> tuple[Machine, Path | str]:
+    """The machine, and what to load other models of it from."""
     looks_like_path = source.endswith((".yaml", ".yml")) or "/" in source
     if looks_like_path or (folder / source).is_file():
         path = _existing(folder, document, source, ("mechanism",))
-        return load_mechanism(path, label=source)
-    return load_mechanism(source, label=document.where("mechanism"))
+        return load_mechanism(path, label=source, model=model), path
+    return load_mechanism(source, label=document.where("mechanism"), model=model), source
 
 
 def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | None:
@@ -271,6 +306,20 @@ def _station(
     return Station(name, camera, station.camera, T_camera_base, photographs, station.observe)
 
 
+def _tracker(
+    folder: Path,
+    document: Document,
+    name: str,
+    station: TrackerStationDocument,
+    names: tuple[str, ...],
+) -> PoseTable:
+    """One tracker's table."""
+    given = station.tracker
+    path = _existing(folder, document, given.poses, ("stations", name, "tracker", "poses"))
+    noise = given.noise
+    return read_poses(path, given.poses, names, noise.position, noise.rotation, name)
+
+
 def _check_size(folder: Path, photo: Photograph, camera: Camera, camera_file: str) -> None:
     label = _inside(folder, photo.path)
     width, height = size = photograph_header(photo.path, label)
@@ -303,11 +352,16 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
                 )
 
 
-def _unphotographed(table: Table, stations: tuple[Station, ...]) -> list[str]:
+def _unphotographed(
+    table: Table, stations: tuple[Station, ...], trackers: tuple[PoseTable, ...]
+) -> list[str]:
     taken = {photo.configuration for station in stations for photo in station.photographs}
+    taken |= {int(k) for tracker in trackers for k in tracker.configuration}
     if len(taken) < 2:
         raise InputError(
-            "only one configuration has photographs",
+            "only one configuration was measured"
+            if trackers
+            else "only one configuration has photographs",
             where=table.label,
             found=table.names[min(taken)],
             expected="two at least; one cannot tell a joint's place from its offset",
@@ -316,7 +370,8 @@ def _unphotographed(table: Table, stations: tuple[Station, ...]) -> list[str]:
     if not missing:
         return []
     return [
-        f"{table.label}: no station has a photograph of configuration {listed(missing)}"
+        f"{table.label}: no station has {'measured' if trackers else 'a photograph of'}"
+        f" configuration {listed(missing)}"
         f" ({len(missing)} of {len(table.names)}); their readings are not used."
     ]
 

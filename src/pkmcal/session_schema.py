@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from pkmcal.files import Schema, closest, shown
 
@@ -48,7 +48,7 @@ def _words(value: Any) -> tuple[str, ...]:
 
 
 class StationDocument(Schema):
-    """One entry of ``stations``."""
+    """One entry of ``stations``: a camera in one place."""
 
     camera: str = Field(description="the camera's file, for example cameras/front.yaml")
     images: str = Field(description="a pattern such as images/front/{configuration}.png")
@@ -56,6 +56,43 @@ class StationDocument(Schema):
         description="legs, board, or [legs, board]"
     )
     pose: PoseDocument | None = None
+
+
+class NoiseDocument(Schema):
+    """``noise`` of a tracker, one standard deviation."""
+
+    position: Annotated[float, Field(gt=0)] = Field(
+        description="the standard deviation of a coordinate in metres, such as 2.0e-5"
+    )
+    rotation: Annotated[float, Field(gt=0)] | None = Field(
+        default=None, description="the standard deviation of a turn in radians, such as 1.0e-4"
+    )
+
+
+class TrackerDocument(Schema):
+    """``tracker``: a laser tracker, a measuring machine or a probe instead of a camera."""
+
+    poses: str = Field(description="the table of what it measured, for example poses.csv")
+    noise: NoiseDocument = Field(description="noise: {position: 2.0e-5, rotation: 1.0e-4}")
+
+
+class TrackerStationDocument(Schema):
+    """One entry of ``stations``: a tracker in one place."""
+
+    tracker: TrackerDocument
+
+
+def _station(value: Any) -> str:
+    """Which of the two an entry of ``stations`` is."""
+    tracker = isinstance(value, dict) and "tracker" in value
+    return "with a tracker" if tracker else "with a camera"
+
+
+AnyStation = Annotated[
+    Annotated[StationDocument, Tag("with a camera")]
+    | Annotated[TrackerStationDocument, Tag("with a tracker")],
+    Discriminator(_station),
+]
 
 
 class BoardDocument(Schema):
@@ -76,11 +113,21 @@ class SessionDocument(Schema):
     pkmcal: Literal[1] = Field(description="the line pkmcal: 1, the format's version")
     mechanism: str = Field(description="a mechanism's file, or a built-in's name")
     joints: JointsDocument = Field(description="file and noise of the joint readings")
-    stations: Annotated[dict[str, StationDocument], Field(min_length=1)] = Field(
-        description="one entry a camera in one place"
+    stations: Annotated[dict[str, AnyStation], Field(min_length=1)] = Field(
+        description="one entry a camera, or a tracker, in one place"
     )
     board: Annotated[BoardDocument | None, BeforeValidator(_board)] = None
 
     def observers(self, word: str) -> list[str]:
         """Names of the stations that observe legs, or the board."""
-        return [name for name, station in self.stations.items() if word in station.observe]
+        return [name for name, station in self.cameras.items() if word in station.observe]
+
+    @property
+    def cameras(self) -> dict[str, StationDocument]:
+        """The stations with a camera."""
+        return {k: s for k, s in self.stations.items() if isinstance(s, StationDocument)}
+
+    @property
+    def trackers(self) -> dict[str, TrackerStationDocument]:
+        """The stations without one."""
+        return {k: s for k, s in self.stations.items() if isinstance(s, TrackerStationDocument)}

@@ -140,12 +140,13 @@ def _pose_blocks(
     measurements: Measurements, row: Integers, place: Integers, n_rows: int
 ) -> PoseBlocks:
     shape = (n_rows, int(place.max(initial=-1)) + 1)
-    station, mount = np.zeros((2, *shape), dtype=int)
+    station, mount, camera = np.zeros((3, *shape), dtype=int)
     present = np.zeros(shape, dtype=bool)
     station[row, place] = measurements.poses.station
     mount[row, place] = measurements.poses.mount
+    camera[row, place] = measurements.camera_of_station[measurements.poses.station]
     present[row, place] = True
-    return PoseBlocks(station, mount, present, measurements.on_platform)
+    return PoseBlocks(station, mount, present, measurements.on_platform, camera)
 
 
 def _pose_data(measurements: Measurements, row: Integers, place: Integers, n_rows: int) -> PoseData:
@@ -155,11 +156,24 @@ def _pose_data(measurements: Measurements, row: Integers, place: Integers, n_row
     target[0, row, place] = measurements.poses.T_station_target
     whiten[0, row, place] = measurements.poses.whiten
     weight[0, row, place] = 1.0
-    return PoseData(target, whiten, weight)
+    return PoseData(target, whiten, weight, _pose_optics(measurements, row, place, shape))
+
+
+def _pose_optics(
+    measurements: Measurements, row: Integers, place: Integers, shape: tuple[int, ...]
+) -> Array:
+    """Change of the poses' errors by their camera's unknowns; its edge shift moves no corner."""
+    poses, factor = measurements.poses, measurements.intrinsics_factor
+    out = np.zeros((*shape, 6, 1 + factor.shape[-1]))
+    n = poses.by_intrinsics.shape[-1]
+    if factor.shape[-1] and n:
+        camera = np.asarray(measurements.camera_of_station)[poses.station]
+        out[0, row, place, :, 1:] = -poses.by_intrinsics @ factor[camera, :n]
+    return out
 
 
 def _lines(measurements: Measurements) -> Integers:
-    """Number (N,) of each edge's line: its station, leg, tube and side; none if nothing is shaded."""
+    """Number (N,) of each edge's line: station, leg, tube and side; none if nothing is shaded."""
     if not measurements.shaded:
         return np.zeros(0, dtype=int)
     e = measurements.edges

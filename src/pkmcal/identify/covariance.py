@@ -203,7 +203,7 @@ class Identifiability:
 def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Identifiability:
     """Rank of the data's own information, drawing left out; the problem's first run.
 
-    Poses, stations, edge shifts and shading are eliminated, frames are taken out, and the columns are
+    Poses, stations, edge shifts and shading are eliminated, frames taken out, and the columns are
     scaled by the drawing's tolerances.
     """
     linear = problem.linearize(state)

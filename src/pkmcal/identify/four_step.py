@@ -362,16 +362,19 @@ def _state(
     ):
         has = index[:, 0] >= 0
         theta[index[has]] = axes[0, has]
-    poses = _poses(machine.with_values(theta), measurements, steps)
+    poses = _poses(machine.with_values(theta), measurements, steps, machine.home())
     n_cameras = int(np.max(measurements.camera_of_station)) + 1
     state = State(theta, stations, poses, np.zeros(n_cameras))
     boards = mount_poses(measurements, state)
     return replace(state, T_mount=boards, on_platform=measurements.on_platform)
 
 
-def _poses(machine: Machine, measurements: Measurements, steps: FourSteps) -> Array:
-    """Platform poses (K, 4, 4) by forward kinematics: from home, else from the pose seen."""
-    found = machine.forward_result(measurements.joints, machine.home())
+def _poses(machine: Machine, measurements: Measurements, steps: FourSteps, home: Array) -> Array:
+    """Platform poses (K, 4, 4) by forward kinematics: from home, else from the pose seen.
+
+    home : (4, 4) of the drawing; what the steps found need not assemble at mid-range.
+    """
+    found = machine.forward_result(measurements.joints, home)
     poses = found.T_base_platform
     seen = np.zeros(len(poses), dtype=bool)
     seen[steps.configuration[steps.posed]] = True

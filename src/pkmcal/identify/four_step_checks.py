@@ -26,7 +26,7 @@ from pkmcal.mechanisms.carriers.rigid import RigidPlatform
 FLAT = 1e-3
 """Singular value of the distances' derivatives by the offsets, of 1 a photograph at most, below
 which a combination of offsets is free."""
-VAGUE = 0.1
+VAGUE = 0.5
 """Standard deviation of a combination of lengths, of a leg's own, beyond which it is free."""
 BUNDLE = "use the joint method (bundle)"
 

@@ -166,7 +166,7 @@ def freedoms(machine: Machine) -> Array:
     All twelve for a spatial machine without fixed parameters. Fixed or tied parameters take
     some away; a machine that moves in fewer directions keeps those that respect its motion.
     """
-    candidates = _respecting_motion(machine.layout.motion)
+    candidates = respecting_motion(machine.layout.motion)
     free = machine.parameters.free_matrix()
     moved = generators(machine.layout, machine.parameters.drawing) @ candidates
     outside = moved - free @ np.linalg.lstsq(free, moved, rcond=None)[0]
@@ -176,7 +176,7 @@ def freedoms(machine: Machine) -> Array:
     return candidates @ vt[size < 1e-9].T
 
 
-def _respecting_motion(motion: Array) -> Array:
+def respecting_motion(motion: Array) -> Array:
     """Frame changes after which the platform still moves along ``motion``, (12, g)."""
     if motion.shape[1] == 6:
         return np.eye(12)

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import perturb
+from pkmcal.geometry.rigid import inverse, perturb
 from pkmcal.identify.measured_platform import Seen, Taken, seen_platform, taken
 from pkmcal.identify.solver import Linear, Values, transposed
 from pkmcal.mechanisms import kinematics
@@ -53,7 +53,7 @@ class _Rows(NamedTuple):
 
 @dataclass(frozen=True)
 class ImplicitProblem:
-    """solver.LeastSquares of B runs with N poses each.
+    """solver.LeastSquares of B runs with N poses each. Stations' unknowns perturb T_base_camera.
 
     layout, drawing (P,), free (P, nz) : the machine. station, mount : (N,). T_camera_board
     (B, N, 4, 4) and readings (B, N, m). form : see the module. weigh : (B, N, r, r) of the rows,
@@ -161,6 +161,17 @@ class ImplicitProblem:
         """The measured poses (B, N, 4, 4) as the machine can take them."""
         return self._rows(state).taken.pose
 
+    def ideal(self, state: ImplicitState) -> ImplicitProblem:
+        """The same problem with poses and readings that the state explains without any residual.
+
+        Ranks are told there: at the data, noise makes what cannot be told look faintly known.
+        """
+        poses = self.platform_poses(state)
+        readings = kinematics.inverse(self.layout, self.theta(state)[:, None], poses)
+        readings = np.where(np.isfinite(readings), readings, self.readings)
+        seen = state.T_camera_base[:, self.station] @ poses @ state.T_mount[:, self.mount]
+        return replace(self, T_camera_board=seen, readings=readings)
+
     def plain(self) -> Array:
         """The matrix (1, 1, r, r) of rows that count alike, and not at all where they are off."""
         off = 6 - self.layout.motion.shape[1]
@@ -174,7 +185,7 @@ class ImplicitProblem:
         mount = shared[:, nz + 6 * s :].reshape(-1, m, 6)
         return ImplicitState(
             state.z + shared[:, :nz],
-            perturb(state.T_camera_base, camera),
+            inverse(perturb(inverse(state.T_camera_base), camera)),
             perturb(state.T_mount, mount),
             state.internal + own,
         )

@@ -15,21 +15,25 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import InputError, ResultError
-from pkmcal.identify.gauge import apply, default_gauge
+from pkmcal.geometry.rigid import apply, cross, dot, pose, rotation
+from pkmcal.identify.gauge import apply as in_gauge
+from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.implicit import Form, ImplicitProblem, ImplicitState
 from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.rotation_axis import axis_frames
 from pkmcal.identify.solver import RESTART_DAMPING, Solution, Stop, eliminate, minimise
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import inverse_result
 
-ROUNDS = 3
-"""Whitening changes by a thousandth after the second."""
-PLACED = (0.1, 0.1)
+ROUNDS = 2
+"""Whitening again, at the solution: it changes by a thousandth after the second."""
+MOST_STEPS = 100
+PLACED = 0.1
 """How well stations and mounts are known before any data, rad and m: far less than a drawing."""
-RANK_TOLERANCE = 1e-6
-"""Singular values of the scaled Jacobian below this share of the largest are zero. Rounding leaves
-1e-12; the tilts of a board, seen through the noise's own tilt alone, 1e-4."""
+RANK_TOLERANCE = 1e-8
+"""Singular values of the scaled Jacobian below this share of the largest are zero: with exact
+derivatives at data without noise, rounding leaves 1e-12."""
 
 
 @dataclass(frozen=True)
@@ -170,24 +174,66 @@ def fit_poses(
     joint_noise: float,
     use_drawing: bool,
 ) -> PoseFit:
-    """The estimate of B runs. noise : (N, 6, 6) of the poses to whiten by; None as printed."""
+    """The estimate of B runs. noise : (N, 6, 6) of the poses to whiten by; None as printed.
+
+    As printed, the axis that the boards turn about is found first and held, [C] III.B.
+    """
     table = machine.parameters
     if use_drawing:
         problem = replace(problem, prior=np.diag(1 / table.tolerances_free()))
-    state, steps, rank, held = start, np.zeros(len(start.z), dtype=int), 0, ()
-    solution = None
-    for turn in range(1 if noise is None else ROUNDS):
-        if noise is not None:
-            problem = replace(problem, weigh=problem.whitening(state, noise, joint_noise))
-        if not turn:
-            keep, rank = unknowns_kept(machine, problem, state, whitened=noise is not None)
-            names = np.array(unknown_names(machine, state), dtype=object)
-            problem, held = replace(problem, keep=keep), tuple(names[~keep])
-        damping = 1e-5 if not turn else RESTART_DAMPING
-        solution = minimise(problem, state, damping=damping, max_steps=100)
-        state, steps = solution.state, steps + solution.steps
-    assert solution is not None  # ROUNDS is at least one
-    return PoseFit(problem, replace(solution, steps=steps), held, rank)
+    state = on_axis(problem, start)
+    problem = problem if noise is None else _whitened(problem, state, noise, joint_noise)
+    keep, rank = unknowns_kept(machine, problem, state, whitened=noise is not None)
+    problem = replace(problem, keep=keep)
+    solution = minimise(problem, state, max_steps=MOST_STEPS)
+    steps = solution.steps
+    for _ in range(0 if noise is None else ROUNDS):
+        problem = _whitened(problem, solution.state, np.asarray(noise), joint_noise)
+        solution = minimise(problem, solution.state, MOST_STEPS, RESTART_DAMPING)
+        steps = steps + solution.steps
+    names = np.array(unknown_names(machine, state), dtype=object)
+    return PoseFit(problem, replace(solution, steps=steps), tuple(names[~keep]), rank)
+
+
+def _whitened(
+    problem: ImplicitProblem, state: ImplicitState, noise: Array, joint_noise: float
+) -> ImplicitProblem:
+    return replace(problem, weigh=problem.whitening(state, noise, joint_noise))
+
+
+def on_axis(problem: ImplicitProblem, state: ImplicitState) -> ImplicitState:
+    """The state with base and platform turned until the boards' one axis of rotation is their z.
+
+    For machines that turn about one axis, where one camera sees one board; others stay as they are.
+    The workspace keeps its place before the camera.
+    """
+    if not _one_axis(problem, state):
+        return state
+    frames = axis_frames(problem.T_camera_board[..., :3, :3])
+    camera, mount = state.T_camera_base[:, 0], state.T_mount[:, 0]
+    axis = frames.camera[..., :, 2]
+    sign = np.sign(dot(axis, camera[:, :3, 2]))[:, None]
+    middle = problem.platform_poses(state)[..., :3, 3].mean(axis=1)
+    turn = turn_between(camera[:, :3, 2], sign * axis) @ camera[:, :3, :3]
+    place = apply(camera, middle) - (turn @ middle[..., None])[..., 0]
+    carried = (mount[:, :3, :3] @ (sign * frames.board[:, 2])[..., None])[..., 0]
+    turned = turn_between(carried, np.array([0.0, 0.0, 1.0])) @ mount[:, :3, :3]
+    return state._replace(
+        T_camera_base=pose(turn, place)[:, None], T_mount=pose(turned, mount[:, :3, 3])[:, None]
+    )
+
+
+def _one_axis(problem: ImplicitProblem, state: ImplicitState) -> bool:
+    alone = state.T_camera_base.shape[1] == state.T_mount.shape[1] == 1
+    return alone and int(problem.layout.motion[:3].any(axis=1).sum()) == 1
+
+
+def turn_between(a: Array, b: Array) -> Array:
+    """The shortest turns (..., 3, 3) that lay unit vectors a (..., 3) on b."""
+    across = cross(a, np.broadcast_to(b, a.shape))
+    size = np.sqrt(dot(across, across))[..., None]
+    angle = np.arctan2(size, dot(a, b)[..., None])
+    return rotation(across * angle / np.where(size > 0, size, 1.0))
 
 
 def unknowns_kept(
@@ -198,23 +244,30 @@ def unknowns_kept(
     By the first run. As printed, the tilts of a board against the axis of rotation have only a
     second-order influence ([C] III.C) and are held.
     """
-    first = problem.select(np.array([0]))
-    jac = scaled_jacobian(first, first.take(state, np.array([0])))
+    first, begin = problem.select(np.array([0])), problem.take(state, np.array([0]))
+    jac = scaled_jacobian(first.ideal(begin), begin)
     sizes = np.concatenate([
         machine.parameters.tolerances_free(),
-        np.tile(np.repeat(PLACED, 3), state.T_camera_base.shape[1] + state.T_mount.shape[1]),
+        np.full(6 * (state.T_camera_base.shape[1] + state.T_mount.shape[1]), PLACED),
     ])  # fmt: skip
     keep = np.ones(len(sizes), dtype=bool)
+    rank, _ = _loose(jac, sizes)
     if not whitened:
         keep[_tilts(problem, state)] = False
-    size = np.abs(jac).max(axis=0)
-    used = np.where(size > 0, size, 1.0)
-    s, vt = np.linalg.svd(jac[:, keep] / used[keep])[1:]
-    rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
-    loose = vt[rank:] / (used * sizes)[keep]  # in units of what is known beforehand
-    held = np.flatnonzero(keep)[_pivots(loose)]
-    keep[held] = False
+    loose = _loose(jac[:, keep], sizes[keep])[1]
+    keep[np.flatnonzero(keep)[_pivots(loose)]] = False
     return keep, rank
+
+
+def _loose(jac: Array, sizes: Array) -> tuple[int, Array]:
+    """Rank of a Jacobian (rows, n) and the directions (k, n) that nothing fixes, in units of what
+    is known beforehand. Columns scaled by their extreme value, [C] IV.C.
+    """
+    extreme = np.abs(jac).max(axis=0)
+    extreme = np.where(extreme > 0, extreme, 1.0)
+    s, vt = np.linalg.svd(jac / extreme)[1:]
+    rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
+    return rank, vt[rank:] / (extreme * sizes)
 
 
 def scaled_jacobian(problem: ImplicitProblem, state: ImplicitState) -> Array:
@@ -225,10 +278,13 @@ def scaled_jacobian(problem: ImplicitProblem, state: ImplicitState) -> Array:
 
 
 def _tilts(problem: ImplicitProblem, state: ImplicitState) -> Array:
-    """Columns of the mounts' turns that the machine itself cannot make."""
-    first = problem.free.shape[1] + 6 * state.T_camera_base.shape[1]
+    """Columns of what the axis found beforehand tells: the mounts' turns that the machine itself
+    cannot make and, where there is one axis and one camera, the camera's.
+    """
     off = np.flatnonzero(~problem.layout.motion[:3].any(axis=1))
-    return (first + 6 * np.arange(state.T_mount.shape[1])[:, None] + off).ravel()
+    stations, mounts = state.T_camera_base.shape[1], state.T_mount.shape[1]
+    bodies = np.arange(0 if _one_axis(problem, state) else stations, stations + mounts)
+    return (problem.free.shape[1] + 6 * bodies[:, None] + off).ravel()
 
 
 def _pivots(loose: Array) -> list[int]:
@@ -268,7 +324,7 @@ def _session_state(
         T_base_platform=poses.T_base_platform,
         internal=poses.internal,
     )
-    state = apply(machine, state, default_gauge(machine))
+    state = in_gauge(machine, state, default_gauge(machine))
     return replace(state, theta=machine.parameters.unit_axes(state.theta))
 
 

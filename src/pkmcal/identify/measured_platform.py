@@ -18,8 +18,8 @@ from pkmcal.identify.pose_rows import turn_jacobian
 
 
 class Seen(NamedTuple):
-    """Platform poses (..., 4, 4) and their change (..., 6, 6) by the station's pose, the mount's
-    and the measured one.
+    """Platform poses (..., 4, 4) and their change (..., 6, 6) by T_base_camera, by the mount's pose
+    and by the measured one.
     """
 
     pose: Array
@@ -47,11 +47,12 @@ def seen_platform(T_camera_base: Array, T_camera_board: Array, T_platform_board:
     arm = (rot @ T_platform_board[..., :3, 3:])[..., 0]
     shape = np.broadcast_shapes(rot.shape[:-2], board.shape[:-1])
     back, rot = np.broadcast_to(back, (*shape, 3, 3)), np.broadcast_to(rot, (*shape, 3, 3))
-    w = T_camera_board[..., :3, 3] - T_camera_base[..., :3, 3]
+    camera = -(back @ T_camera_base[..., :3, 3:])[..., 0]
     lever = skew(arm)
+    eye = np.broadcast_to(np.eye(3), (*shape, 3, 3))
     return Seen(
         pose(rot, board - arm),
-        _columns(-back, back @ skew(w) - lever @ back, -back),
+        _columns(eye, -skew(board - arm - camera), eye),
         _columns(-rot, -lever @ rot, -rot),
         _columns(back, lever @ back, back),
     )

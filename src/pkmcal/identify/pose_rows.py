@@ -21,13 +21,15 @@ from pkmcal.geometry.rigid import dot, pose_difference, skew
 class PoseBlocks:
     """Where the poses are: K configurations of G poses, padded; the same for all runs.
 
-    station, mount : (K, G). present : (K, G) False for padding. on_platform : (M,) of the mounts.
+    station, mount, camera : (K, G). present : (K, G) False for padding. on_platform : (M,) of the
+    mounts.
     """
 
     station: Integers
     mount: Integers
     present: Booleans
     on_platform: Booleans
+    camera: Integers
 
     @property
     def count(self) -> int:
@@ -43,38 +45,48 @@ class PoseBlocks:
 def no_poses() -> PoseBlocks:
     """A session without boards."""
     none = np.zeros((1, 0), dtype=int)
-    return PoseBlocks(none, none, none.astype(bool), np.zeros(0, dtype=bool))
+    return PoseBlocks(none, none, none.astype(bool), np.zeros(0, dtype=bool), none)
 
 
 @dataclass(frozen=True)
 class PoseData:
     """Numbers measured in each run; leading axis B, or 1 where all runs share them.
 
-    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G).
+    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). optics :
+    (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'.
     """
 
     T_station_target: Array = field(default_factory=lambda: np.zeros((1, 1, 0, 4, 4)))
     whiten: Array = field(default_factory=lambda: np.zeros((1, 1, 0, 6, 6)))
     weight: Array = field(default_factory=lambda: np.zeros((1, 1, 0)))
+    optics: Array = field(default_factory=lambda: np.zeros((1, 1, 0, 6, 1)))
 
 
 class PoseRows(NamedTuple):
     """Rows (B, K, 6G) and their derivatives: by the stations (..., 6), by the platform's pose
-    (..., 6) and by the mounts (..., 6), each for its own, (B, K, G, 6, 6).
+    (..., 6) and by the mounts (..., 6), each for its own, (B, K, G, 6, 6); by the camera's unknowns
+    (B, K, G, 6, w).
     """
 
     value: Array
     by_station: Array
     by_own: Array
     by_mount: Array
+    by_optics: Array
 
 
 def pose_rows(
-    blocks: PoseBlocks, data: PoseData, T_camera_base: Array, poses: Array, T_mount: Array
+    blocks: PoseBlocks,
+    data: PoseData,
+    T_camera_base: Array,
+    poses: Array,
+    T_mount: Array,
+    optics: Array,
 ) -> PoseRows:
     """Whitened errors of the predicted poses.
 
-    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4).
+    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), optics
+    (B, C, w).
     """
     moving = blocks.on_platform[blocks.mount][..., None, None]
     camera = T_camera_base[:, blocks.station]
@@ -95,12 +107,13 @@ def pose_rows(
         out[..., 3:, 3:] = by_shift
         return weigh @ out
 
-    eye = np.eye(3)
+    eye, by_optics = np.eye(3), weigh @ data.optics
     return PoseRows(
-        (weigh @ error[..., None])[..., 0],
+        (weigh @ error[..., None] + by_optics @ optics[:, blocks.camera, :, None])[..., 0],
         rows(eye, -skew(place[..., 0]), eye),
         np.where(moving, rows(rot_c, -rot_c @ skew(arm[..., 0]), rot_c), 0.0),
         rows(rot_c @ rot_b, np.zeros((3, 3)), rot_c @ rot_b),
+        by_optics,
     )
 
 

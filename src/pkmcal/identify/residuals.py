@@ -266,16 +266,18 @@ class Problem:
             state.T_camera_base,
             state.T_base_platform,
             state.T_mount,
+            state.optics,
         )
 
     def _pose_by_shared(self, rows: PoseRows) -> Array:
         """Rows of boards' poses by the shared unknowns, (B, K, 6G, na)."""
         shape = rows.by_station.shape[:-1]
-        nz, n_optics = self.free.shape[1], self.n_cameras * self.n_optics
+        optics = np.broadcast_to(rows.by_optics, (*shape, self.n_optics))
         parts = [
-            np.zeros((*shape, nz)),
+            np.zeros((*shape, self.free.shape[1])),
             _one_hot(rows.by_station, self.pose_blocks.station, self.n_stations),
-            np.zeros((*shape, n_optics + self.n_lines)),
+            _one_hot(optics, self.pose_blocks.camera, self.n_cameras),
+            np.zeros((*shape, self.n_lines)),
             _one_hot(rows.by_mount, self.pose_blocks.mount, self.pose_blocks.n_mounts),
         ]
         out = np.concatenate(parts, axis=-1)

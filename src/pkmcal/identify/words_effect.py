@@ -6,7 +6,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import perturb
-from pkmcal.identify.gauge import freedoms, pose_generators
+from pkmcal.identify.gauge import pose_generators, respecting_motion
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.mechanisms.limbs import closure, dense
@@ -44,7 +44,8 @@ def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
     c = closure(machine.layout, machine.values, joints, poses)
     points = c.ends.b_by_pose
     moved = points @ pose_by_parameters(machine, joints, poses)[:, None]
-    frames = points @ (pose_generators(poses) @ freedoms(machine))[:, None]
+    # whether its parameters can follow or not: frames are conventions
+    frames = points @ (pose_generators(poses) @ respecting_motion(machine.layout.motion))[:, None]
     moved = moved.reshape(-1, moved.shape[-1])
     frames = frames.reshape(len(moved), -1)
     u, s, _ = np.linalg.svd(frames, full_matrices=False)

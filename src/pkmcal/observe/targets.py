@@ -82,8 +82,13 @@ def detect_in(
     images: Sequence[Integers], board: Board, names: Sequence[str]
 ) -> tuple[Detection, ...]:
     """The board's corners in photographs, by the first way of finding it."""
+
+    def detect(k: int) -> Detection:
+        # Taken in the thread, so that photographs may be decoded there.
+        return detect_board(images[k], board, names[k], quick=True)
+
     with ThreadPoolExecutor(THREADS) as pool:
-        return tuple(pool.map(lambda i, n: detect_board(i, board, n, quick=True), images, names))
+        return tuple(pool.map(detect, range(len(names))))
 
 
 def detect_again(
