@@ -52,7 +52,12 @@ def test_a_crank_is_the_papers():
     zero = np.zeros(3)
     axis = np.stack([-np.sin(alpha), np.cos(alpha), zero], axis=-1)
     parameters = np.concatenate(
-        [np.zeros((3, 3)), axis, np.tile([0.26, angle, 0.0, 0.14], (3, 1)), np.full((3, 3), np.nan)],
+        [
+            np.zeros((3, 3)),
+            axis,
+            np.tile([0.26, angle, 0.0, 0.14], (3, 1)),
+            np.full((3, 3), np.nan),
+        ],
         axis=1,
     )
     out = np.stack([np.cos(alpha), np.sin(alpha), zero], axis=-1)
@@ -70,17 +75,13 @@ def test_a_crank_is_model_31s():
         parameters = np.array([0, 0, 0, *turn[:, 2], 1, 0, 0, 0, np.nan, np.nan, np.nan])
         # v x z is Rz(psi) x for sin(beta) < 0
         expected = turn @ [np.cos(q), np.sin(q), 0]
-        np.testing.assert_allclose(
-            Crank.point(parameters, np.array(q)).value, expected, atol=1e-15
-        )
+        np.testing.assert_allclose(Crank.point(parameters, np.array(q)).value, expected, atol=1e-15)
 
 
 def test_a_cranks_derivatives_without_a_zero_direction():
     parameters, q = crank(1, zero=False), np.linspace(-1, 1, 5)
     at = Crank.point(parameters, q)
-    oracle = differences(
-        lambda d: Crank.point(parameters + np.append(d, np.zeros(3)), q).value, 10
-    )
+    oracle = differences(lambda d: Crank.point(parameters + np.append(d, np.zeros(3)), q).value, 10)
     np.testing.assert_allclose(at.by_parameters[..., :10], oracle, atol=1e-10)
     np.testing.assert_array_equal(at.by_parameters[..., 10:], 0.0)
 
@@ -257,9 +258,7 @@ def test_motors_are_the_readings_columns():
     machine = read(DELTA)
     assert machine.n_joints == 3
     assert machine.layout.actuated.tolist() == [1, 0, 2]
-    np.testing.assert_allclose(
-        machine.joint_ranges, [[0.1, 0.4], [np.nan, np.nan], [0.05, 0.25]]
-    )
+    np.testing.assert_allclose(machine.joint_ranges, [[0.1, 0.4], [np.nan, np.nan], [0.05, 0.25]])
     T = perturb(np.eye(4), np.array([0, 0, 0, 0.01, 0.02, -0.1]))
     readings = machine.inverse(T[None])[0]
     # the slider's column is the first: 0.2^2 = 0.01^2 + 0.05^2 + (z - q)^2, higher of two
@@ -282,9 +281,7 @@ def test_what_a_file_leaves_out_is_no_parameter():
 def two_rods(second="center: [0.1, 0.0, 0.0], axis: [0, 1, 0], arm: 0.1, along: -0.02"):
     top, first, *rest = DELTA.split("  - ")
     leg = first.replace("arm: 0.1", "arm: 0.1, along: 0.02")
-    other = leg.replace(
-        "center: [0.1, 0.0, 0.0], axis: [0, 1, 0], arm: 0.1, along: 0.02", second
-    )
+    other = leg.replace("center: [0.1, 0.0, 0.0], axis: [0, 1, 0], arm: 0.1, along: 0.02", second)
     assert "along" in other
     return "  - ".join([top, leg, other, *rest])
 
@@ -305,7 +302,9 @@ def test_legs_on_one_motor_share_axis_and_center():
 
 def test_names_for_all_legs_and_opposite_signs():
     table = read(two_rods()).parameters
-    tied = table.with_roles((), (("legs[*].base.arm",), ("legs[1].base.along", "-legs[2].base.along")))
+    tied = table.with_roles(
+        (), (("legs[*].base.arm",), ("legs[1].base.along", "-legs[2].base.along"))
+    )
     free = tied.free_matrix()
     # three axes of two turns each, two ties, and none of the motors' here
     assert free.shape[1] == len(table) - 3 - 2
@@ -456,7 +455,9 @@ BARS = """\
     ],
 )
 def test_faults_of_driven_legs(tmp_path, old, new, sentence):
-    (tmp_path / "m.yaml").write_text(new.join(DELTA.rsplit(old, 1) if old == "\n" else DELTA.split(old, 1)))
+    (tmp_path / "m.yaml").write_text(
+        new.join(DELTA.rsplit(old, 1) if old == "\n" else DELTA.split(old, 1))
+    )
     with pytest.raises(InputError) as caught:
         load_mechanism(tmp_path / "m.yaml")
     assert str(caught.value) == sentence

@@ -23,7 +23,7 @@ from pkmcal.mechanisms import load_mechanism
 from pkmcal.results import load
 from pkmcal.starter import TO_FILL, template_files
 
-COMMANDS = ("demo", "new", "check", "camera", "calibrate", "simulate", "reproduce")
+COMMANDS = ("demo", "new", "check", "camera", "calibrate", "validate", "simulate", "reproduce")
 
 
 def python(*words, **options):

@@ -17,10 +17,11 @@ from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.poses import PoseSet, concatenate_poses
 
 NOISE = np.repeat([np.radians(0.03), 2e-4], 3)
+BOARD = (Mount("board", "platform"),)
 MACHINES = sorted(catalogue())
 
 
-def true_machine(drawing, rng, shift=0.002, turn=np.radians(2)):
+def true_machine(drawing, rng, shift=0.002, turn=0.035):
     table = drawing.parameters
     kinds = np.array([table.kinds[k] for k in table.first_of_free()])
     sigma = np.where(np.isin(kinds, ["axis", "angle"]), turn, shift) * (kinds != "radius")
@@ -62,7 +63,7 @@ def seen_from(camera, body, mount, rng, station=0, number=0):
     )
 
 
-def measured(poses, joints, stations=1, mounts=(Mount("board", "platform"),)):
+def measured(poses, joints, stations=1, mounts=BOARD):
     return Measurements(
         EdgeSet.empty(), joints, 1e-5, stations, np.zeros(stations, int), poses=poses, mounts=mounts
     )

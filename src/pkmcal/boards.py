@@ -124,8 +124,7 @@ def station_board(
     moves = session.board_body == "platform"
     detections = detect_in(images, board, labels)
     nowhere = not any(detection.found for detection in detections)
-    if nowhere:
-        _check_another(session, board, number, detections)
+    _check_another(session, board, number, detections)
     # A board that moves says something new in every photograph; a still one is seen enough.
     most = len(images) if moves else ENOUGH if nowhere else 0
     detections = detect_again(images, board, detections, most)
@@ -147,9 +146,11 @@ def station_board(
 def _check_another(
     session: Session, board: Board, number: int, detections: Sequence[Detection]
 ) -> None:
-    """Raise `InputError` where photographs in which the board is not found show another one."""
+    """Raise `InputError` where photographs show another board, or more of it than is described."""
     station = session.stations[number]
-    few = np.unique(np.linspace(0, len(detections) - 1, EXAMINED).astype(int))
+    shown = np.flatnonzero([detection.found for detection in detections])
+    rows = shown if shown.size else np.arange(len(detections))
+    few = rows[np.unique(np.linspace(0, len(rows) - 1, EXAMINED).astype(int))]
     paths = [station.photographs[k].path for k in few]
     try:
         check_boards(paths, [detections[k] for k in few], board)

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pkmcal.boards import Boards
+from pkmcal.doubts import check_poses, richer_models, scale_doubt
 from pkmcal.gathering import known_stations, with_poses
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.conditions import conditions
@@ -20,10 +21,19 @@ from pkmcal.identify.verdict import Verdict, judge
 from pkmcal.identify.words import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.edges import Observation
-from pkmcal.recognition import boards_of, check_observable, found_stations, read_photographs
+from pkmcal.recognition import (
+    boards_of,
+    check_observable,
+    found_stations,
+    legs_stations,
+    platform_poses,
+    read_photographs,
+)
 from pkmcal.refinement import CameraRefinement, refinement_of
 from pkmcal.session import Session, load_session
 from pkmcal.turns import Progress, identify_poses, take_turns
+from pkmcal.validate.aside import set_aside
+from pkmcal.validate.holdouts import HoldOut, chosen, judged_without
 
 Method = Literal["bundle"] | PaperMethod
 
@@ -33,7 +43,8 @@ class Calibration:
     """Everything that a calibration found.
 
     boards : the calibration board, where stations observe one. findings : what the data tell of
-    the machine and what they leave open. timings : seconds by step.
+    the machine and what they leave open. timings : seconds by step. holdout : configurations that
+    the estimate did not see, and what it predicts of them, where that was asked for.
     """
 
     session: Session
@@ -47,6 +58,7 @@ class Calibration:
     timings: dict[str, float] = field(default_factory=dict)
     boards: Boards = field(default_factory=Boards)
     findings: Findings | None = None
+    holdout: HoldOut | None = None
 
     @property
     def machine(self) -> Machine:
@@ -60,15 +72,18 @@ def calibrate(
     method: Method = "bundle",
     seed: int = 0,
     refine_camera: bool = False,
+    holdout: int = 0,
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate the machine of a session; nothing is written.
 
     session : a loaded session, or its folder.
-    method : ``bundle`` (joint maximum likelihood), ``four-step`` ([A]) or ``linear`` ([B]).
+    method : ``bundle`` (joint maximum likelihood), ``four-step`` ([A]), ``linear`` ([B]) or
+        ``inverse-kinematic`` ([C]).
     seed : of the random search for the stations' poses.
     refine_camera : estimate the cameras' intrinsics with the machine, from their calibration's
         covariance on.
+    holdout : configurations, spread over the workspace, to leave out and then to predict.
     progress : called with the step in words and the share done.
     Raises InputError where the session is at fault, ResultError where nothing can be said.
     """
@@ -78,17 +93,24 @@ def calibrate(
     # beside our own threads they slow it twentyfold.
     with threadpool_limits(1, "blas"):
         told = progress or (lambda _text, _share: None)
-        return _calibrate(session, method, seed, refine_camera, told)
+        return _calibrate(session, method, seed, refine_camera, holdout, told)
 
 
 def _calibrate(
-    session: Session | Path | str, method: Method, seed: int, refine_camera: bool, told: Progress
+    session: Session | Path | str,
+    method: Method,
+    seed: int,
+    refine_camera: bool,
+    holdout: int,
+    told: Progress,
 ) -> Calibration:
     """:func:`calibrate`, step by step."""
     clock = _Clock()
     if not isinstance(session, Session):
         session = load_session(session)
     check_observable(session)
+    # a pose that the machine cannot take is told before any work
+    platform_poses(session, most=not legs_stations(session))
     cameras = refinement_of(session, refine_camera)
     clock.lap("load")
     told("Reading photographs", 0.0)
@@ -105,13 +127,27 @@ def _calibrate(
     else:
         turns = identify_poses(session, boards, known, cameras, told)
     clock.lap("identify")
+    check_poses(session, turns.measurements, turns.estimate)
+    whole = turns.measurements
+    out = chosen(session.machine, turns.estimate, holdout) if holdout else None
+    turns = set_aside(session.machine, turns, out) if out else turns
     estimate = turns.estimate
     if method != "bundle":
         told("Repeating the paper's method", 0.9)
         estimate = by_paper(method, session.machine, turns.measurements, estimate, seed)
     told("Judging", 0.95)
     findings = _findings(turns.measurements, estimate)
-    verdict = judge(turns.observation, estimate, method, findings=findings)
+    richer = richer_models(session, turns.measurements, turns.estimate)
+    unseen = len(out.rows) if out else 0
+    verdict = judge(
+        turns.observation,
+        estimate,
+        method,
+        findings=findings,
+        richer=richer,
+        held_out=unseen,
+        doubts=scale_doubt(session, estimate),
+    )
     clock.lap("identify")
     return Calibration(
         session=session,
@@ -125,6 +161,7 @@ def _calibrate(
         timings=clock.laps,
         boards=boards,
         findings=findings,
+        holdout=judged_without(session.machine, whole, estimate, out) if out else None,
     )
 
 
@@ -136,8 +173,10 @@ def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
         measurements.n_stations,
         estimate.machine.n_legs,
     )
+    if not len(measurements.edges):  # boards alone: of no leg can be said that it was not seen
+        seen = np.ones_like(seen)
     told = what_data_tell(measurements, estimate)
-    counted = conditions(estimate.machine, seen)
+    counted = conditions(estimate.machine, seen) if len(measurements.edges) else ()
     return explain(told, estimate, joined_by_boards(seen, measurements), counted)
 
 

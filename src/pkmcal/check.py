@@ -16,9 +16,12 @@ from threadpoolctl import threadpool_limits
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration import Progress
 from pkmcal.check_board import BoardCheck, BoardsCheck, check_boards
+from pkmcal.check_joints import JointCheck, joint_checks, joint_findings
+from pkmcal.check_poses import pose_findings
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import listed, plain
 from pkmcal.findings import Finding, Level, wrong
+from pkmcal.gathering import known_stations
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.observe import legs
@@ -27,7 +30,9 @@ from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.photographs import label_of
 from pkmcal.recognition import (
     Recognition,
+    board_images,
     check_observable,
+    legs_stations,
     platform_poses,
     recognise,
     why_unrecognised,
@@ -43,12 +48,6 @@ BLURRED = 1.7
 """Blur (px) beyond which edges are not measured well: the model of an edge ends at 1.5."""
 FEW_LEGS = 0.5
 """Share of the legs found in a station's photographs below which it hardly contributes."""
-LITTLE_USED = 0.5
-"""Share of a joint's range below which its configurations are crowded."""
-END = 0.15
-"""Part of a joint's range, at either end, in which a reading is an extreme one."""
-FEW_CONFIGURATIONS = 8
-"""Configurations below which standard deviations are large and mistakes go unnoticed."""
 OTHER_MODE = np.deg2rad(20.0)
 """Turn to another assembly below which one could be taken for the other."""
 
@@ -73,19 +72,6 @@ class StationCheck:
     black: float
     blur: float
     board: BoardCheck | None = None
-
-
-@dataclass(frozen=True)
-class JointCheck:
-    """One joint's readings, m or rad; used : share of its range, ends : readings near either end
-    of it (NaN and 0 where the mechanism file gives no range).
-    """
-
-    name: str
-    low: float
-    high: float
-    used: float
-    ends: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -142,8 +128,8 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
     told("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
     seen = _observed(session, photographs, motion.poses, np.random.default_rng(seed))
-    joints = tuple(_joint(session, k) for k in range(session.joints.shape[1]))
-    findings += [*broken, *motion.findings, *seen.findings, *_joint_findings(session, joints)]
+    joints = joint_checks(session)
+    findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
     for station in seen.stations:
         findings += _station_findings(station, session.machine.n_legs)
     return SessionCheck(
@@ -160,10 +146,13 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
 
 
 def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Finding]]:
-    """Each station's photographs; those that cannot be decoded are findings."""
+    """Each station's photographs of legs; those that cannot be decoded are findings."""
     out: list[legs.Photographs | None] = []
     findings: list[Finding] = []
     for number, station in enumerate(session.stations):
+        if "legs" not in station.observe:  # decoded one by one where the board is looked for
+            out.append(None)
+            continue
         rows: list[int] = []
         images: list[Integers] = []
         for photo in station.photographs:
@@ -193,7 +182,7 @@ class _Motion:
 def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
     """Whether the drawing's machine closes at all readings, and how well it is held there."""
     try:
-        poses = platform_poses(session)
+        poses = platform_poses(session, most=not legs_stations(session))
         found = session.machine.forward_result(session.joints, poses)
         modes = session.machine.assembly_modes(session.joints[0], rng)
     except PkmcalError as error:
@@ -239,26 +228,42 @@ def _observed(
         check_observable(session)
     except InputError as error:
         return _Seen(_unlooked(session, photographs), (wrong(error),))
-    if poses is None or len(whole) < len(photographs):
+    if poses is None or len(whole) < len(legs_stations(session)):
         return _Seen(_unlooked(session, photographs))
     # Of photographs that are broken is told already.
     lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
     boards = BoardsCheck()
     if not lost:
-        boards = check_boards(session, {p.station: p.images for p in whole})
+        boards = check_boards(session, board_images(session, whole))
         lost = any(finding.level is Level.WRONG for finding in boards.findings)
     if lost and any(station.T_camera_base is None for station in session.stations):
         return _Seen(_unlooked(session, photographs), boards.findings)
+    told = (*boards.findings, *(() if lost else pose_findings(session, boards.boards)))
     rngs = rng.spawn(len(whole) + 1)
-    found = recognise(session, whole, poses, rngs[1:], boards.boards)
+    try:
+        starts = None if lost else known_stations(session, boards.boards)
+    except PkmcalError as error:
+        return _Seen(_unlooked(session, photographs), (wrong(error), *boards.findings))
+    found = recognise(session, whole, poses, rngs[1:], boards.boards, starts)
+    looked = {p.station: _station(session, p, found, poses) for p in whole}
     stations = tuple(
-        replace(_station(session, p, found, poses), board=boards.checks.get(p.station))
-        for p in whole
+        replace(
+            looked.get(k, _board_alone(station, k in boards.checks)), board=boards.checks.get(k)
+        )
+        for k, station in enumerate(session.stations)
     )
     if found.complete:
-        return _Seen(stations, boards.findings)
+        return _Seen(stations, told)
     why = why_unrecognised(session, whole, found, rngs[0])
-    return _Seen(stations, (wrong(why), *boards.findings))
+    return _Seen(stations, (wrong(why), *told))
+
+
+def _board_alone(station: Station, seen: bool) -> StationCheck:
+    """A station that observes no legs."""
+    nan = float("nan")
+    return StationCheck(
+        station.name, len(station.photographs), seen, nan, nan, nan, nan, nan, nan, nan
+    )
 
 
 def _unlooked(
@@ -280,7 +285,7 @@ def _station(
 ) -> StationCheck:
     """One station in which the machine was looked for."""
     number = photographs.station
-    pose = recognition.found[number]
+    pose = recognition.found[legs_stations(session).index(number)]
     station, machine = session.stations[number], session.machine
     if not pose.good:
         what = unrecognised_quality(photographs.images, machine.n_legs)
@@ -342,42 +347,3 @@ def _station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
             " Move the camera back or aside, so that it sees the legs one beside the other."
         )
     return [Finding(Level.DOUBTFUL, f"{station.name}: {t}", station.name) for t in texts]
-
-
-def _joint(session: Session, column: int) -> JointCheck:
-    values = session.joints[:, column]
-    low, high = session.machine.joint_ranges[column]
-    stroke = high - low
-    ends = (int(np.sum(values < low + END * stroke)), int(np.sum(values > high - END * stroke)))
-    return JointCheck(
-        name=session.document["joints"]["columns"][column],
-        low=float(values.min()),
-        high=float(values.max()),
-        used=float(np.ptp(values) / stroke),
-        ends=ends,
-    )
-
-
-def _joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Finding]:
-    """What is doubtful, or worth knowing, about where the machine was photographed."""
-    findings: list[Finding] = []
-    crowded = [joint for joint in joints if joint.used < LITTLE_USED]
-    if crowded:
-        findings.append(
-            Finding(
-                Level.NOTE,
-                f"{listed([joint.name for joint in crowded])} used little of the range (down to"
-                f" {min(joint.used for joint in crowded):.0%}): readings near both ends of it"
-                " halve the standard deviations of the offsets.",
-            )
-        )
-    count = len(session.configurations)
-    if count < FEW_CONFIGURATIONS:
-        findings.append(
-            Finding(
-                Level.NOTE,
-                f"There are only {count} configurations: standard deviations will be large and"
-                " mistakes hard to notice. 15 or more are usual.",
-            )
-        )
-    return findings

@@ -17,7 +17,7 @@ from typing import Annotated, cast
 import typer
 
 from pkmcal import __version__
-from pkmcal.commands import calibrate, camera, check, demo, new, reproduce, simulate
+from pkmcal.commands import calibrate, camera, check, demo, new, reproduce, simulate, validate
 from pkmcal.commands.console import print_error
 from pkmcal.errors import InputError, PkmcalError
 
@@ -36,6 +36,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "check": check.check,
     "camera": camera.camera,
     "calibrate": calibrate.calibrate,
+    "validate": validate.validate,
     "simulate": simulate.simulate,
     "reproduce": reproduce.reproduce,
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from math import pi
 
 import numpy as np
@@ -17,15 +18,20 @@ _MARGIN = 0.05
 # Largest difference within K equal readings, in standard deviations: below 6 for any K under
 # a million, so more than this is movement.
 _ALIKE = 6.0
-_UNITS = ((1e-3, "millimetres", "metres", "Divide them by 1000"),
-          (pi / 180, "degrees", "radians", "Multiply them by pi/180"))  # fmt: skip
+_UNITS = {
+    "m": (1e-3, "millimetres", "metres", "Divide them by 1000"),
+    "rad": (pi / 180, "degrees", "radians", "Multiply them by pi/180"),
+}
 
 
-def check_readings(table: Table, ranges: Array, noise: float) -> list[str]:
+def check_readings(
+    table: Table, ranges: Array, noise: float, units: Sequence[str] = ()
+) -> list[str]:
     """Raise `InputError` for readings that cannot be this machine's; return warnings.
 
     ranges : (m, 2) smallest and largest reading of each joint, m or rad; NaN where not known.
-    noise : standard deviation of a reading, m or rad.
+    noise : standard deviation of a reading, m or rad. units : ``m`` or ``rad`` of each joint, m
+    unless told.
     """
     _check_columns(table, len(ranges))
     if len(table.names) < 2:
@@ -36,7 +42,8 @@ def check_readings(table: Table, ranges: Array, noise: float) -> list[str]:
             expected="two at least; one cannot tell a joint's place from its offset",
             next_step="Move the machine and take more photographs; pkmcal plan proposes where to",
         )
-    _check_units(table, ranges)
+    _check_units(table, ranges, units or ["m"] * len(ranges))
+    _check_signs(table, ranges)
     return _check_ranges(table, ranges) + _check_movement(table, noise)
 
 
@@ -61,12 +68,12 @@ def _check_columns(table: Table, n_joints: int) -> None:
         )
 
 
-def _check_units(table: Table, ranges: Array) -> None:
+def _check_units(table: Table, ranges: Array, units: Sequence[str]) -> None:
     """Most readings out of range, and in range once scaled: another unit, not so many mistakes."""
-    known = np.isfinite(ranges).all(axis=1)
-    if not known.any() or _inside(table.values, ranges)[:, known].mean() > 0.5:
-        return
-    for factor, unit, expected, next_step in _UNITS:
+    for kind, (factor, unit, expected, next_step) in _UNITS.items():
+        known = np.isfinite(ranges).all(axis=1) & (np.array(units) == kind)
+        if not known.any() or _inside(table.values, ranges)[:, known].mean() > 0.5:
+            continue
         if _inside(table.values * factor, ranges)[:, known].mean() > 0.5:
             column = int(np.flatnonzero(known)[0])
             low, high = ranges[column]
@@ -77,6 +84,25 @@ def _check_units(table: Table, ranges: Array) -> None:
                 expected=f"{expected}, between {low:g} and {high:g}",
                 next_step=next_step,
             )
+
+
+def _check_signs(table: Table, ranges: Array) -> None:
+    """A joint whose readings are out of range, and in range with the other sign."""
+    here, there = _inside(table.values, ranges), _inside(-table.values, ranges)
+    wrong = np.flatnonzero((here.mean(axis=0) < 0.5) & there.all(axis=0))
+    if not wrong.size:
+        return
+    column = int(wrong[0])
+    row = int(np.argmin(here[:, column]))
+    low, high = ranges[column]
+    names = listed([table.columns[k] for k in wrong])
+    raise InputError(
+        f"the readings of {names} have the wrong sign",
+        where=table.where(row, column),
+        found=f"{table.values[row, column]:g}",
+        expected=f"{low:g} to {high:g}, where all of them lie with the other sign",
+        next_step="Turn the sign of this column round, or the axis and range in the mechanism file",
+    )
 
 
 def _check_ranges(table: Table, ranges: Array) -> list[str]:

@@ -10,7 +10,7 @@ from typing import overload
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards import Boards, find_boards
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import listed
@@ -24,6 +24,11 @@ from pkmcal.session import Session, Station
 
 WORKERS = 2
 """Threads beside one another: decoding and array work release Python's lock."""
+
+MOST = 0.5
+"""Share of the configurations that the drawing has to reach for the rest to be believed."""
+MOST_TURN = 90.0
+"""degrees"""
 
 NOWHERE = StationPose(np.eye(4), score=1.0, chance=1.0)
 """Of a station for whose search there was no start."""
@@ -79,8 +84,12 @@ def legs_stations(session: Session) -> list[int]:
     return [k for k, station in enumerate(session.stations) if "legs" in station.observe]
 
 
-def platform_poses(session: Session) -> Array:
-    """T_base_platform (K, 4, 4) of all configurations by the drawing, or which one has none."""
+def platform_poses(session: Session, *, most: bool = False) -> Array:
+    """T_base_platform (K, 4, 4) of all configurations by the drawing, or which one has none.
+
+    most : be content where the drawing can take the readings of most configurations. What is
+    measured of the platform may tell the rest, for a motor's zero is drawn to degrees at best.
+    """
     try:
         found = session.machine.forward_result(session.joints)
     except GeometryError as error:  # the drawing is the user's: it is at fault
@@ -91,15 +100,53 @@ def platform_poses(session: Session) -> Array:
             expected=error.expected,
             next_step=error.next_step,
         ) from None
-    if found.converged.all():
+    if found.converged.all() or (most and found.converged.mean() > MOST):
+        _check_turns(session, found.T_base_platform, found.converged)
         return found.T_base_platform
     bad = [session.configurations[k] for k in np.flatnonzero(~found.converged)]
+    _check_signs(session, bad)
     raise InputError(
         "the drawing's machine cannot take these readings: its legs do not meet the platform",
         where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
         found=f"a gap of {float(found.error.max()) * 1e3:.3g} mm",
         expected="readings at which all legs reach the platform",
         next_step="Check these readings, the order of their columns, and the drawing's centres",
+    )
+
+
+def _check_signs(session: Session, bad: list[str]) -> None:
+    """Raise `InputError` where one motor's readings with the other sign would close all loops."""
+    machine = session.machine
+    for column, name in enumerate(session.document["joints"]["columns"]):
+        turned = session.joints * np.where(np.arange(machine.n_joints) == column, -1.0, 1.0)
+        if machine.forward_result(turned).converged.all():
+            raise InputError(
+                f"the readings of {name} have the wrong sign",
+                where=f"{session.document['joints']['file']}, column {name}",
+                found=f"readings at which the legs do not meet the platform, in configuration"
+                f" {listed(bad)}",
+                expected="the other sign of this column, with which they meet everywhere",
+                next_step="Turn the sign of this column round, or the axis in the mechanism file",
+            )
+
+
+def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
+    """Raise `InputError` where an articulated platform would turn by more than its bars allow."""
+    joints = {leg.platform.joint for leg in session.machine.document.legs}
+    if not joints & {"bar", "hinged-bar"}:
+        return
+    turn = np.rad2deg(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    bad = np.flatnonzero((np.abs(turn) > MOST_TURN) & usable)
+    if not bad.size:
+        return
+    worst = bad[np.argmax(np.abs(turn[bad]))]
+    raise InputError(
+        "the readings turn the platform beyond 90 degrees, where its side bars lie on each other",
+        where=f"{session.document['joints']['file']}, configuration"
+        f" {listed([session.configurations[k] for k in bad])}",
+        found=f"{turn[worst]:.1f} degrees (configuration {session.configurations[worst]})",
+        expected=f"less than {MOST_TURN:.0f} degrees to either side",
+        next_step="Check these readings, and the zero of the motors",
     )
 
 
@@ -231,11 +278,18 @@ def boards_of(session: Session, photographs: list[legs.Photographs]) -> Boards:
 
     Photographs that only show the board are decoded one by one, as they are looked at.
     """
+    return find_boards(session, board_images(session, photographs))
+
+
+def board_images(
+    session: Session, photographs: list[legs.Photographs]
+) -> dict[int, Sequence[Integers]]:
+    """All stations' photographs by their number: decoded already, or when they are looked at."""
     images: dict[int, Sequence[Integers]] = {p.station: p.images for p in photographs}
     for number, station in enumerate(session.stations):
         if number not in images:
             images[number] = Pictures(session.folder, station)
-    return find_boards(session, images)
+    return images
 
 
 class Pictures(Sequence[Integers]):

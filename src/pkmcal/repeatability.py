@@ -46,6 +46,8 @@ SHARED = 0.3
 """Share of the scatter, above what chance explains, from which its cause is told."""
 BETTER = 0.1
 """Share by which each leg's own motion must explain more than one of the whole to be the cause."""
+TELLING = 0.9
+"""Share that chance explains from which nothing can be told of a motion: too few edges show it."""
 MOSTLY_COMMON = 0.5
 """Scatter, in what photographs promise, below which averaging repeats gains under an eighth."""
 SHUFFLES = 16
@@ -321,7 +323,7 @@ def _explained(look: _Look, rows: Array, groups: Groups) -> float:
 
     rows : (N, 2, p) turn of the edges by a group's motion. What chance explains is found by
     exchanging the repeats of every edge by itself, which leaves its scatter and parts it from
-    the other edges'.
+    the other edges'. Two edges of a leg look like a motion of it however they scatter.
     """
     whiten, rng = _whiten(look), np.random.default_rng(0)
 
@@ -329,9 +331,11 @@ def _explained(look: _Look, rows: Array, groups: Groups) -> float:
         fit = fit_motions(turn, rows, whiten, groups)
         return float(fit.explained.sum() / fit.total.sum())
 
+    if not look.turn.any():
+        return 0.0
     shuffled = [share(look.turn[look.same.exchanged(rng)]) for _ in range(SHUFFLES)]
     chance = float(np.mean(shuffled))
-    return (share(look.turn) - chance) / (1 - chance)
+    return (share(look.turn) - chance) / (1 - chance) if chance < TELLING else 0.0
 
 
 def _over_legs(rows: tuple[LegScatter, ...], share: float) -> LegScatter:

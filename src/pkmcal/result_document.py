@@ -17,6 +17,8 @@ from pkmcal import __version__
 from pkmcal.arrays import Array
 from pkmcal.files import plain
 from pkmcal.geometry.rigid import inverse, skew
+from pkmcal.validate.figures import holdout_document
+from pkmcal.validate.independence import digests
 
 if TYPE_CHECKING:
     from pkmcal.calibration import Calibration
@@ -33,6 +35,12 @@ CONVENTIONS = (
 )
 EDGE_COLUMNS = ("station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt")
 """Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations."""
+POSE_COLUMNS = (
+    "station", "configuration", "target", "weight", "turn1", "turn2", "turn3", "x", "y", "z",
+)  # fmt: skip
+"""Of a row in residuals.poses, the last six whitened together, in standard deviations."""
+OPEN = 1.0
+"""m or rad; a target's place that is known no better is not told by the data."""
 
 
 def document_of(calibration: Calibration) -> dict[str, Any]:
@@ -43,6 +51,7 @@ def document_of(calibration: Calibration) -> dict[str, Any]:
         "conventions": CONVENTIONS,
         "verdict": asdict(calibration.verdict),
         "method": calibration.method,
+        "model": calibration.session.model,
         "seed": calibration.seed,
         "gauge": estimate.gauge,
         "parameters": _parameters(calibration),
@@ -50,9 +59,11 @@ def document_of(calibration: Calibration) -> dict[str, Any]:
         "not_identified": _not_identified(calibration),
         "identifiability": identifiability_of(calibration.findings),
         "stations": _stations(calibration),
+        "targets": _targets(calibration),
         "cameras": _cameras(calibration),
         "configurations": _configurations(calibration),
         "statistics": asdict(estimate.statistics),
+        "holdout": _holdout(calibration),
         "residuals": _residuals(calibration),
         "rejected": _rejected(calibration),
         "mechanism": estimate.machine.to_document(),
@@ -73,6 +84,13 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return found
+
+
+def _holdout(calibration: Calibration) -> dict[str, Any] | None:
+    """Residuals on configurations that were held out, beside those in use."""
+    if calibration.holdout is None:
+        return None
+    return holdout_document(calibration.holdout, calibration.session.configurations)
 
 
 def _parameters(calibration: Calibration) -> list[dict[str, Any]]:
@@ -131,18 +149,41 @@ def identifiability_of(findings: Findings | None) -> dict[str, Any] | None:
 def _stations(calibration: Calibration) -> list[dict[str, Any]]:
     estimate = calibration.estimate
     out: list[dict[str, Any]] = []
-    for s, station in enumerate(calibration.session.stations):
+    session = calibration.session
+    sources = [(x.name, x.camera_file, len(x.photographs)) for x in session.stations]
+    sources += [(table.name, table.label, len(table.configuration)) for table in session.trackers]
+    for s, (name, file, number) in enumerate(sources):
         T_camera_base = estimate.state.T_camera_base[s]
         covariance = base_camera_covariance(T_camera_base, estimate.station_covariance[s])
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         out.append(
             {
-                "name": station.name,
-                "camera": station.camera_file,
+                "name": name,
+                "camera": file,
                 "T_base_camera": inverse(T_camera_base),
                 "sigma_rotation": sigma[:3],
                 "sigma_translation": sigma[3:],
-                "photographs": len(station.photographs),
+                "photographs": number,
+            }
+        )
+    return out
+
+
+def _targets(calibration: Calibration) -> list[dict[str, Any]]:
+    """Boards, and what trackers measured, on their body; sigma null where nothing tells it."""
+    estimate, names = calibration.estimate, [m.name for m in calibration.measurements.mounts]
+    out: list[dict[str, Any]] = []
+    for m, name in enumerate(names):
+        body = "platform" if estimate.state.on_platform[m] else "base"
+        sigma = np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0.0))
+        known = [float(x) if x < OPEN else None for x in sigma]
+        out.append(
+            {
+                "name": name,
+                "fixed_to": body,
+                f"T_{body}_target": estimate.state.T_mount[m],
+                "sigma_rotation": known[:3],
+                "sigma_translation": known[3:],
             }
         )
     return out
@@ -164,7 +205,8 @@ def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
     """Each camera file once, with its edge shift, px outward."""
     estimate, numbers = calibration.estimate, calibration.measurements.camera_of_station.tolist()
     stations = calibration.session.stations
-    files = {c: station.camera_file for c, station in zip(numbers, stations, strict=True)}
+    # trackers, whose number means nothing, come last
+    files = {c: station.camera_file for c, station in zip(numbers, stations, strict=False)}
     return [
         {
             "file": files[c],
@@ -193,9 +235,11 @@ def _refined(calibration: Calibration, file: str) -> dict[str, Any]:
 def _configurations(calibration: Calibration) -> list[dict[str, Any]]:
     """Poses of all configurations; those not used have theirs from the readings alone."""
     session, estimate = calibration.session, calibration.estimate
+    seen = digests(session)
     return [
         {
             "name": name,
+            "photographs": seen.get(name, []),
             "used": bool(estimate.configurations[k]),
             "joints": session.joints[k],
             "joint_residuals": np.round(estimate.joint_residuals[k], 4),
@@ -206,7 +250,7 @@ def _configurations(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _residuals(calibration: Calibration) -> dict[str, Any]:
-    """One row an edge, whitened."""
+    """One row an edge, and one a pose, whitened."""
     edges, estimate = calibration.observation.edges, calibration.estimate
     whole = [edges.station, edges.configuration, edges.leg, edges.tube, edges.side]
     reals = np.column_stack([estimate.edge_weights, estimate.edge_residuals])
@@ -215,7 +259,14 @@ def _residuals(calibration: Calibration) -> dict[str, Any]:
         [*place, *values]
         for place, values in zip(numbers.tolist(), np.round(reals, 3).tolist(), strict=True)
     ]
-    return {"columns": EDGE_COLUMNS, "edges": rows}
+    found = calibration.measurements.poses
+    reals = np.column_stack([estimate.pose_weights, estimate.pose_residuals])
+    numbers = np.column_stack([found.station, found.configuration, found.mount]) + 1
+    poses = [
+        [*place, *values]
+        for place, values in zip(numbers.tolist(), np.round(reals, 3).tolist(), strict=True)
+    ]
+    return {"columns": EDGE_COLUMNS, "edges": rows, "pose_columns": POSE_COLUMNS, "poses": poses}
 
 
 def _rejected(calibration: Calibration) -> list[dict[str, Any]]:
@@ -225,7 +276,7 @@ def _rejected(calibration: Calibration) -> list[dict[str, Any]]:
     for item in calibration.observation.rejected:
         groups.setdefault(item.reason, []).append(
             [
-                session.stations[item.station].name,
+                session.station_names[item.station],
                 session.configurations[item.configuration],
                 item.leg + 1,
                 item.tube + 1,

@@ -79,6 +79,7 @@ def save(calibration: Calibration, folder: Path | str) -> None:
         calibration.verdict,
         findings=calibration.findings,
         timings=calibration.timings,
+        holdout=calibration.holdout,
     )
     texts = {
         MECHANISM: calibrated_mechanism_text(calibration),

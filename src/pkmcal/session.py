@@ -125,7 +125,7 @@ def load_session(folder: Path | str, model: str | None = None) -> Session:
     machine, source = _machine(folder, document, schema.mechanism, model)
     joints_file = _existing(folder, document, schema.joints.file, ("joints", "file"))
     table = read_csv(joints_file, label=schema.joints.file)
-    warnings = check_readings(table, machine.joint_ranges, schema.joints.noise)
+    warnings = check_readings(table, machine.joint_ranges, schema.joints.noise, machine.joint_units)
     board = _board(folder, document, schema)
     warnings += _of_little_use(document, schema)
     stations = tuple(

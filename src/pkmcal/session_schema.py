@@ -84,7 +84,7 @@ class TrackerStationDocument(Schema):
 
 def _station(value: Any) -> str:
     """Which of the two an entry of ``stations`` is."""
-    tracker = isinstance(value, dict) and "tracker" in value
+    tracker = "tracker" in value if isinstance(value, dict) else hasattr(value, "tracker")
     return "with a tracker" if tracker else "with a camera"
 
 
@@ -117,6 +117,9 @@ class SessionDocument(Schema):
         description="one entry a camera, or a tracker, in one place"
     )
     board: Annotated[BoardDocument | None, BeforeValidator(_board)] = None
+    paths: dict[str, list[str]] | None = Field(
+        default=None, description="straight paths by configurations, paths: {line: [c01, c02, c03]}"
+    )
 
     def observers(self, word: str) -> list[str]:
         """Names of the stations that observe legs, or the board."""

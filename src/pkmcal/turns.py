@@ -17,10 +17,11 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards import Boards
-from pkmcal.errors import ResultError
+from pkmcal.errors import InputError, ResultError
+from pkmcal.files import listed
 from pkmcal.gathering import measurements_of
 from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.problem import Estimate, Measurements
+from pkmcal.identify.problem import Estimate, Measurements, State
 from pkmcal.identify.start import better_start
 from pkmcal.observe import legs
 from pkmcal.observe.edges import EdgeSet, Observation, Rejection, concatenate
@@ -110,7 +111,8 @@ def identify_poses(
     told("Identifying", 0.6)
     machine = session.machine
     measurements = measurements_of(session, boards, None, cameras)
-    estimate = bundle(machine, measurements, start_state(machine, measurements, T_camera_base))
+    start = _reached(session, measurements, start_state(machine, measurements, T_camera_base))
+    estimate = bundle(machine, measurements, start)
     for turn in range(1, ROUNDS if cameras.active else 1):
         told("Identifying with the cameras", 0.6 + 0.3 * turn / ROUNDS)
         cameras = cameras.moved(estimate)
@@ -119,6 +121,31 @@ def identify_poses(
         estimate = bundle(machine, measurements, known)
     observation = observation_of(session, [], boards, measurements, estimate)
     return Turns(observation, measurements, estimate, cameras)
+
+
+def _reached(session: Session, measurements: Measurements, start: State) -> State:
+    """The start where the drawing cannot take all readings: from a first estimate by the rest.
+
+    Raises `InputError` for readings that the machine so found cannot take either.
+    """
+    drawn = session.machine.forward_result(session.joints).converged
+    if drawn.all():
+        return start
+    poses = measurements.poses
+    first = replace(measurements, poses=poses.select(drawn[poses.configuration]))
+    estimate = bundle(session.machine, first, start)
+    found = estimate.machine.forward_result(session.joints)
+    bad = [session.configurations[k] for k in np.flatnonzero(~found.converged)]
+    if bad:
+        raise InputError(
+            "the machine cannot take these readings, neither as drawn nor as the other"
+            " configurations show it: its legs do not meet the platform",
+            where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
+            found=f"a gap of {float(found.error.max()) * 1e3:.3g} mm",
+            expected="readings at which all legs reach the platform",
+            next_step="Check these readings, or leave these configurations out",
+        )
+    return replace(estimate.state, T_base_platform=found.T_base_platform, internal=found.internal)
 
 
 def _measure(
@@ -176,6 +203,7 @@ def observation_of(
             [look.point_edge + k for look, k in zip(looks, first, strict=bool(looks))] or nowhere[1]
         ),
         T_camera_base=estimate.state.T_camera_base,
+        poses=measurements.poses,
     )
 
 

@@ -22,7 +22,13 @@ class Method(StrEnum):
     BUNDLE = "bundle"
     FOUR_STEP = "four-step"
     LINEAR = "linear"
+    INVERSE_KINEMATIC = "inverse-kinematic"
 
+
+Model = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="A model that the mechanism file names, such as design."),
+]
 
 WHAT = {
     "report.html": "open it in a browser",
@@ -39,13 +45,21 @@ def calibrate(
     ] = None,
     method: Annotated[
         Method,
-        typer.Option(metavar="NAME", help="bundle, or the papers' own: four-step, linear."),
+        typer.Option(
+            metavar="NAME",
+            help="bundle, or the papers' own: four-step, linear, inverse-kinematic.",
+        ),
     ] = Method.BUNDLE,
+    model: Model = None,
     seed: console.Seed = 0,
     refine_camera: Annotated[
         bool,
         typer.Option("--refine-camera", help="Estimate the cameras' intrinsics as well."),
     ] = False,
+    holdout: Annotated[
+        int,
+        typer.Option(metavar="N", min=0, help="Leave N configurations out, and predict them."),
+    ] = 0,
     as_json: console.Json = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Say nothing if it is well.")
@@ -56,12 +70,17 @@ def calibrate(
     from pkmcal.results import check_output, save
     from pkmcal.session import load_session
 
-    loaded = load_session(session)
+    loaded = load_session(session, model)
     folder = out or loaded.folder / "calibration"
     check_output(folder)
     with console.progress(quiet) as told:
         calibration = run(
-            loaded, method=method.value, seed=seed, refine_camera=refine_camera, progress=told
+            loaded,
+            method=method.value,
+            seed=seed,
+            refine_camera=refine_camera,
+            holdout=holdout,
+            progress=told,
         )
         told("Writing the report", 0.97)
         save(calibration, folder)
@@ -85,6 +104,7 @@ def summary(calibration: Calibration, folder: Path) -> dict[str, Any]:
     from dataclasses import asdict
 
     from pkmcal.commands.figures import figures_of
+    from pkmcal.validate.figures import holdout_document
 
     return {
         "exit_code": exit_code(calibration),
@@ -92,6 +112,9 @@ def summary(calibration: Calibration, folder: Path) -> dict[str, Any]:
         "figures": figures_of(calibration).as_dict(),
         "session_warnings": calibration.session.warnings,
         "files": {name: str(folder / name) for name in WHAT},
+        "holdout": holdout_document(calibration.holdout, calibration.session.configurations)
+        if calibration.holdout
+        else None,
         "timings": calibration.timings,
     }
 
@@ -110,6 +133,12 @@ def tell(out: Console, calibration: Calibration, folder: Path) -> None:
     for card in cards:
         values = ", ".join(_joined(*value) for value in card.values)
         out.print(f"  {card.question:{widest}}  [bold]{values}[/]", soft_wrap=True)
+    if calibration.holdout:
+        from pkmcal.report.validation_page import holdout_sentence, joints_of
+
+        out.print()
+        said = holdout_sentence(calibration.holdout, joints_of(calibration.session))
+        console.print_points(out, [("", said)])
     notes = [*calibration.session.warnings, *verdict.warnings]
     points = [(console.MARKS["doubtful"], note) for note in notes]
     points += [("[cyan]→[/]", advice) for advice in verdict.advice]

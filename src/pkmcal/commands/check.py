@@ -120,7 +120,9 @@ def _station(station: StationCheck, found: SessionCheck) -> list[str]:
         str(station.photographs),
         _number(station.mismatch, "{:.2f}"),
         moved or "–",
-        f"{station.legs:.1f}/{found.n_legs}" if station.recognised else "–",
+        f"{station.legs:.1f}/{found.n_legs}"
+        if station.recognised and math.isfinite(station.legs)
+        else "–",
         _number(station.saturated, "{:.0%}"),
         _number(station.black, "{:.0%}"),
         _number(station.blur, "{:.1f} px"),
@@ -147,7 +149,7 @@ def _boards(found: SessionCheck) -> Table:
 
 def _joints(joints: tuple[JointCheck, ...]) -> Table:
     table = console.plain_table("", "Joint", "Lowest", "Highest", "Of its range", "Near the ends")
-    from pkmcal.check import LITTLE_USED
+    from pkmcal.check_joints import LITTLE_USED
 
     for joint in joints:
         known = math.isfinite(joint.used)

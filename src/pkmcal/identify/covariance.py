@@ -25,7 +25,7 @@ from pkmcal.identify.gauge import (
     projector,
     transformation,
 )
-from pkmcal.identify.hinges import exact_moves, move_generators
+from pkmcal.identify.hinges import conventions, move_generators
 from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import Problem
 from pkmcal.identify.solver import Linear, Reduced, eliminate, reduced_normal, transposed
@@ -217,7 +217,7 @@ def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Id
     tolerance = table.tolerances_free()
     left = rows[:, :nz] * tolerance
     left = left - q @ (q.T @ left)
-    theta, moves = problem.theta(state)[0], exact_moves(machine)
+    theta, moves = problem.theta(state)[0], conventions(machine)
     moved = move_generators(machine.layout, theta) @ moves
     moved = np.linalg.lstsq(problem.free, moved, rcond=None)[0]
     basis = np.linalg.qr(moved / tolerance[:, None], mode="complete")[0][:, moves.shape[1] :]

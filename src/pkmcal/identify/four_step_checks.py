@@ -66,11 +66,11 @@ def stations_are_fixed(items: Items, views: Views, machine: Machine) -> None:
     if not few.size:
         return
     seen = items.centres_seen[views.of_station[few[0]]]
-    need = "two" if legs_of(machine).planar else "three"
+    need = "two or more" if legs_of(machine).planar else "three or more that are not on one line"
     raise ResultError(
         what=f"station {few[0] + 1} sees too few legs for the four steps",
         found=f"{seen.sum()} base centres{_legs_in_brackets(seen)}",
-        expected=f"{need} or more that are not on one line, each leg seen in two directions",
+        expected=f"{need}, each leg seen in two directions",
         next_step=f"give the station's pose, fix a board to the base, or {BUNDLE}",
     )
 
@@ -129,11 +129,14 @@ def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: 
 
 
 def _too_few_at_once(legs: Legs, at_once: Booleans) -> None:
-    need = {6: "three", 3: "two" if legs.planar else "one"}[legs.motion.shape[1]]
+    turns = np.any(legs.motion[:3], axis=1)
+    need = "three or more, not on one line" if turns.all() else "one or more"
+    if turns.any() and not turns.all():  # about z alone
+        need = "two or more" + ("" if legs.planar else ", not one above the other")
     raise ResultError(
         what="no configuration shows enough legs with a length at once to place the platform",
         found=f"{at_once.sum(axis=1).max(initial=0)} at most",
-        expected=f"{need} or more, not on one line, [A] 3.5",
+        expected=f"{need}, [A] 3.5",
         next_step=f"let a station see more legs, photograph one configuration from several "
         f"stations, or {BUNDLE}",
     )

@@ -1,4 +1,4 @@
-"""The inverse-kinematic method of [C]: identification at measured poses, without forward kinematics.
+"""The inverse-kinematic method of [C]: identified at measured poses, without forward kinematics.
 
 Four forms: ``joint`` (eq. 3) or ``implicit`` (eq. 5), each as printed or whitened by its noise with
 what the machine cannot move (errata, [C]). Whitened, the two are one estimate, near the joint one.
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, pose, rotation
 from pkmcal.identify.gauge import apply as in_gauge
@@ -123,12 +123,7 @@ def pose_problem(
     axis B on ``T_camera_base`` and ``T_mount``.
     """
     layout, table = machine.layout, machine.parameters
-    if form == "joint" and layout.shares_motors:
-        raise InputError(
-            what=f"mechanism {machine.name!r} has several rods on a motor: no reading fits all",
-            expected="the implicit form",
-            next_step="use form='implicit'",
-        )
+    _check_form(machine, form)
     runs, count = T_camera_board.shape[:2]
     z = table.to_free(start.theta)
     camera = np.broadcast_to(start.T_camera_base, (runs, *start.T_camera_base.shape[-3:]))
@@ -155,6 +150,15 @@ def pose_problem(
         np.zeros((runs, count, layout.n_internal)),
     )
     return problem, _with_hinges(problem, state)
+
+
+def _check_form(machine: Machine, form: Form) -> None:
+    if form == "joint" and machine.layout.shares_motors:
+        raise InputError(
+            what=f"mechanism {machine.name!r} has several rods on a motor: no reading fits all",
+            expected="the implicit form",
+            next_step="use form='implicit'",
+        )
 
 
 def _with_hinges(problem: ImplicitProblem, state: ImplicitState) -> ImplicitState:
@@ -277,7 +281,7 @@ def scaled_jacobian(problem: ImplicitProblem, state: ImplicitState) -> Array:
     return np.concatenate([rows.reshape(-1, rows.shape[-1]), linear.shared_by])
 
 
-def _tilts(problem: ImplicitProblem, state: ImplicitState) -> Array:
+def _tilts(problem: ImplicitProblem, state: ImplicitState) -> Integers:
     """Columns of what the axis found beforehand tells: the mounts' turns that the machine itself
     cannot make and, where there is one axis and one camera, the camera's.
     """
@@ -291,7 +295,8 @@ def _pivots(loose: Array) -> list[int]:
     """One column for each row of (k, n), chosen so that the rows are fixed best."""
     rows, chosen = loose.copy(), list[int]()
     for _ in range(len(loose)):
-        k = int(np.argmax(np.sum(rows**2, axis=0)))
+        size = np.sum(rows**2, axis=0)
+        k = int(np.argmax(size > 0.99 * size.max()))  # the first of equals
         chosen.append(k)
         along = rows[:, k] / np.linalg.norm(rows[:, k])
         rows = rows - along[:, None] * (along @ rows)
@@ -328,9 +333,8 @@ def _session_state(
     return replace(state, theta=machine.parameters.unit_axes(state.theta))
 
 
-def _updated(before: Array, after: Array, seen: Array) -> Array:
+def _updated(before: Array, after: Array, seen: Integers) -> Array:
     """Poses (n, 4, 4), the new ones where something was seen."""
     out = before.copy()
-    used = np.unique(seen)
-    out[used] = after[used]
+    out[seen] = after[seen]
     return out

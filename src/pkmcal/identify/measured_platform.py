@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Booleans
 from pkmcal.geometry.rigid import pose, rotation, rotation_vector, skew
 from pkmcal.identify.pose_rows import turn_jacobian
 
@@ -76,7 +76,7 @@ def taken(motion: Array, whole: Array) -> Taken:
     Of the turn, ``R = Exp(s) R_own``: R_own about z where the machine turns about z alone (s is
     then horizontal), none where it does not turn. Places that it cannot take are off as they are.
     """
-    can = motion.any(axis=1)
+    can: Booleans = np.any(motion != 0, axis=1)
     own, off, turn_by, off_turn_by = _turn_split(int(can[:3].sum()), whole[..., :3, :3])
     place = np.where(can[3:], whole[..., :3, 3], 0.0)
     missing = np.flatnonzero(~can[3:])

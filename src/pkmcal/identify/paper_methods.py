@@ -1,4 +1,5 @@
-"""[A]'s four steps and [B]'s linear solution as results of their own, to compare with.
+"""[A]'s four steps, [B]'s linear solution and [C]'s inverse-kinematic method as results of their
+own, to compare with.
 
 They come without uncertainties in the papers; here, standard deviations are the spread of the
 method over repetitions with the edges' and readings' stated noise added once more.
@@ -21,11 +22,13 @@ from pkmcal.identify.covariance import data_share
 from pkmcal.identify.four_step import four_step
 from pkmcal.identify.four_step_boards import mount_poses
 from pkmcal.identify.gauge import apply, centre_index, default_gauge
+from pkmcal.identify.hand_eye import start_from_poses
+from pkmcal.identify.inverse_kinematic import inverse_kinematic
 from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
 from pkmcal.identify.residuals import BatchState
 from pkmcal.mechanisms import Machine
 
-Method = Literal["four-step", "linear"]
+Method = Literal["four-step", "linear", "inverse-kinematic"]
 REPETITIONS = 60
 """Repetitions for the standard deviations: they are then known to 9 %."""
 
@@ -71,6 +74,9 @@ def _repeated(
 def _solve(method: Method, machine: Machine, measurements: Measurements, guess: Array) -> State:
     if method == "linear":
         state = linear_state(machine, measurements)
+    elif method == "inverse-kinematic":
+        start = start_from_poses(machine, measurements, guess)
+        state = inverse_kinematic(machine, measurements, start)
     else:
         state = four_step(machine, measurements, T_camera_base_guess=guess)
     state = apply(machine, state, default_gauge(machine))
@@ -126,7 +132,8 @@ def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     noise = measurements.joint_noise * rng.normal(size=measurements.joints.shape)
     poses = measurements.poses
-    move = np.linalg.solve(poses.whiten, rng.normal(size=(len(poses), 6, 1)))[..., 0]
+    # what was not measured has no noise
+    move = (np.linalg.pinv(poses.whiten) @ rng.normal(size=(len(poses), 6, 1)))[..., 0]
     return replace(
         measurements,
         edges=replace(edges, normal=normal),
@@ -144,7 +151,11 @@ def _estimate(
     rows = assembled.problem.block_residuals(batch)[0][assembled.row, assembled.place]
     rows = np.nan_to_num(rows)
     distance = np.sqrt(np.sum(rows**2, axis=-1))
-    scale = max(float(np.median(distance)) / np.sqrt(2 * np.log(2)), 1.0)
+    middle = float(np.median(distance)) if distance.size else 0.0
+    scale = max(middle / np.sqrt(2 * np.log(2)), 1.0)
+    off = _pose_residuals(assembled, batch)
+    count = float(measurements.poses.rows.sum())
+    pose_scale = max(float(np.sqrt(np.sum(off**2) / count)) if count else 1.0, 1.0)
     weight = (distance < 6.5 * scale).astype(float)
     return Estimate(
         machine=machine,
@@ -153,12 +164,20 @@ def _estimate(
         station_covariance=stations,
         edge_shift_sigma=np.zeros(len(state.edge_shift)),
         edge_residuals=rows / scale,
-        pose_residuals=_pose_residuals(assembled, batch),
+        pose_residuals=off / pose_scale,
+        pose_weights=np.ones(len(off)),
+        mount_covariance=np.zeros((len(state.T_mount), 6, 6)),
         edge_weights=weight,
         joint_residuals=_joint_residuals(machine, measurements, state),
         data_share=data_share(machine, state.theta, theta, default_gauge(machine)),
         configurations=assembled.seen,
-        statistics=_statistics(rows, weight, scale),
+        statistics=replace(
+            _statistics(rows, weight, scale),
+            chi2_poses=float(np.sum(off**2)) / pose_scale**2,
+            n_poses=count,
+            dof_poses=count,
+            pose_scale=pose_scale,
+        ),
         gauge=default_gauge(machine).name,
     )
 

@@ -7,7 +7,8 @@ Rows of a configuration are its edges, two each, then its limbs' closures, then 
   covariance. The measured normal is the true one moved by ``basis @ (shift * s)`` when all
   edge points lie s px outward, and ``basis^T n_measured = 0``; hence the plus sign.
 - closure: ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5 whitened; what no reading enters (rods
-  of constant length, joints' axes) is taken as perfect and held to :data:`PERFECT`.
+  of constant length, joints' axes) is taken as perfect and held to
+  :data:`pkmcal.identify.closure_noise.PERFECT`.
 
 Rows on shared unknowns: ``(theta - drawing) / tolerance``, the edge shift's prior, the gauge.
 
@@ -23,23 +24,14 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import edge_normal_jacobians
-from pkmcal.geometry.rigid import inverse, perturb, skew
+from pkmcal.geometry.rigid import skew
 from pkmcal.identify.blocks import BatchState, Blocks, Data
-from pkmcal.identify.gauge import (
-    mount_generators,
-    moved_centres,
-    moved_mounts,
-    pose_generators,
-    station_generators,
-)
-from pkmcal.identify.hinges import move_generators, slid
+from pkmcal.identify.closure_noise import by_noise, joint_rows
 from pkmcal.identify.pose_rows import PoseBlocks, PoseData, PoseRows, no_poses, pose_rows
 from pkmcal.identify.solver import Linear, Values
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, on_tangents
+from pkmcal.identify.steps import moved
+from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure
 
-PERFECT = 1e-6
-"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of
-a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
 SHADING_SIGMA = 0.03
 """Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
 before any data. Path-traced photographs of a known machine show 0.02 (and are best fitted without
@@ -67,7 +59,7 @@ class Problem:
     layout, drawing (P,), free (P, nz) : the machine. blocks, data : the measurements.
     joint_noise : standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns (z, stations, optics) and prior_target : (c,).
-    frames : (12 + 2n, g) frame and hinge changes that the model allows. pose_blocks, pose_data : of
+    frames : (12 + n, g) frame changes and others that the model allows. pose_blocks, pose_data : of
     boards. n_lines : tubes' sides at stations with a shading of their own.
     """
 
@@ -89,15 +81,15 @@ class Problem:
     @property
     def n_shared(self) -> int:
         """Number of shared unknowns."""
-        return self._mounts_at + 6 * self.pose_blocks.n_mounts
+        return self.mounts_at + 6 * self.pose_blocks.n_mounts
 
     @property
-    def _mounts_at(self) -> int:
+    def mounts_at(self) -> int:
         """Where the mounts' unknowns begin: after z, stations, optics and shading."""
-        return self._lines_at + self.n_lines
+        return self.lines_at + self.n_lines
 
     @property
-    def _lines_at(self) -> int:
+    def lines_at(self) -> int:
         """Where the lines' shading begins: after z, stations and optics."""
         return self.free.shape[1] + 6 * self.n_stations + self.n_cameras * self.n_optics
 
@@ -127,7 +119,7 @@ class Problem:
 
     def residuals(self, state: BatchState) -> Values:
         """Residuals; NaN where a leg passes through the camera."""
-        c = self._closure(state)
+        c = self.closure(state)
         edges = self._normals(state, c.ends.a, c.ends.b)
         rows = [self._edge_rows(state, edges.n), self._closure_rows(c)]
         if self.pose_blocks.count:
@@ -137,7 +129,7 @@ class Problem:
 
     def linearize(self, state: BatchState) -> Linear:
         """Residuals and exact Jacobian."""
-        c = self._closure(state)
+        c = self.closure(state)
         edges = self._normals(state, c.ends.a, c.ends.b)
         by_a, by_b = self._project(edges.by_a), self._project(edges.by_b)
         value = [self._edge_rows(state, edges.n), self._closure_rows(c)]
@@ -171,51 +163,8 @@ class Problem:
         )
 
     def moved(self, state: BatchState, shared: Array, own: Array) -> BatchState:
-        """The state after a step.
-
-        The part of the step that only turns or shifts the frames is made as an exact frame
-        change. Added up it would bend the sharp closures and edges at second order, and the
-        drawing's soft hold on the frames would be found along a curved valley.
-        """
-        nz, ns = self.free.shape[1], 6 * self.n_stations
-        by_frames = move_generators(self.layout, self.theta(state), self.drawing)
-        by_frames = np.linalg.pinv(self.free) @ by_frames
-        moves = self.frames @ np.linalg.pinv(by_frames @ self.frames) @ shared[:, :nz, None]
-        z = shared[:, :nz] - (by_frames @ moves)[..., 0]
-        y, slides = moves[:, :12], moves[:, 12:, 0]
-        camera = shared[:, nz : nz + ns].reshape(-1, self.n_stations, 6)
-        camera = camera - (station_generators(state.T_camera_base) @ y[:, None])[..., 0]
-        own = own @ self.layout.own_motion.T
-        pose, internal = own[..., :6], own[..., 6:]
-        pose = pose - (pose_generators(state.T_base_platform) @ y[:, None])[..., 0]
-        n, m = self._lines_at, self._mounts_at
-        mount = shared[:, m:].reshape(*state.T_mount.shape[:2], 6)
-        by_frame = mount_generators(state.T_mount, self.pose_blocks.on_platform)
-        inner = BatchState(
-            state.z + z,
-            perturb(state.T_camera_base, camera),
-            perturb(state.T_base_platform, pose),
-            state.optics + shared[:, nz + ns : n].reshape(state.optics.shape),
-            perturb(state.T_mount, mount - (by_frame @ y[:, None])[..., 0]),
-            state.internal + internal + slides[:, None, 1::2],
-            state.shading + shared[:, n:m],
-        )
-        return self._in_frames(inner, y[..., 0], slides)
-
-    def _in_frames(self, state: BatchState, y: Array, slides: Array) -> BatchState:
-        """The state after exact frame changes y (B, 12) and hinge changes (B, 2n)."""
-        e, f = perturb(np.eye(4), y[:, :6]), perturb(np.eye(4), y[:, 6:])
-        theta = moved_centres(self.layout, slid(self.layout, self.theta(state), slides), e, f)
-        theta = on_tangents(self.layout, theta, self.drawing)
-        return BatchState(
-            (theta - self.drawing) @ np.linalg.pinv(self.free).T,
-            state.T_camera_base @ inverse(e)[:, None],
-            e[:, None] @ state.T_base_platform @ inverse(f)[:, None],
-            state.optics,
-            moved_mounts(state.T_mount, self.pose_blocks.on_platform, e, f),
-            state.internal - slides[:, None, 1::2],
-            state.shading,
-        )
+        """The state after a step; see :mod:`pkmcal.identify.steps`."""
+        return moved(self, state, shared, own)
 
     def select(self, runs: Integers) -> Problem:
         """The problem of some runs only."""
@@ -250,7 +199,7 @@ class Problem:
     def block_residuals(self, state: BatchState) -> Array:
         """Whitened residuals of the blocks without their weights, (B, K, G, 2g)."""
         plain = self.weighted(self.blocks.present[None].astype(float))
-        c = plain._closure(state)
+        c = plain.closure(state)
         n = plain._normals(state, c.ends.a, c.ends.b).n
         return plain._edge_rows(state, n).reshape(*n.shape[:3], 2 * self.blocks.side.shape[-1])
 
@@ -283,7 +232,8 @@ class Problem:
         out = np.concatenate(parts, axis=-1)
         return out.reshape(*out.shape[:2], -1, out.shape[-1])
 
-    def _closure(self, state: BatchState) -> Closure:
+    def closure(self, state: BatchState) -> Closure:
+        """The closure of all runs and configurations, (B, K, E)."""
         theta = self.theta(state)[:, None, :]
         internal = state.internal if self.layout.n_internal else None
         return closure(self.layout, theta, self.data.joints, state.T_base_platform, internal)
@@ -292,8 +242,8 @@ class Problem:
         nz = self.free.shape[1]
         x = np.zeros((state.z.shape[0], self.n_shared))
         x[:, :nz] = state.z
-        x[:, nz + 6 * self.n_stations : self._lines_at] = state.optics.reshape(len(x), -1)
-        x[:, self._lines_at : self._mounts_at] = state.shading
+        x[:, nz + 6 * self.n_stations : self.lines_at] = state.optics.reshape(len(x), -1)
+        x[:, self.lines_at : self.mounts_at] = state.shading
         return x @ self.prior.T - self.prior_target
 
     def _normals(self, state: BatchState, a: Array, b: Array) -> Ends:
@@ -340,50 +290,12 @@ class Problem:
         return self._by_noise(c, c.value[..., None])[..., 0]
 
     def _by_noise(self, c: Closure, rows: Array) -> Array:
-        """Rows (B, K, E, n) of the closure in standard deviations; the noise's own derivative is
-        multiplied by c = 0.
-
-        Rods on one motor share its reading's noise: with slopes g of the motor's rows their
-        covariance is ``sigma^2 g g^T + PERFECT^2``, whitened in closed form.
-        """
-        if not self.layout.shares_motors:
-            return rows / self._closure_sigma(c)[..., None]
-        for motor in range(self.layout.n_readings):
-            slope = np.where(self.layout.row_motor == motor, c.by_reading, 0.0)
-            size = np.sqrt(np.sum(slope**2, axis=-1, keepdims=True))
-            unit = slope / size
-            less = 1 - PERFECT / np.hypot(PERFECT, self.joint_noise * size)
-            part = unit[..., None, :] @ rows
-            rows = rows - (less * unit)[..., None] * part
-        return rows / PERFECT
+        """Rows (B, K, E, n) of the closure in standard deviations."""
+        return by_noise(self.layout, self.joint_noise, c.by_reading, rows)
 
     def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
         """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""
-        if not self.layout.shares_motors:
-            rows = self.layout.driven_rows
-            order = np.argsort(self.layout.row_motor[rows], kind="stable")
-            return c_rows[..., rows[order]]
-        slope = self._closure(state).by_reading[..., None]
-        slope = slope * (self.layout.row_motor[:, None] == np.arange(self.layout.n_readings))
-        unit = slope / np.sqrt(np.sum(slope**2, axis=-2, keepdims=True))
-        return (np.swapaxes(unit, -1, -2) @ c_rows[..., None])[..., 0]
-
-    def _closure_sigma(self, c: Closure) -> Array:
-        """Standard deviation of each closure where every motor moves one rod.
-
-        A crank in line with its rod does not move it, so no closure is sharper than a perfect one;
-        a rod that is read always moves with its reading.
-        """
-        read = np.zeros(self.layout.n_equations, dtype=bool)
-        read[self.layout.driven_rows] = True
-        own = np.append(self.layout.rod_reads[self.layout.closing], self._no_angles)
-        sigma = np.abs(c.by_reading) * self.joint_noise
-        sigma = np.where(own, sigma, np.maximum(sigma, PERFECT))
-        return np.where(read, sigma, PERFECT)
-
-    @property
-    def _no_angles(self) -> Booleans:
-        return np.zeros(len(self.layout.angles), dtype=bool)
+        return joint_rows(self.layout, self.closure(state).by_reading, c_rows)
 
     def _edge_by_shared(
         self, state: BatchState, c: Closure, e: Ends, by_a: Array, by_b: Array

@@ -35,6 +35,18 @@ LARGE = 0.3
 """Share of what is undecided from which on a single cause of it is worth a reason."""
 
 
+POOR = 1.3
+"""Factor on the poses' noise beyond which the model is too poor for them, if that is no chance."""
+
+
+@dataclass(frozen=True)
+class RicherModel:
+    """Another model of the mechanism file, and by how many times their noise poses fit it."""
+
+    name: str
+    scale: float
+
+
 @dataclass(frozen=True)
 class Verdict:
     """What a person should know first.
@@ -58,11 +70,17 @@ def judge(
     told: Identifiability | None = None,
     *,
     findings: Findings | None = None,
+    richer: tuple[RicherModel, ...] = (),
+    doubts: tuple[str, ...] = (),
+    held_out: int = 0,
 ) -> Verdict:
     """The verdict on an estimate of a session by a method.
 
     told : what the data tell of the machine; findings : the same in words, made from ``told`` and
     the edges where absent. Without both, values that the data do not decide speak for themselves.
+    richer : models of the machine that were tried because this one is too poor for the poses.
+    doubts : further reasons against it, found in the session.
+    held_out : configurations that were left out on purpose.
     """
     if findings is None and told is not None:
         stations, legs = len(estimate.state.T_camera_base), estimate.machine.n_legs
@@ -70,9 +88,13 @@ def judge(
         findings = explain(told, estimate, seen)
     large, small = _left_open(estimate, findings) if findings else ((), ())
     left = _undecided_text(estimate) if findings is None else _said(large)
-    reasons = tuple(_reasons(estimate, method, left))
+    reasons = tuple(_reasons(estimate, method, left) + _poses_against(estimate, richer)) + doubts
     matter = tuple(s for s in small if s.matters)
-    warnings = tuple(_warnings(observation, estimate) + _said(matter))
+    warnings = (
+        *_warnings(observation, estimate, held_out),
+        *_poses_doubted(estimate, richer),
+        *_said(matter),
+    )
     if reasons:
         headline = "This calibration should not be used."
     else:
@@ -89,7 +111,7 @@ def judge(
 
 def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]:
     out: list[str] = []
-    lost = float(np.mean(estimate.edge_weights < 0.5))
+    lost = float(np.mean(estimate.edge_weights < 0.5)) if estimate.edge_weights.size else 0.0
     if estimate.statistics.noise_scale > TOO_NOISY and method != "bundle":
         out.append(
             f"The {method} method leaves the edges {estimate.statistics.noise_scale:.0f} times"
@@ -117,6 +139,46 @@ def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]
             f" ({int(bad.sum())} of {bad.size} by more than 6 standard deviations)."
         )
     return out
+
+
+def _poses_against(estimate: Estimate, richer: tuple[RicherModel, ...]) -> list[str]:
+    """Poses that the model does not explain, or that do not agree among themselves."""
+    out: list[str] = []
+    scale = estimate.statistics.pose_scale
+    if scale > TOO_NOISY:
+        out.append(
+            f"The measured poses disagree with the model {scale:.1f} times more than their noise:"
+            f" it leaves out what moves them.{_better(richer)}"
+        )
+    lost = float(np.mean(estimate.pose_weights < 0.5)) if estimate.pose_weights.size else 0.0
+    if lost > TOO_MANY_LOST:
+        out.append(
+            f"{lost:.0%} of the measured poses do not fit the rest; below {TOO_MANY_LOST:.0%} the"
+            " majority can be trusted to be right."
+        )
+    return out
+
+
+def _poses_doubted(estimate: Estimate, richer: tuple[RicherModel, ...]) -> list[str]:
+    """Poses that scatter more than they should, short of a reason against the result."""
+    s = estimate.statistics
+    # the scale of n numbers that are noise has the standard deviation 1 / sqrt(2 n)
+    chance = 1 + 4 / np.sqrt(2 * max(s.dof_poses, 1.0))
+    if not max(POOR, chance) < s.pose_scale <= TOO_NOISY:
+        return []
+    return [
+        f"The measured poses disagree with the model {s.pose_scale:.1f} times more than their"
+        f" noise; all standard deviations are enlarged by as much.{_better(richer)}"
+    ]
+
+
+def _better(richer: tuple[RicherModel, ...]) -> str:
+    """The richer model that fits, as a further sentence; the least rich of those that fit alike."""
+    if not richer:
+        return ""
+    best = min(richer, key=lambda model: model.scale)
+    alike = [model for model in richer if model.scale < 1.1 * best.scale]
+    return f" With --model {alike[0].name} they fit {alike[0].scale:.2f} times their noise."
 
 
 def _singular(estimate: Estimate) -> list[str]:
@@ -187,7 +249,7 @@ def _undecided(estimate: Estimate) -> list[str]:
     return [table.names[k] for k in kinematic if estimate.data_share[k] < DECIDED]
 
 
-def _warnings(observation: Observation, estimate: Estimate) -> list[str]:
+def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> list[str]:
     out: list[str] = []
     table = estimate.machine.parameters
     change = np.abs(_from_drawing(estimate.machine))
@@ -202,7 +264,7 @@ def _warnings(observation: Observation, estimate: Estimate) -> list[str]:
         f"Leg {leg + 1} was seen in few photographs; its values lean on the readings."
         for leg in np.flatnonzero(seen < 0.3 * np.median(seen))
     )
-    unseen = int(np.sum(~estimate.configurations))
+    unseen = int(np.sum(~estimate.configurations)) - held_out
     if unseen:
         out.append(f"{unseen} configurations had no usable photograph and did not take part.")
     if estimate.statistics.noise_scale > 1.5:

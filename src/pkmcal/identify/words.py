@@ -287,10 +287,17 @@ def _merged(parts: list[_Part]) -> list[_Part]:
             out[key] = part
             continue
         old = out[key]
-        pairs = zip(old[1:4], part[1:4], strict=True)
-        space, numbers, own = (np.concatenate(pair) for pair in pairs)
+        space = np.concatenate([old.space, part.space])
+        numbers = _stacked(old.coefficients, part.coefficients)
+        own = np.concatenate([old.own, part.own])
         out[key] = _Part(old.families + part.families, space, numbers, own, old.new + part.new)
     return list(out.values())
+
+
+def _stacked(a: Array, b: Array) -> Array:
+    """Rows of both: legs of one kind may have different numbers (of tubes, with a length or not)."""
+    width = max(a.shape[1], b.shape[1])
+    return np.concatenate([np.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (a, b)])
 
 
 def _sentence(

@@ -114,8 +114,9 @@ def _unseen(told: _Told) -> str:
     if not read:
         whose = "their joints are" if told.several else "its joints are"
         return f"{where}, so that nothing tells where {whose}"
-    values = f"{_count(_dims(told))} of {'each ones' if told.several else 'its'} values"
-    return f"{where}; its readings alone leave {values} " + (
+    whose = "each one's" if told.several else "its"
+    values = f"{_count(_dims(told))} of {whose} values"
+    return f"{where}; {'their' if told.several else 'its'} readings alone leave {values} " + (
         "to the drawing" if told.weak else "free"
     )
 
@@ -319,7 +320,7 @@ def _leg(told: _Told) -> str:
     where = f"of the values of {told.whose}, {_count(_dims(told))} combination"
     where += "" if _dims(told) == 1 else "s"
     each = " each" if told.several else ""
-    return f"{where}{each} {told.open(_dims(told) > 1 or told.several)}, mostly of " + _listed(
+    return f"{where}{each} {told.open(_dims(told) > 1)}, mostly of " + _listed(
         told.names
     )
 

@@ -45,7 +45,7 @@ def load_mechanism(
             what="no built-in machine and no file has this name",
             where=label,
             found=str(source),
-            expected=guess or f"a mechanism file, or {listed(sorted(built_in))}",
+            expected=guess or f"a mechanism file, or {listed(sorted(built_in), len(built_in))}",
         )
     document = read_yaml(path, label)
     checked = validate(document, MechanismDocument)

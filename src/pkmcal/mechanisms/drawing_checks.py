@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from statistics import median
 
 import numpy as np
 
 from pkmcal.errors import InputError
 from pkmcal.files import listed
 from pkmcal.files.yaml_files import field_path
-from pkmcal.mechanisms.joints import equations
 from pkmcal.mechanisms.carriers.contract import platform_carriers
 from pkmcal.mechanisms.driven_checks import check_driven
+from pkmcal.mechanisms.joints import equations
 from pkmcal.mechanisms.limbs import MOTIONS
 from pkmcal.mechanisms.rods import PassiveLength
 from pkmcal.mechanisms.schema import Leg, MechanismDocument
@@ -96,17 +97,17 @@ def _check_guide(j: int, leg: Leg, place: Where) -> None:
 
 
 def _rise(document: MechanismDocument) -> float:
-    """Height of the platform frame above the base frame, m; by the legs where no home is given."""
+    """Height of the platform frame above the base frame, m; by most legs where no home is given."""
     if document.home is not None:
         return document.home.position[2]
     heights = [leg.base.center[2] - leg.platform.center[2] for leg in document.legs]
-    return sum(heights) / len(heights)
+    return median(heights)
 
 
 def _check_parallel(j: int, leg: Leg, place: Where) -> None:
     """A platform that only translates keeps axes parallel; unequal ones would turn it."""
     first, second = (getattr(end, "axis", None) for end in (leg.base, leg.platform))
-    if "universal" != leg.base.joint or leg.platform.joint != "universal":
+    if leg.base.joint != "universal" or leg.platform.joint != "universal":
         return
     if first is None or second is None:
         return

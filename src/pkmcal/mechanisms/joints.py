@@ -13,6 +13,7 @@ Planar and translational machines move as their file says, whatever the axes: th
 
 from __future__ import annotations
 
+from math import hypot
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator
@@ -31,7 +32,7 @@ Equation = Literal["revolute base", "revolute platform", "torsion"]
 
 
 def _direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
-    length = sum(x * x for x in axis) ** 0.5
+    length = hypot(*axis)
     if length < SHORTEST:
         raise ValueError("an axis of length zero is no direction; write one such as [0, 0, 1]")
     if abs(length - 1) < 1e-12:  # read back what was written, to the last digit

@@ -180,8 +180,8 @@ def _singularity(layout: LimbLayout, theta: Array, by_own: Array) -> Array:
     """The same with internal coordinates, which turn as the platform does; by_own (..., E, d)."""
     if layout.n_equations < by_own.shape[-1]:  # fewer than its freedoms: it can always move
         return np.zeros(by_own.shape[:-2])
-    turns = layout.own_motion[:3].any(axis=0)
-    turns[layout.motion.shape[1] :] = True
+    hinges = np.arange(by_own.shape[-1]) >= layout.motion.shape[1]
+    turns = hinges | (np.abs(layout.own_motion[:3]).sum(axis=0) > 0)
     scale = np.where(turns, 1 / _radius(layout, theta)[..., None], 1.0)
     scaled = by_own * scale[..., None, :]
     known = np.isfinite(scaled).all(axis=(-1, -2))
@@ -216,9 +216,7 @@ def home_candidates(layout: LimbLayout, theta: Array, readings: Array) -> Array:
 
 def _hangs(layout: LimbLayout, theta: Array, a: Array) -> bool:
     """Whether cranks reach below their axes at these ends (L, 3), so that the platform does."""
-    drops = [
-        (a[g.legs] - g.of(theta)[..., :3])[..., 2] for g in layout.base if g.carrier.driven
-    ]
+    drops = [(a[g.legs] - g.of(theta)[..., :3])[..., 2] for g in layout.base if g.carrier.driven]
     return bool(drops) and float(np.concatenate(drops).mean()) < 0
 
 

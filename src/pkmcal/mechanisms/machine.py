@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import kinematics
@@ -21,7 +21,7 @@ from pkmcal.mechanisms.carriers.contract import (
 from pkmcal.mechanisms.drawing_checks import check_drawing
 from pkmcal.mechanisms.joints import AXIS, axes_in_use
 from pkmcal.mechanisms.limbs import LimbLayout, layout_of, limb_ends
-from pkmcal.mechanisms.motors import motor_ranges
+from pkmcal.mechanisms.motors import motor_ranges, motor_units
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.mechanisms.rods import CONSTANT, OFFSET, ActuatedLength, PassiveLength
 from pkmcal.mechanisms.schema import MechanismDocument
@@ -60,6 +60,11 @@ class Machine:
         return self.layout.n_readings
 
     @property
+    def joint_units(self) -> tuple[str, ...]:
+        """``m`` or ``rad`` of each reading, (m,)."""
+        return motor_units(self.document)
+
+    @property
     def joint_ranges(self) -> Array:
         """Smallest and largest reading by the file, (m, 2) m or rad; NaN where it is silent.
 
@@ -84,7 +89,7 @@ class Machine:
         return self._ends()[1]
 
     def base_axes(self) -> Array:
-        """Unit axes of the joints on the base, (L, 3), base frame; NaN where none is a parameter."""
+        """Unit axes of the joints on the base, (L, 3), base frame; NaN where none is unknown."""
         return self._axes(self.layout.base_axis)
 
     def platform_axes(self) -> Array:
@@ -172,7 +177,7 @@ class Machine:
             _assign(out, name, float(value))
         return out
 
-    def _axes(self, index: Array) -> Array:
+    def _axes(self, index: Integers) -> Array:
         axes = np.where(index >= 0, self.parameters.unit_axes(self.values)[index], np.nan)
         return axes.reshape(-1, 3)
 

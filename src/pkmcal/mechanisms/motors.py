@@ -54,6 +54,17 @@ def motor_ranges(document: MechanismDocument) -> Array:
     return out
 
 
+def motor_units(document: MechanismDocument) -> tuple[str, ...]:
+    """``m`` or ``rad`` of each reading: a driven carrier with an angle among its numbers turns."""
+    columns = motor_columns(document)
+    out = ["m"] * (int(columns.max(initial=-1)) + 1)
+    for leg, column in zip(document.legs, columns.tolist(), strict=True):
+        carrier = base_carriers()[leg.base.joint]
+        if column >= 0 and carrier.driven and any(p.unit == "rad" for p in carrier.parameters):
+            out[column] = "rad"
+    return tuple(out)
+
+
 def middles(document: MechanismDocument) -> Array:
     """Mid-range reading of each leg, (L,); zero where the file is silent."""
     columns = motor_columns(document)

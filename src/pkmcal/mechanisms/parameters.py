@@ -8,14 +8,13 @@ parameters move together and an axis has two turns, so values = drawing + M z, M
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from difflib import get_close_matches
+from functools import cached_property
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-
 
 EVERY = "legs[*]"
 PARALLEL = 1e-9
@@ -26,8 +25,8 @@ PARALLEL = 1e-9
 class ParameterTable:
     """Every parameter of a machine, in one order.
 
-    names, units, kinds : P entries; ``kinds`` is the tolerance's name: center, offset, radius, axis,
-    arm, angle.
+    names, units, kinds : P entries; ``kinds`` is the tolerance's name: center, offset, radius,
+    axis, arm, angle.
     drawing, tolerance : (P,) drawing values and their standard deviations.
     fixed : names that keep their drawing value.
     tied : groups of names that change by the same amount. opposed : for each group, the names that
@@ -115,20 +114,21 @@ class ParameterTable:
             for e in self._of_all(entry.removeprefix("-"))
         ]
         members = [[(name, sign) for name in self._members(e)] for e, sign in entries]
+        axes = {self.kinds[self.index(m[0][0])] == "axis" for m in members}
+        what = ""
         if len({len(m) for m in members}) > 1:
-            raise InputError(
-                what="a whole centre or axis is tied to a single number",
-                found=", ".join(group),
-                expected="entries of one kind",
-            )
-        ties = [list(tie) for tie in zip(*members, strict=True)]
-        if self.kinds[self.index(members[0][0][0])] == "axis":
+            what = "a whole centre or axis is tied to a single number"
+        elif len(axes) > 1:
+            what = "an axis is tied to a centre"
+        elif len({name for m in members for name, _ in m}) < sum(len(m) for m in members):
+            what = "a parameter is tied to itself"
+        if what:
+            raise InputError(what, found=", ".join(group), expected="entries of one kind, each once")
+        if True in axes:
             self._check_parallel(group, members)
-        return ties
+        return [list(tie) for tie in zip(*members, strict=True)]
 
-    def _check_parallel(
-        self, group: tuple[str, ...], members: list[list[tuple[str, int]]]
-    ) -> None:
+    def _check_parallel(self, group: tuple[str, ...], members: list[list[tuple[str, int]]]) -> None:
         axes = np.array([[s * self.drawing[self.index(n)] for n, s in m] for m in members])
         if axes.shape[1] != 3 or np.abs(axes - axes[0]).max() > PARALLEL:
             raise InputError(
@@ -214,7 +214,7 @@ class ParameterTable:
         return out
 
     def to_free(self, values: Array) -> Array:
-        """z (..., n_free) of values (..., P); what is fixed or tied otherwise is left out."""
+        """Z (..., n_free) of values (..., P); what is fixed or tied otherwise is left out."""
         change = self.on_tangents(values) - self.drawing
         return change @ np.linalg.pinv(self._free).T
 

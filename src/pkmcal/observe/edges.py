@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.observe.poses import PoseSet
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ class Observation:
     points, point_edge : (M, 2) sub-pixel edge points (px) and the edge that each supports,
         for pictures and residuals.
     T_camera_base : (S, 4, 4) poses of the stations as the search left them.
+    poses : of boards, and of trackers' targets.
     """
 
     edges: EdgeSet
@@ -92,6 +94,7 @@ class Observation:
     points: Array
     point_edge: Integers
     T_camera_base: Array
+    poses: PoseSet = field(default_factory=PoseSet.empty)
 
 
 def concatenate(sets: list[EdgeSet]) -> EdgeSet:

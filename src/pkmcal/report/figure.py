@@ -6,20 +6,26 @@ dark theme. Lengths are millimetres.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.report.scene import ELLIPSE, Joint, Scene
 
 RING = 25
 """Points of an ellipsoid's ring."""
 
 
-def figure_of(scene: Scene) -> dict[str, Any]:
-    """Traces, layout and configuration for ``Plotly.newPlot``."""
+def figure_of(
+    scene: Scene, places: tuple[Array, Integers] | None = None, names: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Traces, layout and configuration for ``Plotly.newPlot``.
+
+    places : of measured targets (N, 3), base frame, and their configurations, by their names.
+    """
     base, platform = scene.of_side("base"), scene.of_side("platform")
     return {
         "data": [
@@ -36,6 +42,7 @@ def figure_of(scene: Scene) -> dict[str, Any]:
             _vectors(scene.joints),
             _rings(scene),
             _centres(base, platform),
+            *(_places(*places, names) if places is not None and len(places[0]) else ()),
         ],
         "layout": _layout(),
         "config": {"scrollZoom": True},
@@ -135,6 +142,21 @@ def _centres(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> dict[str, 
             "symbol": ["square"] * len(base) + ["circle"] * len(platform),
         },
     }
+
+
+def _places(points: Array, configuration: Integers, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Markers where measured targets were."""
+    at = np.round(points * 1e3, 2)
+    marker = {
+        "type": "scatter3d",
+        "mode": "markers",
+        "name": "Measured poses",
+        "hovertext": [f"configuration {names[k]}" for k in configuration],
+        "hoverinfo": "text",
+        "marker": {"size": 2.5, "color": "--quiet", "symbol": "diamond"},
+        **{axis: at[:, k].tolist() for k, axis in enumerate("xyz")},
+    }
+    return [marker]
 
 
 def _layout() -> dict[str, Any]:

@@ -100,18 +100,35 @@ def _tool_change(session: Session, tool: ToolPoint) -> Headline | None:
 def _data(session: Session, observation: Observation, estimate: Estimate) -> Headline:
     """Photographs and edges, used and not."""
     taken = sum(len(station.photographs) for station in session.stations)
+    if not taken:
+        return _tables(session, observation, estimate)
     seen = set(zip(*(a.tolist() for a in _photograph_of(observation)), strict=True))
     used = sum(
         (s, photo.configuration) in seen
         for s, station in enumerate(session.stations)
         for photo in station.photographs
     )
-    quiet = int(np.sum(estimate.edge_weights < KEPT))
+    parts = [
+        f"{count(len(weights), thing)} measured, {int(np.sum(weights < KEPT))} of them given less "
+        "than half their weight"
+        for thing, weights in (("edge", estimate.edge_weights), ("pose", estimate.pose_weights))
+        if len(weights)
+    ]
     return Headline(
         "What is it based on?",
         ((f"{used} of {taken}", "photographs"),),
-        f"{count(len(observation.edges), 'edge')} measured, {quiet} of them given less than half "
-        f"their weight; {count(len(observation.rejected), 'finding')} rejected beforehand",
+        f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected",
+    )
+
+
+def _tables(session: Session, observation: Observation, estimate: Estimate) -> Headline:
+    """The same of a session without photographs."""
+    quiet = int(np.sum(estimate.pose_weights < KEPT))
+    kinds = sorted({table.kind for table in session.trackers})
+    return Headline(
+        "What is it based on?",
+        ((f"{len(observation.poses) - quiet} of {len(observation.poses)}", " and ".join(kinds)),),
+        f"measured without a camera; {quiet} of them given less than half their weight",
     )
 
 
@@ -119,21 +136,26 @@ def _fit(estimate: Estimate) -> Headline:
     """Chi-square per degree of freedom."""
     s = estimate.statistics
     value = s.chi2 / s.dof if s.dof > 0 else float("nan")
-    scaled = np.isfinite(s.noise_scale) and abs(s.noise_scale - 1) > 0.005
+    scaled = [
+        f"the {what}' stated noise was multiplied by {number(scale, 2)}"
+        for what, scale in (("edges", s.noise_scale), ("poses", s.pose_scale))
+        if np.isfinite(scale) and abs(scale - 1) > 0.005
+    ]
     return Headline(
         "Does the model explain the data?",
         ((number(value, 2), "χ² per degree of freedom"),),
         f"1 is expected, over {count(s.dof, 'degree')} of freedom"
-        + (
-            f"; reached after the edges' stated noise was multiplied by {number(s.noise_scale, 2)}"
-            if scaled
-            else ""
-        ),
+        + (f"; reached after {' and '.join(scaled)}" if scaled else ""),
     )
 
 
 def _photograph_of(observation: Observation) -> tuple[Integers, Integers]:
-    return observation.edges.station, observation.edges.configuration
+    parts = observation.edges, observation.poses
+    station, configuration = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("station", "configuration")
+    )
+    return station, configuration
 
 
 def _pose_values(position: float, orientation: float) -> tuple[tuple[str, str], ...]:

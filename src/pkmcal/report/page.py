@@ -17,18 +17,21 @@ from pkmcal.report import (
     identifiability,
     parameters,
     pictures,
+    poses,
     provenance,
     rejections,
     residuals,
     scene,
     templating,
     toolpoint,
+    validation_page,
 )
 from pkmcal.session import Session
 
 if TYPE_CHECKING:
     from pkmcal.identify.verdict import Verdict
     from pkmcal.identify.words import Findings
+    from pkmcal.validate.holdouts import HoldOut
 
 
 def report_html(
@@ -39,11 +42,13 @@ def report_html(
     *,
     findings: Findings | None = None,
     timings: Mapping[str, float] | None = None,
+    holdout: HoldOut | None = None,
 ) -> str:
     """One HTML page that needs nothing else: no network, no other file.
 
     verdict : usable, headline, reasons, warnings, advice. findings : what the data tell of the
-    machine; without them their section is left out. timings : seconds by step.
+    machine; without them their section is left out. timings : seconds by step. holdout : what the
+    estimate predicts of configurations that it did not see.
     """
     views = report_views(session, observation, estimate, findings)
     return templating.render(
@@ -51,6 +56,7 @@ def report_html(
         **views,
         verdict=verdict,
         timings=provenance.durations(timings),
+        holdout=validation_page.holdout_views(holdout, session),
         plotly=figure.plotly_script(),
     )
 
@@ -70,19 +76,24 @@ def report_views(
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     groups = parameters.parameter_groups(session.machine, estimate)
     drawn = scene.scene_of(session, estimate, centres)
+    seen = poses.places(observation, estimate)
     return {
         "session": session,
         "estimate": estimate,
         "headlines": headline.headlines(session, observation, estimate, centres, tool),
         "scene": drawn,
         "views": scene.views(drawn),
-        "figure": figure.figure_of(drawn),
+        "figure": figure.figure_of(drawn, seen, session.configurations),
         "groups": groups,
         "unidentified": parameters.bound_together(estimate)
         if findings
         else parameters.unidentified(groups, estimate),
         "told": findings and identifiability.section(findings, machine.parameters),
-        "pictures": pictures.pictures(session, edges, estimate, shifts, centres),
+        "edges": len(edges) > 0,
+        "pictures": pictures.pictures(session, edges, estimate, shifts, centres)
+        if len(edges)
+        else (),
+        "poses": poses.section(session, observation, estimate),
         "residuals": residuals.residual_charts(session, edges, estimate, shifts),
         "reasons": rejections.reasons(session, observation.rejected),
         "stations": provenance.station_rows(session, estimate, camera),

@@ -15,6 +15,8 @@ from pkmcal.identify.problem import Estimate
 from pkmcal.report.wording import brief, count, decimals, number
 from pkmcal.session import Session
 
+OPEN = 1e3
+"""mm; a place that is known no better is not told by the data."""
 PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
 
 
@@ -39,9 +41,31 @@ class StationRow:
 
 def station_rows(session: Session, estimate: Estimate, camera: Integers) -> tuple[StationRow, ...]:
     """One row a station; camera (S,) is the number of its camera file."""
-    return tuple(
-        _station(session, estimate, s, int(camera[s])) for s in range(len(session.stations))
+    cameras = [_station(session, estimate, s, int(camera[s])) for s in range(len(session.stations))]
+    first = len(cameras)
+    trackers = [_tracker(session, estimate, first + t) for t in range(len(session.trackers))]
+    return tuple(cameras + trackers)
+
+
+def _tracker(session: Session, estimate: Estimate, s: int) -> StationRow:
+    table = session.trackers[s - len(session.stations)]
+    position, sigma, turn = _place(estimate, s)
+    rows = len(table.configuration)
+    return StationRow(
+        table.name, table.label, f"tracker, {table.kind}", rows, position, sigma, turn, "", "–"
     )
+
+
+def _place(estimate: Estimate, s: int) -> tuple[tuple[str, str, str], tuple[str, str, str], str]:
+    """A station's place and deviations (mm), and the deviation of its turn (degrees)."""
+    found, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
+    place = inverse(found)[:3, 3] * 1e3
+    sigma = np.sqrt(np.diag(camera_position_covariance(found, covariance))) * 1e3
+    turn = np.rad2deg(np.sqrt(np.trace(covariance[:3, :3]) / 3))
+    known = sigma < OPEN
+    x, y, z = (number(v, decimals(float(d))) for v, d in zip(place, sigma, strict=True))
+    sx, sy, sz = (brief(float(d)) if k else "open" for d, k in zip(sigma, known, strict=True))
+    return (x, y, z), (sx, sy, sz), brief(float(turn)) if turn < 90 else "open"
 
 
 def camera_position_covariance(T_camera_base: Array, covariance: Array) -> Array:
@@ -58,22 +82,17 @@ def camera_position_covariance(T_camera_base: Array, covariance: Array) -> Array
 def _station(session: Session, estimate: Estimate, s: int, camera: int) -> StationRow:
     station = session.stations[s]
     found = estimate.state.T_camera_base[s]
-    covariance = estimate.station_covariance[s]
-    place = inverse(found)[:3, 3] * 1e3
-    sigma = np.sqrt(np.diag(camera_position_covariance(found, covariance))) * 1e3
-    turn = np.rad2deg(np.sqrt(np.trace(covariance[:3, :3]) / 3))
+    position, sigma, turn = _place(estimate, s)
     shift, shift_sigma = estimate.state.edge_shift[camera], estimate.edge_shift_sigma[camera]
     places = decimals(float(shift_sigma))
-    x, y, z = (number(v, decimals(float(d))) for v, d in zip(place, sigma, strict=True))
-    sx, sy, sz = (brief(float(d)) for d in sigma)
     return StationRow(
         name=station.name,
         camera_file=station.camera_file,
         model=station.camera.model,
         photographs=len(station.photographs),
-        position=(x, y, z),
-        sigma=(sx, sy, sz),
-        turn_sigma=brief(float(turn)),
+        position=position,
+        sigma=sigma,
+        turn_sigma=turn,
         moved=_moved(station.T_camera_base, found),
         edge_shift=f"{number(shift, places, signed=True)} ± {number(shift_sigma, places)}",
     )
@@ -102,11 +121,30 @@ def settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ...
             f"radii {tolerance.radius * 1e3:g} mm",
         ),
         ("Solver", f"{count(s.steps, 'step')}; {s.stopped}"),
-        ("χ² of the edges", f"{number(s.chi2_edges, 0)} over {number(s.n_edges, 0)} numbers"),
-        ("χ² of the readings", f"{number(s.chi2_joints, 0)} over {number(s.n_joints, 0)}"),
-        ("χ² of the drawing", f"{number(s.chi2_drawing, 0)} over {number(s.n_drawing, 0)}"),
-        ("Factor on the edges' stated noise", number(s.noise_scale, 2)),
+        *(
+            (f"χ² of the {name}", f"{number(chi2, 0)} over {number(n, 0)} numbers{_left(freedom)}")
+            for name, chi2, n, freedom in (
+                ("edges", s.chi2_edges, s.n_edges, s.dof_edges),
+                ("poses", s.chi2_poses, s.n_poses, s.dof_poses),
+                ("readings", s.chi2_joints, s.n_joints, s.dof_joints),
+                ("drawing", s.chi2_drawing, s.n_drawing, 0.0),
+            )
+            if n
+        ),
+        *(
+            (f"Factor on the {name}' stated noise", number(scale, 2))
+            for name, scale, n in (
+                ("edges", s.noise_scale, s.n_edges),
+                ("poses", s.pose_scale, s.n_poses),
+            )
+            if n
+        ),
     )
+
+
+def _left(freedom: float) -> str:
+    """Degrees of freedom that the numbers leave, where they were counted."""
+    return f", {number(freedom, 0)} degrees of freedom" if freedom >= 0.5 else ""
 
 
 def versions() -> tuple[tuple[str, str], ...]:

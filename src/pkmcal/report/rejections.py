@@ -56,7 +56,7 @@ def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
 
 
 def _photograph(session: Session, item: Rejection) -> str:
-    return f"{session.stations[item.station].name} / {session.configurations[item.configuration]}"
+    return f"{session.station_names[item.station]} / {session.configurations[item.configuration]}"
 
 
 def _what(item: Rejection) -> str:

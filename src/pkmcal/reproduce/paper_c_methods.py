@@ -9,7 +9,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.geometry.rigid import pose_difference
-from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.assembly import assemble
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.hand_eye import Pair, PairProblem, size_of, solve_pairs
@@ -43,9 +43,7 @@ class Fitted(NamedTuple):
 def start(machine: Machine, truth: Truth) -> State:
     """Where every method begins: the drawing, camera and board by the closed form; B runs."""
     n = truth.n_calibration
-    found = forward(
-        machine.layout, machine.parameters.drawing, truth.joints[:, :n], machine.home()
-    )
+    found = forward(machine.layout, machine.parameters.drawing, truth.joints[:, :n], machine.home())
     pair = solve_pairs(found.T_base_platform, truth.seen[:, :n], size_of(machine))
     return State(
         machine.parameters.drawing,
@@ -129,16 +127,23 @@ def bound(machine: Machine, truth: Truth, settings: Settings, rng: np.random.Gen
         z, camera, truth.poses[:, :n], np.zeros((runs, 1, 1)), mount,
         np.zeros((runs, n, machine.layout.n_internal)),
     )  # fmt: skip
-    reduced = eliminate(problem.linearize(batch), np.zeros(runs))
-    rows = reduced.rows.reshape(runs, -1, reduced.rows.shape[-1])
+    step = _drawn(problem, batch, rng)
+    theta = truth.theta + step[:, : z.shape[1]] @ problem.free.T
+    return Fitted(theta, camera[:, 0], mount[:, 0], np.full(runs, np.nan))
+
+
+def _drawn(problem: Problem, state: BatchState, rng: np.random.Generator) -> Array:
+    """Errors (B, na) of the shared unknowns with the covariance of the bound; none along what
+    nothing tells.
+    """
+    reduced = eliminate(problem.linearize(state), np.zeros(len(state.z)))
+    rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
     scale = np.sqrt(np.sum(rows**2, axis=1))
     scale = np.where(scale > 0, scale, 1.0)
     s, vt = np.linalg.svd(np.linalg.qr(rows / scale[:, None], mode="r"))[1:]
     known: Booleans = s > LOOSE * s[:, :1]
     draw = rng.normal(size=s.shape) * np.where(known, 1 / np.where(known, s, 1.0), 0.0)
-    step = (np.swapaxes(vt, -1, -2) @ draw[..., None])[..., 0] / scale
-    theta = truth.theta + step[:, : z.shape[1]] @ problem.free.T
-    return Fitted(theta, camera[:, 0], mount[:, 0], np.full(runs, np.nan))
+    return (np.swapaxes(vt, -1, -2) @ draw[..., None])[..., 0] / scale
 
 
 class Errors(NamedTuple):

@@ -137,7 +137,9 @@ def true_values(kind: Kind, settings: Settings, runs: int, rng: np.random.Genera
     if kind == "design":
         return np.broadcast_to(table_2_values(machine, IDENTIFIED), (runs, len(table))).copy()
     kinds = np.array([table.kinds[k] for k in table.first_of_free()])
-    sigma = np.select([kinds == "axis", kinds == "angle"], [settings.axis_error, 0.0], settings.error)
+    sigma = np.select(
+        [kinds == "axis", kinds == "angle"], [settings.axis_error, 0.0], settings.error
+    )
     if kind == "rods":
         sigma = _alike(machine, sigma)
     values = table.drawing + (sigma * rng.normal(size=(runs, len(sigma)))) @ table.free_matrix().T
@@ -189,9 +191,7 @@ def simulate(kind: Kind, settings: Settings, runs: int, rng: np.random.Generator
     noise = settings.sigma * rng.normal(size=(*poses.shape[:2], 6))
     seen = perturb(camera @ poses @ mount, noise)
     joints = joints + settings.joint_noise * rng.normal(size=joints.shape)
-    return Truth(
-        machine, theta, poses, joints, seen, camera, mount, len(grid()) - settings.control
-    )
+    return Truth(machine, theta, poses, joints, seen, camera, mount, len(grid()) - settings.control)
 
 
 def measurements(truth: Truth, settings: Settings, run: int = 0) -> Measurements:

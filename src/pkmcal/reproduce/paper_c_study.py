@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.identify.implicit import Form
 from pkmcal.identify.rotation_axis import rotation_axis
 from pkmcal.reproduce.paper_c_methods import (
     Errors,
@@ -64,6 +65,7 @@ PLAN: dict[Kind, tuple[tuple[Kind, tuple[str, ...]], ...]] = {
     ),
 }
 """For each truth the models that are fitted to it, and how."""
+PRINTED: tuple[tuple[str, Form], ...] = ((EQ3, "joint"), (EQ5, "implicit"))
 Key = tuple[Kind, Kind, str]
 """Truth, model, method."""
 
@@ -170,7 +172,7 @@ def _work(runs: int, seed: int) -> list[tuple[Kind, int, np.random.SeedSequence]
     for kind in PLAN:
         count = max(2, runs // RODS_SHARE) if kind == "rods" else runs
         size = CHUNK // 4 if kind == "rods" else CHUNK
-        out += [(kind, min(size, count - first)) for first in range(0, count, size)]
+        out.extend((kind, min(size, count - first)) for first in range(0, count, size))
     seeds = np.random.SeedSequence(seed).spawn(len(out))
     return [(kind, n, s) for (kind, n), s in zip(out, seeds, strict=True)]
 
@@ -213,7 +215,7 @@ def _fits(
     if DRAWING in methods:
         drawing = np.broadcast_to(machine.parameters.drawing, (runs, len(machine.parameters)))
         out[DRAWING] = Fitted(drawing, frames, frames, none)
-    for method, form in ((EQ3, "joint"), (EQ5, "implicit")):
+    for method, form in PRINTED:
         if method in methods:
             fit = at_poses(machine, truth, settings, begin, form, whitened=False)
             out[method] = fitted(fit)
@@ -265,8 +267,10 @@ def _axis_of(truth: Truth, settings: Settings) -> Axis:
 
 
 def _axis(parts: list[Axis]) -> Axis:
-    joined = [np.concatenate(arrays) for arrays in zip(*(p[:4] for p in parts), strict=True)]
-    return Axis(*joined, parts[0].dof)
+    spread, expected, tilt, chi2 = (
+        np.concatenate(arrays) for arrays in zip(*(p[:4] for p in parts), strict=True)
+    )
+    return Axis(spread, expected, tilt, chi2, parts[0].dof)
 
 
 def _validation(parts: list[_Part], name: str) -> Validation:

@@ -59,20 +59,20 @@ def table_2_of(machine: Machine, theta: Array) -> Array:
 
 
 def control_residuals(machine: Machine, fit: Fitted, truth: Truth) -> Residuals:
-    """Readings less those that the inverse kinematics wants at the control poses' photographs."""
+    """What the inverse kinematics wants at the control poses' photographs, less the readings."""
     n = truth.n_calibration
     seen = truth.seen[:, n:]
     poses = inverted(fit.T_camera_base)[:, None] @ seen @ inverted(fit.T_mount)[:, None]
     own = taken(machine.layout.motion, poses).pose
     wanted = inverse(machine.layout, fit.theta[:, None], own)
-    return _residuals(truth.joints[:, n:] - wanted)
+    return _residuals(wanted - truth.joints[:, n:])
 
 
 def residuals_before(machine: Machine, truth: Truth) -> Residuals:
     """The same with the drawing, at the true poses: what a controller would be wrong by."""
     n = truth.n_calibration
     wanted = inverse(machine.layout, machine.parameters.drawing, truth.poses[:, n:])
-    return _residuals(truth.joints[:, n:] - wanted)
+    return _residuals(wanted - truth.joints[:, n:])
 
 
 def _residuals(off: Array) -> Residuals:
@@ -87,7 +87,7 @@ class Before(NamedTuple):
 
 
 def before(machine: Machine, truth: Truth, count: int = 400) -> Before:
-    """The drawing's poses against the true ones at the same readings, in the machine's own frame."""
+    """The drawing's poses against the true ones at the same readings, in the machine's frame."""
     poses = workspace(count, np.random.default_rng(0))
     readings = inverse(truth.machine.layout, truth.theta[0], poses)
     found = forward(machine.layout, machine.parameters.drawing, readings, poses).T_base_platform

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.gauge import pose_generators
 from pkmcal.mechanisms import Machine
@@ -24,15 +24,15 @@ OPEN = 1e-9
 class Errors:
     """Errors of n configurations.
 
-    residuals : (n, m) readings measured less predicted, m or rad. position, orientation : (n,) of the
-    tool point, m and rad; NaN where the machine cannot be closed.
+    residuals : (n, m) readings measured less predicted, m or rad. position, orientation : (n,) of
+    the tool point, m and rad; NaN where the machine cannot be closed.
     """
 
     residuals: Array
     position: Array
     orientation: Array
 
-    def of(self, rows: Array) -> Errors:
+    def of(self, rows: Integers) -> Errors:
         """Those of some configurations."""
         return Errors(self.residuals[rows], self.position[rows], self.orientation[rows])
 

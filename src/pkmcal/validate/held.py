@@ -25,9 +25,10 @@ from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.assembly import assemble, batch_of, state_of
 from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.bundle import BatchResult, solve_batch
+from pkmcal.identify.closure_noise import PERFECT
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Measurements, State
-from pkmcal.identify.residuals import PERFECT, Problem
+from pkmcal.identify.residuals import Problem
 from pkmcal.identify.solver import Linear, Reduced, Stop, eliminate, transposed
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward
@@ -100,6 +101,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     soft = replace(measurements, joint_noise=SOFT)
     assembled = assemble(still, soft, default_gauge(still))
     begin = batch_of(still, assembled, replace(start, theta=still.values))
+    _check_enough(assembled.problem, begin)
     result = solve_batch(assembled.problem, begin)
     stop = result.solution.stop[0]
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
@@ -119,6 +121,22 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
         pose_scale=float(result.pose_scale[0]),
         noise=noise,
         by_machine=by_machine,
+    )
+
+
+def _check_enough(problem: Problem, state: BatchState) -> None:
+    """Raise ResultError where there are fewer rows than unknowns."""
+    linear = problem.linearize(state)
+    rows = int(linear.usable.sum()) + len(linear.shared_by)
+    if rows < problem.n_shared + linear.by_own.shape[1] * linear.by_own.shape[-1]:
+        raise _too_little()
+
+
+def _too_little() -> ResultError:
+    return ResultError(
+        "too little was seen to predict readings: some poses follow from their own readings alone",
+        expected="legs, or a board in several more configurations",
+        next_step="Photograph more configurations from each station",
     )
 
 
@@ -150,12 +168,7 @@ def _fit(result: BatchResult) -> _Fit:
     left = left - shared @ inverse @ transposed(shared)
     least = float(np.linalg.eigvalsh(left).min(initial=1.0))
     if least < ALONE:
-        raise ResultError(
-            "too little was seen to predict readings: some poses follow from their own readings"
-            " alone",
-            expected="legs, or a board in several more configurations",
-            next_step="Photograph more configurations from each station",
-        )
+        raise _too_little()
     return _Fit(linear, reduced, inverse, picks, np.linalg.inv(left), _size(problem, state))
 
 
@@ -198,8 +211,8 @@ def _size(problem: Problem, state: BatchState) -> Array:
 def _without_own(problem: Problem, state: BatchState, fit: _Fit) -> BatchState:
     """The poses of fits without each configuration's own readings.
 
-    ``R^-1 Q^T (I - A N^+ S^T) E^T (I - L)^-1 rho``: the answer to readings moved to where the others
-    predict them.
+    ``R^-1 Q^T (I - A N^+ S^T) E^T (I - L)^-1 rho``: the answer to readings moved to where the
+    others predict them.
     """
     value = fit.linear.value[0][..., None]
     moved = transposed(fit.picks) @ fit.loo @ fit.picks @ value
@@ -210,7 +223,7 @@ def _without_own(problem: Problem, state: BatchState, fit: _Fit) -> BatchState:
 
 
 def _deviations(result: BatchResult, fit: _Fit, joint_noise: float) -> tuple[Array, Array]:
-    """Covariance (n, n) of the residuals by noise, and derivatives (n, P) by the machine, m or rad."""
+    """Covariance (n, n) of the residuals by noise, and their derivatives (n, P) by the machine."""
     s, q = fit.reduced.rows[0], fit.reduced.q[0]
     less = 1 - (joint_noise / SOFT) ** 2
     own = fit.picks - (fit.picks @ q) @ transposed(q)

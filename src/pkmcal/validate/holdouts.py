@@ -21,7 +21,6 @@ from pkmcal.validate.judged import (
     fairest,
     promise,
     ratio,
-    rms,
 )
 from pkmcal.validate.regions import Region, places, regions, spread
 
@@ -33,17 +32,17 @@ LEAST = 3
 class Judged:
     """A calibrated machine beside the drawing on n configurations.
 
-    rows : (n,) which. calibrated, drawing : their errors there. before, after : root mean squares of
-    the readings' residuals, weighed by how well the photographs see them (:class:`Weights`), m or
-    rad; floor : what the photographs' noise alone gives. ratio : before over after.
-    promise : the residuals against the deviations.
+    rows : (n,) which. calibrated, drawing : their errors there. before, after : (n,) root mean
+    squares of each configuration's residuals by the drawing and by the calibrated machine, weighed
+    by how well the photographs see them (:class:`Weights`), m or rad; floor : what the photographs'
+    noise alone gives. ratio : before over after. promise : the residuals against the deviations.
     """
 
     rows: Integers
     calibrated: Errors
     drawing: Errors
-    before: float
-    after: float
+    before: Array
+    after: Array
     floor: float
     ratio: Ratio
     promise: Promise
@@ -73,8 +72,8 @@ def judge(
 ) -> Judged:
     """A prediction of the calibrated machine, beside the drawing, on configurations ``rows``.
 
-    covariance : (P, P) of the calibrated machine. by_drawing : the drawing's own prediction; without
-    it the drawing is judged on the calibrated machine's poses.
+    covariance : (P, P) of the calibrated machine. by_drawing : the drawing's own prediction;
+    without it the drawing is judged on the calibrated machine's poses.
     """
     seen = np.flatnonzero(found.seen)
     m = measurements.joints.shape[1]
@@ -93,8 +92,8 @@ def judge(
         rows=rows,
         calibrated=new,
         drawing=old,
-        before=rms(before),
-        after=rms(after),
+        before=before,
+        after=after,
         floor=weights.floor,
         ratio=ratio(before, after),
         promise=promise(new.residuals, noise, by @ covariance @ by.T),
@@ -153,7 +152,7 @@ def by_regions(
 
 
 def chosen(drawing: Machine, whole: Estimate, n: int) -> Region:
-    """n configurations to hold out, spread over the workspace."""
+    """Some configurations, n, to hold out, spread over the workspace."""
     rows = np.flatnonzero(whole.configurations)
     _check(n, rows.size - n, rows.size, "configurations held out")
     points = places(drawing, whole.state.T_base_platform[rows])

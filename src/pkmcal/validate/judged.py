@@ -41,24 +41,47 @@ class Ratio:
 class Promise:
     """Residuals against the deviations that calibration and photographs promise.
 
-    chi2, dof, chance : of the test. factor : residuals over promise, root mean square. kept : not
-    larger than promised but for MARGIN. expected : (m,) root mean square that is promised for each
-    reading, and by_noise : (m,) the part of the photographs' and readings' noise, m or rad.
+    chi2, dof, chance : of all residuals. factor : residuals over promise, root mean square.
+    common : (m,) what each reading is off in all configurations alike, m or rad, and common_sigma :
+    (m,) its standard deviation; common_chance : of all of them being zero. usual, steady : whether
+    residuals, and what they have in common, are not larger than promised but for MARGIN.
+    expected : (n, m) standard deviations that are promised, by_noise : (n, m) the part of the
+    photographs' and the readings' noise, m or rad.
     """
 
     chi2: float
     dof: int
     chance: float
     factor: float
-    kept: bool
+    common: Array
+    common_sigma: Array
+    common_chance: float
+    usual: bool
+    steady: bool
     expected: Array
     by_noise: Array
+
+    @property
+    def kept(self) -> bool:
+        """Whether the deviations may be believed."""
+        return self.usual and self.steady
 
 
 def rms(values: Array) -> float:
     """Root mean square of what is finite; NaN of nothing."""
     found = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(found**2))) if found.size else float("nan")
+
+
+def weighed(values: Array, sigma: Array) -> tuple[Array, Array]:
+    """Mean and root mean square over n configurations of values (n, ...), weighed by their noise.
+
+    sigma : of the same shape; a pose that is hardly seen hardly counts. NaN is left out.
+    """
+    weight = np.where(np.isfinite(values), sigma**-2.0, 0.0)
+    values, total = np.nan_to_num(values), weight.sum(axis=0)
+    mean = np.sum(weight * values, axis=0) / total
+    return mean, np.sqrt(np.sum(weight * values**2, axis=0) / total)
 
 
 def ratio(worse: Array, better: Array) -> Ratio:
@@ -79,25 +102,37 @@ def ratio(worse: Array, better: Array) -> Ratio:
 
 
 def promise(residuals: Array, noise: Array, machine: Array) -> Promise:
-    """Test of residuals (n, m), finite, against covariances (n m, n m) by noise and by the machine."""
+    """Test of finite residuals (n, m) against covariances (n m, n m) by noise and machine.
+
+    All residuals together tell of something that the model leaves out; an error of the machine,
+    which hides in the noise of each, is found in what they have in common, by generalised least
+    squares.
+    """
     from scipy.special import chdtrc
 
-    flat, covariance = residuals.reshape(-1), noise + machine
+    shape, covariance = residuals.shape, noise + machine
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / (scale[:, None] * scale))
     known = values > RANK * values[-1]
-    chi2 = float(np.sum(((flat / scale) @ vectors[:, known]) ** 2 / values[known]))
-    dof = int(known.sum())
-    chance = float(chdtrc(dof, chi2))
-    shape = residuals.shape
+    whiten = (vectors[:, known] / np.sqrt(values[known])).T / scale
+    white = whiten @ residuals.reshape(-1)
+    design = whiten @ np.tile(np.eye(shape[1]), (shape[0], 1))
+    spread = np.linalg.pinv(design.T @ design)
+    common = spread @ design.T @ white
+    chi2, chi2_common = float(white @ white), float(common @ design.T @ white)
+    dof, dof_common = len(white), int(np.linalg.matrix_rank(design))
     return Promise(
         chi2=chi2,
         dof=dof,
-        chance=chance,
+        chance=float(chdtrc(dof, chi2)),
         factor=float(np.sqrt(chi2 / dof)),
-        kept=bool(chdtrc(dof, chi2 / MARGIN**2) > CHANCE),
-        expected=np.sqrt(np.diag(covariance).reshape(shape).mean(axis=0)),
-        by_noise=np.sqrt(np.maximum(np.diag(noise), 0.0).reshape(shape).mean(axis=0)),
+        common=common,
+        common_sigma=np.sqrt(np.diag(spread)),
+        common_chance=float(chdtrc(dof_common, chi2_common)),
+        usual=bool(chdtrc(dof, chi2 / MARGIN**2) > CHANCE),
+        steady=bool(chdtrc(dof_common, chi2_common / MARGIN**2) > CHANCE),
+        expected=np.sqrt(np.diag(covariance)).reshape(shape),
+        by_noise=np.sqrt(np.maximum(np.diag(noise), 0.0)).reshape(shape),
     )
 
 
@@ -106,8 +141,8 @@ class Weights:
     """How well the photographs see each configuration's readings; ``of`` measures residuals by it.
 
     Plain root mean squares are ruled by what a photograph sees worst, depth, where any two machines
-    look alike. matrices : (n, m, m), the mean of their traces is m, so that units stay. floor : root
-    mean square, so weighed, of a perfect machine's residuals, m or rad.
+    look alike. matrices : (n, m, m), the mean of their traces is m, so that units stay. floor :
+    root mean square, so weighed, of a perfect machine's residuals, m or rad.
     """
 
     matrices: Array
@@ -133,6 +168,6 @@ def blocks(covariance: Array, m: int) -> Array:
 
 
 def fairest(own: Errors, laid: Errors, weights: Weights) -> Errors:
-    """The drawing's errors on the poses that suit it best: seen by itself, or by the calibration."""
+    """The drawing's errors on the poses that suit it best: its own, or the calibrated machine's."""
     by_own, by_laid = (rms(weights.of(errors.residuals)) for errors in (own, laid))
     return own if by_own < by_laid else laid

@@ -26,8 +26,8 @@ class Straightness:
 class Square:
     """A commanded square as it was executed, m.
 
-    side : largest error of a side's length. shape : root mean square distance of its points from the
-    commanded ones, laid over each other. place : the same as commanded, in the base frame.
+    side : largest error of a side's length. shape : root mean square distance of its points from
+    the commanded ones, laid over each other. place : the same as commanded, in the base frame.
     points : (n, 3) tool points.
     """
 

@@ -33,8 +33,8 @@ class Region:
 
 
 def places(machine: Machine, poses: Array) -> Array:
-    """Where poses (n, 4, 4) are, as points (n, 6) in metres: turns times the platform's radius, then
-    positions; both from the mean.
+    """Where poses (n, 4, 4) are, as points (n, 6) in metres: turns times the platform's radius,
+    then positions; both from the mean.
     """
     joints = machine.platform_centers()
     radius = float(np.sqrt(np.mean(np.sum((joints - joints.mean(axis=0)) ** 2, axis=1))))
@@ -64,7 +64,7 @@ def clusters(points: Array, n: int) -> Integers:
 
 
 def spread(points: Array, n: int) -> Integers:
-    """n points (sorted) spread over all: the middle one of each of n clusters."""
+    """Some points, n in rising order, spread over all: the middle one of each of n clusters."""
     owner = clusters(points, n)
     chosen: list[int] = []
     for k in range(n):
@@ -75,7 +75,7 @@ def spread(points: Array, n: int) -> Integers:
 
 
 def regions(points: Array, rows: Integers, n: int) -> tuple[Region, ...]:
-    """n regions of configurations ``rows`` at points (k, 6), see :func:`places`."""
+    """The regions, n, of configurations ``rows`` at points (k, 6), see :func:`places`."""
     owner = clusters(points, n)
     scale = points.std(axis=0)
     scale = np.where(scale > 1e-6, scale, np.inf)  # a direction in which nothing moves

@@ -58,6 +58,7 @@ class Bar(PlatformCarrier):
     [C] fig. 3: hinge (s h, 0, 0), center (0, t d, 0).
     """
 
+    floats: ClassVar = True
     joints: ClassVar = ("bar",)
     schema: ClassVar = BarDocument
     shared: ClassVar = ("hinge",)
@@ -213,4 +214,3 @@ class HingedBar(PlatformCarrier):
 def _cos_sin(internal: Array | None) -> tuple[Array, Array]:
     phi = np.zeros(1) if internal is None else internal[..., None]
     return np.cos(phi), np.sin(phi)
-

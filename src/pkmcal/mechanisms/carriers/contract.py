@@ -107,9 +107,11 @@ class PlatformCarrier(Carrier):
 
     turns : B also turns about a hinge, by an internal coordinate of the pose that no reading
     knows; legs with the same ``bar`` in the file share it.
+    floats : ``center`` is told along the base frame's axes.
     """
 
     turns: ClassVar[bool] = False
+    floats: ClassVar[bool] = False
 
     @staticmethod
     @abstractmethod

@@ -94,7 +94,6 @@ class Crank(BaseCarrier):
         out, ahead = c * e0 + s * side, c * side - s * e0
         value = parameters[..., :3] + along * v + radial * e0 + arm * out
         by_reading = arm * ahead
-        shape = value.shape
         # the frame turns by the twist about v, and v itself pulls e0 and side after it
         swing = radial * side + by_reading
         pull = radial * e0 + arm * out
@@ -159,7 +158,8 @@ class Crank(BaseCarrier):
         before, after = _frame(parameters), _frame(Crank.moved(parameters, e, f))
         rot = e[..., :3, :3]
         n = parameters.shape[-1]
-        out = np.array(np.broadcast_to(turned_blocks(n, (0, e), (3, e)), (*_lead(parameters, e), n, n)))
+        shape = (*_lead(parameters, e), n, n)
+        out = np.array(np.broadcast_to(turned_blocks(n, (0, e), (3, e)), shape))
         twist = before.twist[..., None, :] - after.twist[..., None, :] @ rot
         out[..., 7:8, 3:6] = _by_axis(twist, before.v, parameters)
         lag = rot @ _turn_of_e0(before) - _turn_of_e0(after) @ rot

@@ -36,9 +36,7 @@ class RigidPlatform(PlatformCarrier):
         rot = T_base_platform[..., :3, :3]
         turned = (rot @ parameters[..., None])[..., 0]
         by_parameters = np.broadcast_to(rot, (*turned.shape, 3))
-        return CarriedPoint(
-            turned + T_base_platform[..., :3, 3], by_pose(turned), by_parameters
-        )
+        return CarriedPoint(turned + T_base_platform[..., :3, 3], by_pose(turned), by_parameters)
 
     @staticmethod
     def moved(parameters: Array, e: Array, f: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A slider on the base, moved by a motor: A runs along a straight guide (linear delta, hexaglide)."""
+"""A slider on the base, moved by a motor: A runs along a guide (linear delta, hexaglide)."""
 
 from __future__ import annotations
 
@@ -31,9 +31,7 @@ class SliderDocument(Schema):
         tuple[float, float, float],
         Field(description="the joint's place [x, y, z] at reading zero, metres, base frame"),
     ]
-    axis: Annotated[
-        Direction, Field(description="the direction [x, y, z] of a growing reading")
-    ]
+    axis: Annotated[Direction, Field(description="the direction [x, y, z] of a growing reading")]
     motor: Annotated[int, Field(ge=1)] | None = None
     range: Interval | None = None
 

@@ -1,0 +1,259 @@
+"""Poses that disagree with the machine: which of the usual mistakes explains it.
+
+Each mistake is tried: the readings of one motor with the other sign, a board that was moved on the
+platform (or a camera that was pushed) between two configurations, a board of another size than
+its file says. One of them is believed where it alone brings the poses back to their noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.errors import PkmcalError
+from pkmcal.geometry.rigid import inverse, pose, pose_difference
+from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.hand_eye import start_from_poses
+from pkmcal.identify.mounts import mean_pose
+from pkmcal.identify.problem import Estimate, Measurements, State
+from pkmcal.mechanisms import Machine
+
+BAD = 2.0
+"""Factor on the poses' noise, from which mistakes are looked for."""
+LOST = 0.1
+"""Share of poses given up from which they are."""
+CURED = 0.5
+"""A mistake is believed where, put right, the poses' misfit is at most this part of what it was."""
+FEWEST = 3
+"""Poses on either side of a movement: fewer are outliers."""
+OTHER_SIZE = 2e-3
+"""Relative difference of a board's size below which the print is as good as printers are."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A mistake that explains the poses.
+
+    motor : column of the readings with the wrong sign, or exchanged with the other. configuration :
+    the first after a movement; before : the last before it. size : of the board, true over
+    written. moved : T (4, 4) of the board, or the station, from before to after. misfit : what is
+    left, in standard deviations.
+    """
+
+    kind: Literal["sign", "order", "board moved", "camera moved", "size"]
+    misfit: float
+    motor: int = -1
+    other: int = -1
+    station: int = -1
+    before: int = -1
+    configuration: int = -1
+    moved: Array = field(default_factory=lambda: np.eye(4))
+    size: float = 1.0
+
+
+def misfit(estimate: Estimate) -> float:
+    """How far off the poses are, in their standard deviations; those given up count as well."""
+    error = estimate.pose_residuals * estimate.statistics.pose_scale
+    return float(np.sqrt(np.mean(np.minimum(error**2, MOST**2)))) if error.size else 0.0
+
+
+MOST = 100.0
+"""Standard deviations that a residual counts for at most."""
+
+
+def in_doubt(estimate: Estimate) -> bool:
+    """Whether the poses disagree with the machine so much that a mistake is likely."""
+    lost = estimate.pose_weights < 0.5
+    return bool(lost.size) and (
+        estimate.statistics.pose_scale > BAD or lost.mean() > LOST or lost.sum() >= 2 * FEWEST
+    )
+
+
+def wrong_scale(estimate: Estimate, chance: float = 60.0) -> float:
+    """How much larger all lengths came out than the drawing's, 1 where no common factor explains
+    it: a board whose squares are larger than written makes the whole machine larger.
+
+    chance : chi2 by which the drawing has to speak for the factor.
+    """
+    machine = estimate.machine
+    table = machine.parameters
+    length = np.array([unit == "m" and kind != "radius" for unit, kind in zip(
+        table.units, table.kinds, strict=True)])  # fmt: skip
+    moved = length & (np.diag(estimate.covariance) > 0)
+    new, old = machine.values[moved], table.drawing[moved]
+    weight = 1 / table.tolerance[moved] ** 2
+    if not np.any(new):
+        return 1.0
+    back = float(np.sum(weight * new * old) / np.sum(weight * new**2))
+    gain = np.sum(weight * (new - old) ** 2) - np.sum(weight * (back * new - old) ** 2)
+    left = np.sum(weight * (back * new - old) ** 2)
+    return 1 / back if gain > chance and gain > left else 1.0
+
+
+def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate) -> Doubt | None:
+    """The mistake that explains the poses; None where none does.
+
+    machine : by the drawing. estimate : of these measurements.
+    """
+    before = misfit(estimate)
+    tries = [
+        *_signs(machine, measurements),
+        *_orders(machine, measurements),
+        *_movements(machine, measurements, estimate),
+        *_sizes(machine, measurements, estimate),
+    ]
+    found = min(tries, key=lambda doubt: doubt.misfit, default=None)
+    return found if found and found.misfit < max(CURED * before, 1.2) < before else None
+
+
+def _signs(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
+    """Each motor's readings with the other sign."""
+    for motor in range(machine.n_joints):
+        sign = np.where(np.arange(machine.n_joints) == motor, -1.0, 1.0)
+        other = replace(measurements, joints=measurements.joints * sign)
+        low, high = machine.joint_ranges[motor]
+        inside = other.joints[:, motor]
+        slack = 0.2 * (high - low)
+        if np.any(inside < low - slack) or np.any(inside > high + slack):
+            continue
+        estimate = _tried(machine, other, None)
+        if estimate is not None:
+            yield Doubt("sign", misfit(estimate), motor=motor)
+
+
+def _orders(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
+    """Two motors' readings exchanged."""
+    for one, other in combinations(range(machine.n_joints), 2):
+        order = np.arange(machine.n_joints)
+        order[[one, other]] = order[[other, one]]
+        estimate = _tried(
+            machine, replace(measurements, joints=measurements.joints[:, order]), None
+        )
+        if estimate is not None:
+            yield Doubt("order", misfit(estimate), motor=one, other=other)
+
+
+def _tried(machine: Machine, measurements: Measurements, start: State | None) -> Estimate | None:
+    """The estimate from other measurements, from the drawing unless told; None where it fails."""
+    try:
+        if start is None:
+            start = start_from_poses(machine, measurements)
+        return bundle(machine, measurements, start)
+    except (PkmcalError, np.linalg.LinAlgError):
+        return None
+
+
+def _movements(machine: Machine, measurements: Measurements, estimate: Estimate) -> Iterator[Doubt]:
+    """A board, or a camera, elsewhere from some configuration on."""
+    poses, state = measurements.poses, estimate.state
+    for m in np.flatnonzero(measurements.on_platform):
+        for s in np.unique(poses.station[poses.mount == m]):
+            rows = np.flatnonzero((poses.mount == m) & (poses.station == s))
+            rows = rows[np.argsort(poses.configuration[rows], kind="stable")]
+            if len(rows) < 2 * FEWEST:
+                continue
+            at = _jump(measurements, estimate, rows)
+            later = rows[at:]
+            place = int(poses.configuration[rows[at - 1]]), int(poses.configuration[rows[at]])
+            body = state.T_camera_base[s] @ state.T_base_platform[poses.configuration[later]]
+            seen = poses.T_station_target[later]
+            mount = mean_pose(inverse(body) @ seen)
+            on = np.append(measurements.on_platform, True)
+            board = replace(
+                measurements,
+                poses=replace(poses, mount=_changed(poses.mount, later, len(state.T_mount))),
+                mounts=(*measurements.mounts, measurements.mounts[m]),
+            )
+            start = replace(
+                state, T_mount=np.concatenate([state.T_mount, mount[None]]), on_platform=on
+            )
+            tried = _tried(machine, board, start)
+            if tried is not None:
+                change = tried.state.T_mount[-1] @ inverse(tried.state.T_mount[m])
+                yield Doubt(
+                    "board moved", misfit(tried), station=int(s), before=place[0],
+                    configuration=place[1], moved=change,
+                )  # fmt: skip
+            if len(measurements.edges):
+                continue  # its edges would have to move with the camera
+            yield from _camera_moved(machine, measurements, state, int(s), later, place)
+
+
+def _camera_moved(
+    machine: Machine,
+    measurements: Measurements,
+    state: State,
+    s: int,
+    later: Integers,
+    place: tuple[int, int],
+) -> Iterator[Doubt]:
+    poses = measurements.poses
+    number = measurements.camera_of_station
+    there = state.T_base_platform[poses.configuration[later]] @ state.T_mount[poses.mount[later]]
+    station = mean_pose(poses.T_station_target[later] @ inverse(there))
+    camera = replace(
+        measurements,
+        poses=replace(poses, station=_changed(poses.station, later, measurements.n_stations)),
+        n_stations=measurements.n_stations + 1,
+        camera_of_station=np.append(number, number[s]),
+    )
+    start = replace(state, T_camera_base=np.concatenate([state.T_camera_base, station[None]]))
+    tried = _tried(machine, camera, start)
+    if tried is not None:
+        change = inverse(tried.state.T_camera_base[-1]) @ tried.state.T_camera_base[s]
+        yield Doubt(
+            "camera moved", misfit(tried), station=s, before=place[0], configuration=place[1],
+            moved=change,
+        )  # fmt: skip
+
+
+def _changed(index: Integers, rows: Integers, value: int) -> Integers:
+    out = index.copy()
+    out[rows] = value
+    return out
+
+
+def _jump(measurements: Measurements, estimate: Estimate, rows: Integers) -> int:
+    """Where the board's place on the platform jumps: the number of rows before it.
+
+    The split that leaves the least spread about the two parts' medians, all six numbers in
+    units of their own spread.
+    """
+    poses, state = measurements.poses, estimate.state
+    k = poses.configuration[rows]
+    body = state.T_camera_base[poses.station[rows]] @ state.T_base_platform[k]
+    mount = state.T_mount[poses.mount[rows]]
+    off = pose_difference(inverse(body) @ poses.T_station_target[rows], mount)
+    scale = np.median(np.abs(off - np.median(off, axis=0)), axis=0)
+    off = off / np.maximum(scale, 1e-3 * max(scale.max(), 1e-12))
+    rest = [
+        sum(np.abs(part - np.median(part, axis=0)).sum() for part in (off[:at], off[at:]))
+        for at in range(FEWEST, len(rows) - FEWEST + 1)
+    ]
+    return FEWEST + int(np.argmin(rest))
+
+
+def _sizes(machine: Machine, measurements: Measurements, estimate: Estimate) -> Iterator[Doubt]:
+    """A board whose squares have another size: its distances are all wrong by one factor."""
+    poses = measurements.poses
+    boards = [m for m, mount in enumerate(measurements.mounts) if mount.name == "board"]
+    rows = np.flatnonzero(np.isin(poses.mount, boards) & measurements.on_platform[poses.mount])
+    if not boards or len(rows) < 2 * FEWEST:
+        return
+    state = start_state(machine, measurements, estimate.state.T_camera_base)
+    there = state.T_base_platform[poses.configuration[rows], :3, 3]
+    seen = poses.T_station_target[rows, :3, 3]
+    spread = np.sqrt(np.var(there, axis=0).sum() / np.var(seen, axis=0).sum())
+    T = poses.T_station_target.copy()
+    if abs(spread - 1) < OTHER_SIZE:
+        return
+    T[rows] = pose(T[rows, :3, :3], spread * T[rows, :3, 3])
+    other = replace(measurements, poses=replace(poses, T_station_target=T))
+    tried = _tried(machine, other, None)
+    if tried is not None:
+        yield Doubt("size", misfit(tried), size=float(spread))

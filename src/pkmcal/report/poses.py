@@ -1,0 +1,227 @@
+"""Boards and trackers in the report: how far their poses are off, and where they sit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import rotation_vector
+from pkmcal.identify.problem import Estimate
+from pkmcal.observe.edges import Observation
+from pkmcal.observe.poses import PoseSet
+from pkmcal.report.charts import (
+    NORMAL_90,
+    Bar,
+    BarChart,
+    RowChart,
+    bar_chart,
+    box,
+    row_chart,
+)
+from pkmcal.report.residuals import KEPT, SIGMAS, expected_rms
+from pkmcal.report.wording import brief, count, decimals, number
+from pkmcal.session import Session
+from pkmcal.turning import turning
+
+OPEN = 0.3
+"""m or rad; a place that is known no better is not told by the data."""
+MOST = 12
+"""Poses in the list of the worst."""
+
+
+@dataclass(frozen=True)
+class MountRow:
+    """Where a target sits. position : three texts (mm), turn : three (degrees), each with its
+    deviation, or ``open`` where the data do not tell it.
+    """
+
+    name: str
+    frame: str
+    position: tuple[tuple[str, str], ...]
+    turn: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """One measured pose: off by so much, in mm and degrees, and in standard deviations."""
+
+    station: str
+    configuration: str
+    position: str
+    turn: str
+    sigmas: str
+    aside: bool
+
+
+@dataclass(frozen=True)
+class Poses:
+    """The section's content. scale : factor on the stated noise. summary : sentences."""
+
+    summary: tuple[str, ...]
+    mounts: tuple[MountRow, ...]
+    sigmas: BarChart | None
+    position: BarChart | None
+    turn: BarChart | None
+    axes: RowChart | None
+    worst: tuple[PoseRow, ...]
+
+
+def section(session: Session, observation: Observation, estimate: Estimate) -> Poses | None:
+    """The section; None in a session without boards and trackers on the platform."""
+    poses = observation.poses
+    if not len(poses):
+        return None
+    error = errors(poses, estimate)
+    return Poses(
+        summary=_summary(poses, estimate, error)
+        + tuple(text for _, text in turning(session, poses, estimate.state.on_platform)),
+        mounts=tuple(_mount(session, estimate, m) for m in range(len(estimate.state.T_mount))),
+        sigmas=_by_configuration(session, poses, estimate),
+        position=_bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off, mm"),
+        turn=_bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned, degrees"),
+        axes=_axes(poses, estimate),
+        worst=_worst(session, poses, estimate, error),
+    )
+
+
+def errors(poses: PoseSet, estimate: Estimate) -> Array:
+    """Predicted less measured (N, 6): rad and m, station frame; NaN for what was not measured."""
+    white = estimate.pose_residuals * estimate.statistics.pose_scale
+    error = (np.linalg.pinv(poses.whiten) @ white[..., None])[..., 0]
+    known = np.any(poses.whiten != 0, axis=-2)
+    return np.where(known, error, np.nan)
+
+
+def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...]:
+    kept = estimate.pose_weights >= KEPT
+    s = estimate.statistics
+    aside = "" if kept.all() else f", {int(np.sum(~kept))} put aside"
+    seen = count(len(np.unique(poses.configuration)), "configuration")
+    sizes = [_rms(error[kept, 3:]) * 1e3, float(np.rad2deg(_rms(error[kept, :3])))]
+    told = [f"{brief(x)}{u}" for x, u in zip(sizes, (" mm", "°"), strict=True) if np.isfinite(x)]
+    # the factor itself is never below one
+    times = s.pose_scale if s.pose_scale > 1 else np.sqrt(s.chi2_poses / max(s.dof_poses, 1))
+    return (
+        f"{count(len(poses), 'pose')} measured in {seen}{aside}.",
+        f"They are {' and '.join(told)} off the calibrated machine (root mean square), which is"
+        f" {number(times, 2)} times their stated noise.",
+    )
+
+
+def _rms(values: Array) -> float:
+    """Root mean square length of vectors (n, 3), what was not measured left out."""
+    known = np.isfinite(values)
+    if not known.any():
+        return float("nan")
+    return float(np.sqrt(np.mean(np.nansum(values**2, axis=-1))))
+
+
+def _mount(session: Session, estimate: Estimate, m: int) -> MountRow:
+    state, covariance = estimate.state, estimate.mount_covariance
+    T, on_platform = state.T_mount[m], bool(state.on_platform[m])
+    sigma = np.sqrt(np.maximum(np.diag(covariance[m]), 0.0))
+    names = mount_names(session, len(state.T_mount))
+    return MountRow(
+        name=names[m],
+        frame="platform" if on_platform else "base",
+        position=_texts(T[:3, 3], sigma[3:], 1e3),
+        turn=_texts(rotation_vector(T[:3, :3]), sigma[:3], 180 / np.pi),
+    )
+
+
+def mount_names(session: Session, n: int) -> list[str]:
+    """Names of the mounts: the board, where there is one, then the trackers."""
+    trackers = [table.name for table in session.trackers]
+    return ["board"] * (n - len(trackers)) + trackers
+
+
+def _texts(values: Array, sigma: Array, factor: float) -> tuple[tuple[str, str], ...]:
+    out: list[tuple[str, str]] = []
+    for value, spread in zip(values.tolist(), sigma.tolist(), strict=True):
+        if spread > OPEN:
+            out.append(("open", ""))
+        else:
+            text = number(value * factor, decimals(spread * factor))
+            out.append((text, brief(spread * factor) if spread else ""))
+    return tuple(out)
+
+
+def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> BarChart | None:
+    """Root mean square of each configuration's poses in standard deviations."""
+    bars: list[Bar] = []
+    for k in np.unique(poses.configuration).tolist():
+        mine = poses.configuration == k
+        n = float(poses.rows[mine].sum())
+        level = float(np.sqrt(np.sum(estimate.pose_residuals[mine] ** 2) / n))
+        low, high = expected_rms(n)
+        name = session.configurations[k]
+        tip = (
+            f"configuration {name}: {number(level, 2)} σ, {number(low, 2)} to {number(high, 2)}"
+            " expected of noise alone"
+        )
+        bars.append(Bar(name, tip, level, (low, high), level <= high))
+    alt = "Bars of the poses' residuals by configuration"
+    return bar_chart("Poses, by configuration", SIGMAS, bars, _labels(bars), alt)
+
+
+def _bars(session: Session, poses: PoseSet, error: Array, unit: str, title: str) -> BarChart | None:
+    """Length of each configuration's error, largest of its poses."""
+    size = np.linalg.norm(np.nan_to_num(error), axis=-1)
+    if not np.isfinite(error).any():
+        return None
+    bars: list[Bar] = []
+    for k in np.unique(poses.configuration).tolist():
+        value = float(size[poses.configuration == k].max())
+        name = session.configurations[k]
+        bars.append(Bar(name, f"configuration {name}: {brief(value)} {unit}", value, None, True))
+    return bar_chart(title, unit, bars, _labels(bars), f"Bars of the poses' errors in {unit}")
+
+
+def _labels(bars: list[Bar]) -> tuple[tuple[float, str], ...]:
+    every = max(1, -(-len(bars) // 6))
+    return tuple((i + 0.5, bars[i].label) for i in range(0, len(bars), every))
+
+
+def _axes(poses: PoseSet, estimate: Estimate) -> RowChart | None:
+    """Boxes of the whitened residuals, by what they are of."""
+    names = ("turn 1", "turn 2", "turn 3", "place 1", "place 2", "place 3")
+    measured = np.any(poses.whiten != 0, axis=-1)
+    boxes = [
+        box(name, estimate.pose_residuals[measured[:, k], k], "σ", 2)
+        for k, name in enumerate(names)
+    ]
+    alt = "Boxes of the poses' residuals by their six numbers"
+    title = "Poses, by the six numbers"
+    return row_chart(title, SIGMAS, [b for b in boxes if b], NORMAL_90, alt)
+
+
+def _worst(
+    session: Session, poses: PoseSet, estimate: Estimate, error: Array
+) -> tuple[PoseRow, ...]:
+    level = np.sqrt(np.sum(estimate.pose_residuals**2, axis=1) / np.maximum(poses.rows, 1))
+    order = np.argsort(-level, kind="stable")[:MOST]
+    return tuple(_row(session, poses, estimate, error, level, int(k)) for k in order)
+
+
+def _row(
+    session: Session, poses: PoseSet, estimate: Estimate, error: Array, level: Array, k: int
+) -> PoseRow:
+    turn = float(np.rad2deg(np.linalg.norm(error[k, :3])))
+    return PoseRow(
+        station=session.station_names[poses.station[k]],
+        configuration=session.configurations[poses.configuration[k]],
+        position=brief(_rms(error[k : k + 1, 3:]) * 1e3),
+        turn=brief(turn) if np.isfinite(turn) else "",
+        sigmas=number(float(level[k]), 1),
+        aside=bool(estimate.pose_weights[k] < KEPT),
+    )
+
+
+def places(observation: Observation, estimate: Estimate) -> tuple[Array, Integers]:
+    """Where the targets were (N, 3), base frame, by the estimate, and their configurations."""
+    poses, state = observation.poses, estimate.state
+    on = state.on_platform[poses.mount]
+    body = np.where(on[:, None, None], state.T_base_platform[poses.configuration], np.eye(4))
+    return (body @ state.T_mount[poses.mount])[:, :3, 3], poses.configuration

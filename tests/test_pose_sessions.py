@@ -1,0 +1,284 @@
+"""Sessions of poses from tables, without photographs: calibrated, mixed, spoilt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from pkmcal.calibration import calibrate
+from pkmcal.check import Level, check_session
+from pkmcal.errors import InputError
+from pkmcal.files import csv_text, yaml_text
+from pkmcal.geometry.rigid import (
+    inverse,
+    perturb,
+    pose,
+    rotation,
+    rotation_vector,
+)
+from pkmcal.identify.hand_eye import solve_pairs
+from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.results import load, save
+from pkmcal.session import load_session
+from pkmcal.simulate.configurations import draw_configurations
+from pkmcal.simulate.truth import true_machine
+
+T_TRACKER_BASE = pose(rotation(np.array([0.4, -0.2, 2.0])), np.array([1.5, 0.3, -0.4]))
+T_PLATFORM_TARGET = pose(rotation(np.array([0.3, 1.2, 0.4])), np.array([0.03, 0.02, -0.04]))
+COLUMNS = {
+    "poses": ("x", "y", "z", "rx", "ry", "rz"),
+    "points": ("x", "y", "z"),
+    "heights": ("z",),
+}
+POSITION, TURN = 2e-5, 1e-4
+
+
+@dataclass(frozen=True)
+class Made:
+    """A session's folder and what is true of it."""
+
+    folder: object
+    drawing: object
+    machine: object
+    joints: np.ndarray
+    T: np.ndarray
+
+
+def make(folder, name, kind="poses", n=24, seed=0, scale=1.0, model=None, station=None):
+    """A session of one tracker; its noise is as stated."""
+    rng = np.random.default_rng(seed)
+    drawing = load_mechanism(name, model=model)
+    machine = true_machine(drawing, scale, rng)
+    T, joints = configurations(machine, n, rng)
+    place = np.eye(4) if kind == "heights" else T_TRACKER_BASE
+    target = T_PLATFORM_TARGET if station is None else station
+    sigma = np.repeat([TURN, POSITION], 3)
+    seen = perturb(place @ T @ target, sigma * rng.normal(size=(len(T), 6)))
+    noise = 1e-5
+    readings = joints + noise * rng.normal(size=joints.shape)
+    folder.mkdir()
+    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
+    write_joints(folder, readings)
+    write_poses(folder, seen, kind)
+    document = {
+        "pkmcal": 1,
+        "mechanism": "mechanism.yaml",
+        "joints": {"file": "joints.csv", "noise": noise},
+        "stations": {
+            "tracker": {
+                "tracker": {
+                    "poses": "poses.csv",
+                    "noise": {"position": POSITION, "rotation": TURN},
+                }
+            }
+        },
+    }
+    (folder / "session.yaml").write_text(yaml_text(document))
+    return Made(folder, drawing, machine, readings, T)
+
+
+def configurations(machine, n, rng):
+    """Poses (n, 4, 4) and exact readings; of the H4 in the paper's workspace."""
+    if machine.document.motion != "schoenflies":
+        return tuple(part[:n] for part in draw_configurations(machine, n, 0.5, rng))
+    x = rng.uniform([-0.1, -0.1, -0.525, -0.35], [0.1, 0.1, -0.375, 0.35], (n, 4))
+    T = pose(rotation(x[:, 3:] * [0.0, 0.0, 1.0]), x[:, :3])
+    return T, machine.inverse(T)
+
+
+def write_joints(folder, joints):
+    names = [f"{k:03d}" for k in range(len(joints))]
+    columns = [f"motor{k + 1}" for k in range(joints.shape[1])]
+    (folder / "joints.csv").write_text(csv_text(columns, names, joints))
+
+
+def write_poses(folder, seen, kind="poses"):
+    names = [f"{k:03d}" for k in range(len(seen))]
+    values = np.concatenate([seen[:, :3, 3], rotation_vector(seen[:, :3, :3])], axis=1)
+    values = values[:, [2]] if kind == "heights" else values[:, : len(COLUMNS[kind])]
+    (folder / "poses.csv").write_text(csv_text(COLUMNS[kind], names, values))
+
+
+def seen_poses(made):
+    """The tracker's poses without noise."""
+    return T_TRACKER_BASE @ made.T @ T_PLATFORM_TARGET
+
+
+def tool_error(machine, made, n=60):
+    """Root mean square distance (m) of the platform's places from the true ones, after the best
+    fit of both frames, at poses that were not measured.
+    """
+    T, joints = configurations(made.machine, n, np.random.default_rng(99))
+    found = machine.forward(joints)
+    frames = solve_pairs(found[None], T[None], 0.3)
+    off = frames.T_camera_base[0] @ found @ frames.T_mount[0] - T
+    return np.sqrt(np.mean(np.sum(off[:, :3, 3] ** 2, axis=-1)))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "session"
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "6-rus", "h4", "3-upu", "delta"])
+def test_whole_poses_calibrate_any_machine(folder, name):
+    made = make(folder, name)
+    result = calibrate(folder)
+    s = result.estimate.statistics
+    # of n numbers that are noise, the root mean square has the deviation 1 / sqrt(2 n)
+    assert s.pose_scale < 1 + 4 / np.sqrt(2 * s.dof_poses)
+    assert s.n_poses == 6 * 24
+    before, after = tool_error(made.drawing, made), tool_error(result.machine, made)
+    assert after < 0.1 * before
+    assert after < 6e-5
+
+
+def test_stations_and_targets_are_found_with_their_deviations(folder):
+    """In frames that do not matter: from the tracker to the target at each configuration."""
+    made = make(folder, "gough-stewart", seed=3)
+    result = calibrate(folder)
+    state = result.estimate.state
+    found = state.T_camera_base[0] @ state.T_base_platform @ state.T_mount[0]
+    error = rotation_vector((inverse(found) @ seen_poses(made))[:, :3, :3])
+    assert np.sqrt(np.mean(error**2)) < TURN
+    sigma = np.sqrt(np.diag(result.estimate.mount_covariance[0]))
+    assert np.all(sigma > 0)
+    assert np.all(sigma[:3] < 1e-2)
+
+
+def test_points_alone(folder):
+    made = make(folder, "gough-stewart", "points", n=40)
+    result = calibrate(folder)
+    assert result.estimate.statistics.n_poses == 120
+    assert tool_error(result.machine, made) < 0.3 * tool_error(made.drawing, made)
+
+
+def test_heights_of_a_flat_bed(folder):
+    """A linear delta probed: its tilt and bulge go, what the bed does not tell is said."""
+    target = pose(np.eye(3), np.array([0.0, 0.0, -0.04]))
+    made = make(folder, "linear-delta", "heights", n=20, station=target)
+    result = calibrate(folder)
+    s = result.estimate.statistics
+    assert s.n_poses == 20
+    assert s.pose_scale < 1.6
+    T, joints = configurations(made.machine, 60, np.random.default_rng(5))
+
+    def bulge(machine):
+        """Height of the nozzle over the best plane through the true and found heights, rms."""
+        z = machine.forward(joints)[:, 2, 3] - T[:, 2, 3]
+        plane = np.column_stack([T[:, 0, 3], T[:, 1, 3], np.ones(len(T))])
+        return np.sqrt(np.mean((z - plane @ np.linalg.lstsq(plane, z, rcond=None)[0]) ** 2))
+
+    assert bulge(result.machine) < 0.2 * bulge(made.drawing)
+
+
+def test_outliers_are_let_go_and_named(folder):
+    made = make(folder, "h4", n=30)
+    seen = seen_poses(made)
+    seen[7] = perturb(seen[7], np.array([0, 0, 0, 0.004, 0, 0.0]))
+    seen[20] = perturb(seen[20], np.array([0, 0.02, 0, 0, 0, 0.0]))
+    write_poses(folder, seen)
+    result = calibrate(folder)
+    assert np.flatnonzero(result.estimate.pose_weights < 0.5).tolist() == [7, 20]
+    told = [r for r in result.observation.rejected if r.configuration in (7, 20)]
+    assert all("standard deviations from where all others put it" in r.reason for r in told)
+    assert tool_error(result.machine, made) < 6e-5
+
+
+def test_a_model_too_poor_is_refused_and_the_richer_one_named(folder):
+    made = make(folder, "h4", n=40)
+    text = load_mechanism("h4").document
+    assert "design" in text.models
+    document = (folder / "session.yaml").read_text().replace("mechanism.yaml", "h4")
+    (folder / "session.yaml").write_text(document)
+    poor = calibrate(load_session(folder, "design"))
+    assert not poor.verdict.usable
+    assert any("--model calibration they fit" in reason for reason in poor.verdict.reasons)
+    rich = calibrate(load_session(folder, "calibration"))
+    assert rich.verdict.usable
+    assert tool_error(rich.machine, made) < 0.2 * tool_error(poor.machine, made)
+
+
+def test_inverse_kinematic_is_a_method(folder):
+    made = make(folder, "h4", n=30)
+    result = calibrate(folder, method="inverse-kinematic")
+    assert tool_error(result.machine, made) < 0.1 * tool_error(made.drawing, made)
+
+
+def test_everything_is_saved_and_read_back(folder, tmp_path):
+    make(folder, "h4")
+    result = calibrate(folder)
+    save(result, tmp_path / "out")
+    document = load(tmp_path / "out").document
+    assert document["targets"][0]["name"] == "tracker"
+    assert len(document["targets"][0]["T_platform_target"]) == 4
+    assert len(document["residuals"]["poses"]) == 24
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Measured poses" in page
+    assert "Where it sits" in page
+    assert 'id="photographs"' not in page
+
+
+# what is wrong is found
+
+
+def test_a_target_moved_on_the_platform(folder):
+    made = make(folder, "h4", n=30)
+    seen = seen_poses(made)
+    step = perturb(np.eye(4), np.array([0.01, 0.0, 0.02, 0.002, 0.0, 0.001]))
+    seen[18:] = seen[18:] @ step
+    write_poses(folder, seen)
+    with pytest.raises(InputError, match="between configuration 017 and 018"):
+        calibrate(folder)
+
+
+@pytest.mark.parametrize("motor", [0, 2])
+def test_the_sign_of_one_encoder(folder, motor):
+    made = make(folder, "h4", n=30)
+    text = (folder / "mechanism.yaml").read_text()
+    joints = made.joints.copy()
+    joints[:, motor] *= -1
+    write_joints(folder, joints)
+    with pytest.raises(InputError, match=f"the readings of motor{motor + 1} have the wrong sign"):
+        calibrate(folder)
+    assert "range" in text
+
+
+def test_two_columns_exchanged(folder):
+    made = make(folder, "h4", n=30)
+    write_joints(folder, made.joints[:, [1, 0, 2, 3]])
+    with pytest.raises(InputError, match="motor1 and motor2 are exchanged"):
+        calibrate(folder)
+
+
+def test_readings_in_degrees(folder):
+    made = make(folder, "h4", n=30)
+    write_joints(folder, np.rad2deg(made.joints))
+    with pytest.raises(InputError, match="look like degrees") as caught:
+        load_session(folder)
+    assert "pi/180" in str(caught.value)
+
+
+def test_lengths_of_another_scale(folder):
+    made = make(folder, "h4", n=30)
+    seen = seen_poses(made)
+    seen[:, :3, 3] *= 1.05
+    write_poses(folder, seen)
+    verdict = calibrate(folder).verdict
+    assert not verdict.usable
+    assert any("All of the machine came out" in reason for reason in verdict.reasons)
+
+
+def test_check_tells_how_the_platform_turns(folder):
+    made = make(folder, "h4", n=30)
+    found = check_session(folder)
+    assert found.exit_code < 2
+    assert any("turn about one axis" in f.text for f in found.findings)
+    rng = np.random.default_rng(1)
+    seen = perturb(seen_poses(made), np.concatenate([0.01 * rng.normal(size=(30, 3)),
+                                                     np.zeros((30, 3))], axis=1))  # fmt: skip
+    write_poses(folder, seen)
+    doubts = [f.text for f in check_session(folder).findings if f.level is Level.DOUBTFUL]
+    assert any("do not just turn about one axis" in t or "not turn about" in t for t in doubts)

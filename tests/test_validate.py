@@ -1,0 +1,433 @@
+"""Validation: promises that hold, changes that are found, paths, hold-outs, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.errors import GeometryError, InputError, ResultError
+from pkmcal.geometry.rigid import pose, rotation
+from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.problem import Measurements
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.simulate import Settings
+from pkmcal.simulate.demo import demo_camera
+from pkmcal.simulate.edges import EdgeNoise, simulate_edges
+from pkmcal.simulate.truth import draw_truth, true_machine
+from pkmcal.validate.held import held, predict
+from pkmcal.validate.holdouts import by_regions, chosen, hold_out, judge, select
+from pkmcal.validate.judged import promise, ratio, rms, weighed
+from pkmcal.validate.paths import closed_square, square_path, straightness
+from pkmcal.validate.regions import clusters, places, regions, spread
+from pkmcal.validate.words import verdict_of
+from pose_sessions import JOINT_NOISE, T_CAMERA_BASE, measured, papers_case, papers_poses
+
+STATIONS = 3
+
+
+def legs_case(seed, true=None):
+    """A hexapod's edges from three stations, eight configurations each."""
+    drawing, camera = load_mechanism("gough-stewart"), demo_camera()
+    settings = Settings(stations=STATIONS, configurations=8)
+    truth = draw_truth(drawing, (camera,) * STATIONS, settings, seed)
+    true = true or truth.machine
+    rng = np.random.default_rng(seed)
+    edges, readings = simulate_edges(
+        true, truth.T_camera_base, camera, truth.T_base_platform, EdgeNoise(), rng,
+        photographs=truth.photographs,
+    )  # fmt: skip
+    data = Measurements(edges, readings, 3e-6, STATIONS, np.zeros(STATIONS, dtype=int))
+    return drawing, true, truth.T_camera_base, data
+
+
+def calibrated(seed):
+    drawing, true, stations, data = legs_case(seed)
+    return drawing, true, bundle(drawing, data, start_state(drawing, data, stations)), data
+
+
+def seen_by(machine, data, stations):
+    return predict(machine, data, start_state(machine, data, stations))
+
+
+def judged_on(drawing, estimate, machine, data, stations):
+    found = seen_by(machine, data, stations)
+    by_drawing = seen_by(drawing, data, stations)
+    rows = np.flatnonzero(found.seen)
+    return judge(drawing, estimate.covariance, data, found, by_drawing, rows)
+
+
+def changed(machine, name, by):
+    values = machine.values.copy()
+    values[machine.parameters.index(name)] += by
+    return machine.with_values(values)
+
+
+@pytest.fixture(scope="module")
+def hexapod():
+    return calibrated(1)
+
+
+@pytest.fixture(scope="module")
+def h4():
+    """[C]'s machine and its calibration from 71 poses."""
+    drawing = load_mechanism("h4", model="calibration")
+    rng = np.random.default_rng(3)
+    true = true_machine(drawing, 1.0, rng)
+    case = papers_case(true, rng)
+    start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
+    return drawing, true, bundle(drawing, case.measurements, start), case, rng
+
+
+# the machine held
+
+
+def test_held_leaves_radii_alone_free():
+    machine = held(load_mechanism("gough-stewart"))
+    names = machine.parameters.free_names()
+    assert names
+    assert all("radius" in name for name in names)
+    assert held(load_mechanism("h4")).parameters.free_matrix().shape[1] == 0
+
+
+def test_residuals_scatter_as_promised(hexapod):
+    drawing, true, estimate, _ = hexapod
+    chi2 = []
+    for seed in range(60, 66):
+        _, _, stations, data = legs_case(seed, true)
+        chi2.append(judged_on(drawing, estimate, estimate.machine, data, stations).promise)
+    share = np.mean([test.chi2 / test.dof for test in chi2])
+    assert abs(share - 1) < 0.2  # one calibration in all of them; its error is 4 % of the noise
+    assert all(test.kept for test in chi2)
+
+
+def test_own_readings_have_no_part_in_a_pose(hexapod):
+    """A reading that is wrong by 5 mm shows as 5 mm, and moves no seen pose."""
+    _, true, estimate, _ = hexapod
+    _, _, stations, data = legs_case(60, true)
+    start = start_state(estimate.machine, data, stations)
+    wrong = replace(data, joints=data.joints + 5e-3 * (np.arange(len(data.joints)) == 4)[:, None])
+    good, bad = (predict(estimate.machine, d, start) for d in (data, wrong))
+    shift = bad.residuals[4] - good.residuals[4]
+    assert np.abs(shift - 5e-3).max() < 2e-5
+    assert np.abs(bad.T_base_platform[4] - good.T_base_platform[4]).max() < 2e-5
+
+
+def test_own_readings_have_no_part_where_a_board_needs_the_others(h4):
+    drawing, _, estimate, case, _ = h4
+    few = select(case.measurements, np.arange(71) < 12)
+    few = replace(few, joints=few.joints[:12])
+    wrong = replace(few, joints=few.joints + 1e-2 * (np.arange(12) == 4)[:, None])
+    start = start_state(estimate.machine, few, T_CAMERA_BASE[None])
+    good, bad = (predict(estimate.machine, d, start) for d in (few, wrong))
+    shift = bad.residuals[4] - good.residuals[4]
+    assert np.abs(shift - 1e-2).max() < 2e-4  # to first order of a leave-one-out by leverage
+    # the others do take notice, through the camera's and the board's place
+    assert np.abs(bad.residuals[5] - good.residuals[5]).max() > 1e-5
+    del drawing
+
+
+def test_a_board_in_one_configuration_tells_nothing(h4):
+    _, _, estimate, case, _ = h4
+    one = select(case.measurements, np.arange(71) == 0)
+    start = start_state(estimate.machine, one, T_CAMERA_BASE[None])
+    with pytest.raises(ResultError, match="too little was seen to predict readings"):
+        predict(estimate.machine, one, start)
+
+
+# verdicts
+
+
+def test_better_than_the_drawing(hexapod):
+    drawing, true, estimate, _ = hexapod
+    _, _, stations, data = legs_case(60, true)
+    judged = judged_on(drawing, estimate, estimate.machine, data, stations)
+    verdict = verdict_of(judged, (), estimate.machine)
+    assert verdict.usable
+    assert "times better than the drawing: 0." in verdict.headline
+    assert judged.ratio.low > 3
+    assert rms(judged.after) < np.sqrt(2) * judged.floor
+    assert "the photographs' own noise" in verdict.advice[0]
+
+
+def test_a_leg_that_changed_is_named(hexapod):
+    drawing, true, estimate, _ = hexapod
+    _, _, stations, data = legs_case(60, changed(true, "legs[3].length.offset", 1e-3))
+    judged = judged_on(drawing, estimate, estimate.machine, data, stations)
+    verdict = verdict_of(judged, (), estimate.machine)
+    assert not verdict.usable
+    assert judged.ratio.better  # it is still better than the drawing
+    assert "joint 3 reads" in verdict.reasons[0]
+    assert abs(judged.promise.common[2] + 1e-3) < 4 * judged.promise.common_sigma[2]
+
+
+def test_a_calibration_that_made_it_worse(hexapod):
+    drawing, true, estimate, _ = hexapod
+    _, _, stations, data = legs_case(60, true)
+    worse = changed(estimate.machine, "legs[3].length.offset", 0.02)
+    judged = judged_on(drawing, estimate, worse, data, stations)
+    verdict = verdict_of(judged, (), worse)
+    assert not verdict.usable
+    assert verdict.headline.startswith("The drawing predicts the readings")
+    assert "made the machine worse" in verdict.reasons[0]
+    assert "larger than the calibration's deviations" in verdict.reasons[1]
+
+
+def test_the_drawing_itself_is_not_better_than_the_drawing(hexapod):
+    drawing, true, estimate, _ = hexapod
+    _, _, stations, data = legs_case(60, true)
+    judged = judged_on(drawing, estimate, drawing, data, stations)
+    verdict = verdict_of(judged, (), drawing)
+    assert not verdict.usable
+    assert not judged.ratio.better
+
+
+def test_a_board_on_an_h4(h4):
+    drawing, true, estimate, _, rng = h4
+    new = measured(true, papers_poses()[rng.permutation(81)[:12]], rng)
+    start = start_state(estimate.machine, new.measurements, T_CAMERA_BASE[None])
+    found = predict(estimate.machine, new.measurements, start)
+    judged = judge(drawing, estimate.covariance, new.measurements, found, None, np.arange(12))
+    verdict = verdict_of(judged, (), estimate.machine)
+    assert verdict.usable, verdict
+    assert "° against" in verdict.headline
+    assert new.measurements.joint_noise == JOINT_NOISE
+
+
+# figures
+
+
+def test_a_ratio_and_its_spread():
+    rng = np.random.default_rng(0)
+    made = ratio(np.abs(10 * rng.normal(size=400)), np.abs(rng.normal(size=400)))
+    assert made.low < 10 < made.high
+    assert made.sigma == pytest.approx(0.5, rel=0.2)  # sqrt(2/400) / sqrt 2 of both, times ten
+    assert not made.better or made.low > 1
+
+
+def test_a_promise_is_uniform_in_chance_and_finds_what_is_common():
+    rng = np.random.default_rng(1)
+    noise = np.diag(np.tile([1.0, 4.0, 0.25], 10))
+    draws = rng.normal(size=(300, 30)) * np.sqrt(np.diag(noise))
+    tests = [promise(row.reshape(10, 3), noise, 0 * noise) for row in draws]
+    assert abs(np.mean([t.chance for t in tests]) - 0.5) < 4 * 0.289 / np.sqrt(300)
+    off = promise(draws[0].reshape(10, 3) + np.array([0, 0, 1.0]), noise, 0 * noise)
+    assert off.usual
+    assert not off.steady
+    assert np.argmax(np.abs(off.common / off.common_sigma)) == 2
+
+
+def test_poses_that_are_hardly_seen_hardly_count():
+    values, sigma = np.array([[1.0], [100.0], [np.nan]]), np.array([[1.0], [1e4], [1.0]])
+    assert weighed(values, sigma)[1][0] == pytest.approx(1.0, abs=1e-3)
+
+
+# paths
+
+
+def test_straightness():
+    along = np.linspace(0, 1, 9)[:, None] * [0.1, 0.2, 0.05]
+    assert straightness(along).largest < 1e-15
+    normal = np.array([2.0, -1.0, 0.0]) / np.sqrt(5)
+    bent = along + 1e-3 * (np.arange(9) % 2 * 2 - 1)[:, None] * normal
+    found = straightness(bent)
+    assert found.rms == pytest.approx(1e-3, rel=0.02)
+    assert found.rms <= found.largest < 1.2e-3
+
+
+def test_a_square_under_its_own_model_and_under_another():
+    drawing = load_mechanism("h4")
+    middle = pose(np.eye(3), np.array([0, 0, -0.45]))
+    own = closed_square(drawing, drawing, middle)
+    assert max(own.side, own.shape, own.place) < 1e-10
+    larger = true_machine(drawing, 1.0, np.random.default_rng(2))
+    off = closed_square(drawing, larger, middle)
+    assert 1e-4 < off.shape <= off.place
+    assert off.side > 1e-4
+    assert square_path(middle, 0.1, 5).shape == (20, 4, 4)
+
+
+def test_a_square_that_cannot_be_driven():
+    drawing = load_mechanism("h4")
+    with pytest.raises(GeometryError, match="leaves the workspace"):
+        closed_square(drawing, drawing, pose(np.eye(3), np.array([0, 0, -0.45])), side=3.0)
+
+
+# regions and hold-outs
+
+
+def test_regions_are_whole_named_and_the_same_again():
+    rng = np.random.default_rng(4)
+    machine = load_mechanism("gough-stewart")
+    shifts = np.repeat([[0, 0, 0.3], [0.2, 0, 0.3], [0, 0, 0.5]], 5, axis=0)
+    poses = pose(
+        rotation(1e-3 * rng.normal(size=(15, 3))), shifts + 1e-3 * rng.normal(size=(15, 3))
+    )
+    points = places(machine, poses)
+    rows = np.arange(100, 115)
+    found = regions(points, rows, 3)
+    assert sorted(np.concatenate([r.rows for r in found])) == sorted(rows)
+    assert {len(r.rows) for r in found} == {5}
+    names = {tuple(r.rows // 5): r.name for r in found}
+    assert names[(21,) * 5].startswith("towards +x")
+    assert "high" in names[(22,) * 5]
+    assert np.array_equal(clusters(points, 3), clusters(points.copy(), 3))
+    assert len(set(spread(points, 3) // 5)) == 3
+
+
+def test_held_out_regions_know_nothing_of_their_readings(hexapod):
+    drawing, _, estimate, data = hexapod
+    region = chosen(drawing, estimate, 5)
+    held_out = hold_out(drawing, data, estimate, region)
+    assert list(held_out.left_out.rows) == list(region.rows)
+    assert not held_out.estimate.configurations[region.rows].any()
+    spoiled = data.joints.copy()
+    spoiled[region.rows] += 1e-3
+    other = hold_out(drawing, replace(data, joints=spoiled), estimate, region)
+    assert np.allclose(other.estimate.machine.values, held_out.estimate.machine.values, atol=1e-9)
+    shift = other.left_out.calibrated.residuals - held_out.left_out.calibrated.residuals
+    assert np.abs(shift - 1e-3).max() < 1e-4
+
+
+def test_regions_judged_together(hexapod):
+    drawing, _, estimate, data = hexapod
+    found = by_regions(drawing, data, estimate, 3)
+    assert sum(len(item.left_out.rows) for item in found) == estimate.configurations.sum()
+    verdict = verdict_of(None, found, drawing)
+    assert verdict.usable, verdict
+    assert "of regions that it did not see" in verdict.headline
+
+
+def test_poor_extrapolation_is_told(hexapod):
+    drawing, _, estimate, data = hexapod
+    item = hold_out(drawing, data, estimate, chosen(drawing, estimate, 4))
+    far = replace(item, left_out=replace(item.left_out, after=5 * item.left_out.after))
+    (warning,) = verdict_of(None, (far,), drawing).warnings
+    assert warning.startswith("Extrapolation is poor where the platform is spread")
+
+
+@pytest.mark.parametrize("n", [0, 13, 24])
+def test_how_many_to_hold_out(hexapod, n):
+    drawing, _, estimate, _ = hexapod
+    with pytest.raises(InputError, match=r"configurations held out is not possible.*1 to 12"):
+        chosen(drawing, estimate, n)
+
+
+def test_too_few_configurations_to_hold_out(hexapod):
+    drawing, _, estimate, _ = hexapod
+    few = SimpleNamespace(configurations=np.arange(24) < 3, state=estimate.state)
+    with pytest.raises(InputError, match="too few configurations to hold any out"):
+        chosen(drawing, few, 1)
+
+
+# the commands
+
+
+@pytest.fixture(scope="module")
+def kept(demo, tmp_path_factory):
+    """The demonstration's session calibrated without three configurations, and validated."""
+    folder = tmp_path_factory.mktemp("validate")
+    made = run("calibrate", demo.session, "--holdout", 3, "-o", folder / "c", "--json")
+    found = run("validate", folder / "c", demo.session, "-o", folder / "v", "--json")
+    return SimpleNamespace(folder=folder, made=made, found=found)
+
+
+def test_calibrate_with_some_held_out(kept):
+    out = kept.made.json["holdout"]
+    assert len(out["left_out"]["configurations"]) == 3
+    document = json.loads((kept.folder / "c" / "calibration.json").read_text())
+    unused = [c["name"] for c in document["configurations"] if not c["used"]]
+    assert unused == out["left_out"]["configurations"]
+    assert document["holdout"] == out
+    assert (
+        "held out, the calibrated machine predicts"
+        in (kept.folder / "c" / "report.html").read_text()
+    )
+    assert not any("did not take part" in w for w in kept.made.json["verdict"]["warnings"])
+
+
+def test_validate_on_what_was_held_out(kept, demo):
+    assert kept.found.err == ""
+    result = kept.found.json
+    out = kept.made.json["holdout"]["left_out"]["configurations"]
+    assert result["new_data"]["configurations"] == out
+    assert set(result["known_configurations"]).isdisjoint(out)
+    assert result["exit_code"] == kept.found.code == (0 if result["verdict"]["usable"] else 1)
+    page = (kept.folder / "v" / "validation.html").read_text()
+    assert result["verdict"]["headline"] in page
+    assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org", "")
+    assert json.loads((kept.folder / "v" / "validation.json").read_text())["new_data"]
+    del demo
+
+
+def test_validate_in_words(kept, session):
+    path = "\npaths: {ruler: ['0000', '0001', '0002']}\n"
+    (session / "session.yaml").write_text((session / "session.yaml").read_text() + path)
+    done = run("validate", kept.folder / "c", session, "--regions", 2)
+    assert "The calibrated machine" in done.out
+    assert "Straight paths" in done.out
+    assert "each left out once" in " ".join(done.out.split())
+    assert (session / "validation" / "validation.html").is_file()
+
+
+def test_the_same_photographs(demo, session):
+    done = run("validate", demo.calibration, session)
+    assert done.code == 2
+    assert "the session is not independent" in done.err
+    assert "--holdout N" in done.err
+    lines = (session / "joints.csv").read_text().splitlines()
+    (session / "joints.csv").write_text("\n".join([lines[0], *(line + "1" for line in lines[1:])]))
+    again = run("validate", demo.calibration, session)
+    assert again.err == done.err  # known by their content, whatever is said of them
+
+
+def spoil(session, name, old, new):
+    text = (session / name).read_text()
+    assert old in text
+    (session / name).write_text(text.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "said"),
+    [
+        ("joints.csv", "leg", "axis", "have no joint in common; found axis1"),
+        ("joints.csv", "leg6", "axis6", "reads other joints than the calibration"),
+        ("session.yaml", "pkmcal: 1", "pkmcal: 1\npaths: {ruler: ['0000', '0001', 'x']}",
+         "paths.ruler[3]: there is no such configuration; found x"),
+        ("session.yaml", "pkmcal: 1", "pkmcal: 1\npaths: {ruler: ['0000', '0001']}",
+         "too few configurations for a straight path; found 2, expected 3 at least"),
+    ],
+)  # fmt: skip
+def test_sessions_that_do_not_belong(demo, session, name, old, new, said):
+    spoil(session, name, old, new)
+    done = run("validate", demo.calibration, session)
+    assert done.code == 2
+    assert said in done.err
+
+
+def test_another_machine(demo, session):
+    from pkmcal.files import read_yaml, yaml_text
+
+    document = read_yaml(session / "mechanism.yaml").data
+    document["legs"][2]["base"]["center"][0] += 0.05
+    (session / "mechanism.yaml").write_text(yaml_text(document))
+    done = run("validate", demo.calibration, session)
+    assert done.code == 2
+    assert "the calibration is of another machine than the session" in done.err
+    assert "legs[3].base.center.x" in done.err
+
+
+def test_an_output_folder_with_other_things(demo, session):
+    done = run("validate", demo.calibration, session, "-o", session)
+    assert done.code == 2
+    assert "the output folder holds something other than a validation" in done.err
+
+
+def test_no_calibration_there(session):
+    done = run("validate", session, session)
+    assert done.code == 2
+    assert "there is no calibration here" in done.err
