@@ -136,9 +136,11 @@ def bound(machine, case, estimate, rng, draws=30):
     )
     squares = []
     for _ in range(draws):
-        off = problem.moved(state, (half @ rng.normal(size=half.shape[1]))[None], own)
+        # a tenth of an error, so that only its first order counts
+        step = 0.1 * half @ rng.normal(size=half.shape[1])
+        off = problem.moved(state, step[None], own)
         other = machine.with_values(problem.theta(off)[0])
         found = predicted(other, off.T_camera_base[0], off.T_mount[0], joints)
         d = pose_difference(found, centre)
         squares.append([np.mean(np.sum(p**2, axis=1)) for p in (d[:, 3:], d[:, :3])])
-    return np.sqrt(np.mean(squares, axis=0))
+    return 10 * np.sqrt(np.mean(squares, axis=0))

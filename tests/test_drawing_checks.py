@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 
+import numpy as np
 import pytest
 
 from conftest import run
@@ -68,8 +69,16 @@ FAULTS = {
         "3-rpr",
         [("0.3200, 0.1000]", "0.3200, 0.1010]")],
         "m.yaml, line 5, legs[1].platform.center: leg 1 of a planar machine leaves its plane; "
-        "found its platform joint -0.6667 mm above its base joint, expected the same height (z) "
+        "found its platform joint -1 mm above its base joint, expected the same height (z) "
         "for both ends of a leg, at the home pose. Draw the leg in its plane, or write motion: "
+        "spatial.",
+    ),
+    "a later leg out of its plane": (
+        "3-rpr",
+        [("0.0208, -0.0978, 0.1000]", "0.0208, -0.0978, 0.1030]")],
+        "m.yaml, line 9, legs[2].platform.center: leg 2 of a planar machine leaves its plane; "
+        "found its platform joint +3 mm above its base joint, expected the same height (z) for "
+        "both ends of a leg, at the home pose. Draw the leg in its plane, or write motion: "
         "spatial.",
     ),
     "a planar machine's home out of the plane": (
@@ -138,7 +147,19 @@ FAULTS = {
         "3-upu",
         [("legs:", 'tied: [["legs[1].base.axis", "legs[1].length.offset"]]\nlegs:')],
         "m.yaml: a whole centre or axis is tied to a single number; found legs[1].base.axis, "
-        "legs[1].length.offset, expected entries of one kind.",
+        "legs[1].length.offset, expected entries of one kind, each once.",
+    ),
+    "a centre tied to an axis": (
+        "3-upu",
+        [("legs:", 'tied: [["legs[2].base.center", "legs[1].base.axis"]]\nlegs:')],
+        "m.yaml: an axis is tied to a centre; found legs[2].base.center, legs[1].base.axis, "
+        "expected entries of one kind, each once.",
+    ),
+    "a number tied to its opposite": (
+        "3-upu",
+        [("legs:", 'tied: [["legs[1].length.offset", "-legs[1].length.offset"]]\nlegs:')],
+        "m.yaml: a parameter is tied to itself; found legs[1].length.offset, "
+        "-legs[1].length.offset, expected entries of one kind, each once.",
     ),
     "an axis that is no parameter": (
         "gough-stewart",
@@ -184,6 +205,12 @@ def test_whole_axes_may_be_held_or_tied(tmp_path):
     for role, fewer in roles:
         table = load_mechanism(drawn(tmp_path, "3-upu", ("legs:", f"{role}\nlegs:"))).parameters
         assert table.free_matrix().shape[1] == free - fewer
+
+
+def test_an_axis_of_any_length_is_a_direction(tmp_path):
+    path = drawn(tmp_path, "3-rps", ("axis: [-1, 0, 0]", "axis: [-1.0e+200, 0, 0]"))
+    found = load_mechanism(path)
+    np.testing.assert_array_equal(found.base_axes()[0], [-1, 0, 0])
 
 
 # Drawings that pass these checks and still cannot be assembled

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from pkmcal.errors import ResultError
+from pkmcal.geometry.rigid import perturb
 from pkmcal.identify import four_step_checks as checks
 from pkmcal.identify.conditions import Condition, conditions
 from pkmcal.identify.four_step import four_step
 from pkmcal.identify.four_step_model import legs_of
-from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms import load_mechanism, machine_from_document
+from pkmcal.mechanisms.schema import MechanismDocument
 from test_four_step_machines import (
     THREE_BY_THREE,
     THREE_BY_TWO,
@@ -85,6 +87,26 @@ def test_too_few_legs_at_once(hexapod):
     pair = edges.configuration % 3
     part = hexapod.select((edges.leg // 2) == pair)
     refused(hexapod, part, "no configuration shows enough legs", "2 at most", "three or more")
+
+
+@pytest.mark.parametrize(
+    ("name", "motion", "legs", "expected"),
+    [
+        ("3-rpr", "planar", 3, "expected two or more, [A] 3.5"),
+        ("gough-stewart", "schoenflies", 4, "expected two or more, not one above the other, [A]"),
+    ],
+)
+def test_too_few_legs_at_once_where_the_platform_cannot_tilt(name, motion, legs, expected):
+    fields = {**load_mechanism(name).document.model_dump(by_alias=True), "motion": motion}
+    fields["legs"] = fields["legs"][:legs]
+    machine = machine_from_document(MechanismDocument.model_validate(fields))
+    rng, n = np.random.default_rng(3), 24
+    steps = rng.uniform(-1, 1, (n, 6)) * np.repeat([0.2, 0.05], 3)
+    poses = perturb(machine.home(), steps @ machine.layout.motion @ machine.layout.motion.T)
+    scene = make_scene(machine, rng, joints=machine.inverse(poses))
+    edges = scene.measurements.edges
+    part = scene.select(edges.leg == edges.configuration % legs)
+    refused(scene, part, "no configuration shows enough legs", "1 at most", expected)
 
 
 def test_legs_that_are_never_seen_together(hexapod):

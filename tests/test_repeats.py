@@ -10,6 +10,7 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration import calibrate
+from pkmcal.check import Level
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
@@ -28,7 +29,7 @@ from pkmcal.observe.repeats import (
     repeat_scatter,
     same_edges,
 )
-from pkmcal.repeatability import _Look, _station_row
+from pkmcal.repeatability import _findings, _Look, _station_row
 from pkmcal.session import load_session
 from pkmcal.simulate import EdgeNoise, Settings, load_truth, simulate_edges, simulate_session
 from pkmcal.simulate.configurations import draw_configurations
@@ -309,6 +310,26 @@ def test_what_moves_between_repeats_is_recognised(machine, poses, cause):
         assert found.promised == pytest.approx(0.2, rel=0.5)
     else:
         assert getattr(found, cause) > 0.5
+
+
+def test_two_edges_of_a_leg_say_nothing_of_its_motion(machine, poses):
+    """They look like a motion however they scatter; identical repeats have none at all."""
+    rng = np.random.default_rng(8)
+    one_tube = edges_of(machine, poses[:5])
+    one_tube = one_tube.select(one_tube.tube == 0)
+    look = motion_look(machine, poses[:5], lambda _repeat: one_tube, rng)
+    found = _station_row(look, "front")
+    assert found.legs == 0.0
+    assert found.cause == "noise"
+    with np.errstate(all="raise"):
+        still = _station_row(replace(look, turn=0 * look.turn), "front")
+    assert (still.camera, still.platform, still.legs, still.cause) == (0.0, 0.0, 0.0, "noise")
+
+
+def test_repeats_without_an_edge_in_common_are_no_accuracy():
+    (finding,) = _findings(())
+    assert finding.level is Level.DOUBTFUL
+    assert finding.text.startswith("No edge shows in two photographs")
 
 
 # whole sessions

@@ -374,6 +374,18 @@ def test_validate_in_words(kept, session):
     assert (session / "validation" / "validation.html").is_file()
 
 
+def test_the_drawing_is_the_drawing_again(kept, demo):
+    """Held-out regions must not know, through the drawing, what they told the calibration."""
+    from pkmcal.results import load
+    from pkmcal.validation import drawing_of
+
+    drawn = load_mechanism(demo.session / "mechanism.yaml")
+    found = drawing_of(load(kept.folder / "c"))
+    assert np.array_equal(found.parameters.drawing, drawn.parameters.drawing)
+    assert np.array_equal(found.values, drawn.values)
+    assert np.array_equal(found.parameters.free_matrix(), drawn.parameters.free_matrix())
+
+
 def test_the_same_photographs(demo, session):
     done = run("validate", demo.calibration, session)
     assert done.code == 2

@@ -256,6 +256,28 @@ def test_single_changes_have_their_names(change, text):
     assert sentence.text.startswith(text)
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("6-spu-passive", "Of the values of legs 1 and 7, one combination each is free, mostly of"),
+        ("constant-legs", "The tubes' radii of legs 1 and 3 are free."),
+    ],
+)
+def test_legs_with_different_numbers_share_a_sentence(name, text):
+    """A passive leg has no length, a strut one tube: fewer numbers than the leg beside it."""
+    machine = load_mechanism(name)
+    poses = moved(machine, np.random.default_rng(1), 5)
+    if name == "constant-legs":
+        changes = [{f"legs[{j}].tubes[1].radius": 1.0} for j in (1, 3)]
+    else:
+        centres = [f"legs[{{}}].{side}.center.{c}" for side in ("base", "platform") for c in "xyz"]
+        numbers = np.random.default_rng(2).normal(size=6)
+        changes = [{n.format(j): v for n, v in zip(centres, numbers, strict=True)} for j in (1, 7)]
+    null = np.array([unit(machine, change) for change in changes])
+    sentences = describe(machine, np.ones((2, machine.n_legs), bool), null, poses)
+    assert [s.text.startswith(text) for s in sentences] == [True]
+
+
 def test_a_leg_growing_into_its_base_is_found():
     machine, poses = hexapod()
     around = circumstances(machine, np.ones((1, 6), bool), poses[:1])

@@ -23,7 +23,8 @@ class BoardCheck:
 
     found : photographs that show it. corners : mean number in these, of ``corners_of``. rms : px
     off their predicted places. scatter : px by which a board on the base wanders from photograph
-    to photograph; nan where it need not stand still, or is seen once. distance : m.
+    to photograph; nan where it need not stand still, or is seen once. distance : m. unseen : an
+    outer row or column that no photograph shows though it shows all others, in words.
     """
 
     found: int
@@ -32,6 +33,7 @@ class BoardCheck:
     rms: float
     scatter: float
     distance: float
+    unseen: str = ""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,18 @@ def check_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> 
     return BoardsCheck(Boards(found, session.board_body), checks, tuple(findings))
 
 
+def _unseen(one: StationBoard) -> str:
+    """The outer row or column that is never seen though all others are."""
+    board = one.seen.board
+    if board.type == "aruco_grid":
+        return ""
+    seen = one.seen.views.seen.any(axis=0).reshape(board.counts[::-1])
+    for name, axis, at in (("row", 0, 0), ("row", 0, -1), ("column", 1, 0), ("column", 1, -1)):
+        if not np.take(seen, at, axis).any() and np.delete(seen, at, axis).all():
+            return f"the {'first' if at == 0 else 'last'} {name}"
+    return ""
+
+
 def _summary(one: StationBoard) -> BoardCheck:
     seen, stood = one.seen, one.stood
     return BoardCheck(
@@ -78,6 +92,7 @@ def _summary(one: StationBoard) -> BoardCheck:
         rms=float(np.median(seen.rms)),
         scatter=stood.scatter if stood else float("nan"),
         distance=float(np.median(np.linalg.norm(seen.poses.T_camera_board[:, :3, 3], axis=-1))),
+        unseen=_unseen(one),
     )
 
 
@@ -88,6 +103,12 @@ def _doubts(session: Session, number: int, check: BoardCheck) -> list[Finding]:
         text = (
             f"The board's corners lie {check.rms:.2g} px off their places, rms; a flat board, a"
             " sharp photograph and the right camera file leave a tenth of a pixel."
+        )
+        texts.append((Level.DOUBTFUL, text))
+    if check.unseen:
+        text = (
+            f"{check.unseen.capitalize()} of the board's corners is in no photograph: does the"
+            " board have as many squares as its file says?"
         )
         texts.append((Level.DOUBTFUL, text))
     if session.board_body == "base" and check.found == 1 and len(station.photographs) > 1:

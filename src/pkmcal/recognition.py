@@ -27,6 +27,7 @@ WORKERS = 2
 
 MOST = 0.5
 """Share of the configurations that the drawing has to reach for the rest to be believed."""
+ALMOST_ALL = 0.9
 MOST_TURN = 90.0
 """degrees"""
 
@@ -117,28 +118,46 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
 def _check_signs(session: Session, bad: list[str]) -> None:
     """Raise `InputError` where one motor's readings with the other sign would close all loops."""
     machine = session.machine
+    now = _taken(session, session.joints)
     for column, name in enumerate(session.document["joints"]["columns"]):
         turned = session.joints * np.where(np.arange(machine.n_joints) == column, -1.0, 1.0)
-        if machine.forward_result(turned).converged.all():
+        if _taken(session, turned) > max(ALMOST_ALL, now):
             raise InputError(
                 f"the readings of {name} have the wrong sign",
                 where=f"{session.document['joints']['file']}, column {name}",
-                found=f"readings at which the legs do not meet the platform, in configuration"
-                f" {listed(bad)}",
-                expected="the other sign of this column, with which they meet everywhere",
+                found=f"readings that the machine cannot take in configuration {listed(bad)}",
+                expected="the other sign of this column, with which its legs meet the platform",
                 next_step="Turn the sign of this column round, or the axis in the mechanism file",
             )
 
 
+def _taken(session: Session, joints: Array) -> float:
+    """Share of the readings (K, m) that the drawing's machine can take."""
+    found = session.machine.forward_result(joints)
+    turn = _turn(found.T_base_platform) if _folds(session) else np.zeros(len(joints))
+    return float(np.mean(found.converged & (np.abs(turn) <= MOST_TURN)))
+
+
+def _folds(session: Session) -> bool:
+    """Whether the platform has side bars that allow no more than a quarter turn."""
+    joints = {leg.platform.joint for leg in session.machine.document.legs}
+    return bool(joints & {"bar", "hinged-bar"})
+
+
+def _turn(poses: Array) -> Array:
+    """Turns (K,) about z, degrees."""
+    return np.rad2deg(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+
+
 def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
     """Raise `InputError` where an articulated platform would turn by more than its bars allow."""
-    joints = {leg.platform.joint for leg in session.machine.document.legs}
-    if not joints & {"bar", "hinged-bar"}:
+    if not _folds(session):
         return
-    turn = np.rad2deg(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    turn = _turn(poses)
     bad = np.flatnonzero((np.abs(turn) > MOST_TURN) & usable)
     if not bad.size:
         return
+    _check_signs(session, [session.configurations[k] for k in bad])
     worst = bad[np.argmax(np.abs(turn[bad]))]
     raise InputError(
         "the readings turn the platform beyond 90 degrees, where its side bars lie on each other",

@@ -329,10 +329,8 @@ def _explained(look: _Look, rows: Array, groups: Groups) -> float:
 
     def share(turn: Array) -> float:
         fit = fit_motions(turn, rows, whiten, groups)
-        return float(fit.explained.sum() / fit.total.sum())
+        return float(fit.explained.sum() / max(fit.total.sum(), 1e-300))
 
-    if not look.turn.any():
-        return 0.0
     shuffled = [share(look.turn[look.same.exchanged(rng)]) for _ in range(SHUFFLES)]
     chance = float(np.mean(shuffled))
     return (share(look.turn) - chance) / (1 - chance) if chance < TELLING else 0.0
@@ -374,8 +372,9 @@ _CAUSES = {
 
 def _findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
     """What each station's repeats say, and what more of them would bring."""
-    found = [_finding(station) for station in stations]
-    if all(station.promised < MOSTLY_COMMON for station in stations):
+    nothing = "No edge shows in two photographs of one configuration: nothing tells the scatter."
+    found = [_finding(s) for s in stations] or [Finding(Level.DOUBTFUL, nothing)]
+    if stations and all(station.promised < MOSTLY_COMMON for station in stations):
         text = (
             "What the repeats have in common, such as shading, is most of an edge's error: more"
             " repeats will hardly help, more configurations will."

@@ -134,7 +134,7 @@ def _validate(
         progress=lambda text, share: told(text, 0.8 * share),
     )
     told("Predicting the readings", 0.8)
-    drawing = saved.machine.with_values(saved.drawing)
+    drawing = drawing_of(saved)
     found = predict(saved.machine, looked.measurements, looked.estimate.state)
     new = np.flatnonzero(found.seen & ~known)
     judged = _judged(saved, drawing, looked, found, new) if new.size else None
@@ -152,6 +152,16 @@ def _validate(
         paths=tuple(_path(*line, drawing, session, found) for line in lines),
         timings={**looked.timings, "all": time.perf_counter() - began},
     )
+
+
+def drawing_of(saved: SavedCalibration) -> Machine:
+    """The machine as drawn: its values, and where the drawing holds an estimate.
+
+    A calibration read back has its own values for a drawing; regions would be held out of an
+    estimate that is held to what they told.
+    """
+    table = replace(saved.machine.parameters, drawing=saved.drawing.copy())
+    return replace(saved.machine, parameters=table, values=saved.drawing.copy())
 
 
 def _judged(

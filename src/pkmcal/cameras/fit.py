@@ -226,7 +226,7 @@ def covariance_of(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
         whole[np.ix_(fit.free, fit.free)] = part
     q, r = own_factors(linear.by_own, np.zeros(1))
     rows = linear.by_own.shape[-2]
-    inner = np.linalg.inv(r[0] + 1e-300 * np.eye(6))
+    inner = np.linalg.inv(r[0] + 1e-150 * np.eye(6))
     by = np.zeros((len(fit.T_camera_board), 6, n))
     if len(fit.free):
         by[..., fit.free] = -inner @ (transposed(q[0, :, :rows]) @ linear.by_shared[0])

@@ -53,6 +53,9 @@ def simulate(
     board: Annotated[
         bool, typer.Option("--board", help="A board on the base, which joins the stations.")
     ] = False,
+    on_platform: Annotated[
+        bool, typer.Option("--on-platform", help="The board on the platform instead.")
+    ] = False,
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
@@ -69,6 +72,7 @@ def simulate(
         )  # fmt: skip
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
     machine = load_mechanism(mechanism, label=None)
+    place = "platform" if on_platform else "base"
     settings = Settings(
         stations=stations,
         configurations=configurations,
@@ -76,7 +80,8 @@ def simulate(
         tolerance=tolerance,
         joint_noise=joint_noise,
         sensor=Sensor(blur=blur, read_noise=noise),
-        board=board_for(machine) if board else None,
+        board=board_for(machine, place) if board or on_platform else None,
+        board_on=place,
         repeats=repeats,
     )
     with console.progress() as told:
@@ -90,12 +95,13 @@ def simulate(
         )
         return 0
     out = console.out()
+    places = "1 place" if stations == 1 else f"{stations} places"
     console.print_points(
         out,
         [
             (
                 console.MARKS["good"],
-                f"{count} photographs of {machine.name} from {stations} places in {folder}; the"
+                f"{count} photographs of {machine.name} from {places} in {folder}; the"
                 " truth is in its truth.json, which no calibration reads.",
             )
         ],

@@ -295,7 +295,7 @@ def _merged(parts: list[_Part]) -> list[_Part]:
 
 
 def _stacked(a: Array, b: Array) -> Array:
-    """Rows of both: legs of one kind may have different numbers (of tubes, with a length or not)."""
+    """Rows of both; legs may differ in their numbers: of tubes, and passive ones have no length."""
     width = max(a.shape[1], b.shape[1])
     return np.concatenate([np.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (a, b)])
 

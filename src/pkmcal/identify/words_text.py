@@ -320,9 +320,7 @@ def _leg(told: _Told) -> str:
     where = f"of the values of {told.whose}, {_count(_dims(told))} combination"
     where += "" if _dims(told) == 1 else "s"
     each = " each" if told.several else ""
-    return f"{where}{each} {told.open(_dims(told) > 1)}, mostly of " + _listed(
-        told.names
-    )
+    return f"{where}{each} {told.open(_dims(told) > 1)}, mostly of " + _listed(told.names)
 
 
 def _slides_text(told: _Told) -> str:

@@ -123,7 +123,8 @@ class ParameterTable:
         elif len({name for m in members for name, _ in m}) < sum(len(m) for m in members):
             what = "a parameter is tied to itself"
         if what:
-            raise InputError(what, found=", ".join(group), expected="entries of one kind, each once")
+            found = ", ".join(group)
+            raise InputError(what, found=found, expected="entries of one kind, each once")
         if True in axes:
             self._check_parallel(group, members)
         return [list(tie) for tie in zip(*members, strict=True)]

@@ -20,6 +20,7 @@ from pkmcal.geometry.rigid import apply, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.board_finders import dictionary, marker_bits
 from pkmcal.observe.boards import Board, board_from_document
+from pkmcal.session_schema import Body
 from pkmcal.simulate.casting import Part
 from pkmcal.simulate.scene import Discs, Finish, discs_of, machine_parts
 from pkmcal.simulate.shapes import Box, Shape, turned
@@ -33,6 +34,8 @@ SQUARES = (6, 5)
 """Of the board made to measure: large squares are read from afar."""
 SIZE = 1.4
 """Diagonal of that board with its margin, in radii of the base."""
+ON_PLATFORM = 2.0
+"""Diagonal of a board on the platform with its margin, in radii of that."""
 LOOKED_AT = 6
 """Configurations at which the places for a board are tried."""
 SLANTED = 0.6
@@ -176,9 +179,12 @@ def board_part(board: Board, T_base_board: Array) -> Part:
     return Part(sheet, Material(0.75, Printed(sheet.print)))
 
 
-def board_for(machine: Machine) -> Board:
-    """A ChArUco board in proportion to the machine, its diagonal SIZE radii of the base."""
-    diagonal = SIZE * discs_of(machine).base_radius
+def board_for(machine: Machine, on: Body = "base") -> Board:
+    """A ChArUco board in proportion to the machine, its diagonal SIZE radii of the base, or
+    ON_PLATFORM radii of the platform.
+    """
+    discs = discs_of(machine)
+    diagonal = SIZE * discs.base_radius if on == "base" else ON_PLATFORM * discs.platform_radius
     square = round(diagonal / float(np.hypot(SQUARES[0] + 1, SQUARES[1] + 1)), 3)
     return board_from_fields(
         {
@@ -238,6 +244,64 @@ def place_board(
             next_step="put the stations higher, or use a wider lens",
         )
     return places[best]
+
+
+def place_on_platform(
+    machine: Machine,
+    board: Board,
+    cameras: tuple[Camera, ...],
+    T_camera_base: Array,
+    T_base_platform: Array,
+    joints: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """T_platform_board (4, 4): on a bracket above the platform's plate, leaning to where the
+    stations see it best; arguments as of :func:`place_board`.
+    """
+    discs = discs_of(machine)
+    few = np.unique(np.linspace(0, len(joints) - 1, LOOKED_AT).astype(int))
+    finish = Finish.from_noise(SmoothNoise.from_rng(rng))
+    scenes = [
+        (k, machine_parts(machine, discs, finish, T_base_platform[k], joints[k])) for k in few
+    ]
+    places = _brackets(board, discs, rng)
+    seen = np.array(
+        [
+            min(
+                np.mean([_share_seen(board, T, parts, eye, T_base_platform[k] @ place)
+                         for k, parts in scenes])
+                for eye, T in zip(cameras, T_camera_base, strict=True)
+            )
+            for place in places
+        ]
+    )  # fmt: skip
+    best = int(np.argmax(seen))
+    if seen[best] < LEAST_SEEN:
+        raise GeometryError(
+            "there is no place on the platform where all stations see the board",
+            found=f"{seen[best]:.0%} of its corners at most",
+            expected=f"{LEAST_SEEN:.0%}",
+            next_step="put the stations on one side of the machine, or use one",
+        )
+    return places[best]
+
+
+def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
+    """Boards above the platform's plate, their faces away from the base and to all sides."""
+    low, high = board.points.min(axis=0), board.points.max(axis=0)
+    reach = 0.6 * float(np.linalg.norm(high - low))
+    up = np.array([0.0, 0.0, discs.platform_side])
+    out: list[Array] = []
+    for way, lean in product(2 * np.pi * (np.arange(12) + rng.random()) / 12, (0.3, 0.8, 1.3)):
+        side = np.array([np.cos(way), np.sin(way), 0.0])
+        into = -(np.cos(lean) * up + np.sin(lean) * side)
+        right = np.cross(up, into)
+        right = right / np.linalg.norm(right)
+        rot = np.stack([right, np.cross(into, right), into], axis=-1)
+        rot = rotation(rng.normal(0, 0.05, 3)) @ rot
+        centre = discs.platform + (discs.thickness + np.sin(lean) * reach + 0.01) * up
+        out.append(pose(rot, centre - rot @ ((low + high) / 2)))
+    return out
 
 
 def _lying(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:

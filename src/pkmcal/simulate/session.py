@@ -17,6 +17,7 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import csv_text, staged_folder, yaml_text
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
+from pkmcal.observe.boards import Board
 from pkmcal.simulate.board import board_part
 from pkmcal.simulate.casting import Part
 from pkmcal.simulate.render import Sensor, View, photograph, render
@@ -64,6 +65,7 @@ class Studio:
     views: tuple[View, ...]
     sensor: Sensor
     fixed: tuple[Part, ...] = ()
+    board: Board | None = None
 
     @classmethod
     def of(cls, truth: Truth, cameras: Sequence[Camera], settings: Settings) -> Studio:
@@ -80,7 +82,7 @@ class Studio:
         if settings.board is not None and truth.T_base_board is not None:
             fixed = (board_part(settings.board, truth.T_base_board),)
         finish = Finish.from_noise(noise, flat=truth.machine.document.motion == "planar")
-        return cls(truth, discs, finish, room, views, settings.sensor, fixed)
+        return cls(truth, discs, finish, room, views, settings.sensor, fixed, settings.board)
 
     def photographs(self, index: int, shake: tuple[float, float] = (0.0, 0.0)) -> list[Integers]:
         """The repeats (8 bits, (H, W)) of the session's photograph number ``index``.
@@ -104,6 +106,9 @@ class Studio:
         station, k = self.truth.photographs[index]
         poses, joints = self.truth.T_base_platform, self.truth.joints
         parts = machine_parts(self.truth.machine, self.discs, self.finish, poses[k], joints[k])
+        on_platform = self.truth.T_platform_board
+        if on_platform is not None and self.board is not None:
+            parts = [*parts, board_part(self.board, poses[k] @ on_platform)]
         scene = self.room.with_machine([*parts, *self.fixed])
         return render(scene, self.views[station], T_camera_base, rng)
 
@@ -188,7 +193,7 @@ def _session_document(
             name: {
                 "camera": camera_files[name],
                 "images": f"images/{name}/{name_of}.png",
-                "observe": ["legs", "board"] if board else "legs",
+                "observe": list(settings.observe) if board else "legs",
                 "pose": {
                     "position": list(pose.position),
                     "look_at": list(pose.look_at),
@@ -197,7 +202,7 @@ def _session_document(
             }
             for name, pose in zip(truth.stations, truth.rough, strict=True)
         },
-        **({"board": {"file": "board.yaml", "fixed_to": "base"}} if board else {}),
+        **({"board": {"file": "board.yaml", "fixed_to": settings.board_on}} if board else {}),
     }
 
 

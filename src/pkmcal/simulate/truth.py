@@ -21,7 +21,8 @@ from pkmcal.files import read_text
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.boards import Board
-from pkmcal.simulate.board import place_board
+from pkmcal.session_schema import Body
+from pkmcal.simulate.board import place_board, place_on_platform
 from pkmcal.simulate.configurations import draw_configurations
 from pkmcal.simulate.render import Sensor
 from pkmcal.simulate.stations import StationPose, default_stations, rough_pose, share_in_image
@@ -39,7 +40,8 @@ class Settings:
     tolerance : true values differ from the drawing by this many times its tolerances.
     joint_noise : standard deviation of a reading, m. rough_position, rough_angle : by how much
     the session's station poses are off, m and rad. extreme : share of configurations with legs
-    near the ends of their ranges. board : fixed to the base, seen by every station. repeats :
+    near the ends of their ranges. board : seen by every station, fixed to ``board_on``. observe :
+    what the session says of the stations that see one. repeats :
     photographs of each configuration from each station, with sensor noise of their own. shake :
     standard deviations (m, rad) by which the camera moves between them.
     """
@@ -54,6 +56,8 @@ class Settings:
     extreme: float = 0.5
     sensor: Sensor = field(default_factory=Sensor)
     board: Board | None = None
+    board_on: Body = "base"
+    observe: tuple[str, ...] = ("legs", "board")
     repeats: int = 1
     shake: tuple[float, float] = (0.0, 0.0)
 
@@ -71,7 +75,7 @@ class Truth:
     T_camera_base : (S, 4, 4). rough : poses written into the session.
     T_base_platform : (K, 4, 4). joints : (K, m) exact readings. readings : (K, m) with noise.
     photographs : (M, 2) station and configuration of each photograph. seed : of everything.
-    T_base_board : (4, 4) of the board, where there is one. repeats : photographs of each pair.
+    T_base_board, T_platform_board : (4, 4) of the board, where there is one. repeats : photographs of each pair.
     """
 
     machine: Machine
@@ -86,6 +90,7 @@ class Truth:
     seed: int
     T_base_board: Array | None = None
     repeats: int = 1
+    T_platform_board: Array | None = None
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
@@ -127,6 +132,11 @@ def draw_truth(
     T_base_platform, joints, photographs = _configurations(
         machine, cameras, T_camera_base, settings, rngs["configurations"]
     )
+    board = None
+    if settings.board is not None:
+        place = place_board if settings.board_on == "base" else place_on_platform
+        seen = (T_camera_base, T_base_platform, joints, rngs["board"])
+        board = place(machine, settings.board, cameras, *seen)
     noise = settings.joint_noise * rngs["readings"].standard_normal(joints.shape)
     return Truth(
         machine=machine,
@@ -139,12 +149,9 @@ def draw_truth(
         readings=joints + noise,
         photographs=photographs,
         seed=seed,
-        T_base_board=None
-        if settings.board is None
-        else place_board(
-            machine, settings.board, cameras, T_camera_base, T_base_platform, joints, rngs["board"]
-        ),
+        T_base_board=board if settings.board_on == "base" else None,
         repeats=settings.repeats,
+        T_platform_board=board if settings.board_on == "platform" else None,
     )
 
 
@@ -225,6 +232,11 @@ def truth_document(truth: Truth) -> dict[str, Any]:
             [truth.stations[s], truth.configurations[k]] for s, k in truth.photographs.tolist()
         ],
         **({} if truth.T_base_board is None else {"T_base_board": truth.T_base_board.tolist()}),
+        **(
+            {}
+            if truth.T_platform_board is None
+            else {"T_platform_board": truth.T_platform_board.tolist()}
+        ),
         **({"repeats": truth.repeats} if truth.repeats > 1 else {}),
     }
 
@@ -257,6 +269,7 @@ def load_truth(folder: Path | str, drawing: Machine) -> Truth:
         seed=data["seed"],
         T_base_board=np.array(data["T_base_board"]) if "T_base_board" in data else None,
         repeats=data.get("repeats", 1),
+        T_platform_board=np.array(data["T_platform_board"]) if "T_platform_board" in data else None,
     )
 
 

@@ -1,0 +1,159 @@
+"""A board on the platform, rendered: calibrated alone and with the legs, no pose by hand."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+
+from conftest import run
+from pkmcal.calibration import calibrate
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import apply, inverse, pose_difference, register
+from pkmcal.recognition import boards_of, read_photographs
+from pkmcal.session import load_session
+from pkmcal.simulate import load_truth
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """One station, ten configurations, by the command; nobody writes into it."""
+    folder = tmp_path_factory.mktemp("platform") / "session"
+    done = run(
+        "simulate", folder, "--on-platform", "--stations", "1", "--configurations", "10",
+        "--size", "640x480",
+    )  # fmt: skip
+    assert done.code == 0
+    return folder
+
+
+@pytest.fixture
+def folder(rendered, tmp_path):
+    """A copy to spoil, without the truth and without a pose by hand."""
+    shutil.copytree(rendered, tmp_path / "session")
+    (tmp_path / "session" / "truth.json").unlink()
+    change(tmp_path / "session", lambda station: station.pop("pose"))
+    return tmp_path / "session"
+
+
+def change(folder, what):
+    """Change the one station of session.yaml."""
+    path = folder / "session.yaml"
+    document = yaml.safe_load(path.read_text())
+    what(document["stations"]["station1"])
+    path.write_text(yaml.safe_dump(document))
+
+
+def off(result, truth):
+    """Platform's places at the configurations, root mean square distance from the true ones."""
+    found = result.machine.forward(truth.joints)[:, :3, 3]
+    there = truth.T_base_platform[:, :3, 3]
+    return np.sqrt(np.mean(np.sum((apply(register(found, there), found) - there) ** 2, axis=1)))
+
+
+def test_boards_are_where_they_are(rendered):
+    session = load_session(rendered)
+    truth = load_truth(rendered, session.machine)
+    poses = boards_of(session, read_photographs(session)).poses
+    there = truth.T_camera_base[0] @ truth.T_base_platform @ truth.T_platform_board
+    error = pose_difference(poses.T_station_target, there[poses.configuration])
+    z2 = np.sum(np.einsum("nij,nj->ni", poses.whiten, error) ** 2, axis=1)
+    assert len(poses) > 7
+    assert np.all(z2 < 30)  # six squares each; one in twenty thousand
+
+
+def test_legs_and_board_together_need_no_pose_by_hand(rendered, folder):
+    result = calibrate(folder)
+    truth = load_truth(rendered, result.session.machine)
+    s = result.estimate.statistics
+    assert s.n_edges > 100
+    assert s.n_poses > 40
+    drawn = result.session.machine.forward(truth.joints)[:, :3, 3]
+    there = truth.T_base_platform[:, :3, 3]
+    before = np.sqrt(np.mean(np.sum((apply(register(drawn, there), drawn) - there) ** 2, axis=1)))
+    assert off(result, truth) < 0.2 * before
+    # the camera from the board, in frames that do not matter
+    found = result.estimate.state
+    seen = found.T_camera_base[0] @ found.T_base_platform @ found.T_mount[0]
+    true = truth.T_camera_base[0] @ truth.T_base_platform @ truth.T_platform_board
+    error = pose_difference(seen, true)
+    assert np.sqrt(np.mean(error[:, 3:] ** 2)) < 5e-4
+    assert np.sqrt(np.mean(error[:, :3] ** 2)) < 2e-3
+
+
+def test_the_board_alone(folder):
+    change(folder, lambda station: station.update(observe="board"))
+    result = calibrate(folder)
+    assert len(result.observation.edges) == 0
+    assert result.estimate.statistics.pose_scale < 1.6
+    assert result.boards.stations[0].seen.usable.sum() > 7
+
+
+def test_the_board_alone_by_the_command(folder, tmp_path):
+    change(folder, lambda station: station.update(observe="board"))
+    done = run("calibrate", folder, "-o", tmp_path / "out")
+    assert done.code in (0, 1)
+    document = json.loads((tmp_path / "out" / "calibration.json").read_text())
+    assert document["targets"][0]["fixed_to"] == "platform"
+    assert document["residuals"]["edges"] == []
+    assert run("check", folder).code < 2
+
+
+def test_cameras_are_refined_with_the_board(rendered, folder):
+    """A focal length a two-hundredth wrong is drawn back by readings that tell distances."""
+    path = folder / "cameras" / "camera.yaml"
+    document = yaml.safe_load(path.read_text())
+    true = np.array(document["focal"])
+    document["focal"] = (1.005 * true).tolist()
+    n = len(load_session(rendered).stations[0].camera.parameters)
+    sigma = np.zeros(n)
+    sigma[:2] = 0.005 * true
+    document["covariance"] = np.diag(sigma**2).tolist()
+    path.write_text(yaml.safe_dump(document))
+    change(folder, lambda station: station.update(observe="board"))
+    held = calibrate(folder)
+    result = calibrate(folder, refine_camera=True)
+    camera = result.cameras.result(result.estimate, result.cameras.files[0])
+    assert np.all(np.abs(camera.parameters[:2] / true - 1) < 0.002)
+    assert np.all(np.sqrt(np.diag(camera.covariance))[:2] < 0.5 * sigma[:2])
+    scales = [r.estimate.statistics.chi2 for r in (held, result)]
+    assert scales[1] < scales[0]
+
+
+def test_a_photograph_of_another_configuration_is_let_go(folder):
+    images = folder / "images" / "station1"
+    names = sorted(path.name for path in images.iterdir())
+    shutil.copy(images / names[2], images / names[7])
+    change(folder, lambda station: station.update(observe="board"))
+    result = calibrate(folder)
+    lost = result.estimate.pose_weights < 0.5
+    assert result.observation.poses.configuration[lost].tolist() == [7]
+    assert any(
+        r.configuration == 7 and "board lies" in r.reason for r in result.observation.rejected
+    )
+
+
+def test_a_missing_board_file_and_another_camera(folder):
+    (folder / "board.yaml").rename(folder / "away.yaml")
+    with pytest.raises(InputError, match="there is no such file") as caught:
+        load_session(folder)
+    assert "session.yaml, line" in str(caught.value)
+    (folder / "away.yaml").rename(folder / "board.yaml")
+    path = folder / "cameras" / "camera.yaml"
+    path.write_text(path.read_text().replace("[640, 480]", "[800, 600]"))
+    with pytest.raises(InputError, match="another size than its camera"):
+        load_session(folder)
+
+
+def test_inverse_of_a_known_station_is_told(rendered):
+    """The truth's own frames: a check on the simulator."""
+    session = load_session(rendered)
+    truth = load_truth(rendered, session.machine)
+    eye = inverse(truth.T_camera_base[0])[:3, 3]
+    centre = truth.T_base_platform[:, :3, 3].mean(axis=0)
+    board = (truth.T_base_platform @ truth.T_platform_board)[:, :3, 2]
+    # the board's z points into it, away from who looks at it
+    assert np.all(board @ (centre - eye) > 0)
