@@ -12,7 +12,8 @@ import yaml
 from conftest import run
 from pkmcal.calibration import calibrate
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import apply, inverse, pose_difference, register
+from pkmcal.geometry.rigid import inverse, pose_difference
+from pkmcal.identify.hand_eye import solve_pairs
 from pkmcal.recognition import boards_of, read_photographs
 from pkmcal.session import load_session
 from pkmcal.simulate import load_truth
@@ -49,9 +50,15 @@ def change(folder, what):
 
 def off(result, truth):
     """Platform's places at the configurations, root mean square distance from the true ones."""
-    found = result.machine.forward(truth.joints)[:, :3, 3]
-    there = truth.T_base_platform[:, :3, 3]
-    return np.sqrt(np.mean(np.sum((apply(register(found, there), found) - there) ** 2, axis=1)))
+    return apart(result.machine, truth)
+
+
+def apart(machine, truth):
+    """The same of any machine, after the best fit of both frames."""
+    found, there = machine.forward(truth.joints), truth.T_base_platform
+    frames = solve_pairs(found[None], there[None], 0.3)
+    error = frames.T_camera_base[0] @ found @ frames.T_mount[0] - there
+    return np.sqrt(np.mean(np.sum(error[:, :3, 3] ** 2, axis=-1)))
 
 
 def test_boards_are_where_they_are(rendered):
@@ -71,10 +78,7 @@ def test_legs_and_board_together_need_no_pose_by_hand(rendered, folder):
     s = result.estimate.statistics
     assert s.n_edges > 100
     assert s.n_poses > 40
-    drawn = result.session.machine.forward(truth.joints)[:, :3, 3]
-    there = truth.T_base_platform[:, :3, 3]
-    before = np.sqrt(np.mean(np.sum((apply(register(drawn, there), drawn) - there) ** 2, axis=1)))
-    assert off(result, truth) < 0.2 * before
+    assert off(result, truth) < 0.2 * apart(result.session.machine, truth)
     # the camera from the board, in frames that do not matter
     found = result.estimate.state
     seen = found.T_camera_base[0] @ found.T_base_platform @ found.T_mount[0]
@@ -114,25 +118,22 @@ def test_cameras_are_refined_with_the_board(rendered, folder):
     document["covariance"] = np.diag(sigma**2).tolist()
     path.write_text(yaml.safe_dump(document))
     change(folder, lambda station: station.update(observe="board"))
-    held = calibrate(folder)
     result = calibrate(folder, refine_camera=True)
     camera = result.cameras.result(result.estimate, result.cameras.files[0])
-    assert np.all(np.abs(camera.parameters[:2] / true - 1) < 0.002)
-    assert np.all(np.sqrt(np.diag(camera.covariance))[:2] < 0.5 * sigma[:2])
-    scales = [r.estimate.statistics.chi2 for r in (held, result)]
-    assert scales[1] < scales[0]
+    spread = np.sqrt(np.diag(camera.covariance))[:2]
+    assert np.all(spread < 0.5 * sigma[:2])
+    assert np.all(np.abs(camera.parameters[:2] - true) < 4 * spread)
 
 
 def test_a_photograph_of_another_configuration_is_let_go(folder):
     images = folder / "images" / "station1"
     names = sorted(path.name for path in images.iterdir())
-    shutil.copy(images / names[2], images / names[7])
-    change(folder, lambda station: station.update(observe="board"))
+    shutil.copy(images / names[3], images / names[5])
     result = calibrate(folder)
     lost = result.estimate.pose_weights < 0.5
-    assert result.observation.poses.configuration[lost].tolist() == [7]
+    assert result.observation.poses.configuration[lost].tolist() == [5]
     assert any(
-        r.configuration == 7 and "board lies" in r.reason for r in result.observation.rejected
+        r.configuration == 5 and "board lies" in r.reason for r in result.observation.rejected
     )
 
 

@@ -10,14 +10,13 @@ import pytest
 
 from conftest import run
 from pkmcal.check import (
-    JointCheck,
     Level,
     StationCheck,
-    _joint_findings,
     _kinematics,
     _station_findings,
     check_session,
 )
+from pkmcal.check_joints import JointCheck, joint_findings
 from pkmcal.session import load_session
 
 GOOD = StationCheck("front", 15, True, 0.2, 0.04, 0.08, 5.5, 0.05, 0.01, 0.8)
@@ -164,7 +163,7 @@ def test_crowded_and_few_configurations(demo):
         JointCheck("leg1", 0.4, 0.41, 0.07, (0, 0)),
         JointCheck("leg2", 0.35, 0.48, 0.9, (3, 3)),
     )
-    found = _joint_findings(replace(session, configurations=("a", "b")), joints)
+    found = joint_findings(replace(session, configurations=("a", "b")), joints)
     assert [finding.level for finding in found] == [Level.NOTE] * 2
     assert found[0].text.startswith("leg1 used little of the range (down to 7%)")
     assert found[1].text.startswith("There are only 2 configurations")

@@ -110,6 +110,18 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path, monke
     assert "outputs cannot go here" in done.err
 
 
+def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, found):
+    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda *_: pytest.fail("worked first"))
+    (tmp_path / "thesis.tex").write_text("mine")
+    done = run("reproduce", "a", "-o", tmp_path)
+    assert done.code == 2
+    assert "something other than reproductions; found thesis.tex" in done.err
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    (tmp_path / "thesis.tex").rename(tmp_path / "paper-c.json")  # an earlier one of another paper
+    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda *_: found)
+    assert run("reproduce", "a", "-o", tmp_path).code == 0
+
+
 def test_every_paper_of_the_command_has_its_module():
     from importlib import import_module
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from pkmcal.errors import InputError
+from pkmcal.files import read_csv
+from pkmcal.readings import check_readings
 from pkmcal.session import load_session
 
 SESSION = """\
@@ -314,15 +316,21 @@ def scaled(factor):
     return header
 
 
-@pytest.mark.parametrize(
-    ("factor", "unit", "step"),
-    [(1e3, "millimetres", "Divide them by 1000"), (180 / np.pi, "degrees", "Multiply them by")],
-)
-def test_another_unit(folder, factor, unit, step):
-    (folder / "joints.csv").write_text(scaled(factor))
+def test_lengths_in_millimetres(folder):
+    (folder / "joints.csv").write_text(scaled(1e3))
     message = fault(folder)
-    assert f"joints.csv, line 2, column leg1: the readings look like {unit}" in message
-    assert step in message
+    assert "joints.csv, line 2, column leg1: the readings look like millimetres" in message
+    assert "Divide them by 1000" in message
+
+
+def test_motors_in_degrees(folder):
+    """Only what turns can be in degrees; a leg's length as large is merely out of range."""
+    (folder / "joints.csv").write_text(scaled(180 / np.pi))
+    assert "this reading is outside the machine's range" in fault(folder)
+    table = read_csv(folder / "joints.csv", label="joints.csv")
+    ranges = np.tile([0.345, 0.485], (len(table.columns), 1))
+    with pytest.raises(InputError, match="line 2, column leg1: the readings look like degrees"):
+        check_readings(table, ranges, 1e-5, ["rad"] * len(table.columns))
 
 
 def test_one_reading_in_millimetres_is_a_mistake_of_its_own(folder):

@@ -127,7 +127,8 @@ def _calibrate(
     else:
         turns = identify_poses(session, boards, known, cameras, told)
     clock.lap("identify")
-    check_poses(session, turns.measurements, turns.estimate)
+    richer = richer_models(session, turns.measurements, turns.estimate)
+    check_poses(session, turns.measurements, turns.estimate, richer)
     whole = turns.measurements
     out = chosen(session.machine, turns.estimate, holdout) if holdout else None
     turns = set_aside(session.machine, turns, out) if out else turns
@@ -137,7 +138,6 @@ def _calibrate(
         estimate = by_paper(method, session.machine, turns.measurements, estimate, seed)
     told("Judging", 0.95)
     findings = _findings(turns.measurements, estimate)
-    richer = richer_models(session, turns.measurements, turns.estimate)
     unseen = len(out.rows) if out else 0
     verdict = judge(
         turns.observation,

@@ -36,11 +36,11 @@ def _fit(session: Session, boards: Boards) -> list[Finding]:
     known = with_poses(session, boards, known_stations(session, boards))
     cameras = refinement_of(session, refine=False)
     turns = identify_poses(session, boards, known, cameras, lambda _text, _share: None)
-    check_poses(session, turns.measurements, turns.estimate)
+    richer = richer_models(session, turns.measurements, turns.estimate)
+    check_poses(session, turns.measurements, turns.estimate, richer)
     scale = turns.estimate.statistics.pose_scale
     if scale <= POOR:
         return []
-    richer = richer_models(session, turns.measurements, turns.estimate)
     better = min(richer, key=lambda model: model.scale, default=None)
     told = f" With --model {better.name} it is {better.scale:.2f} times." if better else ""
     text = f"The machine explains the measured poses only to {scale:.1f} times their noise.{told}"

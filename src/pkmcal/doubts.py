@@ -7,15 +7,23 @@ import numpy as np
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.pose_doubts import Doubt, find_doubt, in_doubt, wrong_scale
+from pkmcal.identify.pose_doubts import BAD, Doubt, find_doubt, in_doubt, wrong_scale
 from pkmcal.identify.problem import Estimate, Measurements
 from pkmcal.identify.verdict import POOR, RicherModel
 from pkmcal.session import Session
 
 
-def check_poses(session: Session, measurements: Measurements, estimate: Estimate) -> None:
-    """Raise `InputError` where one of the usual mistakes explains why poses do not fit."""
-    if not in_doubt(estimate):
+def check_poses(
+    session: Session,
+    measurements: Measurements,
+    estimate: Estimate,
+    richer: tuple[RicherModel, ...] = (),
+) -> None:
+    """Raise `InputError` where one of the usual mistakes explains why poses do not fit.
+
+    richer : models that were tried; where one of them fits, it is the model that is at fault.
+    """
+    if not in_doubt(estimate) or any(model.scale < BAD for model in richer):
         return
     doubt = find_doubt(session.machine, measurements, estimate)
     if doubt is not None:

@@ -41,8 +41,8 @@ TOO_LARGE = 30.0
 class PoseTable:
     """A tracker's measurements.
 
-    name : of the station. kind : of the table. configuration : (N,) rows of the session's readings. T : (N, 4, 4)
-    T_tracker_target; a point's turn, and all but a height's z, mean nothing.
+    name : of the station. kind : of the table. configuration : (N,) rows of the session's readings.
+    T : (N, 4, 4) T_tracker_target; a point's turn, and all but a height's z, mean nothing.
     position, rotation : standard deviations, m and rad.
     """
 

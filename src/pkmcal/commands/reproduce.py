@@ -48,11 +48,10 @@ def reproduce(
     as_json: console.Json = False,
 ) -> int:
     """Compute the papers' tables and figures again."""
-    from pkmcal.files import check_writable
     from pkmcal.reproduce import Options
     from pkmcal.reproduce import reproduce as computed
 
-    check_writable(out)
+    check_output(out)
     wanted = list(dict.fromkeys(papers or list(Paper)))
     with console.progress(as_json) as told:
         options = Options(runs, seed, long, photographs, told)
@@ -68,6 +67,25 @@ def reproduce(
         tell(terminal, one)
     console.print_files(terminal, [(path, WHAT[Path(path).suffix]) for path in files])
     return code
+
+
+def check_output(folder: Path) -> None:
+    """Raise `InputError` where the folder holds something other than reproductions."""
+    from pkmcal.errors import InputError
+    from pkmcal.files import check_writable, listed
+
+    check_writable(folder)
+    entries = sorted(e.name for e in folder.iterdir()) if folder.is_dir() else []
+    ours = {f"paper-{paper.value}{ending}" for paper in Paper for ending in WHAT}
+    foreign = [name for name in entries if name not in ours]
+    if foreign:
+        raise InputError(
+            "the output folder holds something other than reproductions",
+            where=str(folder),
+            found=listed(foreign, 4),
+            expected="a new or empty folder, or earlier reproductions to replace",
+            next_step="Name another folder with -o, or move these files away",
+        )
 
 
 def save(found: list[Reproduction], folder: Path) -> list[str]:

@@ -225,7 +225,7 @@ def _data(
     basis[0, row, place, 0] = edges.basis
     whiten[0, row, place] = np.linalg.inv(np.linalg.cholesky(edges.covariance))
     optics[0, row, place, :, 0] = edges.shift
-    if factor.shape[-1]:
+    if factor.shape[-1] and len(edges):
         # the measured normals move with the intrinsics; residuals are predicted less measured
         camera = measurements.camera_of_station[edges.station]
         optics[0, row, place, :, 1:] = -edges.by_intrinsics @ factor[camera]

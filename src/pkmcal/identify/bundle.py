@@ -44,7 +44,7 @@ LEAST_SCALE = 1.0
 """The stated noise is never believed to be too large. What moves several edges alike (shading,
 lens) is partly taken up by the parameters, so residuals come out smaller than errors are: scaling
 down by them would promise too much."""
-ROUNDS = 4
+ROUNDS = 12
 
 
 @dataclass(frozen=True)

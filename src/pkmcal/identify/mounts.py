@@ -8,6 +8,10 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import inverse, pose
 from pkmcal.identify.problem import Measurements
 
+TURNS = 15
+ALIKE = 1e-4
+"""rad, about; turns that differ by less are one."""
+
 
 def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array) -> Array:
     """T_mount (M, 4, 4) from the measured poses, the stations' and the platform's.
@@ -23,9 +27,16 @@ def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array)
 
 
 def mean_pose(poses: Array) -> Array:
-    """The pose (4, 4) nearest to poses (n, 4, 4); the identity of none."""
+    """The pose (4, 4) nearest to poses (n, 4, 4), a few wrong ones forgiven; the identity of none.
+
+    The turn with the least sum of distances, as the median has it of numbers (Weiszfeld).
+    """
     if not len(poses):
         return np.eye(4)
-    u, _, vt = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    rot = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    weight, rot = np.ones(len(poses)), np.eye(3)
+    for _ in range(TURNS):
+        u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weight, poses[:, :3, :3]))
+        rot = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        apart = np.linalg.norm(poses[:, :3, :3] - rot, axis=(1, 2))
+        weight = 1 / np.maximum(apart, ALIKE)
     return pose(rot, np.median(poses[:, :3, 3], axis=0))

@@ -57,15 +57,24 @@ class Doubt:
 
 
 def misfit(estimate: Estimate) -> float:
-    """How far off the poses are, in their standard deviations; those given up count as well."""
+    """How far off the poses are, in their standard deviations, root mean square of the better
+    BELIEVED of them, given up or not: outliers of another cause should hide nothing.
+    """
     error = estimate.pose_residuals * estimate.statistics.pose_scale
-    return float(np.sqrt(np.mean(np.minimum(error**2, MOST**2)))) if error.size else 0.0
+    if not error.size:
+        return 0.0
+    each = np.sort(np.mean(error**2, axis=1))
+    return float(np.sqrt(np.mean(each[: max(int(np.ceil(BELIEVED * len(each))), 1)])))
 
 
 SURE = 1.5
 """Standard deviations that a mistake put right leaves, below which no other is tried."""
-MOST = 100.0
-"""Standard deviations that a residual counts for at most."""
+BELIEVED = 0.85
+"""Share of the poses that a mistake put right has to explain."""
+CERTAIN = 12.0
+"""Standard deviations by which a board has to have moved, all six numbers together."""
+ENOUGH = 4.0
+"""Standard deviations that it may leave: a drawing's own errors are in them."""
 
 
 def in_doubt(estimate: Estimate) -> bool:
@@ -115,7 +124,7 @@ def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate)
         # a board that moved and a camera that moved are alike, so both are always tried
         if found.misfit < SURE and doubt.kind not in ("board moved", "camera moved"):
             break
-    return found if found and found.misfit < max(CURED * before, 1.2) < before else None
+    return found if found and found.misfit < min(CURED * before, ENOUGH) else None
 
 
 def _signs(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
@@ -180,7 +189,9 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
                 state, T_mount=np.concatenate([state.T_mount, mount[None]]), on_platform=on
             )
             tried = _tried(machine, board, start)
-            if tried is not None:
+            if tried is not None and _certain(
+                tried.state.T_mount[[m, -1]], tried.mount_covariance[[m, -1]]
+            ):
                 change = tried.state.T_mount[-1] @ inverse(tried.state.T_mount[m])
                 yield Doubt(
                     "board moved", misfit(tried), station=int(s), before=place[0],
@@ -189,6 +200,14 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
             if len(measurements.edges):
                 continue  # its edges would have to move with the camera
             yield from _camera_moved(machine, measurements, state, int(s), later, place)
+
+
+def _certain(T: Array, covariance: Array) -> bool:
+    """Whether two places (2, 4, 4) differ by more than their covariances (2, 6, 6) explain."""
+    off, spread = pose_difference(T[1], T[0]), covariance.sum(axis=0)
+    scale = np.sqrt(np.maximum(np.diag(spread), 1e-30))
+    white = np.linalg.solve(spread / scale / scale[:, None] + 1e-9 * np.eye(6), off / scale)
+    return bool(np.sqrt(white @ (off / scale)) > CERTAIN)
 
 
 def _camera_moved(
@@ -211,7 +230,9 @@ def _camera_moved(
     )
     start = replace(state, T_camera_base=np.concatenate([state.T_camera_base, station[None]]))
     tried = _tried(machine, camera, start)
-    if tried is not None:
+    if tried is not None and _certain(
+        tried.state.T_camera_base[[s, -1]], tried.station_covariance[[s, -1]]
+    ):
         change = inverse(tried.state.T_camera_base[-1]) @ tried.state.T_camera_base[s]
         yield Doubt(
             "camera moved", misfit(tried), station=s, before=place[0], configuration=place[1],

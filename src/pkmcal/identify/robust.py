@@ -25,6 +25,9 @@ TAIL = np.exp(-(FULL**2) / 2)
 """That share: of two residuals' norms beyond FULL."""
 MEDIAN = float(np.sqrt(2 * np.log(2)))
 """Of the norm of two residuals that are noise."""
+POSE_STEPS = 10
+"""Steps of a stage where there are poses: against readings a hundred times sharper they allow
+short steps only at first, and one that is refused would look as if all had settled."""
 STAGES = 30
 WIDE = 4.0
 """Geman-McClure scale in units of the residuals' robust scale."""
@@ -119,6 +122,7 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
     least_scale : the robust scale is not believed below this (1: stated noise is a floor).
     """
     state, steps = start, 0
+    most = POSE_STEPS if problem.pose_blocks.count else 1
     d = distances(problem, state)
     cut = [4 * WIDE * scale for scale in scales(problem, d, least_scale)]
     for _ in range(STAGES):
@@ -128,8 +132,8 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
         cut = new
         weight = Both(*(_soft(part, c) for part, c in zip(d, cut, strict=True)))
         damping = RESTART_DAMPING if steps else FIRST_DAMPING
-        found = minimise(problem.weighted(*weight), state, max_steps=1, damping=damping)
-        state, steps = found.state, steps + 1
+        found = minimise(problem.weighted(*weight), state, max_steps=most, damping=damping)
+        state, steps = found.state, steps + int(found.steps.max())
         d = distances(problem, state)
         if settled:
             break

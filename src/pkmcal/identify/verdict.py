@@ -13,8 +13,7 @@ from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, singularity
-from pkmcal.mechanisms.limbs import closure
+from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.observe.edges import Observation
 
 FAR = 5.0
@@ -185,8 +184,7 @@ def _singular(estimate: Estimate) -> list[str]:
     """Where most poses are singular, small errors move the platform far and nothing is linear."""
     machine = estimate.machine
     poses = estimate.state.T_base_platform[estimate.configurations]
-    c = closure(machine.layout, machine.values, machine.inverse(poses), poses)
-    weak = singularity(machine.layout, machine.values, c.by_pose) < NEAR_SINGULAR
+    weak = on_manifold(machine.layout, machine.values, poses).singularity < NEAR_SINGULAR
     if weak.mean() < MOSTLY:
         return []
     return [

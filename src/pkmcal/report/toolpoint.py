@@ -69,8 +69,8 @@ def pose_covariance(machine: Machine, covariance: Array, joints: Array, poses: A
 def without_frames(machine: Machine, poses: Array, change: Array) -> Array:
     """Changes (n, 6, m) of poses less what only turns or shifts base and platform as wholes.
 
-    By least squares. Only frame changes that keep the motion, and that no parameters follow (some are fixed, or
-    tied): what parameters follow is taken out of their covariance already.
+    By least squares. Only frame changes that keep the motion, and that no parameters follow (some
+    are fixed, or tied): what parameters follow is taken out of their covariance already.
     """
     allowed = respecting_motion(machine.layout.motion)
     followed = np.linalg.qr(freedoms(machine))[0]
@@ -93,10 +93,10 @@ def pose_jacobian(machine: Machine, joints: Array, poses: Array) -> Array:
     From the implicit function closure(theta, X) = 0 at given readings: dX = -(dc/dX)^+ dc/dtheta.
     """
     layout = machine.layout
-    c = closure(layout, machine.values, joints, poses)
-    by_pose = c.by_pose @ layout.motion
+    internal = machine.forward_result(joints, poses).internal if layout.n_internal else None
+    c = closure(layout, machine.values, joints, poses, internal)
     by_theta = dense(c, len(machine.values))
-    return -layout.motion @ np.linalg.pinv(by_pose) @ by_theta
+    return -layout.own_motion[:6] @ np.linalg.pinv(layout.by_own(c)) @ by_theta
 
 
 def _off(

@@ -75,7 +75,8 @@ class Truth:
     T_camera_base : (S, 4, 4). rough : poses written into the session.
     T_base_platform : (K, 4, 4). joints : (K, m) exact readings. readings : (K, m) with noise.
     photographs : (M, 2) station and configuration of each photograph. seed : of everything.
-    T_base_board, T_platform_board : (4, 4) of the board, where there is one. repeats : photographs of each pair.
+    T_base_board, T_platform_board : (4, 4) of the board, where there is one. repeats : photographs
+    of each pair.
     """
 
     machine: Machine
