@@ -66,7 +66,9 @@ def take_turns(
     T_camera_base : (S, 4, 4) of all stations. lap : called with the name of a step that is done.
     """
     told("Finding the legs", 0.35)
-    machine, poses = session.machine, session.machine.forward(session.joints)
+    machine = session.machine
+    # the nearest poses, where the drawing does not quite close: recognition has seen to it
+    poses = machine.forward_result(session.joints).T_base_platform
     looks = _each(
         photographs,
         lambda p: legs.search(p, machine, T_camera_base[p.station], poses[p.configuration]),

@@ -77,6 +77,8 @@ def report_views(
     groups = parameters.parameter_groups(session.machine, estimate)
     drawn = scene.scene_of(session, estimate, centres)
     seen = poses.places(observation, estimate)
+    # boards and trackers alone have no edges to show; legs without any do have a question
+    photographed = len(edges) > 0 or not len(observation.poses)
     return {
         "session": session,
         "estimate": estimate,
@@ -89,9 +91,9 @@ def report_views(
         if findings
         else parameters.unidentified(groups, estimate),
         "told": findings and identifiability.section(findings, machine.parameters),
-        "edges": len(edges) > 0,
+        "edges": photographed,
         "pictures": pictures.pictures(session, edges, estimate, shifts, centres)
-        if len(edges)
+        if photographed
         else (),
         "poses": poses.section(session, observation, estimate),
         "residuals": residuals.residual_charts(session, edges, estimate, shifts),

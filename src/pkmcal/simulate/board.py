@@ -16,7 +16,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError
-from pkmcal.geometry.rigid import apply, inverse, pose, rotation
+from pkmcal.geometry.rigid import apply, cross, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.board_finders import dictionary, marker_bits
 from pkmcal.observe.boards import Board, board_from_document
@@ -295,9 +295,9 @@ def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Arra
     for way, lean in product(2 * np.pi * (np.arange(12) + rng.random()) / 12, (0.3, 0.8, 1.3)):
         side = np.array([np.cos(way), np.sin(way), 0.0])
         into = -(np.cos(lean) * up + np.sin(lean) * side)
-        right = np.cross(up, into)
+        right = cross(up, into)
         right = right / np.linalg.norm(right)
-        rot = np.stack([right, np.cross(into, right), into], axis=-1)
+        rot = np.stack([right, cross(into, right), into], axis=-1)
         rot = rotation(rng.normal(0, 0.05, 3)) @ rot
         centre = discs.platform + (discs.thickness + np.sin(lean) * reach + 0.01) * up
         out.append(pose(rot, centre - rot @ ((low + high) / 2)))
