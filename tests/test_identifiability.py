@@ -27,7 +27,6 @@ from pkmcal.simulate import EdgeNoise, Settings, simulate_edges, true_machine
 from pkmcal.simulate.stations import default_stations
 from test_joint_machines import JOINT_NOISE, Session, camera
 
-
 LARGEST = 1.9
 """Mean of some 42 squared normal deviates that is exceeded once in a thousand times."""
 

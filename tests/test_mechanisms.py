@@ -347,7 +347,9 @@ def test_carriers_broadcast(side, carrier):
             "name: small\nmotion: planar",
             "nam: small\nmotoin: planar",
             "m.yaml, line 1, nam: this key is not known; found nam, expected name (known here: "
-            "fixed, home, legs, models, motion, name, tied, tolerance). Then look at line 2, motoin.",
+            "fixed, home, legs, models, motion, name, tied, tolerance). "
+            "Then look at line 2, "
+            "motoin.",
         ),
         (
             "[0.0, 0.1, 0.2]",

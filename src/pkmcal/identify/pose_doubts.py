@@ -189,8 +189,9 @@ def _movements(machine: Machine, measurements: Measurements, estimate: Estimate)
                 state, T_mount=np.concatenate([state.T_mount, mount[None]]), on_platform=on
             )
             tried = _tried(machine, board, start)
+            pair = np.array([m, -1])
             if tried is not None and _certain(
-                tried.state.T_mount[[m, -1]], tried.mount_covariance[[m, -1]]
+                tried.state.T_mount[pair], tried.mount_covariance[pair]
             ):
                 change = tried.state.T_mount[-1] @ inverse(tried.state.T_mount[m])
                 yield Doubt(

@@ -18,6 +18,7 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words_advice import advice_on
+from pkmcal.identify.words_driven import conventions_held
 from pkmcal.identify.words_effect import platform_by_parameters
 from pkmcal.identify.words_families import Circumstances, Family, circumstances, families
 from pkmcal.identify.words_text import naming, said_of
@@ -71,7 +72,8 @@ class Findings:
     told : rank and spectrum. unidentified : what such data do not tell, of ``told.unidentified``
     and of what they know ``HARDLY``. weak : what the drawing knows better. by_drawing : how far
     (m, as ``Sentence.moves_platform``) the platform moves when all parameters are as wrong as the
-    drawing's tolerances let expect.
+    drawing's tolerances let expect. conventional : held parameters for which any value would
+    do; also_conventional : combinations of the other held ones.
     """
 
     told: Identifiability
@@ -79,6 +81,8 @@ class Findings:
     weak: tuple[Sentence, ...]
     by_drawing: float
     conditions: tuple[Condition, ...] = ()
+    conventional: tuple[str, ...] = ()
+    also_conventional: int = 0
 
 
 class _Part(NamedTuple):
@@ -120,16 +124,19 @@ def explain(
     machine, table = estimate.machine, estimate.machine.parameters
     poses = estimate.state.T_base_platform[estimate.configurations]
     effect = platform_by_parameters(machine, poses)
+    photographed = estimate.edge_weights.size > 0
     drawing = effect @ (table.free_matrix() * table.tolerances_free())
     lost = (*told.unidentified, *(d for d in told.weak if d.information < HARDLY))
     weak = tuple(d for d in told.weak if d.information >= HARDLY)
 
     def said(directions: tuple[Direction, ...], weak: bool) -> tuple[Sentence, ...]:
         null = vectors(directions, machine)
-        return describe(machine, seen, null, poses, _information(directions, told), weak=weak)
+        known = _information(directions, told)
+        return describe(machine, seen, null, poses, known, weak=weak, photographed=photographed)
 
     by_drawing = float(np.linalg.norm(drawing))
-    return Findings(told, said(lost, False), said(weak, True), by_drawing, conditions)
+    held = conventions_held(machine, effect)
+    return Findings(told, said(lost, False), said(weak, True), by_drawing, conditions, *held)
 
 
 def _information(directions: tuple[Direction, ...], told: Identifiability) -> Array:
@@ -169,6 +176,7 @@ def describe(
     information: Array | None = None,
     *,
     weak: bool = False,
+    photographed: bool = True,
 ) -> tuple[Sentence, ...]:
     """Sentences for a space of changes that the data do not see.
 
@@ -176,12 +184,12 @@ def describe(
     all parameters in their units, any basis. T_base_platform : (K, 4, 4) the session's poses.
     information : (n,) singular values of what the data know of each after all, in units of the
     tolerance; 0 where absent. weak : say that the drawing knows them better, not that they are
-    free.
+    free. photographed : whether legs were, and not boards or poses only.
     """
     space = _open(machine, null, information)
     if len(space.rows) == 0:
         return ()
-    around = circumstances(machine, seen, T_base_platform)
+    around = circumstances(machine, seen, T_base_platform, photographed)
     effect = platform_by_parameters(machine, T_base_platform) * space.unit
     parts = _merged(_explained(around, space))
     sentences = [_sentence(around, space, part, effect, weak) for part in parts]
@@ -224,9 +232,9 @@ def _explained(around: Circumstances, space: _Open) -> list[_Part]:
     """Families that lie in the open space, each with what it says anew."""
     parts: list[_Part] = []
     done = np.zeros((0, space.rows.shape[1]))
-    known = list(families(around))
+    known, whole = list(families(around)), space
     for family, inside in [*((f, share) for share in INSIDE for f in known[:-1]), (known[-1], 0.0)]:
-        if len(done) == len(space.rows):
+        if len(done) == len(whole.rows):
             break
         found = _within(family, space, inside)
         new = _directions(found - (found @ done.T) @ done)
@@ -238,7 +246,16 @@ def _explained(around: Circumstances, space: _Open) -> list[_Part]:
         numbers = _coefficients(family, space, found)
         own = numbers @ family.columns.T / space.unit
         parts.append(_Part((family,), found, numbers, own, len(new)))
+        if family.kind in EQUIVALENT:
+            space = _without(space, new)
     return parts
+
+
+def _without(space: _Open, said: Array) -> _Open:
+    """The open space where changes (k, P) in it count for nothing, as frames do."""
+    kept = np.linalg.svd(space.rows @ said.T)[0][:, len(said) :].T
+    frames = np.concatenate([space.frames, said.T], axis=1)
+    return _Open(kept @ space.rows, kept @ space.covariance @ kept.T, frames, space.unit)
 
 
 def _directions(rows: Array) -> Array:
@@ -271,7 +288,20 @@ def _coefficients(family: Family, space: _Open, found: Array) -> Array:
     return (solved[: columns.shape[1]] / scale[:, None]).T
 
 
-ONE_SENTENCE = ("unseen", "common turn", "axis", "slide", "rod", "centre", "leg", "radius", "depth")
+EQUIVALENT = ("against", "turn")
+"""Kinds that are taken out of what is said afterwards: changes of the description, not of a leg."""
+ONE_SENTENCE = (
+    "unseen",
+    "common turn",
+    "axis",
+    "slide",
+    "rod",
+    "centre",
+    "leg",
+    "radius",
+    "depth",
+    "leg sizes",
+)
 """Kinds that are said of several legs at once where they say the same of each."""
 
 

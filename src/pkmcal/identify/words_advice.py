@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.geometry.rigid import rotation_vector
+from pkmcal.identify.words_driven import is_driven
 from pkmcal.identify.words_families import AXES, Circumstances, Family
 from pkmcal.identify.words_text import named
 
 TURNED = 0.02
 """Turn (rad) of the platform between configurations below which they only shift it."""
 MOST_FIXED = 3
+PARALLEL = 1e-9
+"""Component of an axis below which the file can hold it alone."""
 BY_CALIPER = ("radius", "radii", "depth")
 
 
@@ -28,7 +31,7 @@ def advice_on(
     """
     kind = families[0].kind
     if not matters:
-        return f"Nothing needs to be done; {_fixing(names)} silences this."
+        return f"Nothing needs to be done; {_fixing(_enough(around, families[0], names))} silences this."
     legs = sorted({leg for family in families for leg in family.legs})
     if kind == "unseen":
         do = f"Photograph {named(legs)}, from another station if need be"
@@ -40,11 +43,11 @@ def advice_on(
         do = f"Measure the tubes of {named(legs)} with a caliper and give a small tolerance.radius"
     elif kind == "common turn":
         do = "Legs look the same however these axes lie: leave them to the drawing"
-    elif kind in ("axis", "axes"):
-        do = "Photograph configurations that turn these joints further, to both sides"
+    elif kind in ("axis", "axes", "tilts"):
+        do = f"{_take(around)} configurations that turn these joints further, to both sides"
     else:
         do = _more(around, legs)
-    return f"{do}; or {_holding(names, weak)}."
+    return f"{do}; or {_holding(_enough(around, families[0], names), weak)}."
 
 
 def _tying(around: Circumstances, legs: list[int]) -> str:
@@ -64,13 +67,33 @@ def _more(around: Circumstances, legs: list[int]) -> str:
     those = named(legs) if len(legs) < around.machine.n_legs else "all legs"
     point = "points" if len(legs) == 1 else "point"
     if len(poses) == 1:
-        return f"Photograph more configurations, so that {those} {point} elsewhere too"
+        return f"{_take(around)} more configurations, so that {those} {point} elsewhere too"
     turn = rotation_vector(poses[:, :3, :3] @ poses[0, :3, :3].T)
     can_turn = around.machine.layout.motion[:3].any()
     if can_turn and np.abs(turn).max() < TURNED:
         return f"Turn the platform in some configurations, so that {those} {point} elsewhere"
-    ends = "with lengths near both ends of their range"
-    return f"Photograph configurations in which {those} {point} elsewhere, {ends}"
+    what = "readings" if is_driven(around.machine) else "lengths"
+    ends = f"with {what} near both ends of their range"
+    return f"{_take(around)} configurations in which {those} {point} elsewhere, {ends}"
+
+
+def _take(around: Circumstances) -> str:
+    return "Photograph" if around.photographed else "Measure"
+
+
+def _enough(around: Circumstances, family: Family, names: tuple[str, ...]) -> tuple[str, ...]:
+    """What is enough to hold: one end of legs of which only the difference counts, and one axis
+    for a turn of all.
+    """
+    chosen: tuple[str, ...] = ()
+    if family.kind == "against":
+        chosen = tuple(name for name in names if ".platform." in name)
+    elif family.kind == "turn":
+        drawn = dict(
+            zip(around.machine.parameters.names, around.machine.parameters.drawing, strict=True)
+        )
+        chosen = tuple(n for n in sorted(names) if ".axis." in n and abs(drawn[n]) < PARALLEL)[:1]
+    return chosen or names
 
 
 def _holding(names: tuple[str, ...], weak: bool) -> str:
@@ -94,4 +117,5 @@ def _fixing(names: tuple[str, ...]) -> str:
 def _entry(name: str, names: tuple[str, ...]) -> str:
     whole, _, component = name.rpartition(".")
     every = component in AXES and all(f"{whole}.{c}" in names for c in AXES)
-    return whole if every or ".axis." in name else name
+    alone = len(names) == 1
+    return whole if every or (".axis." in name and not alone) else name

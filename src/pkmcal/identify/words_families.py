@@ -17,6 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, skew
+from pkmcal.identify.words_driven import driven_families, remaining
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import limb_ends
 
@@ -29,7 +30,8 @@ class Places(NamedTuple):
     """Positions of the parameters, -1 where a leg has none.
 
     base, platform, base_axis, platform_axis : (L, 3). rod : (L,) offset or constant length.
-    constant : (L,) legs of constant length. radius : per leg, (tubes,).
+    constant : (L,) legs of constant length. radius : per leg, (tubes,). others : per leg, what
+    cranks and bars have besides.
     """
 
     base: Integers
@@ -39,11 +41,12 @@ class Places(NamedTuple):
     rod: Integers
     constant: Booleans
     radius: tuple[Integers, ...]
+    others: tuple[Integers, ...]
 
     def of_leg(self, leg: int) -> Integers:
         """All of a leg's parameters but its radii."""
         rows = [*self.base[leg], *self.platform[leg], *self.base_axis[leg]]
-        rows = np.array([*rows, *self.platform_axis[leg], self.rod[leg]])
+        rows = np.array([*rows, *self.platform_axis[leg], self.rod[leg], *self.others[leg]])
         return rows[rows >= 0]
 
 
@@ -66,7 +69,15 @@ def places(machine: Machine) -> Places:
         np.maximum(constant, offset),
         constant >= 0,
         tuple(np.array(rows, dtype=int) for rows in radius),
+        tuple(np.array(_others(at, j), dtype=int) for j in legs),
     )
+
+
+def _others(at: dict[str, int], leg: int) -> list[int]:
+    """A leg's parameters that are neither centre, axis, length nor tube."""
+    start = tuple(f"legs[{leg}].{side}." for side in ("base", "platform"))
+    known = tuple(f"{body}{part}" for body in start for part in ("center", "axis"))
+    return [k for n, k in at.items() if n.startswith(start) and not n.startswith(known)]
 
 
 @dataclass(frozen=True)
@@ -74,7 +85,8 @@ class Circumstances:
     """What the candidates are made from.
 
     machine : with the present values. seen : (S, L) legs that each station sees.
-    T_base_platform : (K, 4, 4) poses of the session. at : the parameters' places.
+    T_base_platform : (K, 4, 4) poses of the session. at : the parameters' places. photographed :
+    whether legs are in photographs; otherwise only boards or poses were seen.
     along_base, along_platform : (L, 3) mean direction of each leg in the frame of either body.
     """
 
@@ -82,11 +94,14 @@ class Circumstances:
     seen: Booleans
     T_base_platform: Array
     at: Places
+    photographed: bool
     along_base: Array
     along_platform: Array
 
 
-def circumstances(machine: Machine, seen: Booleans, T_base_platform: Array) -> Circumstances:
+def circumstances(
+    machine: Machine, seen: Booleans, T_base_platform: Array, photographed: bool = True
+) -> Circumstances:
     """Leg directions at the poses (K, 4, 4), and the rest as it is."""
     readings = np.zeros((len(T_base_platform), machine.n_joints))
     ends = limb_ends(machine.layout, machine.values, readings, T_base_platform)
@@ -95,7 +110,8 @@ def circumstances(machine: Machine, seen: Booleans, T_base_platform: Array) -> C
     turned = u @ T_base_platform[:, :3, :3]
     along = [v.mean(axis=0) for v in (u, turned)]
     along = [v / np.linalg.norm(v, axis=-1, keepdims=True) for v in along]
-    return Circumstances(machine, seen, T_base_platform, places(machine), along[0], along[1])
+    at = places(machine)
+    return Circumstances(machine, seen, T_base_platform, at, photographed, along[0], along[1])
 
 
 @dataclass(frozen=True)
@@ -115,6 +131,7 @@ def families(around: Circumstances) -> Iterator[Family]:
     """Every candidate, the most particular first."""
     legs = range(around.machine.n_legs)
     yield from (_unseen(around, j) for j in legs if not around.seen[:, j].any())
+    yield from (Family(*change) for change in driven_families(around))
     for j in legs:
         yield from _axes(around, j)
         if around.at.radius[j].size:
@@ -127,12 +144,14 @@ def families(around: Circumstances) -> Iterator[Family]:
     for j in legs:
         own = around.at.of_leg(j)
         yield Family("leg", (j,), _one_hot(around, own))
-        if around.at.radius[j].size:
+        if around.at.radius[j].size and around.photographed:
             own = np.concatenate([own, around.at.radius[j]])
             yield Family("depth", (j,), _one_hot(around, own))
-    for group in groups(around.seen):
+    tubes = around.photographed and any(rows.size for rows in around.at.radius)
+    for group in groups(around.seen) if tubes else ():
         yield Family("spread", group, _spread(around, group))
     yield from _common(around)
+    yield from (Family(*change) for change in remaining(around))
     yield Family("rest", tuple(legs), np.eye(len(around.machine.parameters)))
 
 
@@ -247,7 +266,8 @@ def _common(around: Circumstances) -> Iterator[Family]:
             columns = _one_hot(around, at.rod[legs])
             yield Family(f"common {kind}", tuple(legs.tolist()), columns.sum(1, keepdims=True))
             yield Family(f"{kind}s", tuple(legs.tolist()), columns)
-    yield Family("spread", all_legs, _spread(around, all_legs))
+    if around.photographed and any(rows.size for rows in at.radius):
+        yield Family("spread", all_legs, _spread(around, all_legs))
     yield Family("scale", all_legs, _scale(around))
     slides = np.concatenate([_slides(around, j) for j in all_legs], axis=1)
     yield Family("slides", all_legs, slides)

@@ -17,13 +17,29 @@ THROUGH = 0.05
 SAME = 1e-3
 """Part of its greatest number below which a number of a change is nothing."""
 MOST_NAMES = 4
+NAMES = {
+    "length.offset": "offset",
+    "length.constant": "length",
+    "base.arm": "arm",
+    "base.angle": "crank angle",
+    "base.along": "place along its axis",
+    "base.radial": "axis' distance from its centre",
+}
+"""What a leg's numbers are called."""
+SIZES = {
+    "radius": "the radius of the base joints",
+    "height": "the height of the base joints",
+    "arm": "the arms' length",
+    "angle": "the crank angle",
+    "rod": "the rods' length",
+}
 
 
 def naming(family: Family, coefficients: Array) -> str:
     """What tells two changes of one kind apart in words; coefficients (k, m) of the family."""
     if family.kind == "slide":
         return _sliding(coefficients)
-    return _directions(coefficients) if family.kind == "centre" else ""
+    return _directions(coefficients) if family.kind == "centre" else family.among
 
 
 def said_of(
@@ -97,8 +113,9 @@ def parameter(name: str) -> str:
         return f"{found[3]} of {leg} {found[1]} {what}"
     if found := re.fullmatch(r"tubes\[(\d+)\]\.radius", path):
         return f"the radius of {leg} tube {found[1]}"
-    length = {"length.offset": "offset", "length.constant": "length"}
-    return f"{leg} {length.get(path, path)}"
+    if found := re.fullmatch(r"platform\.hinge\.([xyz])", path):
+        return f"{found[1]} of {leg} hinge"
+    return f"{leg} {NAMES.get(path, path.replace('.', ' '))}"
 
 
 def _listed(names: tuple[str, ...]) -> str:
@@ -366,6 +383,54 @@ def _rest(told: _Told) -> str:
     return f"{what} of {_listed(told.names)} {told.open(k > 1)}"
 
 
+def _against(told: _Told) -> str:
+    """Shifts of both ends alike, of which only the difference counts."""
+    numbers = np.abs(told.coefficients).max(axis=0).reshape(3, -1).max(axis=1)
+    axes = [c for c, x in zip(AXES, numbers, strict=True) if x > 0.05 * numbers.max()]
+    legs = told.around.machine.document.legs
+    other, size = "platform", ""
+    if any("bar" in leg.platform.joint for leg in legs):
+        other, size = (
+            "side bars'",
+            " (the bars' half width cannot be told from the base joints' places)",
+        )
+    elif {"x", "y"} <= set(axes):
+        size = ", as the difference of base and platform radius"
+    if size.startswith(" (") and axes != ["y"]:
+        size = ""
+    return (
+        f"of {joined(axes)} of the base joints and of the {other} joints, only the difference "
+        f"is seen{size}: both can shift alike {_ways(len(told.coefficients))}"
+    )
+
+
+def _turn_text(told: _Told) -> str:
+    axis = told.family.among
+    return (
+        f"the turn of the base frame about {axis} {told.open(False)}: what is fixed or tied in the "
+        "mechanism file does not hold the base joints' axes and places, which can turn together, "
+        "the camera with them"
+    )
+
+
+def _sizes(told: _Told) -> str:
+    whose = "of all legs alike" if told.family.kind == "sizes" else f"of {told.whose}"
+    chosen = told.family.among.split(",")
+    what = f"{joined([SIZES[name] for name in chosen])}, {whose},"
+    better = " better than the drawing does" if told.weak else ""
+    if len(chosen) == 1:
+        return f"{what[:-1]} {told.open(False)}"
+    return f"{what} cannot be told apart{better} {_ways(_dims(told))}"
+
+
+def _tilts(told: _Told) -> str:
+    what = "the tilts of the base joints' axes to each other (how parallel they are)"
+    where = "each with its joint's place along it"
+    seen = "readings say nothing of them, only the board's tilt does"
+    ways = _ways(len(told.coefficients))
+    return f"{what}, {where}, {told.open(True)} {ways}, mostly {_listed(told.names)}: {seen}"
+
+
 _TEXTS: dict[str, Callable[[_Told], str]] = {
     "unseen": _unseen,
     "common turn": _common_turn,
@@ -385,6 +450,11 @@ _TEXTS: dict[str, Callable[[_Told], str]] = {
     "slides": _slides_text,
     "centres": _centres,
     "axes": _axes_text,
+    "against": _against,
+    "turn": _turn_text,
+    "sizes": _sizes,
+    "leg sizes": _sizes,
+    "tilts": _tilts,
     "radius": _radius,
     "radii": _radius,
     "depth": _depth,

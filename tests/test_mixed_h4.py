@@ -1,0 +1,74 @@
+"""One camera that sees an H4's forearms and the board on its platform, in one estimate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from pkmcal.geometry.rigid import look_at, perturb
+from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.problem import Measurements, Mount
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.observe.edges import EdgeSet
+from pkmcal.observe.poses import PoseSet
+from pkmcal.simulate import EdgeNoise, simulate_edges, true_machine
+from test_joint_machines import camera
+
+READING = 1e-5
+POSE = np.array([3e-4] * 3 + [1e-4] * 3)
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory):
+    """The H4 with forearms that a camera can see."""
+    document = load_mechanism("h4").to_document()
+    for leg in document["legs"]:
+        leg["tubes"] = [{"radius": 0.008, "from": 0.03, "to": 0.45}]
+    path = tmp_path_factory.mktemp("h4") / "h4.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return load_mechanism(path)
+
+
+def estimates(machine, seed):
+    """From the forearms, from the board, from both; of one true machine."""
+    rng = np.random.default_rng(seed)
+    home, n = machine.home(), 30
+    step = np.zeros((n, 6))
+    step[:, 3:], step[:, 2] = rng.uniform(-0.12, 0.12, (n, 3)), rng.uniform(-0.7, 0.7, n)
+    poses = perturb(home, step)
+    eye = np.array([1.3, 0.3, -0.2])
+    T = look_at(eye, 0.6 * home[:3, 3], np.array([0, 0, 1.0]))[None]
+    true = true_machine(machine, 1.0, rng)
+    noise = EdgeNoise(shift=0.1, tilt=0.1)
+    edges, joints = simulate_edges(true, T, camera(), poses, noise, rng, joint_noise=READING)
+    T_mount = perturb(np.eye(4), np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.05]))
+    seen = perturb(T[0] @ poses @ T_mount, POSE * rng.normal(size=(n, 6)))
+    whiten = np.broadcast_to(np.diag(1 / POSE), (n, 6, 6))
+    board = PoseSet(np.zeros(n, int), np.arange(n), np.zeros(n, int), seen, whiten)
+    rough = perturb(T, 0.01 * rng.normal(size=(1, 6)))
+    for legs, targets in ((edges, None), (EdgeSet.empty(), board), (edges, board)):
+        measurements = Measurements(
+            legs,
+            joints,
+            READING,
+            1,
+            np.zeros(1, int),
+            poses=PoseSet.empty() if targets is None else targets,
+            mounts=() if targets is None else (Mount("board", "platform"),),
+        )
+        yield bundle(machine, measurements, start_state(machine, measurements, rough))
+
+
+def test_forearms_and_board_together_know_more_than_each(machine):
+    motor = np.flatnonzero(np.array(machine.parameters.kinds) == "angle")
+    legs, board, both = (np.diag(e.covariance)[motor] for e in estimates(machine, 0))
+    assert np.all(both < legs)
+    assert np.all(both < board)
+    # as much as two independent sources: what is worth less than 0.8 of that would be lost
+    assert np.all(1 / both > 0.8 * (1 / legs + 1 / board))
+
+
+def test_what_both_see_agrees(machine):
+    chi2 = [list(estimates(machine, seed))[2].statistics for seed in range(3)]
+    assert 0.8 < np.mean([s.chi2 / s.dof for s in chi2]) < 1.2
