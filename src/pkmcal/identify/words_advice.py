@@ -7,7 +7,7 @@ import numpy as np
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.words_driven import is_driven
 from pkmcal.identify.words_families import AXES, Circumstances, Family
-from pkmcal.identify.words_text import named
+from pkmcal.identify.words_names import named
 
 TURNED = 0.02
 """Turn (rad) of the platform between configurations below which they only shift it."""
@@ -31,7 +31,8 @@ def advice_on(
     """
     kind = families[0].kind
     if not matters:
-        return f"Nothing needs to be done; {_fixing(_enough(around, families[0], names))} silences this."
+        enough = _fixing(_enough(around, families[0], names))
+        return f"Nothing needs to be done; {enough} silences this."
     legs = sorted({leg for family in families for leg in family.legs})
     if kind == "unseen":
         do = f"Photograph {named(legs)}, from another station if need be"

@@ -43,9 +43,11 @@ def driven_families(around: Circumstances) -> Iterator[Change]:
     if not is_driven(around.machine):
         return
     legs = tuple(range(around.machine.n_legs))
-    yield "against", legs, _against(around), ""
+    against = _against(around)
+    yield "against", legs, against, ""
     for axis in (2, 0, 1):
-        yield "turn", legs, _turn(around, axis), AXES[axis]
+        # with shifts of both ends: what is held of the one end, the other makes good
+        yield "turn", legs, np.concatenate([_turn(around, axis), against], axis=1), AXES[axis]
     sizes = size_columns(around)
     together = {name: column.sum(axis=1, keepdims=True) for name, column in sizes.items()}
     for n in range(1, len(sizes) + 1):

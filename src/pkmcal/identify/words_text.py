@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.words_families import AXES, Circumstances, Family, line_of
+from pkmcal.identify.words_names import count, joined, listed, named, ways
+from pkmcal.identify.words_text_driven import DRIVEN
 
 ALIGNED = 0.985
 """Cosine (10 degrees) of a direction with an axis that still is called by that axis's name."""
@@ -16,23 +17,6 @@ THROUGH = 0.05
 """Distance of a joint from an axis, in parts of the joints' spread, that still lies on it."""
 SAME = 1e-3
 """Part of its greatest number below which a number of a change is nothing."""
-MOST_NAMES = 4
-NAMES = {
-    "length.offset": "offset",
-    "length.constant": "length",
-    "base.arm": "arm",
-    "base.angle": "crank angle",
-    "base.along": "place along its axis",
-    "base.radial": "axis' distance from its centre",
-}
-"""What a leg's numbers are called."""
-SIZES = {
-    "radius": "the radius of the base joints",
-    "height": "the height of the base joints",
-    "arm": "the arms' length",
-    "angle": "the crank angle",
-    "rod": "the rods' length",
-}
 
 
 def naming(family: Family, coefficients: Array) -> str:
@@ -53,11 +37,11 @@ def said_of(
     first = families[0]
     legs = sorted({leg for family in families for leg in family.legs})
     tell = _TEXTS.get(first.kind, _rest)
-    text = tell(_Told(around, first, tuple(legs), coefficients, names, weak))
+    text = tell(Told(around, first, tuple(legs), coefficients, names, weak))
     return text[0].upper() + text[1:]
 
 
-class _Told:
+class Told:
     """What a text is made from."""
 
     def __init__(
@@ -88,64 +72,33 @@ class _Told:
         """Whether it is about more than one leg."""
         return len(self.legs) > 1
 
-
-def named(legs: Iterable[int]) -> str:
-    """``leg 3``, ``legs 1, 2 and 5``, ``legs 1 to 6``, from numbers that count from 0."""
-    found = sorted({leg + 1 for leg in legs})
-    if len(found) > 2 and found[-1] - found[0] == len(found) - 1:
-        return f"legs {found[0]} to {found[-1]}"
-    return ("leg " if len(found) == 1 else "legs ") + joined([str(n) for n in found])
+    @property
+    def dims(self) -> int:
+        """Dimensions of one leg's part where several legs were put together."""
+        return max(1, len(self.coefficients) // len(self.legs))
 
 
-def joined(words: list[str]) -> str:
-    """``a, b and c``."""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-
-
-def parameter(name: str) -> str:
-    """A parameter in words: ``z of leg 3's base joint``, ``leg 2's offset``."""
-    match = re.fullmatch(r"legs\[(\d+)\]\.(.+)", name)
-    if not match:
-        return name
-    leg, path = f"leg {match[1]}'s", match[2]
-    if found := re.fullmatch(r"(base|platform)\.(center|axis)\.([xyz])", path):
-        what = "joint" if found[2] == "center" else "axis"
-        return f"{found[3]} of {leg} {found[1]} {what}"
-    if found := re.fullmatch(r"tubes\[(\d+)\]\.radius", path):
-        return f"the radius of {leg} tube {found[1]}"
-    if found := re.fullmatch(r"platform\.hinge\.([xyz])", path):
-        return f"{found[1]} of {leg} hinge"
-    return f"{leg} {NAMES.get(path, path.replace('.', ' '))}"
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    words = [parameter(name) for name in names[:MOST_NAMES]]
-    if len(names) > MOST_NAMES:
-        return f"{', '.join(words)} and {len(names) - MOST_NAMES} more"
-    return joined(words)
-
-
-def _unseen(told: _Told) -> str:
+def _unseen(told: Told) -> str:
     where = f"{told.whose} {'are' if told.several else 'is'} in no photograph"
     read = any(told.around.at.rod[leg] >= 0 for leg in told.legs)
     if not read:
         whose = "their joints are" if told.several else "its joints are"
         return f"{where}, so that nothing tells where {whose}"
     whose = "each one's" if told.several else "its"
-    values = f"{_count(_dims(told))} of {whose} values"
+    values = f"{count(told.dims)} of {whose} values"
     return f"{where}; {'their' if told.several else 'its'} readings alone leave {values} " + (
         "to the drawing" if told.weak else "free"
     )
 
 
-def _common_turn(told: _Told) -> str:
+def _common_turn(told: Told) -> str:
     return (
         f"the common direction of both universal axes of {'each of ' if told.several else ''}"
         f"{told.whose} {told.open(False)}: only the angle between the two can be seen"
     )
 
 
-def _axis(told: _Told) -> str:
+def _axis(told: Told) -> str:
     node = getattr(told.around.machine.document.legs[told.legs[0]], told.family.among)
     whose = f"the {node.joint} ax{'es' if told.several else 'is'} of {told.whose}"
     return f"the direction of {whose} on the {told.family.among} {told.open(False)}"
@@ -162,14 +115,14 @@ def _sliding(coefficients: Array) -> str:
     return "whole" if whole else "together"
 
 
-def _slide(told: _Told) -> str:
+def _slide(told: Told) -> str:
     moves = {
         "base": "can grow while its base joint moves back along it",
         "platform": "can grow while its platform joint moves on along it",
         "both": "can grow and shift along itself, its two joints and its length together",
         "whole": "can shift along itself with both joints",
         "together": "can grow while both of its joints move along it",
-    }[_sliding(told.coefficients[: _dims(told)])]
+    }[_sliding(told.coefficients[: told.dims])]
     if told.family.among == "passive":
         moves = "can shift along itself, its two joints by themselves"
     direction = "one direction each" if told.several else "one direction"
@@ -179,19 +132,14 @@ def _slide(told: _Told) -> str:
     return f"{start}: {each} {moves}{unsure}"
 
 
-def _dims(told: _Told) -> int:
-    """Dimensions of one leg's part where several legs were put together."""
-    return max(1, len(told.coefficients) // len(told.legs))
-
-
-def _rod(told: _Told) -> str:
+def _rod(told: Told) -> str:
     constant = told.around.at.constant[list(told.legs)].all()
     what = "constant length" if constant else "offset"
     return f"the {what}{'s' if told.several else ''} of {told.whose} {told.open(told.several)}"
 
 
-def _centre(told: _Told) -> str:
-    where = _directions(told.coefficients[: _dims(told)])
+def _centre(told: Told) -> str:
+    where = _directions(told.coefficients[: told.dims])
     return f"{told.ends(told.family.among)} {told.open(told.several)} {where}"
 
 
@@ -215,7 +163,7 @@ def _axis_name(vector: Array) -> str:
     return AXES[int(np.argmax(size))] if size.max() > ALIGNED else ""
 
 
-def _group(told: _Told) -> str:
+def _group(told: Told) -> str:
     side = told.family.among
     what = {
         "base": told.ends("base"),
@@ -226,7 +174,7 @@ def _group(told: _Told) -> str:
     return f"{_relation(told)}: {what} can{unsure}{',' if unsure else ''} {_rigid(told, side)}"
 
 
-def _relation(told: _Told) -> str:
+def _relation(told: Told) -> str:
     """How the group is seen with the other legs."""
     seen, legs = told.around.seen, list(told.legs)
     others = [j for j in range(seen.shape[1]) if j not in legs]
@@ -242,7 +190,7 @@ def _relation(told: _Told) -> str:
     return f"although {told.whose} {verb} seen with the others, these data do not tie them"
 
 
-def _rigid(told: _Told, side: str) -> str:
+def _rigid(told: Told, side: str) -> str:
     """A group's open rigid motions in words, after "can"."""
     if side == "both":
         base, platform = np.split(told.coefficients, 2, axis=1)
@@ -259,7 +207,7 @@ def _both(shift: str, turn: str) -> str:
     return " and ".join(part for part in (shift, turn) if part)
 
 
-def _freedoms(told: _Told, coefficients: Array, side: str) -> tuple[str, str]:
+def _freedoms(told: Told, coefficients: Array, side: str) -> tuple[str, str]:
     """``shift along x`` and ``turn about the line through joints 1 and 4``, either may be empty."""
     at = told.around.at
     centres = at.base if side == "base" else at.platform
@@ -287,7 +235,7 @@ def _pure_shifts(scaled: Array) -> Array:
     return (u[:, rank:].T @ scaled)[:, 3:]
 
 
-def _about(told: _Told, twist: Array, points: Array, spread: float) -> str:
+def _about(told: Told, twist: Array, points: Array, spread: float) -> str:
     """``turn about the axis through joints 1 and 4``, for one twist."""
     middle = points[list(told.legs)].mean(axis=0)
     point, direction, pitch = line_of(twist, middle)
@@ -304,134 +252,77 @@ def _about(told: _Told, twist: Array, points: Array, spread: float) -> str:
     return f"turn about {'a line along ' + axis if axis else 'one axis'}"
 
 
-def _coordinate(told: _Told) -> str:
+def _coordinate(told: Told) -> str:
     body = told.family.kind.partition(" of ")[2]
     what = "heights (z)" if told.family.among == "z" else f"{told.family.among} coordinates"
     where = {"base": "the base joints", "platform": "the platform joints"}.get(body, "all joints")
-    ways = _ways(len(told.coefficients))
-    return f"the {what} of {where} {told.open(True)} against each other {ways}"
+    how = ways(len(told.coefficients))
+    return f"the {what} of {where} {told.open(True)} against each other {how}"
 
 
-def _ways(k: int) -> str:
-    return "in one way" if k == 1 else f"in {_count(k)} ways"
-
-
-def _count(k: int) -> str:
-    words = ("no", "one", "two", "three", "four", "five", "six")
-    return words[k] if k < len(words) else str(k)
-
-
-def _lengths(told: _Told) -> str:
+def _lengths(told: Told) -> str:
     what = "constant lengths" if "constant" in told.family.kind else "offsets"
     if told.family.kind.startswith("common"):
         return f"the common part of the {what} of {told.whose} {told.open(False)}"
-    ways = _ways(len(told.coefficients))
-    return f"the {what} of {told.whose} {told.open(True)} {ways}: they can change together"
+    how = ways(len(told.coefficients))
+    return f"the {what} of {told.whose} {told.open(True)} {how}: they can change together"
 
 
-def _scale_text(told: _Told) -> str:
+def _scale_text(told: Told) -> str:
     return f"the size of everything {told.open(False)}: all lengths can grow by the same share"
 
 
-def _leg(told: _Told) -> str:
-    where = f"of the values of {told.whose}, {_count(_dims(told))} combination"
-    where += "" if _dims(told) == 1 else "s"
+def _leg(told: Told) -> str:
+    where = f"of the values of {told.whose}, {count(told.dims)} combination"
+    where += "" if told.dims == 1 else "s"
     each = " each" if told.several else ""
-    return f"{where}{each} {told.open(_dims(told) > 1)}, mostly of " + _listed(told.names)
+    return f"{where}{each} {told.open(told.dims > 1)}, mostly of " + listed(told.names)
 
 
-def _slides_text(told: _Told) -> str:
-    k = _count(len(told.coefficients))
+def _slides_text(told: Told) -> str:
+    k = count(len(told.coefficients))
     return (
         f"legs that grow while their joints move along them {told.open(True)} in {k} "
-        f"combination{'' if len(told.coefficients) == 1 else 's'}, mostly of {_listed(told.names)}"
+        f"combination{'' if len(told.coefficients) == 1 else 's'}, mostly of {listed(told.names)}"
     )
 
 
-def _centres(told: _Told) -> str:
-    ways = _ways(len(told.coefficients))
+def _centres(told: Told) -> str:
+    how = ways(len(told.coefficients))
     return (
-        f"how the {told.family.among} joints lie to each other {told.open(False)} {ways}, mostly "
-        f"{_listed(told.names)}"
+        f"how the {told.family.among} joints lie to each other {told.open(False)} {how}, mostly "
+        f"{listed(told.names)}"
     )
 
 
-def _axes_text(told: _Told) -> str:
-    return f"the directions of the joints' axes {told.open(True)} {_ways(len(told.coefficients))}"
+def _axes_text(told: Told) -> str:
+    return f"the directions of the joints' axes {told.open(True)} {ways(len(told.coefficients))}"
 
 
-def _radius(told: _Told) -> str:
+def _radius(told: Told) -> str:
     return f"the tubes' radii of {told.whose} {told.open(True)}"
 
 
-def _depth(told: _Told) -> str:
+def _depth(told: Told) -> str:
     return (
         f"the tubes' radii of {told.whose} and the distance to the camera cannot be told apart"
         + (" better than the drawing does" if told.weak else "")
     )
 
 
-def _spread(told: _Told) -> str:
+def _spread(told: Told) -> str:
     legs = "the legs" if len(told.legs) == told.around.machine.n_legs else told.whose
     better = " better than the drawing does" if told.weak else ""
     return f"how far apart {legs} stand and how thick their tubes are cannot be told apart{better}"
 
 
-def _rest(told: _Told) -> str:
+def _rest(told: Told) -> str:
     k = len(told.coefficients)
-    what = "a combination" if k == 1 else f"{_count(k)} combinations"
-    return f"{what} of {_listed(told.names)} {told.open(k > 1)}"
+    what = "a combination" if k == 1 else f"{count(k)} combinations"
+    return f"{what} of {listed(told.names)} {told.open(k > 1)}"
 
 
-def _against(told: _Told) -> str:
-    """Shifts of both ends alike, of which only the difference counts."""
-    numbers = np.abs(told.coefficients).max(axis=0).reshape(3, -1).max(axis=1)
-    axes = [c for c, x in zip(AXES, numbers, strict=True) if x > 0.05 * numbers.max()]
-    legs = told.around.machine.document.legs
-    other, size = "platform", ""
-    if any("bar" in leg.platform.joint for leg in legs):
-        other, size = (
-            "side bars'",
-            " (the bars' half width cannot be told from the base joints' places)",
-        )
-    elif {"x", "y"} <= set(axes):
-        size = ", as the difference of base and platform radius"
-    if size.startswith(" (") and axes != ["y"]:
-        size = ""
-    return (
-        f"of {joined(axes)} of the base joints and of the {other} joints, only the difference "
-        f"is seen{size}: both can shift alike {_ways(len(told.coefficients))}"
-    )
-
-
-def _turn_text(told: _Told) -> str:
-    axis = told.family.among
-    return (
-        f"the turn of the base frame about {axis} {told.open(False)}: what is fixed or tied in the "
-        "mechanism file does not hold the base joints' axes and places, which can turn together, "
-        "the camera with them"
-    )
-
-
-def _sizes(told: _Told) -> str:
-    whose = "of all legs alike" if told.family.kind == "sizes" else f"of {told.whose}"
-    chosen = told.family.among.split(",")
-    what = f"{joined([SIZES[name] for name in chosen])}, {whose},"
-    better = " better than the drawing does" if told.weak else ""
-    if len(chosen) == 1:
-        return f"{what[:-1]} {told.open(False)}"
-    return f"{what} cannot be told apart{better} {_ways(_dims(told))}"
-
-
-def _tilts(told: _Told) -> str:
-    what = "the tilts of the base joints' axes to each other (how parallel they are)"
-    where = "each with its joint's place along it"
-    seen = "readings say nothing of them, only the board's tilt does"
-    ways = _ways(len(told.coefficients))
-    return f"{what}, {where}, {told.open(True)} {ways}, mostly {_listed(told.names)}: {seen}"
-
-
-_TEXTS: dict[str, Callable[[_Told], str]] = {
+_TEXTS: dict[str, Callable[[Told], str]] = {
     "unseen": _unseen,
     "common turn": _common_turn,
     "axis": _axis,
@@ -450,11 +341,7 @@ _TEXTS: dict[str, Callable[[_Told], str]] = {
     "slides": _slides_text,
     "centres": _centres,
     "axes": _axes_text,
-    "against": _against,
-    "turn": _turn_text,
-    "sizes": _sizes,
-    "leg sizes": _sizes,
-    "tilts": _tilts,
+    **DRIVEN,
     "radius": _radius,
     "radii": _radius,
     "depth": _depth,

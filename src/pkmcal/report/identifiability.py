@@ -11,7 +11,7 @@ from pkmcal.identify.conditions import Condition
 from pkmcal.identify.words import Findings, Sentence
 from pkmcal.mechanisms import ParameterTable
 from pkmcal.report.charts import Bar, BarChart
-from pkmcal.report.parameters import in_words
+from pkmcal.report.parameters import grouped, in_words
 from pkmcal.report.wording import brief, count, joined
 
 FLOOR = 1e-3
@@ -52,7 +52,7 @@ def section(findings: Findings, table: ParameterTable) -> Section:
         unidentified=findings.unidentified,
         weak=findings.weak,
         conditions=findings.conditions,
-        fixed=_fixed(table),
+        fixed=_fixed(table, findings),
         tied=_tied(table),
     )
 
@@ -115,16 +115,44 @@ def _tip(k: int, value: float, rank: int) -> str:
     return f"Direction {k + 1}: the data know it {brief(value)} times better than the drawing"
 
 
-def _fixed(table: ParameterTable) -> str:
+def _fixed(table: ParameterTable, findings: Findings) -> str:
     """What the mechanism file holds, in a sentence; empty where it holds nothing."""
     if not table.fixed:
         return ""
+    told = [name for name in table.fixed if name in findings.conventional]
+    if told or findings.also_conventional:
+        return _by_convention(table, findings, told)
     verb = "was" if len(table.fixed) == 1 else "were"
     return (
         f"{_listed(table.fixed)} {verb} not estimated: the mechanism file lists "
         f"{'it' if len(table.fixed) == 1 else 'them'} under fixed, so the drawing's value counts "
         "as exact and no direction belongs to it."
     )
+
+
+def _by_convention(table: ParameterTable, findings: Findings, told: list[str]) -> str:
+    """The same where some of what is held only chooses frames, or repeats what is free."""
+    others = [name for name in table.fixed if name not in told]
+    parts: list[str] = []
+    if told:
+        parts.append(
+            f"{_listed(tuple(told))} {'is' if len(told) == 1 else 'are'} held by convention: any "
+            "other value would only move a frame, or be made good by a value that is estimated, "
+            "and the platform would be where it is."
+        )
+    if others:
+        verb = "is" if len(others) == 1 else "are"
+        parts.append(
+            f"{_listed(tuple(others))} {verb} held by the model that the mechanism file describes: "
+            "the drawing's value counts as exact and no direction belongs to it."
+        )
+    if findings.also_conventional:
+        parts.append(
+            f"Of these, {count(findings.also_conventional, 'combination')} would only move a frame "
+            "too, such as the heights of base joints and platform joints, of which with a camera "
+            "and a board only the sum is seen."
+        )
+    return " ".join(parts)
 
 
 def _tied(table: ParameterTable) -> str:
@@ -136,8 +164,9 @@ def _tied(table: ParameterTable) -> str:
 
 
 def _listed(names: tuple[str, ...]) -> str:
-    words = [in_words(name) for name in names[:MOST_NAMES]]
-    if len(names) > MOST_NAMES:
-        words.append(f"{len(names) - MOST_NAMES} more")
+    groups = grouped(names)
+    words = groups[:MOST_NAMES]
+    if len(groups) > MOST_NAMES:
+        words.append(f"{len(groups) - MOST_NAMES} more")
     text = joined(words)
     return text[0].upper() + text[1:]

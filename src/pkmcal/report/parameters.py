@@ -10,6 +10,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words import Findings
+from pkmcal.identify.words_names import named
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.report.wording import (
     SCALES,
@@ -181,6 +182,23 @@ def in_words(name: str) -> str:
     """A parameter's name for people: ``leg 3 base centre z``."""
     leg, path = split_name(name)
     return f"leg {leg} {label(path)}" if leg else label(path)
+
+
+def grouped(names: tuple[str, ...]) -> list[str]:
+    """Names in words, one entry for what three legs or more have: ``hinge y of legs 1 to 4``."""
+    legs: dict[str, list[int]] = {}
+    for name in names:
+        leg, path = split_name(name)
+        legs.setdefault(path, []).append(leg or 0)
+    out: list[str] = []
+    for name in names:
+        leg, path = split_name(name)
+        several = len(legs[path]) > 2
+        if not several:
+            out.append(in_words(name))
+        elif leg == legs[path][0]:
+            out.append(f"{label(path)} of {named(j - 1 for j in legs[path])}")
+    return out
 
 
 def tight_pairs(covariance: Array) -> list[tuple[int, int, float]]:

@@ -11,6 +11,17 @@ SCALES = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
 """Factor and name of the unit that the report shows, by the unit inside."""
 
 LARGEST_DECIMALS = 6
+LABELS = {
+    "base.arm": "arm length",
+    "base.angle": "crank angle",
+    "base.along": "place along the crank axis",
+    "base.radial": "crank axis distance",
+    "platform.hinge.x": "hinge x",
+    "platform.hinge.y": "hinge y",
+    "platform.hinge.z": "hinge z",
+    "length.constant": "rod length",
+}
+"""Names of parameters whose paths say too little."""
 LEG = re.compile(r"legs\[(\d+)\]\.(.+)")
 
 
@@ -53,6 +64,8 @@ def split_name(name: str) -> tuple[int | None, str]:
 
 def label(path: str) -> str:
     """A parameter's path without its leg, in words: ``base centre z``, ``tube 1 radius``."""
+    if path in LABELS:
+        return LABELS[path]
     words = re.sub(r"tubes\[(\d+)\]", r"tube \1", path).replace("center", "centre")
     return words.replace(".", " ").replace("_", " ")
 
