@@ -12,6 +12,7 @@ from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
+from pkmcal.identify.words_effect import platform_by_parameters
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.observe.edges import Observation
@@ -97,14 +98,30 @@ def judge(
     if reasons:
         headline = "This calibration should not be used."
     else:
-        covariance = free_of_gauge(estimate)
-        headline = (
-            f"Calibrated: joint centres to {_centre_sigma(estimate, covariance) * 1e3:.2g} mm"
-            f" and offsets to {_offset_sigma(estimate, covariance) * 1e3:.2g} mm"
-            " (standard deviations)."
-        )
+        headline = _headline(observation, estimate)
     return Verdict(
         not reasons, headline, reasons, warnings, tuple(_advice(estimate) + _harmless(small))
+    )
+
+
+def _headline(observation: Observation, estimate: Estimate) -> str:
+    """What was reached: of joints where legs were seen, of the platform where only it was.
+
+    Boards tell where the platform goes, and leave open what does not move it.
+    """
+    if not len(observation.edges):
+        used = estimate.state.T_base_platform[estimate.configurations]
+        by = platform_by_parameters(estimate.machine, used)
+        sigma = float(np.sqrt(np.sum((by @ estimate.covariance) * by)))
+        return (
+            f"Calibrated: the platform's joints to {sigma * 1e3:.2g} mm at given readings"
+            " (standard deviation)."
+        )
+    covariance = free_of_gauge(estimate)
+    return (
+        f"Calibrated: joint centres to {_centre_sigma(estimate, covariance) * 1e3:.2g} mm"
+        f" and offsets to {_offset_sigma(estimate, covariance) * 1e3:.2g} mm"
+        " (standard deviations)."
     )
 
 

@@ -47,6 +47,7 @@ def parameter(name: str) -> str:
 
 
 def listed(names: tuple[str, ...]) -> str:
+    """The first parameters in words, the others counted."""
     words = [parameter(name) for name in names[:MOST_NAMES]]
     if len(names) > MOST_NAMES:
         return f"{', '.join(words)} and {len(names) - MOST_NAMES} more"
@@ -54,9 +55,11 @@ def listed(names: tuple[str, ...]) -> str:
 
 
 def ways(k: int) -> str:
+    """``in one way``, ``in six ways``."""
     return "in one way" if k == 1 else f"in {count(k)} ways"
 
 
 def count(k: int) -> str:
+    """Small numbers as words."""
     words = ("no", "one", "two", "three", "four", "five", "six")
     return words[k] if k < len(words) else str(k)

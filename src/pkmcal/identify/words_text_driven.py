@@ -47,9 +47,9 @@ def _against(told: Told) -> str:
 def _turn_text(told: Told) -> str:
     axis = told.family.among
     return (
-        f"the turn of the base frame about {axis} {told.open(False)}: what is fixed or tied in the "
-        "mechanism file does not hold the base joints' axes and places, which can turn together, "
-        "the camera with them"
+        f"the turn of the base frame about {axis} {told.open(False)}: the axes and places of all "
+        "base joints can turn together and the camera with them; nothing that the mechanism file "
+        "holds stops it"
     )
 
 

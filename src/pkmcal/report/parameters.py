@@ -138,13 +138,25 @@ def unidentified(
         out = _by_kind(groups, estimate)
     else:
         out = [f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak)]
-    return (*out, *bound_together(estimate))
+    return (*out, *bound_together(estimate, findings))
 
 
-def bound_together(estimate: Estimate) -> tuple[str, ...]:
-    """Sentences on pairs that can hardly be told apart."""
-    names, pairs = estimate.machine.parameters.names, tight_pairs(estimate.covariance)
-    return tuple(_pair_text(names[i], names[j], rho) for i, j, rho in pairs)
+def bound_together(estimate: Estimate, findings: Findings | None = None) -> tuple[str, ...]:
+    """Sentences on pairs that can hardly be told apart, but those that a finding names together."""
+    names = estimate.machine.parameters.names
+    said = [] if findings is None else [set(s.parameters) for s in findings.unidentified]
+    pairs = [
+        (names[i], names[j], rho)
+        for i, j, rho in tight_pairs(estimate.covariance)
+        if not _one_axis(names[i], names[j]) and not any({names[i], names[j]} <= s for s in said)
+    ]
+    return tuple(_pair_text(*pair) for pair in pairs[:MOST_PAIRS])
+
+
+def _one_axis(first: str, second: str) -> bool:
+    """Whether two parameters are components of one direction, of which only turns are free."""
+    whole = first.rpartition(".")[0]
+    return whole.endswith("axis") and whole == second.rpartition(".")[0]
 
 
 def _by_kind(groups: tuple[Group, ...], estimate: Estimate) -> list[str]:
@@ -210,5 +222,5 @@ def tight_pairs(covariance: Array) -> list[tuple[int, int, float]]:
     free = np.flatnonzero(sigma > EXACT)
     rho = covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
     i, j = np.nonzero(np.triu((np.abs(rho) > TIGHT) & (np.abs(rho) < 1 - 1e-9), 1))
-    order = np.argsort(-np.abs(rho[i, j]), kind="stable")[:MOST_PAIRS]
+    order = np.argsort(-np.abs(rho[i, j]), kind="stable")
     return [(int(free[i[n]]), int(free[j[n]]), float(rho[i[n], j[n]])) for n in order]

@@ -1,0 +1,184 @@
+"""What boards on platforms leave open on cranks, sliders and bars: [C]'s machine and the deltas."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.words import explain
+from pkmcal.identify.words_driven import conventions_held, size_columns
+from pkmcal.identify.words_effect import platform_by_parameters
+from pkmcal.identify.words_families import circumstances
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms.parameters import ParameterTable
+from pkmcal.report.identifiability import section
+from pkmcal.report.parameters import grouped, in_words
+from pose_sessions import estimated, measured, papers_poses, upright
+
+
+@cache
+def told_of(name, model=None, shape=""):
+    """Rank test and findings of a session of 40 to 71 poses; shape: straight, of one line."""
+    rng = np.random.default_rng(1)
+    machine = load_mechanism(name, model=model)
+    poses = papers_poses()[:71] if name == "h4" else kit_poses(rng, machine, shape)
+    case = measured(machine, poses, rng)
+    estimate = estimated(machine, case, rng)
+    assembled = assemble(machine, case.measurements, default_gauge(machine))
+    state = batch_of(machine, assembled, estimate.state)
+    told = identifiability(assembled.problem, machine, state)
+    return told, explain(told, estimate, np.ones((1, machine.n_legs), bool)), estimate
+
+
+def kit_poses(rng, machine, shape):
+    x = rng.uniform([-0.06, -0.06, -0.03], [0.06, 0.06, 0.03], (40, 3)) * (
+        [0, 0, 1] if shape == "straight" else 1
+    )
+    return upright(np.c_[x + machine.home()[:3, 3], np.zeros(40)])
+
+
+def of(findings, start):
+    return [s for s in (*findings.unidentified, *findings.weak) if s.text.startswith(start)]
+
+
+def test_the_half_width_is_told_from_the_base_by_nobody():
+    told, findings, _ = told_of("h4")
+    assert len(told.unidentified) == 2
+    (width,) = of(findings, "Of y of the base joints and of the side bars' joints, only the diff")
+    assert "the bars' half width cannot be told from the base joints' places" in width.text
+    assert set(width.parameters) == {
+        f"legs[{j}].{side}.center.y" for j in range(1, 5) for side in ("base", "platform")
+    }
+    assert (width.dimensions, width.matters) == (1, False)
+    assert ".base." not in width.advice  # either end is enough, the bars are one value
+
+
+def test_the_turn_about_z_is_found_and_one_number_holds_it():
+    _, findings, _ = told_of("h4")
+    (turn,) = of(findings, "The turn of the base frame about z is free")
+    assert (turn.dimensions, turn.matters) == (1, False)
+    assert 'fixed: ["legs[1].base.axis.x"]' in turn.advice
+
+
+def test_what_the_advice_holds_leaves_nothing_open():
+    machine = load_mechanism("h4")
+    table = machine.parameters
+    held = (*table.fixed, "legs[1].base.axis.x", "legs[1].platform.center.y")
+    tied = tuple(
+        tuple(f"-{n}" if n in against else n for n in group)
+        for group, against in zip(table.tied, table.opposed, strict=True)
+    )
+    rng = np.random.default_rng(1)
+    case = measured(machine, papers_poses()[:71], rng)
+    estimate = estimated(machine, case, rng)
+    machine = replace(machine, parameters=table.with_roles(held, tied))
+    assembled = assemble(machine, case.measurements, default_gauge(machine))
+    told = identifiability(assembled.problem, machine, batch_of(machine, assembled, estimate.state))
+    before = told_of("h4")[0]
+    assert told.unidentified == ()
+    assert told.rank == before.rank
+    assert told.n_parameters == before.n_parameters - 2
+
+
+def test_parallelism_is_said_to_be_the_boards():
+    _, findings, _ = told_of("h4")
+    (tilt,) = of(findings, "How the base joints' axes are tilted to each other")
+    assert tilt.text.count("only the board's tilt does") == 1
+
+
+@pytest.mark.parametrize("name", ["delta", "linear-delta"])
+def test_of_both_radii_only_the_difference_is_seen(name):
+    _, findings, _ = told_of(name)
+    first = findings.unidentified[0]
+    assert first.text.startswith(
+        "Of x, y and z of the base joints and of the platform joints, only the difference is seen, "
+        "as the difference of base and platform radius"
+    )
+    assert (first.dimensions, first.matters) == (6, False)
+    assert ".base." not in first.advice
+
+
+def test_heights_alone_confound_arms_and_rods():
+    _, findings, _ = told_of("delta", None, "straight")
+    (sizes,) = of(findings, "The arms' length and the rods' length, of all legs alike, cannot")
+    assert sizes.matters
+    assert set(sizes.parameters) >= {"legs[1].base.arm", "legs[1].length.constant"}
+    whole = told_of("delta")[1]
+    assert not of(whole, "The arms' length and the rods' length, of all legs alike")
+
+
+@pytest.mark.parametrize(
+    "case", [("h4",), ("h4", "rods"), ("delta",), ("linear-delta",), ("delta", None, "straight")]
+)
+def test_no_sentence_speaks_of_tubes_or_photographs_of_legs(case):
+    told, findings, _ = told_of(*case)
+    sentences = (*findings.unidentified, *findings.weak)
+    text = " ".join(f"{s.text} {s.advice}" for s in sentences)
+    for word in ("tube", "hotograph", "base.arm is", "caliper"):
+        assert word not in text
+    assert sum(s.dimensions for s in sentences) == len(told.unidentified) + len(told.weak)
+
+
+def test_sizes_are_columns_of_the_machine():
+    machine = load_mechanism("linear-delta")
+    around = circumstances(machine, np.ones((1, 3), bool), machine.home()[None])
+    sizes = size_columns(around)
+    assert set(sizes) == {"radius", "height", "rod"}
+    centres = machine.values + 1e-3 * sizes["radius"].sum(axis=1)
+    moved = np.linalg.norm(machine.with_values(centres).base_centers()[:, :2], axis=1)
+    np.testing.assert_allclose(
+        moved - np.linalg.norm(machine.base_centers()[:, :2], axis=1), 1e-3, atol=1e-6
+    )
+
+
+# ------------------------------------------------------------------- what is held, and why
+
+
+def test_what_the_calibration_model_holds_is_convention():
+    _, findings, estimate = told_of("h4")
+    assert set(findings.conventional) == set(estimate.machine.parameters.fixed)
+    said = section(findings, estimate.machine.parameters).fixed
+    assert "are held by convention" in said
+    assert "held by the model" not in said
+    assert said.startswith("Crank axis distance of legs 1 to 4,")
+    assert "hinge z of legs 1 to 4" in said
+
+
+def test_the_design_models_assumptions_are_no_conventions():
+    _, findings, estimate = told_of("h4", "design")
+    assert not any(".axis." in name for name in findings.conventional)
+    assert findings.also_conventional > 0  # the heights' sum among them
+    said = section(findings, estimate.machine.parameters).fixed
+    assert "held by the model that the mechanism file describes" in said
+    assert "of which with a camera and a board only the sum is seen" in said
+
+
+def test_a_held_arm_is_no_convention():
+    machine = load_mechanism("delta")
+    poses = upright(np.c_[np.random.default_rng(0).uniform(-0.03, 0.03, (12, 3)), np.zeros(12)])
+    poses[:, 2, 3] -= 0.22
+    table = machine.parameters
+    held = {}
+    for names in (("legs[1].base.arm",), ("legs[1].base.center.x",)):
+        one = replace(machine, parameters=table.with_roles(names, ()))
+        held[names[0]] = conventions_held(one, platform_by_parameters(one, poses))
+    assert held["legs[1].base.arm"] == ((), 0)
+    assert held["legs[1].base.center.x"] == (("legs[1].base.center.x",), 0)
+
+
+def test_names_for_people():
+    table: ParameterTable = load_mechanism("h4").parameters
+    names = tuple(n for n in table.names if n.endswith(("angle", "hinge.y")))
+    assert grouped(names) == ["crank angle of legs 1 to 4", "hinge y of legs 1 to 4"]
+    assert in_words("legs[2].base.arm") == "leg 2 arm length"
+    assert in_words("legs[2].length.constant") == "leg 2 rod length"
+    assert grouped(("legs[1].base.arm", "legs[2].base.arm")) == [
+        "leg 1 arm length",
+        "leg 2 arm length",
+    ]
