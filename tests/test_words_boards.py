@@ -18,7 +18,7 @@ from pkmcal.identify.words_families import circumstances
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.report.identifiability import section
-from pkmcal.report.parameters import grouped, in_words
+from pkmcal.report.parameters import bound_together, grouped, in_words, tight_pairs
 from pose_sessions import estimated, measured, papers_poses, upright
 
 
@@ -148,6 +148,24 @@ def test_what_the_calibration_model_holds_is_convention():
     assert "held by the model" not in said
     assert said.startswith("Crank axis distance of legs 1 to 4,")
     assert "hinge z of legs 1 to 4" in said
+    assert "Of the heights of base joints and platform only the sum counts" in said
+
+
+def test_ties_are_said_once_with_their_signs():
+    _, findings, estimate = told_of("h4")
+    assert section(findings, estimate.machine.parameters).tied == (
+        "Changes together, as one value: platform centre y of legs 1 to 4 (by opposite amounts); "
+        "hinge x of legs 1 to 4 (by opposite amounts)."
+    )
+
+
+def test_pairs_that_a_finding_names_are_not_said_again():
+    _, findings, estimate = told_of("h4")
+    pairs = {(i, j) for i, j, _ in tight_pairs(estimate.covariance)}
+    names = estimate.machine.parameters.names
+    turning = [(names[i], names[j]) for i, j in pairs if "axis" in names[i] and "axis" in names[j]]
+    assert turning
+    assert not [text for text in bound_together(estimate, findings) if text.count("base axis") > 1]
 
 
 def test_the_design_models_assumptions_are_no_conventions():

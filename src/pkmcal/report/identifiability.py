@@ -11,7 +11,7 @@ from pkmcal.identify.conditions import Condition
 from pkmcal.identify.words import Findings, Sentence
 from pkmcal.mechanisms import ParameterTable
 from pkmcal.report.charts import Bar, BarChart
-from pkmcal.report.parameters import grouped, in_words
+from pkmcal.report.parameters import grouped
 from pkmcal.report.wording import brief, count, joined
 
 FLOOR = 1e-3
@@ -140,6 +140,11 @@ def _by_convention(table: ParameterTable, findings: Findings, told: list[str]) -
             "other value would only move a frame, or be made good by a value that is estimated, "
             "and the platform would be where it is."
         )
+    if any(".platform." in name and name.endswith(".z") for name in told):
+        parts.append(
+            "Of the heights of base joints and platform only the sum counts: the camera and the "
+            "board take up the rest."
+        )
     if others:
         verb = "is" if len(others) == 1 else "are"
         parts.append(
@@ -156,11 +161,27 @@ def _by_convention(table: ParameterTable, findings: Findings, told: list[str]) -
 
 
 def _tied(table: ParameterTable) -> str:
-    if not table.tied:
+    groups = [names for names in _together(table) if not names & set(table.fixed)]
+    if not groups:
         return ""
-    groups = [joined([in_words(name) for name in group]) for group in table.tied[:MOST_NAMES]]
-    more = f" and {len(table.tied) - MOST_NAMES} more" if len(table.tied) > MOST_NAMES else ""
-    return f"Changes together, as one value: {'; '.join(groups)}{more}."
+    against = {name for names in table.opposed for name in names}
+    order = [tuple(name for name in table.names if name in names) for names in groups]
+    said = [
+        joined(grouped(names)) + (" (by opposite amounts)" if against & set(names) else "")
+        for names in order[:MOST_NAMES]
+    ]
+    more = f" and {len(order) - MOST_NAMES} more" if len(order) > MOST_NAMES else ""
+    return f"Changes together, as one value: {'; '.join(said)}{more}."
+
+
+def _together(table: ParameterTable) -> list[set[str]]:
+    """Ties, where those that share a name are one."""
+    out: list[set[str]] = []
+    for names in table.tied:
+        touching = [group for group in out if group & set(names)]
+        out = [group for group in out if group not in touching]
+        out.append(set(names).union(*touching))
+    return out
 
 
 def _listed(names: tuple[str, ...]) -> str:

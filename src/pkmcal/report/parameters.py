@@ -144,19 +144,21 @@ def unidentified(
 def bound_together(estimate: Estimate, findings: Findings | None = None) -> tuple[str, ...]:
     """Sentences on pairs that can hardly be told apart, but those that a finding names together."""
     names = estimate.machine.parameters.names
-    said = [] if findings is None else [set(s.parameters) for s in findings.unidentified]
+    found = () if findings is None else findings.unidentified
+    said = [{_whole_axis(name) for name in s.parameters} for s in found]
     pairs = [
         (names[i], names[j], rho)
         for i, j, rho in tight_pairs(estimate.covariance)
-        if not _one_axis(names[i], names[j]) and not any({names[i], names[j]} <= s for s in said)
+        for pair in [{_whole_axis(names[i]), _whole_axis(names[j])}]
+        if len(pair) == 2 and not any(pair <= s for s in said)
     ]
     return tuple(_pair_text(*pair) for pair in pairs[:MOST_PAIRS])
 
 
-def _one_axis(first: str, second: str) -> bool:
-    """Whether two parameters are components of one direction, of which only turns are free."""
-    whole = first.rpartition(".")[0]
-    return whole.endswith("axis") and whole == second.rpartition(".")[0]
+def _whole_axis(name: str) -> str:
+    """The axis that a parameter is a component of, elsewhere the parameter itself."""
+    whole = name.rpartition(".")[0]
+    return whole if whole.endswith("axis") else name
 
 
 def _by_kind(groups: tuple[Group, ...], estimate: Estimate) -> list[str]:
