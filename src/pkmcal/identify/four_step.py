@@ -341,7 +341,7 @@ def _views(
     if guess is None:
         checks.stations_are_fixed(items, views, machine)
         checks.stations_are_joined(items, views)
-    elif checks.loose_legs(items) is not None:
+    elif checks.is_loose(items):
         return together(guess, len(on_base))
     return views
 

@@ -12,13 +12,12 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
-from pkmcal.geometry.rigid import dot
 from pkmcal.identify.four_step_axes import Axes, in_base
 from pkmcal.identify.four_step_base import Items
 from pkmcal.identify.four_step_boards import Views
 from pkmcal.identify.four_step_model import Legs, legs_of
 from pkmcal.identify.four_step_offsets import COLLAPSED, deviations
-from pkmcal.identify.registration import fixes_pose, loose
+from pkmcal.identify.registration import fixes_pose, loose, parts_of
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.fixed import FixedPoint
 from pkmcal.mechanisms.carriers.rigid import RigidPlatform
@@ -77,16 +76,19 @@ def stations_are_fixed(items: Items, views: Views, machine: Machine) -> None:
 
 def stations_are_joined(items: Items, views: Views) -> None:
     """The stations share enough legs, or a board, to become one frame ([A] 3.3)."""
-    free = loose_legs(items)
-    if free is None:
+    free = _free(items)
+    if not free.shape[-1]:
         return
+    seen = items.seen[items.fixed()]
+    parts = parts_of(items.drawing, seen, free, items.n_directions)
+    a, b = (np.flatnonzero(part[: len(items.drawn)]) for part in parts)
     sees = [
         f"station {s + 1} sees legs {listed(np.flatnonzero(items.centres_seen[view]))}"
         for s, view in enumerate(views.of_station)
     ]
     raise ResultError(
-        what=f"the stations share too few legs: the base joints of legs {listed(free[0])} can "
-        f"move against those of legs {listed(free[1])}",
+        what=f"the stations share too few legs: the base joints of legs {listed(a)} can "
+        f"move against those of legs {listed(b)}",
         found="; ".join(sees),
         expected="stations that share three legs, or fewer with revolute axes, [A] 3.3",
         next_step="fix a calibration board to the base where the stations see it, or let a "
@@ -94,11 +96,13 @@ def stations_are_joined(items: Items, views: Views) -> None:
     )
 
 
-def loose_legs(items: Items) -> tuple[Integers, Integers] | None:
-    """Legs whose base joints the views leave free against other legs', or None."""
-    use = items.fixed()
-    free = loose(items.drawing, items.seen[use], items.n_directions)
-    return _parts(items.drawn, free[: len(items.drawn)]) if free.shape[-1] else None
+def is_loose(items: Items) -> bool:
+    """Whether the views leave some base joints free to move against others."""
+    return _free(items).shape[-1] > 0
+
+
+def _free(items: Items) -> Array:
+    return loose(items.drawing, items.seen[items.fixed()], items.n_directions)
 
 
 def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: str) -> None:
@@ -112,11 +116,10 @@ def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: 
     posed = fixes_pose(legs.platform, at_once, motion=legs.motion)
     if not posed.any():
         _too_few_at_once(legs, at_once)
-    free = loose(
-        legs.platform[legs.closing], at_once[np.ix_(posed, legs.closing)], motion=legs.motion
-    )
+    known = (legs.platform[legs.closing], at_once[np.ix_(posed, legs.closing)])
+    free = loose(*known, motion=legs.motion)
     if free.shape[-1]:
-        a, b = _parts(legs.platform[legs.closing], free)
+        a, b = parts_of(*known, free, motion=legs.motion)
         names = np.flatnonzero(legs.closing)
         raise ResultError(
             what=f"the platform joints of legs {listed(names[a])} can move against those of legs "
@@ -211,16 +214,6 @@ def passive_legs_are_fixed(machine: Machine, platform: Array) -> None:
             expected="two directions at least, [A] 3.5",
             next_step=f"add configurations that tilt or shift the platform, or {BUNDLE}",
         )
-
-
-def _parts(points: Array, free: Array) -> tuple[Integers, Integers]:
-    """Two sets of points between which a distance is free; free (n, 3, f) ways to move."""
-    apart = points[:, None] - points
-    rate = np.abs(dot(apart[..., None, :], np.moveaxis(free[:, None] - free, -1, -2)))
-    rate = rate.max(axis=-1)
-    i, j = np.unravel_index(np.argmax(rate), rate.shape)
-    tied = rate < 0.05 * rate.max()
-    return np.flatnonzero(tied[i] & ~tied[j]), np.flatnonzero(tied[j] & ~tied[i])
 
 
 def listed(numbers: Integers) -> str:

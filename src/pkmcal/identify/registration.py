@@ -187,6 +187,28 @@ def loose(items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY
     return vectors[:, values < LOOSE].reshape(len(items), 3, -1)
 
 
+def parts_of(
+    items: Array, seen: Booleans, free: Array, directions: int = 0, motion: Array = ANY_MOTION
+) -> tuple[Booleans, Booleans]:
+    """Two sets of items (n,) that ``free`` (n, 3, f), found by :func:`loose`, moves against each
+    other: what moves while one frame's items are held, and what while another's are.
+
+    Items that belong to both, such as two joints about whose line the rest turns, are in none.
+    Distances would not do: out of a plane of joints they change in second order only.
+    """
+    own = _own_motions(items, directions, motion)
+    flat = free.reshape(len(own), -1)
+    stay = []
+    for frame in seen:
+        mask = np.repeat(frame, 3)
+        held = own @ np.linalg.lstsq(own[mask], flat[mask], rcond=LOOSE)[0]
+        rate = np.linalg.norm((flat - held).reshape(len(items), -1), axis=1)
+        stay.append(rate < 0.05 * rate.max())
+    first = next(s for s in stay if not s.all())
+    other = next(s for s, frame in zip(stay, seen, strict=True) if (frame & ~first).any())
+    return first & ~other, other & ~first
+
+
 def fixes_pose(
     items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY_MOTION
 ) -> Booleans:
