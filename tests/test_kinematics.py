@@ -467,7 +467,7 @@ def test_readings_out_of_reach():
     far = [0.4] * 5 + [3.0]
     assert sentence(GeometryError, hexapod().forward, [[0.4] * 6, far, far]) == (
         "forward kinematics found no pose for 2 of 3 configurations, first at row 1; "
-        "found closure error 1.7e+03 mm, expected readings that the machine can reach. "
+        "found closure error 1.71e+03 mm, expected readings that the machine can reach. "
         "Check the readings, or give a start nearer to the pose."
     )
 

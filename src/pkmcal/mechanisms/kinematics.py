@@ -1,22 +1,33 @@
 """Inverse and forward kinematics of any machine, batched over poses.
 
 Forward kinematics solves the closure for the pose by Levenberg-Marquardt from a start in the
-right assembly; each configuration of the batch has its own damping and stops on its own.
+right assembly, see :mod:`pkmcal.mechanisms.closing`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import perturb, pose, rotation
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, limb_ends, rod_lengths
+from pkmcal.mechanisms.batches import damped_step
+from pkmcal.mechanisms.closing import CONVERGED, MAX_STEPS, close
+from pkmcal.mechanisms.layout import LimbLayout
+from pkmcal.mechanisms.rows import (
+    Rows,
+    base_ends,
+    by_readings,
+    limb_lines,
+    platform_ends,
+    pose_rows,
+    rod_lengths,
+    rows_between,
+)
 
-MAX_STEPS = 60
-CONVERGED = 1e-12
-"""Closure error (m) below which a configuration is solved: 100 times rounding at 1 m."""
 SETTLING = 15
 """Steps for a machine's second rods; a pose that they all allow takes four."""
 SETTLED = 1e-15
@@ -31,16 +42,27 @@ class ForwardResult:
     """Poses found from readings, and how far to trust each.
 
     T_base_platform : (..., 4, 4); converged : (...); error : (...) largest closure error, m.
-    singularity : (...) smallest singular value of the inverse Jacobian with rotations scaled
-        by the platform's radius: 1 is a good machine, 0 a singular pose.
     internal : (..., n) the hinges' turns of an articulated platform, rad; n = 0 for a rigid one.
+    layout, theta, readings : the machine, and what it was closed at.
     """
 
     T_base_platform: Array
     converged: Booleans
     error: Array
-    singularity: Array
     internal: Array
+    layout: LimbLayout = field(repr=False)
+    theta: Array = field(repr=False)
+    readings: Array = field(repr=False)
+
+    @cached_property
+    def singularity(self) -> Array:
+        """(...) smallest singular value of the inverse Jacobian with rotations scaled by the
+        platform's radius: 1 is a good machine, 0 a singular pose. Found when first asked for: it
+        takes longer than the poses.
+        """
+        poses, phi = self.T_base_platform, self.internal
+        rows = pose_rows(self.layout, self.theta, self.readings, poses, phi)
+        return singularity_of(self.layout, scaled_rows(self.layout, self.theta, rows))
 
 
 def inverse(layout: LimbLayout, theta: Array, poses: Array) -> Array:
@@ -55,8 +77,8 @@ def inverse(layout: LimbLayout, theta: Array, poses: Array) -> Array:
 def inverse_result(layout: LimbLayout, theta: Array, poses: Array) -> tuple[Array, Array]:
     """Readings (..., m) and internal coordinates (..., n) at poses (..., 4, 4)."""
     shape = np.broadcast_shapes(poses.shape[:-2], theta.shape[:-1])
-    internal = np.zeros((*shape, layout.n_internal))
-    legs = _leg_inverse(layout, theta, poses)
+    internal = _upright(layout, theta, poses, shape)
+    legs = _leg_inverse(layout, theta, poses, internal)
     if not layout.shares_motors:
         return legs[..., np.flatnonzero(layout.actuated >= 0)][..., _in_columns(layout)], internal
     columns = layout.actuated[None] == np.arange(layout.n_readings)[:, None]
@@ -69,22 +91,28 @@ def _in_columns(layout: LimbLayout) -> Integers:
     return np.argsort(layout.actuated[layout.actuated >= 0], kind="stable")
 
 
-def _leg_inverse(layout: LimbLayout, theta: Array, poses: Array) -> Array:
+def _upright(layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, ...]) -> Array:
+    """Internal coordinates (..., n) that leave the bars' directions as they are, about."""
+    out = np.zeros((*shape, layout.n_internal))
+    for group in layout.platform if layout.n_internal else ():
+        if group.carrier.turns:
+            turn = group.carrier.upright(group.of(theta), poses[..., None, :, :])
+            out[..., layout.internal[group.legs]] = turn
+    return out
+
+
+def _leg_inverse(layout: LimbLayout, theta: Array, poses: Array, internal: Array) -> Array:
     """Each leg's own reading (..., L), zero where it has none."""
-    zeros = np.zeros((*poses.shape[:-2], layout.n_readings))
-    c = closure(layout, theta, zeros, poses)
-    out = np.zeros(c.distance.shape)
-    rods = rod_lengths(layout, theta, zeros)
-    legs = np.flatnonzero(layout.closing)
-    rows = np.flatnonzero(layout.rod_reads[legs])
+    at_zero = base_ends(layout, theta, np.zeros(layout.n_readings))
+    platform = platform_ends(layout, theta, poses, internal)
+    distance = limb_lines(at_zero, platform)[1]
     # linear in the reading of a rod on a fixed centre
-    out[..., legs[rows]] = -c.value[..., rows] / c.by_reading[..., rows]
+    out = np.where(layout.rod_reads, distance - at_zero.length, 0.0)
     for group in layout.base:
         if group.carrier.driven:
-            at = (..., group.legs)
-            b = c.ends.b[..., group.legs, :]
+            b, rods = platform.b[..., group.legs, :], at_zero.length[..., group.legs]
             near = layout.middle[group.legs]
-            out[at] = group.carrier.reading(group.of(theta), b, rods[at], near)
+            out[..., group.legs] = group.carrier.reading(group.of(theta), b, rods, near)
     return out
 
 
@@ -99,15 +127,24 @@ def _settled(
     pick = (layout.row_motor[:, None] == np.arange(m)).astype(float)
     x = np.concatenate([readings, internal], axis=-1)
     for _ in range(SETTLING):
-        c = closure(layout, theta, x[..., :m], poses, x[..., m:])
-        jac = np.concatenate([c.by_reading[..., None] * pick, c.by_internal], axis=-1)
+        c, by_reading = rows_and_drives(layout, theta, x[..., :m], poses, x[..., m:])
+        jac = np.concatenate([by_reading[..., None] * pick, c.by_internal], axis=-1)
         # what is out of reach is NaN and stays so
         jac, value = np.nan_to_num(jac), np.nan_to_num(c.value)
-        step = _damped_solve(jac, value, np.full(value.shape[:-1], 1e-14))
+        step = damped_step(jac, value, np.full(value.shape[:-1], 1e-14))
         x = x - step
         if np.abs(step).max(initial=0.0) < SETTLED:
             break
     return x[..., :m], x[..., m:]
+
+
+def rows_and_drives(
+    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array
+) -> tuple[Rows, Array]:
+    """The closure's rows, and their derivatives (..., E) by their legs' own readings."""
+    base = base_ends(layout, theta, readings)
+    rows = rows_between(layout, theta, base, platform_ends(layout, theta, poses, internal), poses)
+    return rows, by_readings(layout, base, rows)
 
 
 def forward(
@@ -123,48 +160,23 @@ def forward(
     internal coordinates (..., n), from zero where they are not given.
     """
     shape = np.broadcast_shapes(readings.shape[:-1], start.shape[:-2], theta.shape[:-1])
-    current = np.broadcast_to(start, (*shape, 4, 4)).copy()
-    phi = np.zeros((*shape, layout.n_internal)) if internal is None else internal
-    phi = np.broadcast_to(phi, (*shape, layout.n_internal))
-    damping = np.full(shape, 1e-6)
-    c = closure(layout, theta, readings, current, phi)
-    cost = np.sum(c.value**2, axis=-1)
-    for _ in range(MAX_STEPS):
-        active = np.max(np.abs(c.value), axis=-1) > CONVERGED * 1e-2
-        if not active.any():
-            break
-        step = -_damped_solve(layout.by_own(c), c.value, damping)
-        step = np.where(active[..., None], step, 0.0) @ layout.own_motion.T
-        trial, phi_trial = perturb(current, step[..., :6]), phi + step[..., 6:]
-        c_trial = closure(layout, theta, readings, trial, phi_trial)
-        cost_trial = np.sum(c_trial.value**2, axis=-1)
-        better = cost_trial < cost
-        if not (better & active).any() and np.all(damping[active] > 1e3):
-            break
-        current = np.where(better[..., None, None], trial, current)
-        phi = np.where(better[..., None], phi_trial, phi)
-        cost = np.where(better, cost_trial, cost)
-        damping = np.clip(np.where(better, damping * 0.05, damping * 30), 1e-14, 1e6)
-        c = closure(layout, theta, readings, current, phi)
-    return _result(layout, theta, current, phi, c.value, c)
+    count = math.prod(shape)
 
+    def rows(array: Array, *tail: int) -> Array:
+        whole = array if array.shape == (*shape, *tail) else np.broadcast_to(array, (*shape, *tail))
+        return whole.reshape(count, *tail)
 
-def _result(
-    layout: LimbLayout, theta: Array, poses: Array, internal: Array, value: Array, c: Closure
-) -> ForwardResult:
-    reached = np.isfinite(c.value).all(axis=-1)
-    error = np.where(reached, np.abs(value).max(axis=-1, initial=0.0), np.inf)
-    least = _singularity(layout, theta, layout.by_own(c))
-    return ForwardResult(poses, error < CONVERGED, error, least, internal)
-
-
-def _damped_solve(jac: Array, value: Array, damping: Array) -> Array:
-    """Levenberg-Marquardt step with column scaling, (..., d)."""
-    normal = np.swapaxes(jac, -1, -2) @ jac
-    scale = np.einsum("...ii->...i", normal) + 1e-300
-    normal = normal + damping[..., None, None] * scale[..., None] * np.eye(jac.shape[-1])
-    gradient = np.swapaxes(jac, -1, -2) @ value[..., None]
-    return np.linalg.solve(normal, gradient)[..., 0]
+    n = layout.n_internal
+    found = close(
+        layout,
+        theta if theta.ndim == 1 else rows(theta, theta.shape[-1]),
+        rows(readings, layout.n_readings),
+        rows(start, 4, 4),
+        rows(np.zeros(n) if internal is None else internal, n),
+    )
+    poses, inner = found.poses.reshape(*shape, 4, 4), found.internal.reshape(*shape, n)
+    error = found.error.reshape(shape)
+    return ForwardResult(poses, error < CONVERGED, error, inner, layout, theta, readings)
 
 
 def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:
@@ -173,23 +185,37 @@ def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:
     by_pose : the closure's, (..., E, 6). Rotations are scaled by the platform's radius, so a row is
     about a unit direction; zero means that the platform can move with all joints locked.
     """
-    return _singularity(layout, theta, by_pose @ layout.motion)
+    own = by_pose[..., layout.freedoms]
+    scale = own_scale(layout, theta)[..., : own.shape[-1]]
+    return singularity_of(layout, own * scale[..., None, :])
 
 
-def _singularity(layout: LimbLayout, theta: Array, by_own: Array) -> Array:
-    """The same with internal coordinates, which turn as the platform does; by_own (..., E, d)."""
-    if layout.n_equations < by_own.shape[-1]:  # fewer than its freedoms: it can always move
-        return np.zeros(by_own.shape[:-2])
-    hinges = np.arange(by_own.shape[-1]) >= layout.motion.shape[1]
-    turns = hinges | (np.abs(layout.own_motion[:3]).sum(axis=0) > 0)
-    scale = np.where(turns, 1 / _radius(layout, theta)[..., None], 1.0)
-    scaled = by_own * scale[..., None, :]
+def scaled_rows(layout: LimbLayout, theta: Array, rows: Rows) -> Array:
+    """Rows (..., E, d + n) by the pose's own freedoms, hinges last, without units: turns, which the
+    hinges' are too, count as the platform's joints' ways.
+    """
+    return layout.by_own(rows) * own_scale(layout, theta)[..., None, :]
+
+
+def singularity_of(layout: LimbLayout, scaled: Array) -> Array:
+    """Smallest singular value (...) of :func:`scaled_rows`; NaN where they are not known."""
+    if layout.n_equations < scaled.shape[-1]:  # fewer than its freedoms: it can always move
+        return np.zeros(scaled.shape[:-2])
     known = np.isfinite(scaled).all(axis=(-1, -2))
     least = np.linalg.svd(np.nan_to_num(scaled), compute_uv=False)[..., -1]
     return np.where(known, least, np.nan)
 
 
-def _radius(layout: LimbLayout, theta: Array) -> Array:
+def own_scale(layout: LimbLayout, theta: Array) -> Array:
+    """What one unit of each of the pose's own freedoms is, (..., d + n): 1 m along the base's
+    axes, and turns, hinges' too, that move the platform's joints by 1 m.
+    """
+    hinges = np.arange(layout.own_motion.shape[1]) >= layout.motion.shape[1]
+    turns = hinges | (np.abs(layout.own_motion[:3]).sum(axis=0) > 0)
+    return np.where(turns, 1 / platform_radius(layout, theta)[..., None], 1.0)
+
+
+def platform_radius(layout: LimbLayout, theta: Array) -> Array:
     """Root mean square distance (...) of the platform's joints from their mean, m."""
     points = [g.carrier.point(g.of(theta), np.eye(4)).value for g in layout.platform]
     centres = np.concatenate(points, axis=-2)
@@ -202,12 +228,12 @@ def home_candidates(layout: LimbLayout, theta: Array, readings: Array) -> Array:
     """Starts for a machine whose file names no home pose: the platform unturned, its joints'
     mean above (and below) the base joints' mean, at the height that the rods reach; (k, 4, 4).
     """
-    ends = limb_ends(layout, theta, readings, np.eye(4))
-    shift = ends.a.mean(axis=-2) - ends.b.mean(axis=-2)
-    reach = _reach(layout, theta, readings)
-    flat = float(np.linalg.norm((ends.b + shift - ends.a)[..., :2], axis=-1).mean())
+    a, b = base_ends(layout, theta, readings).a, platform_ends(layout, theta, np.eye(4)).b
+    shift = a.mean(axis=-2) - b.mean(axis=-2)
+    reach = typical_reach(layout, theta, readings)
+    flat = float(np.linalg.norm((b + shift - a)[..., :2], axis=-1).mean())
     height = np.sqrt(max(reach**2 - flat**2, (0.3 * reach) ** 2))
-    sides = (-1, 1) if _hangs(layout, theta, ends.a) else (1, -1)
+    sides = (-1, 1) if _hangs(layout, theta, a) else (1, -1)
     starts = [pose(np.eye(3), shift + np.array([0.0, 0.0, s * height])) for s in sides]
     if layout.motion.shape[1] == 3 and layout.motion[2, 0] == 1:
         starts = [pose(rotation(np.array([0, 0, a])), shift) for a in (0.0, 0.5, -0.5, 1.0, -1.0)]
@@ -220,7 +246,7 @@ def _hangs(layout: LimbLayout, theta: Array, a: Array) -> bool:
     return bool(drops) and float(np.concatenate(drops).mean()) < 0
 
 
-def _reach(layout: LimbLayout, theta: Array, readings: Array) -> float:
+def typical_reach(layout: LimbLayout, theta: Array, readings: Array) -> float:
     """Mean length of the rods whose length is known, m."""
     return float(np.abs(rod_lengths(layout, theta, readings)[layout.closing]).mean())
 
@@ -234,21 +260,24 @@ def on_manifold(layout: LimbLayout, theta: Array, poses: Array) -> ForwardResult
     """
     current = np.array(poses)
     readings, phi = inverse_result(layout, theta, current)
-    c = closure(layout, theta, readings, current, phi)
+    c, drives = rows_and_drives(layout, theta, readings, current, phi)
     free = layout.driven_rows.size < layout.n_equations or layout.shares_motors
     for _ in range(MAX_STEPS if free else 0):
-        value, blind = _undriven(layout, c)
+        value, blind = undriven(layout, c, drives)
         value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.by_pose @ layout.motion)
         if np.abs(value).max(initial=0.0) < CONVERGED * 1e-2:
             break
         step = -np.linalg.pinv(by_pose) @ value[..., None]
         current = perturb(current, (layout.motion @ step)[..., 0])
         readings, phi = inverse_result(layout, theta, current)
-        c = closure(layout, theta, readings, current, phi)
-    return _result(layout, theta, current, phi, _undriven(layout, c)[0], c)
+        c, drives = rows_and_drives(layout, theta, readings, current, phi)
+    reached = np.isfinite(c.value).all(axis=-1)
+    left = np.abs(undriven(layout, c, drives)[0]).max(axis=-1, initial=0.0)
+    error = np.where(reached, left, np.inf)
+    return ForwardResult(current, error < CONVERGED, error, phi, layout, theta, readings)
 
 
-def _undriven(layout: LimbLayout, c: Closure) -> tuple[Array, Array]:
+def undriven(layout: LimbLayout, c: Rows, by_reading: Array) -> tuple[Array, Array]:
     """Combinations (..., r, E) of the closure's rows that neither drives nor hinges move, and
     their values (..., r).
     """
@@ -256,33 +285,8 @@ def _undriven(layout: LimbLayout, c: Closure) -> tuple[Array, Array]:
     blind = np.eye(layout.n_equations)[passive]
     if layout.shares_motors:
         pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
-        moved = np.concatenate([c.by_reading[..., None] * pick, c.by_internal], axis=-1)
+        moved = np.concatenate([by_reading[..., None] * pick, c.by_internal], axis=-1)
         moved = np.nan_to_num(moved)
         q = np.linalg.qr(moved, mode="complete")[0]
         blind = np.swapaxes(q[..., moved.shape[-1] :], -1, -2)
     return (blind @ c.value[..., None])[..., 0], blind
-
-
-def assembly_modes(
-    layout: LimbLayout,
-    theta: Array,
-    readings: Array,
-    rng: np.random.Generator,
-    starts: int = 400,
-) -> Array:
-    """Distinct poses that close the machine at one set of readings (m,): (k, 4, 4).
-
-    A multi-start search: every mode returned is one; that none is missing is not proven.
-    """
-    home = home_candidates(layout, theta, readings)[0]
-    reach = _reach(layout, theta, readings)
-    turns = rng.normal(size=(starts, 3)) * 1.2
-    shifts = rng.normal(size=(starts, 3)) * reach
-    delta = np.concatenate([turns, shifts], axis=-1) @ layout.motion @ layout.motion.T
-    found = forward(layout, theta, readings, perturb(home, delta))
-    poses = found.T_base_platform[found.converged]
-    kept: list[Array] = []
-    for candidate in poses:  # few distinct ones: a loop over results, not over work
-        if all(np.abs(candidate - other).max() > 1e-6 for other in kept):
-            kept.append(candidate)
-    return np.stack(kept) if kept else np.zeros((0, 4, 4))

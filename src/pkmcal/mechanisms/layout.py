@@ -22,6 +22,7 @@ from pkmcal.mechanisms.schema import MechanismDocument
 
 if TYPE_CHECKING:
     from pkmcal.mechanisms.limbs import Closure
+    from pkmcal.mechanisms.rows import Rows
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,14 @@ class CarrierGroup:
     constants: Array
     silent: Booleans
 
+    @cached_property
+    def complete(self) -> bool:
+        """Whether the file gives every number."""
+        return not self.silent.any()
+
     def of(self, theta: Array) -> Array:
         """The group's parameters (..., g, n) out of all, (..., P)."""
-        if not self.silent.any():
+        if self.complete:
             return theta[..., self.index]
         known = theta[..., np.where(self.silent, 0, self.index)]
         return np.where(self.silent, self.constants, known)
@@ -80,12 +86,17 @@ class LimbLayout:
     motion: Array
     n_parameters: int
 
-    @property
+    @cached_property
     def n_equations(self) -> int:
         """Rows of the closure: lengths, then angles."""
         return int(self.closing.sum()) + len(self.angles)
 
-    @property
+    @cached_property
+    def all_close(self) -> bool:
+        """Whether the length of every leg is an equation."""
+        return bool(self.closing.all())
+
+    @cached_property
     def driven_rows(self) -> Integers:
         """Rows of the closure that belong to legs with a reading, in the legs' order."""
         return np.flatnonzero(self.actuated[self.closing] >= 0)
@@ -120,9 +131,20 @@ class LimbLayout:
         out[:6, d:], out[6:, :d] = 0.0, 0.0
         return out
 
-    def by_own(self, rows: Closure) -> Array:
+    @cached_property
+    def free(self) -> Booleans:
+        """(6,) which of (omega, tau) the motion has."""
+        return np.asarray(self.motion.any(axis=1))
+
+    @cached_property
+    def freedoms(self) -> slice:
+        """The same as a slice of the six."""
+        used = np.flatnonzero(self.free)
+        return slice(int(used[0]), int(used[-1]) + 1)
+
+    def by_own(self, rows: Closure | Rows) -> Array:
         """Rows (..., E, d + n) by the pose's own freedoms, internal coordinates last."""
-        by_pose = rows.by_pose @ self.motion
+        by_pose = rows.by_pose[..., self.freedoms]
         if not self.n_internal:
             return by_pose
         return np.concatenate([by_pose, rows.by_internal], axis=-1)
@@ -134,7 +156,7 @@ MOTIONS: dict[str, Array] = {
     "translation": np.eye(6)[:, 3:],
     "schoenflies": np.eye(6)[:, 2:],
 }
-"""Columns: the directions (omega, tau) in which the platform can move, base frame."""
+"""Columns: the directions (omega, tau) in which the platform can move, base frame; neighbours."""
 
 
 def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLayout:

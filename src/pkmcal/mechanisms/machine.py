@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import pose, rotation
-from pkmcal.mechanisms import kinematics
+from pkmcal.mechanisms import (
+    amplification,
+    assembly_modes,
+    extents,
+    kinematics,
+    paths,
+    signs,
+    velocities,
+    workspace,
+)
 from pkmcal.mechanisms.carriers.contract import (
     ParameterKind,
     base_carriers,
@@ -102,6 +112,10 @@ class Machine:
 
     def home(self) -> Array:
         """A start for forward kinematics: the file's home, or the platform above the base."""
+        return self._home.copy()
+
+    @cached_property
+    def _home(self) -> Array:
         if self.document.home is not None:
             h = self.document.home
             return pose(rotation(np.array(h.rotation_vector)), np.array(h.position))
@@ -155,13 +169,96 @@ class Machine:
     def forward_result(self, joints: Array, start: Array | None = None) -> kinematics.ForwardResult:
         """As :meth:`forward`, with convergence and nearness to singularity, nothing raised."""
         readings = _checked(joints, (self.n_joints,), "joints")
-        begin = self.home() if start is None else _checked(start, (4, 4), "start")
+        begin = self._home if start is None else _checked(start, (4, 4), "start")
         return kinematics.forward(self.layout, self.values, readings, begin)
+
+    def inverse_jacobian(self, T_base_platform: Array) -> Array:
+        """Readings' rates from the platform's twist, (n, m, 6), at poses (n, 4, 4).
+
+        The twist is (omega, tau), base frame; see :func:`velocities.inverse_jacobian`.
+        """
+        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        return velocities.inverse_jacobian(self.layout, self.values, poses)
+
+    def forward_jacobian(self, T_base_platform: Array) -> Array:
+        """The platform's twist from the readings' rates, (n, 6, m), at poses (n, 4, 4).
+
+        NaN where the pose is singular; see :func:`velocities.forward_jacobian`.
+        """
+        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        return velocities.forward_jacobian(self.layout, self.values, poses)
+
+    def amplification(
+        self, T_base_platform: Array, p_platform: Array | None = None
+    ) -> amplification.Amplification:
+        """Speeds, forces and conditioning at poses (n, 4, 4), of a point (3,) of the platform, m;
+        see :mod:`pkmcal.mechanisms.amplification`.
+        """
+        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        point = None if p_platform is None else _checked(p_platform, (3,), "p_platform")
+        return amplification.amplification(self.layout, self.values, poses, point)
+
+    def limits(self) -> workspace.Limits:
+        """The machine with its ranges and home's assembly, for the functions of workspaces."""
+        return workspace.Limits(
+            self.layout, self.values, self.joint_ranges, self.joint_units, self.home()
+        )
+
+    def reachable(self, T_base_platform: Array) -> workspace.Reach:
+        """Which poses (n, 4, 4) the machine can take, and why not the others."""
+        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        return workspace.reachable(self.limits(), poses)
+
+    def extents(
+        self, directions: Array, start: Array | None = None, most: float | None = None
+    ) -> extents.Extents:
+        """How far the platform comes along directions (k, 3) or twists (k, 6) from a pose (4, 4),
+        home when absent; see :func:`pkmcal.mechanisms.extents.extents`.
+        """
+        axes = np.asarray(directions, dtype=float)
+        axes = _checked(axes, (6,) if axes.shape[-1:] == (6,) else (3,), "directions")
+        begin = self._home if start is None else _checked(start, (4, 4), "start")
+        return extents.extents(self.limits(), axes.reshape(-1, axes.shape[-1]), begin, most)
+
+    def grid(
+        self, directions: Array | None = None, middle: Array | None = None, count: int = 25
+    ) -> extents.Grid:
+        """The workspace at the orientation of a pose (4, 4), home when absent: along all of the
+        motion's directions, or a section along two (2, 3); see
+        :func:`pkmcal.mechanisms.extents.grid`.
+        """
+        own = np.eye(3)[self.layout.free[3:]]
+        axes = own if directions is None else _checked(directions, (3,), "directions")
+        begin = self._home if middle is None else _checked(middle, (4, 4), "middle")
+        return extents.grid(self.limits(), begin, axes, count)
+
+    def check_path(self, T_base_platform: Array) -> paths.PathCheck:
+        """Whether a path of poses (n, 4, 4) stays in the workspace and crosses no singular pose,
+        and where not.
+        """
+        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        return paths.check_path(self.limits(), poses)
+
+    def same_assembly(self, T_base_platform: Array, T_reference: Array | None = None) -> Booleans:
+        """Whether poses (n, 4, 4) may belong to the assembly of a reference (4, 4), home when
+        absent. False is sure, True is not; see :func:`pkmcal.mechanisms.signs.same_assembly`.
+        """
+        poses = _checked(T_base_platform, (4, 4), "T_base_platform")
+        other = self._home if T_reference is None else _checked(T_reference, (4, 4), "T_reference")
+        return signs.same_assembly(self.layout, self.values, poses, other)
 
     def assembly_modes(self, joints: Array, rng: np.random.Generator) -> Array:
         """Distinct poses (k, 4, 4) that close the machine at one set of readings (m,)."""
+        return self.assembly_modes_result(joints, rng).poses
+
+    def assembly_modes_result(
+        self, joints: Array, rng: np.random.Generator, most: int = 100_000
+    ) -> assembly_modes.AssemblyModes:
+        """As :meth:`assembly_modes`, with signs, counts and what may be missing; most : starts."""
         readings = _checked(joints, (self.n_joints,), "joints")
-        return kinematics.assembly_modes(self.layout, self.values, readings, rng)
+        return assembly_modes.assembly_modes(
+            self.layout, self.values, readings, self._home, rng, most
+        )
 
     def middle_readings(self) -> Array:
         """Readings (m,) at mid-range, zero where the file gives no range."""

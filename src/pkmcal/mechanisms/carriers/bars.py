@@ -14,8 +14,8 @@ from pydantic import Field
 from pkmcal.arrays import Array
 from pkmcal.files import Schema
 from pkmcal.geometry.rigid import cross, dot, rotation, skew
+from pkmcal.mechanisms.batches import turned
 from pkmcal.mechanisms.carriers.contract import (
-    CarriedPoint,
     PlatformCarrier,
     direction_by_frame,
     moved_direction,
@@ -24,7 +24,6 @@ from pkmcal.mechanisms.carriers.contract import (
     turned_blocks,
     vectors,
 )
-from pkmcal.mechanisms.carriers.rigid import by_pose
 from pkmcal.mechanisms.joints import Direction
 
 BarNumber = Annotated[int, Field(ge=1, description="the number of the side bar, from 1")]
@@ -65,17 +64,24 @@ class Bar(PlatformCarrier):
     parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("hinge", "m", "center"))
 
     @staticmethod
-    def point(
+    def place(
         parameters: Array, T_base_platform: Array, internal: Array | None = None
-    ) -> CarriedPoint:
-        """B, its derivatives by pose and parameters."""
+    ) -> tuple[Array, Array]:
+        """B, and the turned hinge: the bar does not turn."""
         del internal
-        rot = T_base_platform[..., :3, :3]
-        turned = (rot @ parameters[..., 3:, None])[..., 0]
-        value = turned + T_base_platform[..., :3, 3] + parameters[..., :3]
-        by_parameters = np.zeros((*value.shape, 6))
-        by_parameters[..., :3], by_parameters[..., 3:] = np.eye(3), rot
-        return CarriedPoint(value, by_pose(turned), by_parameters)
+        arm = turned(T_base_platform[..., :3, :3], parameters[..., 3:])
+        return arm + T_base_platform[..., :3, 3] + parameters[..., :3], arm
+
+    @staticmethod
+    def by_parameters(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> Array:
+        """Identity for the bar, R for the hinge."""
+        del internal
+        shape = np.broadcast_shapes(parameters.shape[:-1], T_base_platform.shape[:-2])
+        out = np.zeros((*shape, 3, 6))
+        out[..., :3], out[..., 3:] = np.eye(3), T_base_platform[..., :3, :3]
+        return out
 
     @staticmethod
     def moved(parameters: Array, e: Array, f: Array) -> Array:
@@ -117,20 +123,28 @@ class HingedBar(PlatformCarrier):
     )
 
     @staticmethod
-    def point(
+    def place(
         parameters: Array, T_base_platform: Array, internal: Array | None = None
-    ) -> CarriedPoint:
-        """B, its derivatives by pose and parameters."""
+    ) -> tuple[Array, Array]:
+        """B, and all of it but t."""
+        center, axis = parameters[..., :3], parameters[..., 6:]
+        w = axis / np.sqrt(dot(axis, axis))[..., None]
+        cos, sin = _cos_sin(internal)
+        swung = cos * center + sin * cross(w, center) + (1 - cos) * dot(w, center)[..., None] * w
+        arm = turned(T_base_platform[..., :3, :3], parameters[..., 3:6] + swung)
+        return arm + T_base_platform[..., :3, 3], arm
+
+    @staticmethod
+    def by_parameters(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> Array:
+        """In the parameters' order."""
         rot = T_base_platform[..., :3, :3]
         center, axis = parameters[..., :3], parameters[..., 6:]
         size = np.sqrt(dot(axis, axis))[..., None]
         w = axis / size
         cos, sin = _cos_sin(internal)
         high = dot(w, center)[..., None]
-        side = cross(w, center)
-        swung = cos * center + sin * side + (1 - cos) * high * w
-        arm = (rot @ (parameters[..., 3:6] + swung)[..., None])[..., 0]
-        value = arm + T_base_platform[..., :3, 3]
         eye = np.eye(3)
         outer = w[..., :, None] * w[..., None, :]
         c, s = cos[..., None], sin[..., None]
@@ -138,11 +152,25 @@ class HingedBar(PlatformCarrier):
         by_w = -s * skew(center)
         by_w = by_w + (1 - c) * (high[..., None] * eye + w[..., :, None] * center[..., None, :])
         by_axis = by_w @ (eye - outer) / size[..., None]
-        by_parameters = np.zeros((*value.shape, 9))
-        by_parameters[..., :3] = rot @ by_center
-        by_parameters[..., 3:6] = rot
-        by_parameters[..., 6:] = rot @ by_axis
-        return CarriedPoint(value, by_pose(arm), by_parameters)
+        by_center, by_axis = rot @ by_center, rot @ by_axis
+        out = np.zeros((*np.broadcast_shapes(by_center.shape, by_axis.shape)[:-1], 9))
+        out[..., :3], out[..., 3:6], out[..., 6:] = by_center, rot, by_axis
+        return out
+
+    @staticmethod
+    def upright(parameters: Array, T_base_platform: Array) -> Array:
+        """Minus the platform's turn about the hinge: of the turn's quaternion the part about w."""
+        axis, rot = parameters[..., 6:], T_base_platform[..., :3, :3]
+        axial = np.stack(
+            [
+                rot[..., 2, 1] - rot[..., 1, 2],
+                rot[..., 0, 2] - rot[..., 2, 0],
+                rot[..., 1, 0] - rot[..., 0, 1],
+            ],
+            axis=-1,
+        )
+        along = dot(axial, axis) / np.sqrt(dot(axis, axis))
+        return -2 * np.arctan2(along, 1 + np.trace(rot, axis1=-2, axis2=-1))
 
     @staticmethod
     def by_internal(
@@ -154,7 +182,7 @@ class HingedBar(PlatformCarrier):
         cos, sin = _cos_sin(internal)
         side = cross(w, center)
         ahead = cos * side + sin * cross(w, side)
-        return (T_base_platform[..., :3, :3] @ ahead[..., None])[..., 0]
+        return turned(T_base_platform[..., :3, :3], ahead)
 
     @staticmethod
     def moved(parameters: Array, e: Array, f: Array) -> Array:

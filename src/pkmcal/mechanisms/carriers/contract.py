@@ -4,7 +4,8 @@ A limb is a rod between a point A on the base side and a point B on the platform
 ``|B(X; theta) - A(q; theta)| = length(q; theta)``. The base carrier gives A, the platform
 carrier gives B. A carrier names the joint kinds it serves in mechanism files, the schema of
 its fields, its parameters, and the point with its exact derivatives, for any number of legs
-and configurations at once.
+and configurations at once. Kinematics needs the point and how it moves, ``place``; identification
+also its derivatives by the parameters.
 """
 
 from __future__ import annotations
@@ -89,8 +90,22 @@ class BaseCarrier(Carrier):
 
     @staticmethod
     @abstractmethod
-    def point(parameters: Array, readings: Array) -> CarriedPoint:
-        """A for parameters (..., n) and readings (...,) (m or rad)."""
+    def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
+        """A and its derivative by the reading, (..., 3) each, for parameters (..., n) and readings
+        (...,) (m or rad). What the readings do not change needs not have their shape.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def by_parameters(parameters: Array, readings: Array) -> Array:
+        """Derivatives (..., 3, n) of A by the parameters."""
+
+    @classmethod
+    def point(cls, parameters: Array, readings: Array) -> CarriedPoint:
+        """A with all derivatives."""
+        shape = (*np.broadcast_shapes(parameters.shape[:-1], readings.shape), 3)
+        value, by_reading = (np.broadcast_to(x, shape) for x in cls.place(parameters, readings))
+        return CarriedPoint(value, by_reading, cls.by_parameters(parameters, readings))
 
     @staticmethod
     def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
@@ -115,10 +130,38 @@ class PlatformCarrier(Carrier):
 
     @staticmethod
     @abstractmethod
-    def point(
+    def place(
         parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> tuple[Array, Array]:
+        """B and the arm that turns with the platform, (..., 3) m each, base frame: by the pose's
+        left perturbation B moves by ``omega x arm + tau``.
+
+        For parameters (..., n), poses (..., 4, 4) and internal coordinates (...,), rad.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def by_parameters(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> Array:
+        """Derivatives (..., 3, n) of B by the parameters."""
+
+    @classmethod
+    def point(
+        cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> CarriedPoint:
-        """B for parameters (..., n), poses (..., 4, 4) and internal coordinates (...,), rad."""
+        """B with all derivatives."""
+        value, arm = cls.place(parameters, T_base_platform, internal)
+        by_parameters = cls.by_parameters(parameters, T_base_platform, internal)
+        return CarriedPoint(value, by_pose(arm), by_parameters)
+
+    @staticmethod
+    def upright(parameters: Array, T_base_platform: Array) -> Array:
+        """Internal coordinates (...,) that leave a bar's direction as it is, about: a start for the
+        search for the right ones.
+        """
+        shape = np.broadcast_shapes(parameters.shape[:-1], T_base_platform.shape[:-2])
+        return np.zeros(shape)
 
     @staticmethod
     def by_internal(
@@ -128,6 +171,14 @@ class PlatformCarrier(Carrier):
         del internal
         shape = np.broadcast_shapes(parameters.shape[:-1], T_base_platform.shape[:-2])
         return np.zeros((*shape, 3))
+
+
+def by_pose(arm: Array) -> Array:
+    """Change (..., 3, 6) of a platform's point by the pose, its turned arm (..., 3) given."""
+    out = np.zeros((*arm.shape, 6))
+    out[..., :3] = -skew(arm)
+    out[..., 3:] = np.eye(3)
+    return out
 
 
 def vectors(name: str, unit: str, tolerance: str) -> tuple[ParameterKind, ...]:

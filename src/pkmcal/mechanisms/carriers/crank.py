@@ -12,7 +12,6 @@ from pkmcal.files import Schema
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
-    CarriedPoint,
     ParameterKind,
     direction_by_frame,
     moved_direction,
@@ -84,28 +83,34 @@ class Crank(BaseCarrier):
     )
 
     @staticmethod
-    def point(parameters: Array, readings: Array) -> CarriedPoint:
-        """A, its derivatives by reading and parameters."""
+    def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
+        """A, and the arm's direction ahead times its length."""
+        frame = _frame(parameters)
+        arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
+        out, ahead = _turned(frame, parameters, readings)
+        value = parameters[..., :3] + along * frame.v + radial * frame.e0 + arm * out
+        return value, arm * ahead
+
+    @staticmethod
+    def by_parameters(parameters: Array, readings: Array) -> Array:
+        """In the parameters' order."""
         frame = _frame(parameters)
         v, e0, side = frame.v, frame.e0, frame.side
-        arm, angle, along, radial = (parameters[..., k, None] for k in range(6, 10))
-        turn = readings[..., None] + angle
-        c, s = np.cos(turn), np.sin(turn)
-        out, ahead = c * e0 + s * side, c * side - s * e0
-        value = parameters[..., :3] + along * v + radial * e0 + arm * out
+        arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
+        out, ahead = _turned(frame, parameters, readings)
         by_reading = arm * ahead
         # the frame turns by the twist about v, and v itself pulls e0 and side after it
         swing = radial * side + by_reading
         pull = radial * e0 + arm * out
         by_v = along[..., None] * np.eye(3) + _outer(swing, frame.twist) - _outer(v, pull)
         by_zero = _outer(swing, side * frame.drawn / frame.n)
-        by_parameters = np.zeros((*value.shape, 13))
+        by_parameters = np.zeros((*by_reading.shape, 13))
         by_parameters[..., :3] = np.eye(3)
         by_parameters[..., 3:6] = _by_axis(by_v, v, parameters)
         for k, column in enumerate((out, by_reading, v, e0), start=6):
             by_parameters[..., k] = column
         by_parameters[..., 10:] = by_zero
-        return CarriedPoint(value, by_reading, by_parameters)
+        return by_parameters
 
     @staticmethod
     def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
@@ -182,6 +187,13 @@ def _frame(parameters: Array) -> _Frame:
     side = cross(v, e0)
     twist = np.where(drawn, -high * side, cross(UP, side)) / n
     return _Frame(v, e0, side, twist, n, drawn)
+
+
+def _turned(frame: _Frame, parameters: Array, readings: Array) -> tuple[Array, Array]:
+    """The arm's direction and, square to it, the one in which its end moves, (..., 3) each."""
+    turn = readings[..., None] + parameters[..., 7, None]
+    c, s = np.cos(turn), np.sin(turn)
+    return c * frame.e0 + s * frame.side, c * frame.side - s * frame.e0
 
 
 def _outer(a: Array, b: Array) -> Array:

@@ -9,7 +9,6 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
-    CarriedPoint,
     moved_point,
     point_by_frame,
     turned_blocks,
@@ -29,13 +28,16 @@ class FixedPoint(BaseCarrier):
     parameters: ClassVar = CENTER
 
     @staticmethod
-    def point(parameters: Array, readings: Array) -> CarriedPoint:
-        """A is the centre itself, (..., 3)."""
+    def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
+        """A is the centre itself, (..., 3), whatever the reading."""
+        del readings
+        return parameters, np.zeros_like(parameters)
+
+    @staticmethod
+    def by_parameters(parameters: Array, readings: Array) -> Array:
+        """Identity."""
         shape = np.broadcast_shapes(parameters.shape[:-1], readings.shape)
-        value = np.broadcast_to(parameters, (*shape, 3))
-        return CarriedPoint(
-            value, np.zeros((*shape, 3)), np.broadcast_to(np.eye(3), (*shape, 3, 3))
-        )
+        return np.broadcast_to(np.eye(3), (*shape, 3, 3))
 
     @staticmethod
     def moved(parameters: Array, e: Array, f: Array) -> Array:

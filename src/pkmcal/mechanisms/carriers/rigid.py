@@ -7,9 +7,8 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.geometry.rigid import skew
+from pkmcal.mechanisms.batches import turned
 from pkmcal.mechanisms.carriers.contract import (
-    CarriedPoint,
     PlatformCarrier,
     moved_point,
     point_by_frame,
@@ -28,15 +27,22 @@ class RigidPlatform(PlatformCarrier):
     parameters: ClassVar = CENTER
 
     @staticmethod
-    def point(
+    def place(
         parameters: Array, T_base_platform: Array, internal: Array | None = None
-    ) -> CarriedPoint:
-        """B = R b + t; by the pose's left perturbation, dB = -[R b]x omega + tau."""
+    ) -> tuple[Array, Array]:
+        """B = R b + t, the arm R b."""
         del internal
-        rot = T_base_platform[..., :3, :3]
-        turned = (rot @ parameters[..., None])[..., 0]
-        by_parameters = np.broadcast_to(rot, (*turned.shape, 3))
-        return CarriedPoint(turned + T_base_platform[..., :3, 3], by_pose(turned), by_parameters)
+        arm = turned(T_base_platform[..., :3, :3], parameters)
+        return arm + T_base_platform[..., :3, 3], arm
+
+    @staticmethod
+    def by_parameters(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> Array:
+        """R."""
+        del internal
+        shape = np.broadcast_shapes(parameters.shape[:-1], T_base_platform.shape[:-2])
+        return np.broadcast_to(T_base_platform[..., :3, :3], (*shape, 3, 3))
 
     @staticmethod
     def moved(parameters: Array, e: Array, f: Array) -> Array:
@@ -55,11 +61,3 @@ class RigidPlatform(PlatformCarrier):
         """A turn."""
         del parameters, e
         return turned_blocks(3, (0, f))
-
-
-def by_pose(turned: Array) -> Array:
-    """Change (..., 3, 6) of a platform's point by the pose, its turned arm (..., 3) given."""
-    out = np.zeros((*turned.shape, 6))
-    out[..., :3] = -skew(turned)
-    out[..., 3:] = np.eye(3)
-    return out

@@ -12,7 +12,6 @@ from pkmcal.files import Schema
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
-    CarriedPoint,
     direction_by_frame,
     moved_direction,
     moved_point,
@@ -47,17 +46,24 @@ class Slider(BaseCarrier):
     parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("axis", "1", "axis"))
 
     @staticmethod
-    def point(parameters: Array, readings: Array) -> CarriedPoint:
-        """A, its derivatives by reading and parameters."""
+    def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
+        """A, and v."""
+        axis = parameters[..., 3:]
+        v = axis / np.sqrt(dot(axis, axis))[..., None]
+        return parameters[..., :3] + readings[..., None] * v, v
+
+    @staticmethod
+    def by_parameters(parameters: Array, readings: Array) -> Array:
+        """Identity for the centre; the axis's length changes nothing."""
         axis = parameters[..., 3:]
         size = np.sqrt(dot(axis, axis))[..., None]
         v, q = axis / size, readings[..., None]
-        value = parameters[..., :3] + q * v
-        by_parameters = np.zeros((*value.shape, 6))
-        by_parameters[..., :3] = np.eye(3)
+        shape = np.broadcast_shapes(parameters.shape[:-1], readings.shape)
+        out = np.zeros((*shape, 3, 6))
+        out[..., :3] = np.eye(3)
         across = np.eye(3) - v[..., :, None] * v[..., None, :]
-        by_parameters[..., 3:] = (q / size)[..., None] * across
-        return CarriedPoint(value, np.broadcast_to(v, value.shape), by_parameters)
+        out[..., 3:] = (q / size)[..., None] * across
+        return out
 
     @staticmethod
     def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:

@@ -1,0 +1,160 @@
+"""All poses that close a machine at one set of readings: its assembly modes.
+
+A search from random starts, continued until nothing new is likely to come. It proves nothing: what
+it can say is how small the share of starts must be that lead to a mode that it did not find.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import pose, pose_difference, rotation
+from pkmcal.mechanisms.closing import CONVERGED, Closed, close
+from pkmcal.mechanisms.kinematics import inverse_result, typical_reach
+from pkmcal.mechanisms.layout import LimbLayout
+from pkmcal.mechanisms.rows import base_ends, platform_ends
+from pkmcal.mechanisms.signs import assembly_sign
+
+BATCH = 1000
+"""Starts at a time."""
+OFTEN = 10
+"""Times that the rarest mode must have been found before the search ends. Were the next rarest
+half as likely to be met, it would have been missed with a chance of exp(-5), 0.7 percent."""
+SURE = 1e-3
+"""Chance left that a mode of the share :attr:`AssemblyModes.missing` was missed."""
+APART = 1e-6
+"""Poses (1 and m) nearer than this are one: where two modes merge, a closure that is right to
+1e-14 m leaves 1e-7."""
+
+
+@dataclass(frozen=True)
+class AssemblyModes:
+    """Poses (k, 4, 4) that close the machine, the nearest to home first.
+
+    internal : (k, n) the hinges' turns of an articulated platform, rad.
+    found : (k,) how many starts led to each. sign : (k,) 1 where the Jacobian's determinant has
+        home's sign, -1 where not: such a mode cannot be reached from home without crossing a
+        singular pose; with home's sign it may be. 0 where there is no determinant.
+    starts, closed : how many starts were tried, and how many of them led to any pose.
+    missing : a mode that is not listed is met by less than this share of the starts that close the
+        machine, with 99.9 percent probability; 1 where no start did.
+    complete : every mode was found so often that another is unlikely; False where the search was
+        stopped by the number of starts before.
+    """
+
+    poses: Array
+    internal: Array
+    found: Integers
+    sign: Integers
+    starts: int
+    closed: int
+    missing: float
+    complete: bool
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+
+def assembly_modes(
+    layout: LimbLayout,
+    theta: Array,
+    readings: Array,
+    home: Array,
+    rng: np.random.Generator,
+    most: int = 100_000,
+) -> AssemblyModes:
+    """Distinct poses that close the machine at readings (m,); home (4, 4) has its assembly's sign.
+
+    theta : (P,). most : the largest number of starts. Poses whose readings are those of two modes
+    that merge, nearer than 1e-6, count as one.
+    """
+    modes, found = np.zeros((0, 12 + 2 * layout.n_internal)), np.zeros(0, dtype=int)
+    starts = closed = 0
+    complete = False
+    while not complete and starts < most:
+        begin, internal = _starts(layout, theta, readings, home, rng)
+        at = np.broadcast_to(readings, (BATCH, readings.shape[-1]))
+        result = close(layout, theta, at, begin, internal)
+        good = _coordinates(result)[result.error < CONVERGED]
+        modes, found = _counted(modes, found, good)
+        starts, closed = starts + BATCH, closed + len(good)
+        complete = bool(found.size) and bool(found.min() >= OFTEN)
+        if not closed and starts >= most // 10:
+            break
+    poses, internal = _of_coordinates(modes)
+    near = np.argsort(np.linalg.norm(pose_difference(poses, home), axis=-1), kind="stable")
+    poses, internal, found = poses[near], internal[near], found[near]
+    at_home = assembly_sign(layout, theta, *_closed_at(layout, theta, home))
+    sign = (assembly_sign(layout, theta, readings, poses, internal) * at_home).astype(int)
+    missing = 1 - SURE ** (1 / closed) if closed else 1.0
+    return AssemblyModes(poses, internal, found, sign, starts, closed, missing, complete)
+
+
+def _closed_at(layout: LimbLayout, theta: Array, home: Array) -> tuple[Array, Array, Array]:
+    """Readings, pose and hinges' turns of home."""
+    readings, internal = inverse_result(layout, theta, home)
+    return readings, home, internal
+
+
+def _starts(
+    layout: LimbLayout, theta: Array, readings: Array, home: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Poses (n, 4, 4) anywhere that the motion allows, and any turns of the hinges (n, k).
+
+    Turns are evenly spread; the platform's joints come to lie about the base's, at distances of
+    about the rods' lengths.
+    """
+    free = layout.free
+    if free[:3].all():
+        four = rng.normal(size=(BATCH, 4))
+        turn = _of_quaternion(four / np.linalg.norm(four, axis=1, keepdims=True))
+    else:
+        turn = rotation(rng.uniform(-np.pi, np.pi, (BATCH, 3)) * free[:3])
+    rot = turn @ home[:3, :3]
+    a = base_ends(layout, theta, readings).a.mean(axis=-2)
+    b = platform_ends(layout, theta, pose(rot, np.zeros(3))).b.mean(axis=-2)
+    shift = rng.normal(size=(BATCH, 3)) * typical_reach(layout, theta, readings)
+    position = np.where(free[3:], a - b + shift, home[:3, 3])
+    return pose(rot, position), rng.uniform(-np.pi, np.pi, (BATCH, layout.n_internal))
+
+
+def _of_quaternion(q: Array) -> Array:
+    """Rotation matrices (n, 3, 3) of unit quaternions (n, 4), the real part first."""
+    w, v = q[:, :1, None], q[:, 1:]
+    outer = v[:, :, None] * v[:, None, :]
+    skew = np.cross(np.eye(3)[None], -v[:, None, :])
+    return (2 * w * w - 1) * np.eye(3) + 2 * outer + 2 * w * skew
+
+
+def _coordinates(result: Closed) -> Array:
+    """Numbers (n, 12 + 2 k) that are the same where the platform stands the same: the pose's, and
+    the hinges' turns as cosines and sines.
+    """
+    phi = result.internal
+    return np.concatenate([result.poses[:, :3].reshape(-1, 12), np.cos(phi), np.sin(phi)], axis=-1)
+
+
+def _of_coordinates(modes: Array) -> tuple[Array, Array]:
+    """Poses (k, 4, 4) and hinges' turns (k, n)."""
+    matrix = modes[:, :12].reshape(-1, 3, 4)
+    cos, sin = np.split(modes[:, 12:], 2, axis=1)
+    return pose(matrix[..., :3], matrix[..., 3]), np.arctan2(sin, cos)
+
+
+def _counted(modes: Array, found: Integers, more: Array) -> tuple[Array, Integers]:
+    """Modes (k, c) and their counts (k,) with more coordinates (n, c) that close the machine."""
+    left = more
+    kept, counts = list(modes), list(found)
+    k = 0
+    while len(left):  # a loop over modes, not over starts
+        if k == len(kept):
+            kept.append(left[0])
+            counts.append(0)
+        same: Booleans = np.abs(left - kept[k]).max(axis=-1) < APART
+        counts[k] += int(np.count_nonzero(same))
+        left = left[~same]
+        k += 1
+    return np.array(kept).reshape(len(kept), modes.shape[1]), np.array(counts, dtype=int)

@@ -1,0 +1,160 @@
+"""Many small matrices at once: arrays of a batch kept with the batch fastest in memory.
+
+NumPy runs through its arrays in the order of their memory. Where the first axis, the batch, is the
+fastest, one call works on long rows of numbers, and a thousand poses cost little more than one. The
+shapes are the usual ones, (n, ...): only :func:`batch_last` chooses, and the functions here, given
+such an array, answer with such an array.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import dot, skew
+
+WORTH = 16
+"""Poses from which on the other order of memory pays."""
+FEW = 100
+"""Numbers below which calls cost more than arithmetic."""
+NEXT = ((1, 2), (2, 0), (0, 1))
+TURNING = -skew(np.eye(3))
+"""The cross product's signs: ``(a x b)_i`` is the sum of ``TURNING[i, j, k] a_j b_k``."""
+
+
+def batch_last(array: Array) -> Array:
+    """The same (n, ...) with axis 0 fastest in memory."""
+    return _first(np.ascontiguousarray(_last(array)))
+
+
+def _last(array: Array) -> Array:
+    """A view with the batch as last axis; ``np.moveaxis`` takes as long as some arithmetic."""
+    return array.transpose(*range(1, array.ndim), 0)
+
+
+def _first(array: Array) -> Array:
+    """A view with the batch, the last axis, as first."""
+    return array.transpose(array.ndim - 1, *range(array.ndim - 1))
+
+
+def is_batch_last(array: Array) -> bool:
+    """Whether axis 0 is the fastest in memory."""
+    several = array.size > array.shape[0] > 1 if array.ndim > 1 else False
+    return several and array.strides[0] == array.itemsize
+
+
+def fresh(like: Array, shape: tuple[int, ...]) -> Array:
+    """An empty array in the same order of memory."""
+    if is_batch_last(like):
+        return _first(np.empty((*shape[1:], shape[0])))
+    return np.empty(shape)
+
+
+def picked(array: Array, rows: Integers) -> Array:
+    """Some rows of a batch, (n, ...) -> (k, ...), in the same order of memory."""
+    if is_batch_last(array):
+        return _first(np.take(_last(array), rows, axis=-1))
+    return array[rows]
+
+
+def turned(rot: Array, p: Array) -> Array:
+    """Rotations (..., 3, 3) times vectors (..., 3); leading axes broadcast."""
+    if not is_batch_last(rot):
+        return (rot @ p[..., None])[..., 0]
+    out = fresh(rot, (*np.broadcast_shapes(rot.shape[:-2], p.shape[:-1]), 3))
+    part = np.empty_like(out)
+    np.multiply(rot[..., 0], p[..., 0, None], out=out)
+    for k in (1, 2):
+        np.multiply(rot[..., k], p[..., k, None], out=part)
+        out += part
+    return out
+
+
+def moments(arm: Array, w: Array, out: Array) -> None:
+    """Writes arm x w, (..., 3) each, into ``out``, an array like w."""
+    if out.size < FEW:  # one call then takes less time than nine
+        np.einsum("ijk,...j,...k->...i", TURNING, arm, w, out=out)
+        return
+    for k, (i, j) in enumerate(NEXT):
+        np.multiply(arm[..., i], w[..., j], out=out[..., k])
+        out[..., k] -= arm[..., j] * w[..., i]
+
+
+def stepped(poses: Array, delta: Array) -> Array:
+    """Poses (n, 4, 4) moved by small steps (n, 6), as :func:`pkmcal.geometry.rigid.perturb` does to
+    second order.
+
+    Cayley's map, ``I + 2 / (1 + w.w) ([w]x + [w]x^2)`` with w = omega / 2: exactly a rotation, and
+    without sines, so that a search may take it at every step.
+    """
+    out = np.empty_like(poses)
+    w, rot = delta[:, :3] / 2, poses[:, :3, :3]
+    if is_batch_last(poses):
+        swung = _crossed(w, rot)
+        swung += _crossed(w, swung)
+        size = dot(w, w)
+    else:
+        turn = skew(w)
+        swung = turn @ rot
+        swung += turn @ swung
+        size = (w * w).sum(axis=-1)
+    swung *= (2 / (1 + size))[:, None, None]
+    np.add(rot, swung, out=out[:, :3, :3])
+    np.add(poses[:, :3, 3], delta[:, 3:], out=out[:, :3, 3])
+    out[:, 3] = poses[:, 3]
+    return out
+
+
+def _crossed(w: Array, matrix: Array) -> Array:
+    """Each column of matrices (n, 3, 3) under w (n, 3) x."""
+    out = np.empty_like(matrix)
+    for k, (i, j) in enumerate(NEXT):
+        np.multiply(w[:, i, None], matrix[:, j], out=out[:, k])
+        out[:, k] -= w[:, j, None] * matrix[:, i]
+    return out
+
+
+def damped_step(jac: Array, value: Array, damping: Array) -> Array:
+    """Levenberg-Marquardt steps (..., d) with column scaling: the least |jac x - value|.
+
+    jac (..., E, d), value (..., E), damping (...), relative to each column's square.
+    """
+    if is_batch_last(jac):
+        return _eliminated(jac, value, damping)
+    transposed = jac.swapaxes(-1, -2)
+    normal = transposed @ jac
+    d = jac.shape[-1]
+    diagonal = normal.reshape(*normal.shape[:-2], d * d)[..., :: d + 1]
+    diagonal *= 1 + damping[..., None]
+    diagonal += 1e-300
+    return np.linalg.solve(normal, transposed @ value[..., None])[..., 0]
+
+
+def _eliminated(jac: Array, value: Array, damping: Array) -> Array:
+    """The same by one elimination for the whole batch (n, E, d); no pivots, as the normal matrices
+    are positive definite. Where rounding made one singular its step is not finite.
+    """
+    d = jac.shape[-1]
+    j, r = _last(jac), _last(value)
+    # upper half of the normal matrix, and the right side as its last column
+    a = [np.empty((d - k + 1, jac.shape[0])) for k in range(d)]
+    part = np.empty_like(a[0])
+    with np.errstate(all="ignore"):
+        for k, row in enumerate(a):
+            np.einsum("en,ekn->kn", j[:, k], j[:, k:], out=row[:-1])
+            np.einsum("en,en->n", j[:, k], r, out=row[-1])
+            row[0] *= 1 + damping
+            row[0] += 1e-300
+        for k, row in enumerate(a):
+            row[1:] /= row[0]
+            for i in range(k + 1, d):
+                # what is left of row i: row_i - (a_ki / a_kk) row_k
+                share = np.multiply(row[i - k], row[0], out=part[-1])
+                np.multiply(row[i - k :], share, out=part[: d - i + 1])
+                a[i] -= part[: d - i + 1]
+        x = np.empty((d, jac.shape[0]))
+        for k in range(d - 1, -1, -1):
+            x[k] = a[k][-1]
+            for i in range(k + 1, d):
+                x[k] -= np.multiply(a[k][i - k], x[i], out=part[0])
+    return _first(x)
