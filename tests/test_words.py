@@ -321,7 +321,7 @@ def test_what_the_drawing_knows_better_is_not_called_free():
     machine, poses = hexapod()
     null = unit(machine, {"legs[3].length.offset": 1.0})[None]
     seen = np.ones((1, 6), bool)
-    (weak,) = describe(machine, seen, null, poses, information=np.array([0.5]), weak=True)
+    (weak,) = describe(machine, seen, null, poses, information=np.array([0.5]))
     (open_,) = describe(machine, seen, null, poses)
     assert weak.text.startswith("The offset of leg 3 is known from the drawing only.")
     assert "smaller tolerances" in weak.advice

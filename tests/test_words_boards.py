@@ -8,15 +8,19 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.solver import Stop
+from pkmcal.identify.verdict import judge
 from pkmcal.identify.words import explain
 from pkmcal.identify.words_driven import conventions_held, size_columns
-from pkmcal.identify.words_effect import platform_by_parameters
+from pkmcal.identify.words_effect import platform_by_parameters, pose_by_parameters
 from pkmcal.identify.words_families import circumstances
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
+from pkmcal.observe.edges import EdgeSet, Observation
 from pkmcal.report.identifiability import section
 from pkmcal.report.parameters import bound_together, grouped, in_words, tight_pairs
 from pose_sessions import estimated, measured, papers_poses, upright
@@ -27,7 +31,7 @@ def told_of(name, model=None, shape=""):
     """Rank test and findings of a session of 40 to 71 poses; shape: straight, of one line."""
     rng = np.random.default_rng(1)
     machine = load_mechanism(name, model=model)
-    poses = papers_poses()[:71] if name == "h4" else kit_poses(rng, machine, shape)
+    poses = papers_poses()[:71] if name.startswith("h4") else kit_poses(rng, machine, shape)
     case = measured(machine, poses, rng)
     estimate = estimated(machine, case, rng)
     assembled = assemble(machine, case.measurements, default_gauge(machine))
@@ -37,6 +41,9 @@ def told_of(name, model=None, shape=""):
 
 
 def kit_poses(rng, machine, shape):
+    if machine.layout.motion.shape[1] == 6:
+        size = np.repeat([0.2, 0.05], 3)
+        return perturb(np.tile(machine.home(), (40, 1, 1)), size * rng.uniform(-1, 1, (40, 6)))
     x = rng.uniform([-0.06, -0.06, -0.03], [0.06, 0.06, 0.03], (40, 3)) * (
         [0, 0, 1] if shape == "straight" else 1
     )
@@ -89,7 +96,7 @@ def test_what_the_advice_holds_leaves_nothing_open():
 def test_parallelism_is_said_to_be_the_boards():
     _, findings, _ = told_of("h4")
     (tilt,) = of(findings, "How the base joints' axes are tilted to each other")
-    assert tilt.text.count("only the board's tilt does") == 1
+    assert tilt.text.count("only the platform's tilt does") == 1
 
 
 @pytest.mark.parametrize("name", ["delta", "linear-delta"])
@@ -104,13 +111,55 @@ def test_of_both_radii_only_the_difference_is_seen(name):
     assert ".base." not in first.advice
 
 
-def test_heights_alone_confound_arms_and_rods():
+def test_poses_on_one_line_confound_sizes():
     _, findings, _ = told_of("delta", None, "straight")
-    (sizes,) = of(findings, "The arms' length and the rods' length, of all legs alike, cannot")
+    (sizes,) = of(findings, "The radius of the base joints and the arms' length, of all legs alike")
     assert sizes.matters
-    assert set(sizes.parameters) >= {"legs[1].base.arm", "legs[1].length.constant"}
+    assert sizes.moves_platform > 0.1 * findings.by_drawing
+    assert set(sizes.parameters) >= {"legs[1].base.arm", "legs[1].base.center.y"}
     whole = told_of("delta")[1]
-    assert not of(whole, "The arms' length and the rods' length, of all legs alike")
+    assert all(s.moves_platform < 0.1 * whole.by_drawing for s in alike(whole))
+
+
+def alike(findings):
+    every = (*findings.unidentified, *findings.weak)
+    return [s for s in every if "of all legs alike, cannot be told apart" in s.text]
+
+
+def test_what_moves_with_hinges_moves_no_platform():
+    """Bars that turn on hinges take up what shifts their joints: the centre bar stays."""
+    _, findings, estimate = told_of("h4", "rods")
+    (shifts,) = of(findings, "Of x, y and z of the base joints and of the side bars' joints")
+    assert shifts.text.count("in eight ways") == 1
+    assert not shifts.matters
+    machine, poses = estimate.machine, estimate.state.T_base_platform
+    by = pose_by_parameters(machine, machine.inverse(poses), poses)
+    table, step = machine.parameters, 1e-6
+    free = table.free_matrix()
+    rng = np.random.default_rng(0)
+    joints = machine.inverse(poses)
+    before = machine.forward(joints, poses)
+    for _ in range(3):
+        change = free @ (table.tolerances_free() * rng.normal(size=free.shape[1])) * step
+        after = machine.with_values(machine.values + change).forward(joints, before)
+        moved = pose_difference(after, before)
+        np.testing.assert_allclose(moved, by @ change, atol=2e-4 * np.abs(moved).max())
+
+
+def test_radii_are_no_business_of_boards():
+    """A hexapod by its platform's poses: of its tubes nothing is said."""
+    _, findings, _ = told_of("gough-stewart")
+    assert not [s for s in (*findings.unidentified, *findings.weak) if "tube" in s.text]
+
+
+def test_weak_and_free_are_told_together():
+    """Poses' noise blends the two; a sentence says which of them it is by what the data know."""
+    _, findings, _ = told_of("linear-delta")
+    (lean,) = of(findings, "How the guides of legs 1 to 3 lean cannot be told from where they")
+    assert lean.weak
+    assert lean in findings.weak
+    assert "better than the drawing does" in lean.text
+    assert not any(s.weak for s in findings.unidentified)
 
 
 @pytest.mark.parametrize(
@@ -123,6 +172,7 @@ def test_no_sentence_speaks_of_tubes_or_photographs_of_legs(case):
     for word in ("tube", "hotograph", "base.arm is", "caliper"):
         assert word not in text
     assert sum(s.dimensions for s in sentences) == len(told.unidentified) + len(told.weak)
+    assert len({s.text for s in sentences}) == len(sentences)
 
 
 def test_sizes_are_columns_of_the_machine():
@@ -135,6 +185,18 @@ def test_sizes_are_columns_of_the_machine():
     np.testing.assert_allclose(
         moved - np.linalg.norm(machine.base_centers()[:, :2], axis=1), 1e-3, atol=1e-6
     )
+
+
+def test_a_search_that_has_not_settled_is_refused():
+    _, findings, estimate = told_of("h4")
+    nothing = Observation(
+        EdgeSet.empty(), (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
+    )
+    assert judge(nothing, estimate, findings=findings).usable
+    statistics = replace(estimate.statistics, stopped=Stop.STEPS.value, steps=100)
+    unsettled = replace(estimate, statistics=statistics)
+    (reason,) = judge(nothing, unsettled, findings=findings).reasons
+    assert "had not settled after 100 steps" in reason
 
 
 # ------------------------------------------------------------------- what is held, and why

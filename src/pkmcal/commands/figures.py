@@ -63,6 +63,7 @@ def figures_of(calibration: Calibration) -> Figures:
         estimate.state.T_base_platform,
         np.flatnonzero(estimate.configurations),
         centres,
+        legs_seen=estimate.edge_weights.size > 0,
     )
     return Figures(calibration, centres, tool)
 

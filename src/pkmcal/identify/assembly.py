@@ -61,7 +61,7 @@ def assemble(
         use_drawing,
         radius_prior,
         intrinsics=measurements.intrinsics_factor.shape[-1],
-        n_mounts=len(measurements.mounts),
+        on_platform=measurements.on_platform,
         n_lines=int(line.max(initial=-1)) + 1,
     )
     if measurements.intrinsics_at.size:
@@ -241,20 +241,21 @@ def prior_rows(
     use_drawing: bool,
     radius_prior: bool = True,
     intrinsics: int = 0,
-    n_mounts: int = 0,
+    on_platform: Booleans | None = None,
     n_lines: int = 0,
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
     Without the drawing the frames are free, so the gauge's constraints stand in as rows: they
     can be met exactly, hence fix the frames and pull on nothing else. ``intrinsics`` unknowns a
-    camera stand in units of their prior.
+    camera stand in units of their prior. on_platform : (M,) mounts; see :func:`_mount_rows`.
     """
+    moving = np.zeros(0, dtype=bool) if on_platform is None else on_platform
     table, free = machine.parameters, machine.parameters.free_matrix()
     nz = free.shape[1]
     lines_at = nz + 6 * n_stations + n_cameras * (1 + intrinsics)
     mounts_at = lines_at + n_lines
-    na = mounts_at + 6 * n_mounts
+    na = mounts_at + 6 * len(moving)
     first, tolerance = table.first_of_free(), table.tolerances_free()
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
     held = (radius & radius_prior) | (~radius & use_drawing)
@@ -265,14 +266,33 @@ def prior_rows(
     optics[:, nz + 6 * n_stations : lines_at] = np.diag(1 / sigma)
     shading = np.zeros((n_lines, na))
     shading[:, lines_at:mounts_at] = np.eye(n_lines) / SHADING_SIGMA
-    rows = [drawing, optics, shading]
+    mounts = _mount_rows(machine, moving, na)
+    rows = [drawing, optics, shading, mounts]
     kinds = ["drawing"] * len(drawing) + ["camera"] * len(optics) + ["shading"] * n_lines
+    kinds += ["mount"] * len(mounts)
     if not use_drawing and freedoms(machine).shape[1]:
         c = frame_rows(machine, gauge) @ free / float(np.mean(tolerance[~radius]))
         rows.append(np.concatenate([c, np.zeros((len(c), na - nz))], axis=1))
         kinds += ["gauge"] * len(c)
     prior = np.concatenate(rows)
     return prior, np.zeros(len(prior)), tuple(kinds)
+
+
+def _mount_rows(machine: Machine, on_platform: Booleans, na: int) -> Array:
+    """What is on a platform is as near its start as the machine is large, rows (3 M', na).
+
+    Where a platform turns about one axis, nothing tells along it how high the board sits; its tilt
+    by a tenth of a degree then seems to, and would carry the board off by metres.
+    """
+    moving = np.flatnonzero(on_platform)
+    rows = np.zeros((3 * len(moving), na))
+    if not len(moving):
+        return rows
+    lift = machine.home()[:3, 3] - machine.base_centers().mean(axis=0)
+    size = np.linalg.norm(lift) + np.linalg.norm(machine.platform_centers(), axis=-1).max()
+    at = na - 6 * len(on_platform) + 6 * moving[:, None] + [3, 4, 5]
+    rows[np.arange(len(rows)), at.ravel()] = 1 / size
+    return rows
 
 
 def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState:

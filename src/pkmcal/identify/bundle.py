@@ -197,11 +197,20 @@ def bundle(
     gauge = gauge or default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing)
     batch = batch_of(machine, assembled, start)
-    result = solve_batch(assembled.problem, batch, robust=robust, scale_noise=scale_noise)
+    problem = _mounts_near(assembled, batch)
+    result = solve_batch(problem, batch, robust=robust, scale_noise=scale_noise)
     stop = result.solution.stop[0]
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(what=f"the joint estimate failed: {stop.value}")
     return _estimate(machine, measurements, start, assembled, result, gauge)
+
+
+def _mounts_near(assembled: Assembled, start: BatchState) -> Problem:
+    """The problem whose mounts are known to be near their start, as far as nothing else tells."""
+    problem = assembled.problem
+    mounts = np.array(assembled.priors) == "mount"
+    there = problem.prior_values(start)[0]
+    return replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
 
 
 def start_state(machine: Machine, measurements: Measurements, T_camera_base_guess: Array) -> State:
@@ -328,11 +337,12 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     kinds = np.array(assembled.priors)
     rows = slice(0, problem.n_edge_rows), problem.closure_rows, problem.pose_rows
     chi2 = [float(np.sum(linear.value[0, :, part] ** 2)) for part in rows]
-    chi2_drawing = float(np.sum(linear.shared_value[0, kinds != "gauge"] ** 2))
+    drawn = ~np.isin(kinds, ("gauge", "mount"))
+    chi2_drawing = float(np.sum(linear.shared_value[0, drawn] ** 2))
     n_edges = float(edge_count(problem, result.weight)[0])
     n_poses = float(pose_count(problem, result.pose_weight)[0])
     n_joints = linear.value[0, :, rows[1]].size
-    n_drawing = int(np.sum(kinds != "gauge"))
+    n_drawing = int(np.sum(drawn))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))
     unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
     freedom = [

@@ -92,7 +92,8 @@ def group_fit(linear: Linear, reduced: Reduced, group: slice, count: Array) -> t
     values, vectors = np.linalg.eigh(normal / (scale[:, :, None] * scale[:, None, :]))
     known = values > UNKNOWN * values[:, -1:]
     rows = rows / scale[:, None, :] @ vectors
-    shared = np.sum(rows**2 * np.where(known, 1 / np.abs(values), 0.0)[:, None], axis=(1, 2))
+    variance = np.where(known, 1 / np.where(known, values, 1.0), 0.0)
+    shared = np.sum(rows**2 * variance[:, None], axis=(1, 2))
     return np.sum(linear.value[:, :, group] ** 2, axis=(1, 2)), count - own - shared
 
 
@@ -211,7 +212,10 @@ def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Id
     table, nz = machine.parameters, problem.free.shape[1]
     # what is known beforehand of cameras and shading is no drawing: without it, a shift of every
     # line by itself would hide the tubes' radii
-    beside = linear.shared_by[~linear.shared_by[:, :nz].any(axis=1)]
+    other = linear.shared_by[:, :nz].any(axis=1) | linear.shared_by[:, problem.mounts_at :].any(
+        axis=1
+    )
+    beside = linear.shared_by[~other]
     rows = np.concatenate([rows.reshape(-1, rows.shape[-1]), beside])
     q = _column_space(rows[:, nz:])
     tolerance = table.tolerances_free()

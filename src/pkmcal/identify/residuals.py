@@ -239,12 +239,18 @@ class Problem:
         return closure(self.layout, theta, self.data.joints, state.T_base_platform, internal)
 
     def _prior_rows(self, state: BatchState) -> Array:
+        return self.prior_values(state) - self.prior_target
+
+    def prior_values(self, state: BatchState) -> Array:
+        """What the prior's rows (B, c) come to, before their targets are taken off."""
         nz = self.free.shape[1]
         x = np.zeros((state.z.shape[0], self.n_shared))
         x[:, :nz] = state.z
         x[:, nz + 6 * self.n_stations : self.lines_at] = state.optics.reshape(len(x), -1)
         x[:, self.lines_at : self.mounts_at] = state.shading
-        return x @ self.prior.T - self.prior_target
+        mounts = x[:, self.mounts_at :].reshape(len(x), -1, 6)  # of which only places are known
+        mounts[..., 3:] = state.T_mount[..., :3, 3]
+        return x @ self.prior.T
 
     def _normals(self, state: BatchState, a: Array, b: Array) -> Ends:
         """Predicted normals in the camera frames, [B] eq. 3; last axes (K, G, g)."""

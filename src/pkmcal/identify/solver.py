@@ -24,12 +24,15 @@ from pkmcal.arrays import Array, Booleans, Integers
 FIRST_DAMPING = 1e-5
 RESTART_DAMPING = 1e-9
 """First damping where the start is an answer already, to slightly other weights."""
-LEAST_DAMPING = 1e-12
+LEAST_DAMPING = 1e-14
 MOST_DAMPING = 1e9
 """Damping beyond which a step is below rounding: nothing downhill was found."""
 STEP_TOLERANCE = 1e-7
 """A step that changes all fitted values together by less, in standard deviations, ends the
 search: a ten-millionth of what the noise does, and above the rounding of 1e-9 or so."""
+REFUSED = 1e-3
+"""The same of a step that is refused, though the linear model promises something of it: that little
+is its rounding, where a direction is a millionth as well known as the others."""
 
 ROUNDING = 1e-13
 """Of the cost, relative."""
@@ -180,7 +183,7 @@ def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
 
 
 def minimise(
-    problem: LeastSquares, start: Any, max_steps: int = 50, damping: float = FIRST_DAMPING
+    problem: LeastSquares, start: Any, max_steps: int = 100, damping: float = FIRST_DAMPING
 ) -> Solution:
     """Least squares from ``start``, all runs at once; each stops on its own."""
     values = problem.residuals(start)
@@ -238,6 +241,7 @@ def _try(problem: LeastSquares, state: Any, damping: Array) -> tuple[Any, _Gain]
     # a step near the end changes the cost by less than its rounding, and then it cannot be judged
     small |= np.abs(descent - size2) < ROUNDING * cost
     accepted = cost_trial <= cost * (1 + ROUNDING)
+    small |= ~accepted & (descent - size2 < (REFUSED * (1 + 1e-3 * np.sqrt(cost))) ** 2)
     next_damping = np.where(
         accepted, damping * np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2)), damping * 8
     )

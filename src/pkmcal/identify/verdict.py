@@ -11,7 +11,8 @@ from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.problem import Estimate
-from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
+from pkmcal.identify.solver import Stop
+from pkmcal.identify.words import Findings, Sentence, explain, only_heights, seen_legs
 from pkmcal.identify.words_effect import platform_by_parameters
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
@@ -89,7 +90,9 @@ def judge(
     large, small = _left_open(estimate, findings) if findings else ((), ())
     left = _undecided_text(estimate) if findings is None else _said(large)
     reasons = tuple(_reasons(estimate, method, left) + _poses_against(estimate, richer)) + doubts
-    matter = tuple(s for s in small if s.matters)
+    # what is a small part of the deviation that was reached is in that, and in the report
+    least = LARGE * _platform_sigma(estimate) if small else 0.0
+    matter = tuple(s for s in small if s.matters and s.moves_platform > least)
     warnings = (
         *_warnings(observation, estimate, held_out),
         *_poses_doubted(estimate, richer),
@@ -110,12 +113,9 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
     Boards tell where the platform goes, and leave open what does not move it.
     """
     if not len(observation.edges):
-        used = estimate.state.T_base_platform[estimate.configurations]
-        by = platform_by_parameters(estimate.machine, used)
-        sigma = float(np.sqrt(np.sum((by @ estimate.covariance) * by)))
         return (
-            f"Calibrated: the platform's joints to {sigma * 1e3:.2g} mm at given readings"
-            " (standard deviation)."
+            f"Calibrated: the platform's joints to {_platform_sigma(estimate) * 1e3:.2g} mm at"
+            " given readings (standard deviation)."
         )
     covariance = free_of_gauge(estimate)
     return (
@@ -123,6 +123,13 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
         f" and offsets to {_offset_sigma(estimate, covariance) * 1e3:.2g} mm"
         " (standard deviations)."
     )
+
+
+def _platform_sigma(estimate: Estimate) -> float:
+    """Deviation (m, root mean square) of the platform's joints at given readings."""
+    used = estimate.state.T_base_platform[estimate.configurations]
+    by = platform_by_parameters(estimate.machine, used)
+    return float(np.sqrt(np.sum((by @ estimate.covariance) * by)))
 
 
 def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]:
@@ -144,6 +151,12 @@ def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]
         out.append(
             f"{lost:.0%} of the edges do not fit the rest; below {TOO_MANY_LOST:.0%} the majority"
             " can be trusted to be right."
+        )
+    if estimate.statistics.stopped == Stop.STEPS.value:
+        out.append(
+            f"The search for the best values had not settled after {estimate.statistics.steps}"
+            " steps, so these are not the best: check that the drawing's tolerances fit the"
+            " machine, or measure more configurations."
         )
     out.extend(undecided)
     out.extend(_singular(estimate))
@@ -304,7 +317,7 @@ def _from_drawing(machine: Machine) -> Array:
 
 def _advice(estimate: Estimate) -> list[str]:
     used = int(np.sum(estimate.configurations))
-    if used < 10:
+    if used < 10 and not only_heights(estimate):
         return [
             f"Only {used} configurations were used. Standard deviations fall with the square root"
             " of their number; extreme leg lengths help most."

@@ -20,8 +20,9 @@ from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words_advice import advice_on
 from pkmcal.identify.words_driven import conventions_held
 from pkmcal.identify.words_effect import platform_by_parameters
-from pkmcal.identify.words_families import Circumstances, Family, circumstances, families
-from pkmcal.identify.words_text import naming, said_of
+from pkmcal.identify.words_families import Circumstances, Family, all_radii, circumstances, families
+from pkmcal.identify.words_parts import Part, merged
+from pkmcal.identify.words_text import said_of
 from pkmcal.mechanisms import Machine
 
 if TYPE_CHECKING:
@@ -54,7 +55,8 @@ class Sentence:
     text, advice : what, and what to do. parameters : the names that it is about, most first.
     dimensions : independent changes that it stands for. moves_platform : how far (m, root mean
     square over its joints and poses) the platform moves when these changes are as large as the
-    drawing's tolerance lets expect. matters : whether that is more than nothing.
+    drawing's tolerance lets expect. matters : whether that is more than nothing. weak : the data
+    know it, yet less than the drawing does.
     """
 
     text: str
@@ -63,6 +65,7 @@ class Sentence:
     dimensions: int
     moves_platform: float
     matters: bool
+    weak: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,21 +86,6 @@ class Findings:
     conditions: tuple[Condition, ...] = ()
     conventional: tuple[str, ...] = ()
     also_conventional: int = 0
-
-
-class _Part(NamedTuple):
-    """Families with one text.
-
-    space : (k, P) changes that they explain, scaled. coefficients : (k, m) the family's own numbers
-    for them; own : (k, P) what these change, scaled, which differs from ``space`` by frames.
-    new : how many of the k nobody said before.
-    """
-
-    families: tuple[Family, ...]
-    space: Array
-    coefficients: Array
-    own: Array
-    new: int
 
 
 class _Open(NamedTuple):
@@ -124,19 +112,31 @@ def explain(
     machine, table = estimate.machine, estimate.machine.parameters
     poses = estimate.state.T_base_platform[estimate.configurations]
     effect = platform_by_parameters(machine, poses)
-    photographed = estimate.edge_weights.size > 0
+    photographed, heights = estimate.edge_weights.size > 0, only_heights(estimate)
     drawing = effect @ (table.free_matrix() * table.tolerances_free())
     lost = (*told.unidentified, *(d for d in told.weak if d.information < HARDLY))
     weak = tuple(d for d in told.weak if d.information >= HARDLY)
 
-    def said(directions: tuple[Direction, ...], weak: bool) -> tuple[Sentence, ...]:
+    def said(directions: tuple[Direction, ...]) -> tuple[Sentence, ...]:
         null = vectors(directions, machine)
         known = _information(directions, told)
-        return describe(machine, seen, null, poses, known, weak=weak, photographed=photographed)
+        return describe(
+            machine, seen, null, poses, known, photographed=photographed, heights=heights
+        )
 
+    # Poses and heights blend what they hardly see with what they do not: together it has names.
+    sentences = (*said(lost), *said(weak)) if photographed else said((*lost, *weak))
+    free = tuple(s for s in sentences if not s.weak)
+    rest = tuple(s for s in sentences if s.weak)
     by_drawing = float(np.linalg.norm(drawing))
     held = conventions_held(machine, effect)
-    return Findings(told, said(lost, False), said(weak, True), by_drawing, conditions, *held)
+    return Findings(told, free, rest, by_drawing, conditions, *held)
+
+
+def only_heights(estimate: Estimate) -> bool:
+    """Whether nothing but heights was measured: what is not measured leaves no residual."""
+    poses = estimate.pose_residuals
+    return not estimate.edge_weights.size and len(poses) > 0 and not poses[:, :5].any()
 
 
 def _information(directions: tuple[Direction, ...], told: Identifiability) -> Array:
@@ -175,24 +175,28 @@ def describe(
     T_base_platform: Array,
     information: Array | None = None,
     *,
-    weak: bool = False,
     photographed: bool = True,
+    heights: bool = False,
 ) -> tuple[Sentence, ...]:
     """Sentences for a space of changes that the data do not see.
 
     machine : at the estimate. seen : (S, L) legs that each station sees. null : (n, P) changes of
     all parameters in their units, any basis. T_base_platform : (K, 4, 4) the session's poses.
     information : (n,) singular values of what the data know of each after all, in units of the
-    tolerance; 0 where absent. weak : say that the drawing knows them better, not that they are
-    free. photographed : whether legs were, and not boards or poses only.
+    tolerance, 0 where absent: from ``HARDLY`` on it is said that the drawing knows it better, not
+    that it is free. photographed : whether legs were, and not boards or poses only. heights :
+    whether it was heights only.
     """
     space = _open(machine, null, information)
     if len(space.rows) == 0:
         return ()
-    around = circumstances(machine, seen, T_base_platform, photographed)
+    around = circumstances(machine, seen, T_base_platform, photographed, heights)
+    if not photographed:  # nobody asks a board how thick legs are
+        radii = _within(all_radii(around), space, INSIDE[0])
+        space = _without(space, radii)
     effect = platform_by_parameters(machine, T_base_platform) * space.unit
-    parts = _merged(_explained(around, space))
-    sentences = [_sentence(around, space, part, effect, weak) for part in parts]
+    parts = merged(_explained(around, space))
+    sentences = [_sentence(around, space, part, effect) for part in parts]
     return _few(sentences)
 
 
@@ -228,9 +232,9 @@ def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
     return vt[s > least * max(float(s[0]), 1e-300)]
 
 
-def _explained(around: Circumstances, space: _Open) -> list[_Part]:
+def _explained(around: Circumstances, space: _Open) -> list[Part]:
     """Families that lie in the open space, each with what it says anew."""
-    parts: list[_Part] = []
+    parts: list[Part] = []
     done = np.zeros((0, space.rows.shape[1]))
     known, whole = list(families(around)), space
     for family, inside in [*((f, share) for share in INSIDE for f in known[:-1]), (known[-1], 0.0)]:
@@ -245,7 +249,7 @@ def _explained(around: Circumstances, space: _Open) -> list[_Part]:
         done = _orthonormal(np.concatenate([done, new]))
         numbers = _coefficients(family, space, found)
         own = numbers @ family.columns.T / space.unit
-        parts.append(_Part((family,), found, numbers, own, len(new)))
+        parts.append(Part((family,), found, numbers, own, len(new)))
         if family.kind in EQUIVALENT:
             space = _without(space, new)
     return parts
@@ -290,51 +294,12 @@ def _coefficients(family: Family, space: _Open, found: Array) -> Array:
 
 EQUIVALENT = ("against", "turn")
 """Kinds that are taken out of what is said afterwards: changes of the description, not of a leg."""
-ONE_SENTENCE = (
-    "unseen",
-    "common turn",
-    "axis",
-    "slide",
-    "rod",
-    "centre",
-    "leg",
-    "radius",
-    "depth",
-    "leg sizes",
-)
-"""Kinds that are said of several legs at once where they say the same of each."""
 
 
-def _merged(parts: list[_Part]) -> list[_Part]:
-    """Parts of one kind for several legs as one."""
-    out: dict[tuple[object, ...], _Part] = {}
-    for place, part in enumerate(parts):
-        family = part.families[0]
-        key: tuple[object, ...] = (place,)
-        if family.kind in ONE_SENTENCE:
-            key = (family.kind, family.among, len(part.space), naming(family, part.coefficients))
-        if key not in out:
-            out[key] = part
-            continue
-        old = out[key]
-        space = np.concatenate([old.space, part.space])
-        numbers = _stacked(old.coefficients, part.coefficients)
-        own = np.concatenate([old.own, part.own])
-        out[key] = _Part(old.families + part.families, space, numbers, own, old.new + part.new)
-    return list(out.values())
-
-
-def _stacked(a: Array, b: Array) -> Array:
-    """Rows of both; legs may differ in their numbers: of tubes, and passive ones have no length."""
-    width = max(a.shape[1], b.shape[1])
-    return np.concatenate([np.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (a, b)])
-
-
-def _sentence(
-    around: Circumstances, space: _Open, part: _Part, effect: Array, weak: bool
-) -> Sentence:
+def _sentence(around: Circumstances, space: _Open, part: Part, effect: Array) -> Sentence:
     found = _directions(part.space)
     mixed = found @ space.rows.T
+    weak = _known(space, mixed) >= HARDLY
     moved = effect @ found.T
     moved = float(np.sqrt(np.trace(moved @ (mixed @ space.covariance @ mixed.T) @ moved.T)))
     table = around.machine.parameters
@@ -355,7 +320,15 @@ def _sentence(
         part.new,
         moved,
         matters,
+        weak,
     )
+
+
+def _known(space: _Open, mixed: Array) -> float:
+    """What the data know at most of changes, rows (k, n) of coordinates in the open space."""
+    # the estimate's information is the drawing's, one, and the data's
+    data = mixed @ (np.linalg.inv(space.covariance) - np.eye(len(space.rows))) @ mixed.T
+    return float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
 
 
 def _few(sentences: list[Sentence]) -> tuple[Sentence, ...]:

@@ -15,6 +15,8 @@ MOST_FIXED = 3
 PARALLEL = 1e-9
 """Component of an axis below which the file can hold it alone."""
 BY_CALIPER = ("radius", "radii", "depth")
+ACROSS = "Measure x and y too, by a board on the platform (observe: board) or a tracker"
+"""More heights of the same bed would not help."""
 
 
 def advice_on(
@@ -64,6 +66,8 @@ def _tying(around: Circumstances, legs: list[int]) -> str:
 
 def _more(around: Circumstances, legs: list[int]) -> str:
     """Which configurations are missing."""
+    if around.heights:
+        return ACROSS
     poses = around.T_base_platform
     those = named(legs) if len(legs) < around.machine.n_legs else "all legs"
     point = "points" if len(legs) == 1 else "point"

@@ -48,6 +48,10 @@ def driven_families(around: Circumstances) -> Iterator[Change]:
     for axis in (2, 0, 1):
         # with shifts of both ends: what is held of the one end, the other makes good
         yield "turn", legs, np.concatenate([_turn(around, axis), against], axis=1), AXES[axis]
+    for j in legs:
+        lean = _lean(around, j)
+        if lean.any():
+            yield "lean", (j,), lean, ""
     sizes = size_columns(around)
     together = {name: column.sum(axis=1, keepdims=True) for name, column in sizes.items()}
     for n in range(1, len(sizes) + 1):
@@ -93,6 +97,18 @@ def _turn(around: Circumstances, axis: int) -> Array:
     """Turns of the base frame and of the platform frame, (P, 2)."""
     moved = generators(around.machine.layout, around.machine.values)
     return moved[:, [axis, 6 + axis]]
+
+
+def _lean(around: Circumstances, leg: int) -> Array:
+    """A guide leaning about the middle of where its carriage was, (P, 3); zero of other joints."""
+    machine, at = around.machine, around.at
+    out = np.zeros((len(machine.parameters), 3))
+    if machine.document.legs[leg].base.joint == "slider":
+        readings = machine.inverse(around.T_base_platform)
+        middle = float(np.nanmean(readings[:, machine.layout.actuated[leg]]))
+        out[at.base_axis[leg]] = np.eye(3)
+        out[at.base[leg]] = -middle * np.eye(3)
+    return out
 
 
 def size_columns(around: Circumstances) -> dict[str, Array]:

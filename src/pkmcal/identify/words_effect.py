@@ -24,25 +24,28 @@ SEED = 4
 def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
     """Derivatives (n, 6, P) of the pose (omega, tau) by the parameters at given readings.
 
-    joints (n, m), poses T_base_platform (n, 4, 4). From the implicit function
-    closure(theta, X) = 0: dX = -(dc/dX)^+ dc/dtheta.
+    joints (n, m), poses T_base_platform (n, 4, 4). From the implicit function closure(theta, X) = 0
+    at given readings: dX = -(dc/dX)^+ dc/dtheta, with X the pose and, where the platform has
+    hinges, their turns.
     """
-    c = closure(machine.layout, machine.values, joints, poses)
-    motion = machine.layout.motion
+    layout = machine.layout
+    internal = machine.forward_result(joints, poses).internal if layout.n_internal else None
+    c = closure(layout, machine.values, joints, poses, internal)
     by_theta = dense(c, len(machine.values))
-    return -motion @ np.linalg.pinv(c.by_pose @ motion) @ by_theta
+    return -layout.own_motion[:6] @ np.linalg.pinv(layout.by_own(c)) @ by_theta
 
 
 def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
     """Displacements of the platform's joints by the parameters, (r, P); frames taken out.
+
+    Joints on side bars count as if they were fixed to the centre bar, which carries the tool.
 
     Rows are the joints' coordinates at the session's poses (K, 4, 4) and at others around them,
     divided by the root of the number of joints and poses: for a change v of the parameters
     ``norm(out @ v)`` is the joints' displacement (m, root mean square).
     """
     joints, poses = _around(machine, T_base_platform)
-    c = closure(machine.layout, machine.values, joints, poses)
-    points = c.ends.b_by_pose
+    points = closure(machine.layout, machine.values, joints, poses).ends.b_by_pose
     moved = points @ pose_by_parameters(machine, joints, poses)[:, None]
     # whether its parameters can follow or not: frames are conventions
     frames = points @ (pose_generators(poses) @ respecting_motion(machine.layout.motion))[:, None]

@@ -86,7 +86,8 @@ class Circumstances:
 
     machine : with the present values. seen : (S, L) legs that each station sees.
     T_base_platform : (K, 4, 4) poses of the session. at : the parameters' places. photographed :
-    whether legs are in photographs; otherwise only boards or poses were seen.
+    whether legs are in photographs; otherwise only boards or poses were seen. heights : whether it
+    was nothing but heights.
     along_base, along_platform : (L, 3) mean direction of each leg in the frame of either body.
     """
 
@@ -97,10 +98,15 @@ class Circumstances:
     photographed: bool
     along_base: Array
     along_platform: Array
+    heights: bool = False
 
 
 def circumstances(
-    machine: Machine, seen: Booleans, T_base_platform: Array, photographed: bool = True
+    machine: Machine,
+    seen: Booleans,
+    T_base_platform: Array,
+    photographed: bool = True,
+    heights: bool = False,
 ) -> Circumstances:
     """Leg directions at the poses (K, 4, 4), and the rest as it is."""
     readings = np.zeros((len(T_base_platform), machine.n_joints))
@@ -111,7 +117,9 @@ def circumstances(
     along = [v.mean(axis=0) for v in (u, turned)]
     along = [v / np.linalg.norm(v, axis=-1, keepdims=True) for v in along]
     at = places(machine)
-    return Circumstances(machine, seen, T_base_platform, at, photographed, along[0], along[1])
+    return Circumstances(
+        machine, seen, T_base_platform, at, photographed, along[0], along[1], heights
+    )
 
 
 @dataclass(frozen=True)
@@ -276,9 +284,14 @@ def _common(around: Circumstances) -> Iterator[Family]:
     axes = np.concatenate([at.base_axis.ravel(), at.platform_axis.ravel()])
     if (axes >= 0).any():
         yield Family("axes", all_legs, _one_hot(around, axes[axes >= 0]))
-    radii = np.concatenate(at.radius)
-    if radii.size:
-        yield Family("radii", all_legs, _one_hot(around, radii))
+    if any(rows.size for rows in at.radius):
+        yield all_radii(around)
+
+
+def all_radii(around: Circumstances) -> Family:
+    """The radii of all tubes, (P, tubes)."""
+    legs = tuple(range(around.machine.n_legs))
+    return Family("radii", legs, _one_hot(around, np.concatenate(around.at.radius)))
 
 
 def _scale(around: Circumstances) -> Array:

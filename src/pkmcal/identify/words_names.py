@@ -62,4 +62,5 @@ def ways(k: int) -> str:
 def count(k: int) -> str:
     """Small numbers as words."""
     words = ("no", "one", "two", "three", "four", "five", "six")
+    words += ("seven", "eight", "nine", "ten", "eleven", "twelve")
     return words[k] if k < len(words) else str(k)

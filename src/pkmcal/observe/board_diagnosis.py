@@ -32,6 +32,12 @@ WIDEST = 512
 takes a quarter of a second there, a second and more at full size."""
 FAMILY = 1000
 """Markers in the largest dictionary of a family, whose first ones are the smaller dictionaries."""
+OTHER_MARKER = 0.1
+"""Part by which markers must differ from their description: their corners are found to half a
+pixel or so, which is a twentieth of the smallest that are looked at."""
+LEAST_MARKER = 10.0
+"""px; the side of such a marker."""
+LEAST_MARKERS = 4
 NO_SIZE = 9999
 """Of a dictionary that is alone."""
 
@@ -39,13 +45,16 @@ NO_SIZE = 9999
 def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board) -> None:
     """Raise `InputError` where some or all photographs show another board than `board`."""
     missed = [f for f, d in zip(files, found, strict=True) if not d.found]
-    shown = [f for f, d in zip(files, found, strict=True) if d.found]
+    seen = [(f, d) for f, d in zip(files, found, strict=True) if d.found]
+    shown = [path for path, _ in seen]
     size = found[0].image_size
     other: str | None = None
-    for path in shown[:LOOKED_AT]:
+    for path, detection in seen[:LOOKED_AT]:
         # One photograph alone may show something beside the board that looks like more of it.
-        other = _larger(decode(path, size, path.name), board)
+        image = decode(path, size, path.name)
+        other = _larger(image, board)
         if other is None:
+            _check_marker(image, board, detection, path)
             break
     if other is not None:
         raise _another(shown[0], other, board)
@@ -61,6 +70,47 @@ def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board
                 expected=f"{board.described}, as in {listed([f.name for f in shown], 3)}",
                 next_step="Calibrate with the photographs of one board",
             )
+
+
+def _check_marker(image: Integers, board: Board, detection: Detection, path: Path) -> None:
+    """Raise `InputError` where a ChArUco board's markers have another size than described.
+
+    Corners stay right to 0.02 px with any size, yet those of squares that seem to be full of
+    marker, or empty, come out up to six times as uncertain as they are.
+    """
+    share = marker_share(image, board, detection) if board.type == "charuco" else None
+    if share is None:
+        return
+    square, marker = board.document["square"], board.document["marker"]
+    if abs(share * square / marker - 1) <= OTHER_MARKER:
+        return
+    raise InputError(
+        "the board's markers have another size than its file says",
+        where=path.name,
+        found=f"markers {share:.2f} of a square wide",
+        expected=f"{marker / square:.2f}, by marker: {marker:g} and square: {square:g}",
+        next_step="Measure a marker and a square with a ruler, the marker with its black border",
+    )
+
+
+def marker_share(image: Integers, board: Board, detection: Detection) -> float | None:
+    """Width of a ChArUco board's markers in squares, by the corners found; None for too few."""
+    import cv2
+
+    ids, corners = detect_markers(image, board.document["dictionary"])
+    wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
+    large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER
+    corners, wide = corners[large], wide[large]
+    if len(corners) < LEAST_MARKERS:
+        return None
+    places = board.points[detection.ids, :2] / board.document["square"]
+    plane: Any = cv2.findHomography(detection.pixels, places, cv2.RANSAC, 0.05)[0]
+    if plane is None:
+        return None
+    there = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), plane).reshape(-1, 4, 2)
+    shares = np.linalg.norm(np.diff(there, axis=1), axis=-1)
+    # the detector's corners lie on the outermost dark pixels' centres
+    return float(np.median(shares * (wide + 1) / wide))
 
 
 def check_any(found: Sequence[Detection], board: Board) -> None:

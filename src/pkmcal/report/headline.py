@@ -15,6 +15,9 @@ from pkmcal.report.toolpoint import ToolPoint
 from pkmcal.report.wording import brief, count, number
 from pkmcal.session import Session
 
+NO_TURN = 1e-9
+"""rad; what rounding leaves."""
+
 
 @dataclass(frozen=True)
 class Headline:
@@ -34,7 +37,7 @@ def headlines(
 ) -> tuple[Headline, ...]:
     """The cards in their order; those that have nothing to tell are left out."""
     cards = (
-        _joint_sigma(centres),
+        _joint_sigma(centres) if len(observation.edges) else None,
         _tool_sigma(session, tool),
         _change(centres),
         _tool_change(session, tool),
@@ -65,8 +68,8 @@ def _tool_sigma(session: Session, tool: ToolPoint) -> Headline | None:
         "How well is the platform's pose known?",
         _pose_values(tool.position.mean(), tool.orientation.mean()),
         f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
-        f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where}), "
-        f"{brief(np.rad2deg(tool.orientation.max()))}°",
+        f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where})"
+        f"{_turned(float(tool.orientation.max()))}",
     )
 
 
@@ -93,7 +96,7 @@ def _tool_change(session: Session, tool: ToolPoint) -> Headline | None:
         "What did the drawing do to the platform's pose?",
         _pose_values(off.mean(), turn.mean()),
         "mean error of the drawing's pose at the same readings; worst "
-        f"{brief(off.max() * 1e3)} mm (configuration {where}), {brief(np.rad2deg(turn.max()))}°",
+        f"{brief(off.max() * 1e3)} mm (configuration {where}){_turned(float(turn.max()))}",
     )
 
 
@@ -159,7 +162,13 @@ def _photograph_of(observation: Observation) -> tuple[Integers, Integers]:
 
 
 def _pose_values(position: float, orientation: float) -> tuple[tuple[str, str], ...]:
-    return ((brief(position * 1e3), "mm"), (brief(float(np.rad2deg(orientation))), "°"))
+    turn = ((brief(float(np.rad2deg(orientation))), "°"),) if orientation > NO_TURN else ()
+    return ((brief(position * 1e3), "mm"), *turn)
+
+
+def _turned(orientation: float) -> str:
+    """A turn (rad) as a further part; nothing of a platform that only shifts."""
+    return f", {brief(float(np.rad2deg(orientation)))}°" if orientation > NO_TURN else ""
 
 
 def _centre_name(centres: tuple[Centres, ...], position: int) -> str:

@@ -115,4 +115,5 @@ def _tool_point(
         estimate.state.T_base_platform,
         np.flatnonzero(estimate.configurations),
         centres,
+        legs_seen=estimate.edge_weights.size > 0,
     )

@@ -10,6 +10,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.problem import Estimate
+from pkmcal.identify.words_names import named
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.predict import legs_in_camera
@@ -200,11 +201,11 @@ def _is_kind(edges: EdgeSet, leg: int, tube: int, side: int) -> Booleans:
 
 def _joints(session: Session, estimate: Estimate) -> RowChart | None:
     """Residuals of the readings by joint."""
-    actuated = np.flatnonzero(session.machine.layout.actuated >= 0)
+    motor = session.machine.layout.actuated
     white = estimate.joint_residuals[estimate.configurations]
+    moved = [np.flatnonzero(motor == column).tolist() for column in range(white.shape[1])]
     boxes = [
-        box(f"leg {leg + 1}", white[:, column], "σ", 2, leg + 1)
-        for column, leg in enumerate(actuated.tolist())
+        box(named(legs), white[:, column], "σ", 2, legs[0] + 1) for column, legs in enumerate(moved)
     ]
     alt = "Boxes of the readings' residuals by joint"
     return row_chart("Joint readings, by leg", SIGMAS, [b for b in boxes if b], NORMAL_90, alt)

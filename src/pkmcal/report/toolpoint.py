@@ -10,8 +10,8 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.gauge import freedoms, pose_generators, respecting_motion
+from pkmcal.identify.words_effect import pose_by_parameters
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import closure, dense
 
 
 @dataclass(frozen=True)
@@ -39,18 +39,23 @@ def tool_point(
     poses: Array,
     used: Integers,
     centres: tuple[Centres, ...],
+    *,
+    legs_seen: bool = True,
 ) -> ToolPoint:
     """How well the poses of the configurations ``used`` (n,) are known, and how wrong they were.
 
     covariance : (P, P) about the best fit of the frames, so that no three joints carry the
-    uncertainty of all. joints (K, m), poses T_base_platform (K, 4, 4).
+    uncertainty of all. joints (K, m), poses T_base_platform (K, 4, 4). legs_seen : whether legs
+    tell where the joints are, and these the frames. A board leaves open what shifts joints and
+    moves nothing, so without legs frames are by the poses themselves.
     """
-    jacobian = pose_jacobian(calibrated, joints[used], poses[used])
-    jacobian = without_frames(calibrated, poses[used], jacobian)
+    jacobian = pose_by_parameters(calibrated, joints[used], poses[used])
+    jacobian = without_frames(calibrated, poses[used], jacobian, every=not legs_seen)
     variance = np.einsum("kip,pq,kiq->ki", jacobian, covariance, jacobian)
     off = _off(drawing, calibrated, joints[used], poses[used], centres)
     good = np.isfinite(off).all(axis=1)
-    off[good] = without_frames(calibrated, poses[used][good], off[good][..., None])[..., 0]
+    left = without_frames(calibrated, poses[used][good], off[good][..., None], every=not legs_seen)
+    off[good] = left[..., 0]
     return ToolPoint(
         configurations=used,
         position=np.sqrt(variance[:, 3:].sum(axis=-1)),
@@ -62,21 +67,22 @@ def tool_point(
 
 def pose_covariance(machine: Machine, covariance: Array, joints: Array, poses: Array) -> Array:
     """Covariance (n, 6, 6) of (omega, tau) of T_base_platform from the parameters' (P, P)."""
-    jacobian = pose_jacobian(machine, joints, poses)
+    jacobian = pose_by_parameters(machine, joints, poses)
     return jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
 
 
-def without_frames(machine: Machine, poses: Array, change: Array) -> Array:
+def without_frames(machine: Machine, poses: Array, change: Array, *, every: bool = False) -> Array:
     """Changes (n, 6, m) of poses less what only turns or shifts base and platform as wholes.
 
-    By least squares. Only frame changes that keep the motion, and that no parameters follow (some
-    are fixed, or tied): what parameters follow is taken out of their covariance already.
+    By least squares. Only frame changes that keep the motion, and, but for ``every`` one, that no
+    parameters follow (some are fixed, or tied): what parameters follow is taken out of their
+    covariance already.
     """
-    allowed = respecting_motion(machine.layout.motion)
-    followed = np.linalg.qr(freedoms(machine))[0]
-    rest = allowed - followed @ (followed.T @ allowed)
-    u, s, _ = np.linalg.svd(rest, full_matrices=False)
-    rest = u[:, s > 1e-9]
+    rest = respecting_motion(machine.layout.motion)
+    if not every:
+        followed = np.linalg.qr(freedoms(machine))[0]
+        u, s, _ = np.linalg.svd(rest - followed @ (followed.T @ rest), full_matrices=False)
+        rest = u[:, s > 1e-9]
     if not rest.shape[1] or not len(poses):
         return change
     size = float(np.linalg.norm(machine.platform_centers(), axis=-1).max())
@@ -85,18 +91,6 @@ def without_frames(machine: Machine, poses: Array, change: Array) -> Array:
     flat = (unit * change).reshape(len(frames), -1)
     left = flat - frames @ np.linalg.lstsq(frames, flat, rcond=1e-9)[0]
     return left.reshape(change.shape) / unit
-
-
-def pose_jacobian(machine: Machine, joints: Array, poses: Array) -> Array:
-    """Derivatives (n, 6, P) of (omega, tau) of T_base_platform by the parameters.
-
-    From the implicit function closure(theta, X) = 0 at given readings: dX = -(dc/dX)^+ dc/dtheta.
-    """
-    layout = machine.layout
-    internal = machine.forward_result(joints, poses).internal if layout.n_internal else None
-    c = closure(layout, machine.values, joints, poses, internal)
-    by_theta = dense(c, len(machine.values))
-    return -layout.own_motion[:6] @ np.linalg.pinv(layout.by_own(c)) @ by_theta
 
 
 def _off(

@@ -1,0 +1,160 @@
+"""Kits of deltas: calibrated by a webcam and a board, and by the heights of a flat bed alone."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from kit_sessions import Kit, board_kit, flatness, places, probe_kit, tool
+from pkmcal.geometry.rigid import apply, register
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.report.page import report_views
+
+KITS = ("delta", "linear-delta")
+
+
+@pytest.fixture(scope="module", params=KITS)
+def by_board(request, tmp_path_factory):
+    kit = board_kit(tmp_path_factory.mktemp("kit") / "session", request.param)
+    return kit, kit.calibrated()
+
+
+@pytest.fixture(scope="module")
+def by_heights(tmp_path_factory):
+    kit = probe_kit(tmp_path_factory.mktemp("kit") / "session")
+    return kit, kit.calibrated()
+
+
+def test_a_board_and_a_webcam_calibrate_a_kit(by_board):
+    kit, found = by_board
+    error = tool(kit, found)
+    assert error.before > 3e-4
+    assert error.after < 0.2 * error.before
+    assert error.after < 1e-4
+    assert 0.3 < error.after / error.expected < 2.2
+    assert found.verdict.usable
+    assert found.verdict.warnings == ()
+    s = found.estimate.statistics
+    assert s.stopped == "converged"
+    assert abs(s.chi2_poses / s.dof_poses - 1) < 4 * np.sqrt(2 / s.dof_poses)
+
+
+def test_the_report_promises_what_is_kept(by_board):
+    """The card about the platform's pose, by the poses and not by joints that nobody saw."""
+    kit, found = by_board
+    cards = report_views(found.session, found.observation, found.estimate, found.findings)[
+        "headlines"
+    ]
+    questions = [card.question for card in cards]
+    assert "How well are the joint centres known?" not in questions
+    card = cards[questions.index("How well is the platform's pose known?")]
+    ((value, unit),) = card.values  # a delta does not turn, so there is no angle
+    assert unit == "mm"
+    error = tool(kit, found)
+    assert 0.5 < 1e-3 * float(value) / error.expected < 1.5
+    off = cards[questions.index("What did the drawing do to the platform's pose?")]
+    assert 0.5 < 1e-3 * float(off.values[0][0]) / error.before < 1.5
+
+
+def test_heights_flatten_the_bed_and_are_refused(by_heights):
+    kit, found = by_heights
+    error = tool(kit, found)
+    assert flatness(kit, found.machine) < 0.3 * flatness(kit, kit.drawing)
+    assert flatness(kit, found.machine) < 3e-5
+    assert error.after < error.before
+    assert error.after > 1e-4  # a flat bed is no proof
+    assert 0.2 < error.after / error.expected < 2.2
+    assert error.sideways > 0.7 * error.after
+    assert not found.verdict.usable
+
+
+def test_heights_do_not_tell_rods_from_radius_and_it_is_said(by_heights):
+    _, found = by_heights
+    told = found.findings.told
+    assert told.rank == 4
+    assert told.rank + len(told.unidentified) == told.n_parameters - told.n_frames
+    said = " ".join((*found.verdict.reasons, *found.verdict.warnings))
+    assert "The radius of the base joints and the rods' length" in said
+    assert "cannot be told apart by heights" in said
+    assert "How the guides of legs 1 to 3 lean cannot be told from where they stand" in said
+    assert "Measure x and y too, by a board on the platform" in said
+    for word in ("camera", "tube", "hotograph", "caliper", "extreme leg lengths"):
+        assert word not in said
+    assert not any("extreme leg lengths" in advice for advice in found.verdict.advice)
+
+
+def test_what_looks_as_flat_is_what_the_sentence_says(by_heights):
+    """Rods and radius changed as told: the heights stay, x and y stretch as told."""
+    _, found = by_heights
+    text = next(s.text for s in found.findings.unidentified if "of all legs alike" in s.text)
+    numbers = re.search(
+        r"rods 1 mm longer and the radius of the base joints (\S+) mm (larger|smaller), the bed "
+        r"looks as flat, and x and y (stretch|shrink) by (\S+)%",
+        text,
+    )
+    assert numbers
+    radius = 1e-3 * float(numbers[1]) * (1 if numbers[2] == "larger" else -1)
+    share = 1e-2 * float(numbers[4]) * (1 if numbers[3] == "stretch" else -1)
+    drawing = load_mechanism("linear-delta")
+    other = sized(drawing, 1e-3, radius)
+    assert flatness(kit_of(drawing), other) < 3e-6
+    xy = drawing.forward(joints := bed_readings(drawing))[:, :2, 3]
+    moved = other.forward(joints)[:, :2, 3] - xy
+    assert np.sum(moved * xy) / np.sum(xy**2) == pytest.approx(share, rel=0.1)
+    # the other way round they bend the bed
+    assert flatness(kit_of(drawing), sized(drawing, 1e-3, -radius)) > 2e-5
+    # 6 mm wrong, and a bed flat to 0.01 mm: what users of printers met
+    assert flatness(kit_of(drawing), sized(drawing, 6e-3, 6 * radius)) < 1e-5
+
+
+def sized(drawing, rod, radius):
+    """The machine with longer rods and a larger radius of the base joints."""
+    values, table = drawing.values.copy(), drawing.parameters
+    for leg in (1, 2, 3):
+        values[table.index(f"legs[{leg}].length.constant")] += rod
+        centre = [table.index(f"legs[{leg}].base.center.{axis}") for axis in "xy"]
+        values[centre] *= 1 + radius / np.linalg.norm(values[centre])
+    return drawing.with_values(values)
+
+
+def kit_of(machine):
+    return Kit("linear-delta", None, machine, machine)
+
+
+def bed_readings(machine):
+    T = places("linear-delta", 100, np.random.default_rng(3))
+    T[:, 2, 3] = 0.06
+    return machine.inverse(T)
+
+
+def test_more_heights_of_one_bed_do_not_help(tmp_path):
+    """25 points: the same sentence, and the same verdict."""
+    kit = probe_kit(tmp_path / "session", n=25)
+    found = kit.calibrated()
+    assert not found.verdict.usable
+    texts = [s.text for s in (*found.findings.unidentified, *found.findings.weak)]
+    assert any("of all legs alike, cannot be told apart by heights" in text for text in texts)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [*KITS, "heights"])
+def test_errors_are_as_large_as_promised(tmp_path, make):
+    """Ten machines of each kind: error over standard deviation, root mean square."""
+    ratios, gains = [], []
+    for seed in range(10):
+        folder = tmp_path / str(seed)
+        kit = probe_kit(folder, seed) if make == "heights" else board_kit(folder, make, seed)
+        error = tool(kit, kit.calibrated())
+        ratios.append(error.after / error.expected)
+        gains.append(error.before / error.after)
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.3
+    assert np.median(gains) > (1.5 if make == "heights" else 5)
+
+
+def test_registration_is_rigid():
+    """The measure of the tests: no scale is taken out with the frame."""
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    left = apply(register(1.01 * points, points), 1.01 * points) - points
+    assert np.sqrt(np.mean(left**2)) == pytest.approx(0.01 * points.std(), rel=0.1)

@@ -1,0 +1,52 @@
+"""A ChArUco board whose markers are not of the size that its file says."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from pkmcal.errors import InputError
+from pkmcal.observe.board_diagnosis import marker_share
+from pkmcal.observe.boards import detect_board, detect_boards
+from test_boards import CAMERAS, FILES, board_of, render
+from test_targets import poses_around
+
+TRUE = 0.022 / 0.03
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    board = board_of(tmp_path_factory.mktemp("board"), FILES["charuco"])
+    return [render(CAMERAS["pinhole"], T, board, seed=k) for k, T in enumerate(poses_around(4))]
+
+
+@pytest.fixture
+def paths(images, tmp_path):
+    out = [tmp_path / f"{k}.png" for k in range(len(images))]
+    for path, image in zip(out, images, strict=True):
+        cv2.imwrite(str(path), image)
+    return out
+
+
+def described(tmp_path, marker):
+    return board_of(tmp_path, FILES["charuco"].replace("marker: 0.022", f"marker: {marker}"))
+
+
+def test_markers_are_measured_in_photographs(images, tmp_path):
+    board = board_of(tmp_path, FILES["charuco"])
+    shares = [marker_share(image, board, detect_board(image, board)) for image in images]
+    np.testing.assert_allclose(shares, TRUE, rtol=0.03)
+
+
+@pytest.mark.parametrize("marker", [0.015, 0.019, 0.026])
+def test_a_wrong_size_is_told_with_the_right_one(paths, tmp_path, marker):
+    with pytest.raises(InputError, match="markers have another size than its file says") as caught:
+        detect_boards(paths, described(tmp_path, marker))
+    assert f"by marker: {marker} and square: 0.03" in str(caught.value)
+    assert "found markers 0.7" in str(caught.value)
+
+
+@pytest.mark.parametrize("marker", [0.021, 0.022, 0.0235])
+def test_what_a_ruler_may_be_off_is_accepted(paths, tmp_path, marker):
+    assert all(detection.found for detection in detect_boards(paths, described(tmp_path, marker)))
