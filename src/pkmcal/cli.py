@@ -17,7 +17,19 @@ from typing import Annotated, cast
 import typer
 
 from pkmcal import __version__
-from pkmcal.commands import calibrate, camera, check, demo, new, reproduce, simulate, validate
+from pkmcal.commands import (
+    calibrate,
+    camera,
+    check,
+    demo,
+    export,
+    new,
+    reproduce,
+    servo,
+    simulate,
+    validate,
+    watch,
+)
 from pkmcal.commands.console import print_error
 from pkmcal.errors import InputError, PkmcalError
 
@@ -37,6 +49,9 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "camera": camera.camera,
     "calibrate": calibrate.calibrate,
     "validate": validate.validate,
+    "servo": servo.servo,
+    "export": export.export,
+    "watch": watch.watch,
     "simulate": simulate.simulate,
     "reproduce": reproduce.reproduce,
 }

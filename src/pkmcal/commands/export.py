@@ -1,0 +1,107 @@
+"""``pkmcal export``: a machine for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pkmcal.commands import console
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pkmcal.export.source import Source
+    from pkmcal.export.writing import Export
+
+
+def export(
+    calibration: Annotated[
+        str,
+        typer.Argument(
+            metavar="CALIBRATION",
+            help="The folder that calibrate wrote; or a mechanism file, or a built-in machine.",
+        ),
+    ],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="FORMAT",
+            help="c, json, klipper, linuxcnc, mujoco, reprap, ros or yaml.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="export-FORMAT unless given."),
+    ] = None,
+    session: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="The session, for its cameras, where it is not found."),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Export a calibration that was refused.")
+    ] = False,
+    as_json: console.Json = False,
+) -> int:
+    """Write the machine for a controller, a firmware or a simulator."""
+    from pkmcal.export.source import load_source
+    from pkmcal.export.writing import check_output, exporter_of, write
+    from pkmcal.export.writing import export as run
+
+    exporter_of(to)
+    source = load_source(calibration, session)
+    folder = out or _beside(calibration, to)
+    made = run(source, to, force=force)
+    check_output(folder, made.files)
+    write(made, folder)
+    if as_json:
+        console.print_json(summary(made, source, folder))
+    else:
+        tell(console.out(), made, source, folder)
+    return 0
+
+
+def _beside(calibration: str, to: str) -> Path:
+    """Beside a calibration's folder, or here for a machine that is only a file or a name."""
+    path = Path(calibration)
+    folder = path.parent if path.is_file() and path.suffix == ".json" else path
+    if (folder / "calibration.json").is_file():
+        return folder.resolve().parent / f"export-{to}"
+    return Path(f"export-{to}")
+
+
+def summary(made: Export, source: Source, folder: Path) -> dict[str, Any]:
+    """What the command says, for programs."""
+    return {
+        "exit_code": 0,
+        "format": made.exporter.name,
+        "machine": source.machine.name,
+        "calibrated": source.calibrated,
+        "usable": source.usable,
+        "headline": source.headline,
+        "differences": [
+            {"what": d.what, "largest": d.largest, "limit": d.limit, "unit": d.unit}
+            for d in made.differences
+        ],
+        "notes": [{"level": note.level.value, "text": note.text} for note in made.notes],
+        "files": {name: str(folder / name) for name in made.files},
+    }
+
+
+def tell(out: Console, made: Export, source: Source, folder: Path) -> None:
+    """What the command says, for people."""
+    state = "good" if source.calibrated and source.usable else "doubtful"
+    console.print_points(out, [(console.MARKS[state], f"{source.origin}: {source.headline}")])
+    points = [
+        (
+            console.MARKS["good"],
+            f"Read again and compared: {d.what}, {d.largest:.2g} {d.unit} at most.",
+        )
+        for d in made.differences
+    ]
+    points += [(console.MARKS[note.level.value], note.text) for note in made.notes]
+    console.print_points(out, points)
+    out.print()
+    console.print_files(out, [(str(folder / name), made.exporter.title) for name in made.files])

@@ -1,0 +1,1 @@
+"""Control by the legs' directions and edges in the image, [B] 4-9: laws, simulation, analysis."""

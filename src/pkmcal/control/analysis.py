@@ -1,0 +1,240 @@
+"""Where control by the legs works: which legs must be seen, where it is singular, and other
+equilibria.
+
+The control rests where N^T e = 0. That is the goal; another pose at which the legs look the same,
+e = 0; or one at which their errors cancel. Three legs' directions, for instance, leave several
+poses of a platform of six freedoms, as three points seen by a camera do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.control.laws import Task, task_of
+from pkmcal.control.seen import SeenMachine, legs_at, moved_to, true_edges
+from pkmcal.control.simulation import assembly_sign, outside, platform_joints
+from pkmcal.geometry.rigid import dot, perturb
+from pkmcal.mechanisms.kinematics import inverse_result, on_manifold
+
+BLIND = 1e-6
+"""Visibility below which a motion is not seen at all: rounding leaves 1e-9."""
+FADING = 0.1
+"""Part of its usual visibility below which a pose is near one where a motion is not seen."""
+STEPS = 80
+RESTS = 1e-13
+"""m or rad; a descent whose steps are shorter has ended."""
+ALIKE = 1e-7
+"""Norm of e below which two poses look the same: a tenth of a thousandth of a pixel."""
+FLAT = 1e-6
+"""Norm of N^T e, as a part of |N| |e|, below which the errors cancel."""
+APART = 1e-3
+"""m, root mean square of the platform's joints, beyond which two poses are different ones."""
+
+
+def matrix_at(seen: SeenMachine, law: str, poses: Array) -> Array:
+    """N (R, s, k 3, f) at goals themselves, poses (R, 4, 4), by the free twists in metres."""
+    task = _task(seen, law, poses, true_edges(seen, poses))
+    return task.matrix.reshape(len(poses), len(seen.legs), -1, task.matrix.shape[-1])
+
+
+def _task(seen: SeenMachine, law: str, poses: Array, goal: Array) -> Task:
+    legs = legs_at(seen, poses)
+    legs = moved_to(legs, legs.b.mean(axis=-2))
+    return task_of(law, seen, true_edges(seen, poses), goal, legs)
+
+
+def visibility(matrix: Array) -> Array:
+    """Smallest singular value of N (..., s, k, f) as a part of its largest, (...); 0 is blind."""
+    rows = matrix.reshape(*matrix.shape[:-3], -1, matrix.shape[-1])
+    values = np.linalg.svd(np.nan_to_num(rows), compute_uv=False)
+    if rows.shape[-2] < rows.shape[-1]:
+        return np.zeros(values.shape[:-1])
+    return values[..., -1] / np.maximum(values[..., 0], 1e-300)
+
+
+@dataclass(frozen=True)
+class Subset:
+    """Some of the legs. legs : from 0. worst, usual : visibility over the workspace, its smallest
+    and its median.
+    """
+
+    legs: tuple[int, ...]
+    worst: float
+    usual: float
+
+    @property
+    def blind(self) -> bool:
+        """Whether some motion is seen nowhere."""
+        return self.usual < BLIND
+
+    @property
+    def fading(self) -> bool:
+        """Whether some motion is hardly seen at some poses."""
+        return self.worst < FADING * self.usual
+
+
+def subsets(matrix: Array, legs: Integers) -> tuple[Subset, ...]:
+    """Every choice of legs, the smaller first, the best first of those of a size.
+
+    matrix : (R, s, k, f) of all legs. legs : (s,) their numbers.
+    """
+    found: list[Subset] = []
+    for size in range(1, len(legs) + 1):
+        several = [_subset(matrix, legs, rows) for rows in combinations(range(len(legs)), size)]
+        found += sorted(several, key=lambda subset: -subset.worst)
+    return tuple(found)
+
+
+def _subset(matrix: Array, legs: Integers, rows: Iterable[int]) -> Subset:
+    chosen = list(rows)
+    values = visibility(matrix[:, chosen])
+    numbers = tuple(int(legs[row]) for row in chosen)
+    return Subset(numbers, float(values.min()), float(np.median(values)))
+
+
+@dataclass(frozen=True)
+class Equilibria:
+    """Where the control could come to rest, from S starts to G goals each.
+
+    reached, alike, cancelled, out : parts of the starts whose descent ends at the goal; at another
+    pose that looks the same; where errors cancel; and outside of the workspace.
+    T_base_platform : (k, 4, 4) poses other than the goal, in the workspace and the goal's assembly.
+    goal : (k,) of which goal. looks_alike : (k,). distance : (k,) m of the platform's joints.
+    readings : (k,) largest difference of a reading from the goal's, m or rad.
+    """
+
+    reached: float
+    alike: float
+    cancelled: float
+    out: float
+    T_base_platform: Array
+    goal: Integers
+    looks_alike: Booleans
+    distance: Array
+    readings: Array
+
+
+def equilibria(seen: SeenMachine, law: str, goals: Array, starts: Array) -> Equilibria:
+    """Descents of |e|^2 from starts (S, 4, 4) to every goal (G, 4, 4), batched.
+
+    Every equilibrium that is found is one; that none is missing is not proven.
+    """
+    machine = seen.machine
+    g, s = len(goals), len(starts)
+    goal = np.repeat(goals, s, axis=0)
+    poses = _descended(seen, law, np.tile(starts, (g, 1, 1)), true_edges(seen, goal))
+    task = _task(seen, law, poses, true_edges(seen, goal))
+    size = np.sqrt(dot(task.error, task.error))
+    slope = (np.swapaxes(task.matrix, -1, -2) @ task.error[..., None])[..., 0]
+    largest = np.sqrt(np.sum(task.matrix**2, axis=(-1, -2)))
+    off = platform_joints(machine, poses) - platform_joints(machine, goal)
+    distance = np.sqrt(np.mean(dot(off, off), axis=-1))
+    readings, wanted = (_readings(seen, p) for p in (poses, goal))
+    inside = ~outside(machine, readings)
+    inside &= assembly_sign(machine, poses) * assembly_sign(machine, goal) >= 0
+    looks = size < ALIKE
+    flat = np.sqrt(dot(slope, slope)) < FLAT * largest * np.maximum(size, ALIKE)
+    at_goal = looks & (distance < APART)
+    other = inside & ~at_goal & (looks | flat)
+    kept = _distinct(platform_joints(machine, poses), other, _of(g, s))
+    return Equilibria(
+        reached=float(at_goal.mean()),
+        alike=float((other & looks).mean()),
+        cancelled=float((other & ~looks).mean()),
+        out=float((~inside & ~at_goal).mean()),
+        T_base_platform=poses[kept],
+        goal=_of(g, s)[kept],
+        looks_alike=looks[kept],
+        distance=distance[kept],
+        readings=np.abs(readings - wanted).max(axis=-1)[kept],
+    )
+
+
+def _of(goals: int, starts: int) -> Integers:
+    return np.repeat(np.arange(goals), starts)
+
+
+def _readings(seen: SeenMachine, poses: Array) -> Array:
+    return inverse_result(seen.machine.layout, seen.theta, poses)[0]
+
+
+def _descended(seen: SeenMachine, law: str, poses: Array, goal: Array) -> Array:
+    """Levenberg-Marquardt on |e|^2 with the poses' free twists, (R, 4, 4)."""
+    layout, theta = seen.machine.layout, seen.theta
+    bound = layout.n_equations > layout.driven_rows.size or layout.shares_motors
+    damping = np.full(len(poses), 1e-3)
+    now = _Slope.of(_task(seen, law, poses, goal))
+    for _ in range(STEPS):
+        step = now.step(damping, poses)
+        if np.abs(step).max() < RESTS:
+            break
+        trial = perturb(poses, step)
+        if bound:
+            trial = on_manifold(layout, theta, trial).T_base_platform
+        new = _Slope.of(_task(seen, law, trial, goal))
+        with np.errstate(invalid="ignore"):
+            better = new.cost < now.cost
+        poses = np.where(better[:, None, None], trial, poses)
+        now = now.replaced(new, better)
+        damping = np.clip(np.where(better, damping * 0.1, damping * 10), 1e-12, 1e8)
+    return poses
+
+
+@dataclass(frozen=True)
+class _Slope:
+    """A task's arrays (R, ...) that a descent needs."""
+
+    error: Array
+    matrix: Array
+    twist: Array
+    pivot: Array
+
+    @classmethod
+    def of(cls, task: Task) -> _Slope:
+        matrix = np.nan_to_num(task.matrix)
+        return cls(np.nan_to_num(task.error, nan=1e3), matrix, task.twist, task.legs.pivot)
+
+    @property
+    def cost(self) -> Array:
+        return dot(self.error, self.error)
+
+    def replaced(self, new: _Slope, where: Booleans) -> _Slope:
+        """The new rows where they count."""
+        pairs = zip(vars(self).values(), vars(new).values(), strict=True)
+        return _Slope(*(np.where(where.reshape(-1, *[1] * (b.ndim - 1)), b, a) for a, b in pairs))
+
+    def step(self, damping: Array, poses: Array) -> Array:
+        """Damped steps (R, 6), the project's twist at the platform's origin; at most 0.1 m."""
+        turned = np.swapaxes(self.matrix, -1, -2)
+        normal = turned @ self.matrix
+        scale = np.trace(normal, axis1=-2, axis2=-1) / normal.shape[-1] + 1e-300
+        normal = normal + (damping * scale)[:, None, None] * np.eye(normal.shape[-1])
+        step = -np.linalg.solve(normal, turned @ self.error[..., None])[..., 0]
+        size = np.sqrt(dot(step, step))[:, None]
+        step = step * np.minimum(1.0, 0.1 / np.maximum(size, 1e-300))
+        twist = (self.twist @ step[..., None])[..., 0]
+        moved = twist[:, 3:] + np.cross(twist[:, :3], poses[:, :3, 3] - self.pivot)
+        return np.concatenate([twist[:, :3], moved], axis=-1)
+
+
+def _distinct(joints: Array, which: Booleans, goal_of: Integers) -> Integers:
+    """Of rows that are the same pose for the same goal the first."""
+    kept: list[int] = []
+    for row in np.flatnonzero(which):  # few distinct ones: a loop over results
+        same = [k for k in kept if goal_of[k] == goal_of[row]]
+        off = joints[same] - joints[row]
+        if not same or np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=-1)).min() > APART:
+            kept.append(int(row))
+    return np.array(kept, dtype=int)
+
+
+def of_legs(seen: SeenMachine, legs: Iterable[int]) -> SeenMachine:
+    """The same with fewer seen legs, numbers from 0."""
+    wanted = list(legs)
+    rows = [int(np.flatnonzero(seen.legs == j)[0]) for j in wanted]
+    return replace(seen, legs=np.array(wanted), radius=seen.radius[rows])

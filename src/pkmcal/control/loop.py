@@ -1,0 +1,380 @@
+"""The loop that a laboratory connects: one photograph or its edges in, joint velocities out.
+
+    servo = VisualServo.from_calibration("calibration", "station1", goal=T_base_platform)
+    while True:
+        step = servo.step_image(image, readings)
+        send(step.joint_velocities)
+
+One call a sample, nothing done in between. Velocities are zero, and ``step.sentence`` says why,
+whenever control must stop; nothing is latched, so a loop that shall stay stopped stops calling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras import Camera
+from pkmcal.control.laws import BLIND, Task, law_named, solution, task_of
+from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image, seen_machine
+from pkmcal.control.track import Sight, check_image, start_state, track
+from pkmcal.control.track_fit import LAG, LegLines, weighted
+from pkmcal.control.track_goal import (
+    Goal,
+    GoalPhotograph,
+    aspect_of,
+    check_sides,
+    checked_normals,
+    goal_of,
+)
+from pkmcal.control.track_start import FITS, assembly_sentence, misfit
+from pkmcal.control.track_status import (
+    Status,
+    Step,
+    leaving,
+    leg_list,
+    limited,
+    missing_clauses,
+    motor_name,
+    range_sentence,
+    vague_sentence,
+)
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import dot
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
+
+__all__ = ["GoalPhotograph", "Status", "Step", "VisualServo"]
+
+TOLERANCE = 5e-4
+"""Reading (m or rad) by which the machine may still be off at the goal: one photograph of 640x480
+pixels tells it to 0.3 mm."""
+BESIDE = 3 * LAG
+"""Metres between a photograph and its readings that a control loop's delay does not explain."""
+VAGUE = 4.0
+"""Tolerances that the standard deviation of a reading's way to the goal may have without a word."""
+SIGMAS = 5.0
+"""The same in standard deviations, where a photograph says what these are."""
+UNSEEN = 0.05
+"""m or rad of a reading: what a photograph tells worse than that it does not show."""
+ELSEWHERE = 0.02
+"""Root mean square angle (rad) that is no noise: where readings are to stay and the edges are this
+far from the goal, the law has come to rest in another place."""
+
+
+NOT_FOUND = (
+    "likely causes: another assembly than the start's, readings of another photograph, a camera"
+    " that was moved, too little light"
+)
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """One sample: edges (s, 2, 3) of the seen legs, readings (m,), why legs are missing (s,), their
+    lines where a photograph gave them, the pose (4, 4) by the readings, where it is known, and by
+    how much (m) the photograph contradicts the readings.
+    """
+
+    normals: Array
+    readings: Array
+    reasons: tuple[str, ...]
+    lines: LegLines | None = None
+    pose: Array | None = None
+    beside: float = 0.0
+
+
+class VisualServo:
+    """Control of a calibrated machine by its legs in one camera, [B] III with the errata.
+
+    machine : with calibrated values. camera : needed for photographs only. T_camera_base : (4, 4).
+    goal : a platform pose (4, 4), edges (s, 2, 3) of the seen legs, or a :class:`GoalPhotograph`.
+    law : "edges" or "directions". gain : 1/s; less than one over the time from one sample to the
+    next, delay included. rate_limits : the largest velocity of every motor, or (m,) of each.
+    legs : (s,) seen legs from 0, all with tubes unless given. start : (4, 4) a pose near which the
+    machine stands at first, its home unless given: it decides which assembly is meant.
+    tolerance : m or rad of a reading, at the goal. period : s between samples, to foresee the end
+    of a motor's range. edge_shift : px, as calibrated. Raises InputError for what cannot be.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        camera: Camera | None,
+        T_camera_base: Array,
+        goal: Array | GoalPhotograph,
+        *,
+        law: str = "edges",
+        gain: float = 1.0,
+        rate_limits: float | Array | None = None,
+        legs: Integers | None = None,
+        start: Array | None = None,
+        tolerance: float = TOLERANCE,
+        period: float = 0.0,
+        edge_shift: float = 0.0,
+    ) -> None:
+        law_named(law)
+        _check_positive("gain", gain)
+        _check_positive("tolerance", tolerance)
+        self.machine, self.law, self.gain = machine, law, gain
+        self.tolerance, self.period = tolerance, period
+        self.seen = seen_machine(machine, np.asarray(T_camera_base, dtype=float), legs)
+        self.rate_limits = _limits(machine, rate_limits)
+        self._sight = None if camera is None else Sight(self.seen, camera, edge_shift)
+        self._ranges = machine.joint_ranges
+        self._parts: dict[bytes, SeenMachine] = {}
+        self.goal: Goal = goal_of(self._sight, self.seen, goal)
+        self.reset(start)
+
+    @classmethod
+    def from_calibration(
+        cls,
+        folder: Path | str,
+        station: str,
+        goal: Array | GoalPhotograph,
+        *,
+        session: Path | None = None,
+        **options: Any,
+    ) -> VisualServo:
+        """The machine, the camera and its place as ``pkmcal calibrate`` found them.
+
+        session : where the cameras' files are, if not above or beside the folder. options : as for
+        the class. Raises InputError where the calibration has no such station, and ResultError
+        for a calibration that was refused.
+        """
+        from pkmcal.control.track_calibration import calibrated_station
+
+        at = calibrated_station(folder, station, session)
+        options.setdefault("edge_shift", at.edge_shift)
+        return cls(at.machine, at.camera, at.T_camera_base, goal, **options)
+
+    def reset(self, start: Array | None = None) -> None:
+        """Forget all samples; the next one is a first one near ``start`` (4, 4), or home."""
+        self._start = np.asarray(self.machine.home() if start is None else start, dtype=float)
+        self._pose, self._started = self._start, False
+        self._track = start_state(self.seen, self._start)
+
+    def step_edges(self, normals: Array, readings: Array) -> Step:
+        """Velocities from the edges (s, 2, 3) of the seen legs, camera frame, NaN for a leg that
+        is not seen, and the readings (m,). Raises InputError for arrays that cannot be these.
+        """
+        edges = checked_normals(self.seen, normals, "the edges")
+        reasons = ("no edges were given",) * len(self.seen.legs)
+        return self._step(_Sample(edges, self._checked(readings), reasons))
+
+    def step_image(self, image: Integers, readings: Array) -> Step:
+        """Velocities from a photograph (height, width), uint8, and the readings (m,).
+
+        Raises InputError for an image that is not this camera's.
+        """
+        if self._sight is None:
+            raise InputError("a photograph needs the camera", next_step="give it to VisualServo")
+        check_image(image, self._sight.camera)
+        q = self._checked(readings)
+        at = track(self._sight, self._track, image, q)
+        self._track = at.state
+        sample = _Sample(
+            at.lines.normal, q, at.reasons, at.lines, at.state.T_base_platform, at.beside
+        )
+        if not at.closed:
+            return self._stopped(sample, Status.UNREACHABLE, "")
+        if not self._started and 2 * at.found.sum() < len(at.found):
+            legs = self.seen.legs[at.found].tolist()
+            found = f"only {leg_list(legs)} found" if legs else "no leg was found"
+            return self._stopped(sample, Status.NOT_FOUND, f"{found}; {NOT_FOUND}")
+        return self._step(sample)
+
+    def _step(self, sample: _Sample) -> Step:
+        """Everything after the edges."""
+        known = np.isfinite(sample.normals + self.goal.normals)
+        used = np.all(known.reshape(len(known), -1), axis=1)
+        if not used.any():
+            return self._stopped(sample, Status.LOST, self._missing(sample, used))
+        seen = self._part(used)
+        pose = self._pose_of(sample, seen)
+        if pose is None:
+            return self._stopped(sample, Status.UNREACHABLE, "")
+        if not self._started:
+            check_sides(self.seen, sample.normals, pose)
+            off = misfit(self.seen, sample.normals, pose, sample.readings)
+            if off > FITS:
+                why = assembly_sentence(self.seen, sample.normals, pose, sample.readings)
+                return self._stopped(sample, Status.WRONG_ASSEMBLY, why)
+        self._pose = pose
+        cosine = dot(sample.normals[used], self.goal.normals[used])
+        if np.min(cosine) < 0:
+            far = leg_list(seen.legs[np.min(cosine, axis=1) < 0].tolist())
+            why = f"{far} would turn by more than 90 degrees in the image; go there in parts"
+            return self._stopped(sample, Status.TOO_FAR, why)
+        u = directions_of(sample.normals[used])
+        legs = legs_from_image(seen, u, sample.readings, self._pose)
+        task = task_of(self.law, seen, sample.normals[used], self.goal.normals[used], legs)
+        error, noise = _root_mean_square(task.error), float("nan")
+        if sample.lines is not None:
+            task, noise = weighted(self.law, task, sample.lines, used)
+        return self._answer(sample, used, task, error, noise)
+
+    def _answer(
+        self, sample: _Sample, used: Booleans, task: Task, error: float, noise: float
+    ) -> Step:
+        """Checks of the law's problem, then its solution; noise : rad of each of its rows."""
+        stop = self._unfit(sample, used, task)
+        if stop is not None:
+            return stop
+        known = noise > 0
+        sigma = noise * _spread(task) if known else np.full(self.machine.n_joints, np.nan)
+        vague = float(sigma.max()) if known else 0.0
+        if vague > UNSEEN:
+            return self._stopped(sample, Status.LOST, self._missing(sample, used))
+        self._started = True
+        off = task.readings @ solution(task)
+        wanted = -self.gain * off
+        velocities, slowed = limited(wanted, self.rate_limits)
+        leaves, outside = leaving(self._ranges, sample.readings, velocities, self.period)
+        if leaves.any():
+            why = range_sentence(self.machine, self._ranges, sample.readings, leaves)
+            return self._stopped(sample, Status.OUT_OF_RANGE, why)
+        still = bool(np.max(np.abs(off)) <= self.tolerance)
+        # a leg's direction scatters by more than that, so photographs are asked in sigmas
+        typical = _root_mean_square(task.error / np.sqrt(3)) / noise if known else np.inf
+        converged = still and (error < ELSEWHERE or typical < SIGMAS)
+        warnings = self._warnings(sample, used, slowed, outside)
+        if still and not converged:
+            warnings = (*warnings, _elsewhere(error))
+        if vague > VAGUE * self.tolerance:
+            warnings = (*warnings, vague_sentence(self.machine, sigma))
+        status = Status.CONVERGED if converged else Status.RUNNING
+        return Step(
+            velocities, error, off, sigma, converged, status, status.value, warnings, used,
+            sample.normals,
+        )  # fmt: skip
+
+    def _unfit(self, sample: _Sample, used: Booleans, task: Task) -> Step | None:
+        """Why the law's problem must not be solved, if it must not."""
+        rows = task.legs.rows @ task.twist
+        if not (np.isfinite(task.matrix).all() and np.isfinite(task.readings).all()):
+            return self._stopped(sample, Status.SINGULAR, "a motor is in line with its rod")
+        least = self._least(sample, rows)
+        if least < NEAR_SINGULAR:
+            why = f"smallest singular value {least:.2g}; {NEAR_SINGULAR} is the least allowed"
+            return self._stopped(sample, Status.SINGULAR, why)
+        squares = np.linalg.eigvalsh(task.matrix.T @ task.matrix)
+        if squares[0] < BLIND**2 * squares[-1]:
+            return self._stopped(sample, Status.LOST, self._missing(sample, used))
+        if aspect_of(self.machine, task.legs) * self.goal.aspect < 0:
+            why = "it was crossed, or the goal is in another assembly: choose a goal on this side"
+            return self._stopped(sample, Status.CROSSING, why)
+        return None
+
+    def _least(self, sample: _Sample, rows: Array) -> float:
+        """Distance from a singular pose, as :func:`pkmcal.mechanisms.kinematics.singularity`."""
+        if not self.machine.layout.n_internal:
+            return float(np.linalg.svd(rows, compute_uv=False)[-1])
+        return float(self.machine.forward_result(sample.readings, self._pose).singularity)
+
+    def _pose_of(self, sample: _Sample, seen: SeenMachine) -> Array | None:
+        """The pose (4, 4) by forward kinematics, None where there is none.
+
+        Where the law does without, the last one known serves: it decides the assembly only.
+        """
+        if sample.pose is not None:
+            return sample.pose
+        if seen.by_image_alone and self._started:
+            return self._pose
+        found = self.machine.forward_result(sample.readings, self._pose)
+        return found.T_base_platform if bool(found.converged) else None
+
+    def _part(self, used: Booleans) -> SeenMachine:
+        """The seen machine with some of its legs only; made once for each choice."""
+        key = used.tobytes()
+        if key not in self._parts:
+            seen = self.seen
+            legs, radius = seen.legs[used], seen.radius[used]
+            self._parts[key] = replace(seen, legs=legs, radius=radius)
+        return self._parts[key]
+
+    def _stopped(self, sample: _Sample, status: Status, why: str) -> Step:
+        nothing = np.full(self.machine.n_joints, np.nan)
+        return Step(
+            joint_velocities=np.zeros(self.machine.n_joints),
+            error=float("nan"),
+            remaining=nothing,
+            sigma=nothing,
+            converged=False,
+            status=status,
+            sentence=f"{status.value}: {why}" if why else status.value,
+            warnings=(),
+            used=np.zeros(len(self.seen.legs), dtype=bool),
+            normals=sample.normals,
+        )
+
+    def _missing(self, sample: _Sample, used: Booleans) -> str:
+        """Which legs are missing and why, and what is left."""
+        lost = "; ".join(self._lost(sample, used))
+        if not used.any():
+            return lost
+        left = f"{leg_list(self.seen.legs[used].tolist())} alone cannot show every motion"
+        return f"{left}; {lost}" if lost else left
+
+    def _lost(self, sample: _Sample, used: Booleans) -> list[str]:
+        return missing_clauses(self.seen.legs, used, self.goal.normals, sample.reasons)
+
+    def _warnings(
+        self, sample: _Sample, used: Booleans, slowed: bool, outside: Booleans
+    ) -> tuple[str, ...]:
+        out = self._lost(sample, used)
+        if sample.beside > BESIDE:
+            out.append(
+                f"the photograph contradicts the readings by {sample.beside * 1e3:.1f} mm in a"
+                " rod's length: they are of another time, or not this machine's"
+            )
+        if slowed:
+            out.append("slowed down to the motors' largest velocities")
+        for k in np.flatnonzero(outside):
+            out.append(f"the motor of {motor_name(self.machine, int(k))} is outside its range")
+        return tuple(out)
+
+    def _checked(self, readings: Array) -> Array:
+        q = np.asarray(readings, dtype=float)
+        if q.shape != (self.machine.n_joints,) or not np.isfinite(q).all():
+            raise InputError(
+                what="the readings are not one finite number a motor",
+                found=f"{q.tolist()}" if q.ndim < 2 else f"shape {q.shape}",
+                expected=f"{self.machine.n_joints} numbers, in m or rad",
+            )
+        return q
+
+
+def _root_mean_square(error: Array) -> float:
+    """Root mean square length (rad) of a law's error vectors, (3 k,) one behind the other."""
+    return float(np.sqrt(3 * np.mean(error**2)))
+
+
+def _spread(task: Task) -> Array:
+    """Standard deviations (m,) of the readings' way to the goal, for rows with that of 1."""
+    factor = task.readings @ np.linalg.inv(task.matrix.T @ task.matrix)
+    return np.sqrt(np.sum(factor * task.readings, axis=1))
+
+
+def _elsewhere(error: float) -> str:
+    return (
+        f"the machine comes to rest with its legs {np.rad2deg(error):.2g} degrees from the goal's:"
+        " another equilibrium of the law, or a goal of another machine or camera place"
+    )
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not (np.isfinite(value) and value > 0):
+        raise InputError(f"{name} must be a positive number", found=value)
+
+
+def _limits(machine: Machine, limits: float | Array | None) -> Array | None:
+    if limits is None:
+        return None
+    array = np.broadcast_to(np.asarray(limits, dtype=float), (machine.n_joints,))
+    if not (np.isfinite(array) & (array > 0)).all():
+        raise InputError("rate limits must be positive numbers", found=array.tolist())
+    return array

@@ -1,0 +1,314 @@
+"""A machine before a camera, as a controller believes it to be, and its legs at one moment.
+
+What control by the legs needs ([B] III): the points A_j and the rods' lengths by the readings, both
+believed, and the legs' directions, measured. Where every leg is seen and the platform is rigid,
+nothing else enters: B = A + length u, and neither the platform's geometry nor forward kinematics
+is asked. What is not seen, and what axes and articulated platforms add, comes from the pose that
+the readings give.
+
+A twist is (omega, tau) as in :mod:`pkmcal.geometry.rigid`, along the base frame's axes; tau is the
+velocity of the point of the platform that is at ``pivot``, which for the project's own twist is
+the platform's origin, and for [B]'s the camera's centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.errors import InputError
+from pkmcal.geometry.cylinders import SIDE_SIGNS, line_through
+from pkmcal.geometry.rigid import apply, cross, dot, inverse, register, skew
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.kinematics import forward, inverse_result
+from pkmcal.mechanisms.limbs import (
+    Closure,
+    LimbEnds,
+    along,
+    closure,
+    limb_ends,
+    rod_lengths,
+)
+from pkmcal.mechanisms.rows import base_ends
+from pkmcal.mechanisms.velocities import readings_rows
+
+
+@dataclass(frozen=True)
+class SeenMachine:
+    """What a controller believes of a machine and of the camera before it.
+
+    machine : its values may be (..., P), one machine a run. T_camera_base : (..., 4, 4).
+    legs : (s,) the legs that are seen, from 0. radius : (s,) m, of each one's visible tube.
+    """
+
+    machine: Machine
+    T_camera_base: Array
+    legs: Integers
+    radius: Array
+
+    @property
+    def theta(self) -> Array:
+        """The machine's values, (..., P)."""
+        return self.machine.values
+
+    @cached_property
+    def by_image_alone(self) -> bool:
+        """Whether every leg is seen and closes, and nothing but rods holds a rigid platform."""
+        layout = self.machine.layout
+        every = len(self.legs) == layout.n_legs and bool(layout.closing.all())
+        return self.rigid and every and not len(layout.angles)
+
+    @cached_property
+    def rigid(self) -> bool:
+        """Whether the platform is one rigid body."""
+        carriers = [g.carrier for g in self.machine.layout.platform]
+        return not any(carrier.turns or carrier.floats for carrier in carriers)
+
+    @cached_property
+    def home(self) -> Array:
+        """The drawing's home pose (4, 4)."""
+        return self.machine.with_values(self.machine.parameters.drawing).home()
+
+    def camera_centre(self) -> Array:
+        """The camera's centre of projection, (..., 3) m, base frame."""
+        return inverse(self.T_camera_base)[..., :3, 3]
+
+
+def seen_machine(
+    machine: Machine, T_camera_base: Array, legs: Integers | None = None
+) -> SeenMachine:
+    """A machine whose given legs (all that have tubes unless given) are seen by a camera.
+
+    Of a leg's tubes the one of which most is to be seen at home counts.
+    Raises InputError for a leg that does not exist or has no tube.
+    """
+    tubed = [j for j, leg in enumerate(machine.document.legs) if leg.tubes]
+    wanted = np.array(tubed if legs is None else legs, dtype=int)
+    missing = sorted({int(j) + 1 for j in wanted} - {j + 1 for j in tubed})
+    if missing or not len(wanted) or len(set(wanted.tolist())) < len(wanted):
+        raise InputError(
+            what=f"control by the legs of {machine.name!r} needs legs with tubes, each once",
+            found=f"legs {', '.join(str(int(j) + 1) for j in wanted)}" if len(wanted) else "none",
+            expected=f"some of {', '.join(str(j + 1) for j in tubed)}" if tubed else "tubes",
+            next_step="give the visible cylinders under tubes in the mechanism file, or other legs",
+        )
+    tubes = visible_tubes(machine, wanted)
+    radii = machine.radii()
+    radius = np.array([radii[j][t] for j, t in zip(wanted, tubes, strict=True)])
+    return SeenMachine(machine, T_camera_base, wanted, radius)
+
+
+def visible_tubes(machine: Machine, legs: Integers) -> Integers:
+    """Of each leg (s,) the number of the tube of which most is to be seen at home."""
+    home = machine.with_values(machine.parameters.drawing).home()
+    readings = machine.inverse(home[None])[0]
+    ends = limb_ends(machine.layout, machine.parameters.drawing, readings, home)
+    length = np.sqrt(dot(ends.b - ends.a, ends.b - ends.a))
+    chosen: list[int] = []
+    for j in legs:
+        tubes = machine.document.legs[j].tubes
+        seen = [min(tube.stop, float(length[j])) - tube.start for tube in tubes]
+        chosen.append(int(np.argmax(seen)))
+    return np.array(chosen, dtype=int)
+
+
+@dataclass(frozen=True)
+class Legs:
+    """All limbs at one moment, base frame, leading axes broadcast; L legs, E rows of closure.
+
+    a, b, u : (..., L, 3). length : (..., L). pivot : (..., 3) where tau is taken.
+    a_by_reading : (..., L, 3). b_by_pose : (..., L, 3, 6), b_by_internal : (..., L, 3, n).
+    rows : (..., E, 6), hinges : (..., E, n), drives : (..., E, m) of the closure, by the twist,
+    the hinges' and the readings' rates.
+    """
+
+    a: Array
+    b: Array
+    u: Array
+    length: Array
+    pivot: Array
+    a_by_reading: Array
+    b_by_pose: Array
+    b_by_internal: Array
+    rows: Array
+    hinges: Array
+    drives: Array
+
+
+def legs_at(seen: SeenMachine, T_base_platform: Array, readings: Array | None = None) -> Legs:
+    """The limbs of the believed machine at poses (..., 4, 4); readings (..., m) of inverse
+    kinematics unless given. The twist is the project's: the pivot is the platform's origin.
+    """
+    layout, theta = seen.machine.layout, seen.theta
+    found, internal = inverse_result(layout, theta, T_base_platform)
+    q = found if readings is None else readings
+    c = closure(layout, theta, q, T_base_platform, internal)
+    return _of_closure(seen, c, c.u, T_base_platform[..., :3, 3])
+
+
+def legs_from_image(
+    seen: SeenMachine, u_camera: Array, readings: Array, near: Array | None = None
+) -> Legs:
+    """The limbs as the controller takes them to be.
+
+    u_camera : (..., s, 3) measured directions of the seen legs, camera frame. readings : (..., m).
+    near : (..., 4, 4) a pose to start forward kinematics from, where it is needed; the pose that
+    the seen legs give, or home, unless given. The pivot is the middle of the platform's joints.
+    """
+    rot_t = np.swapaxes(seen.T_camera_base[..., :3, :3], -1, -2)[..., None, :, :]
+    u = (rot_t @ u_camera[..., None])[..., 0]
+    if seen.by_image_alone:
+        return _by_image(seen, u, readings)
+    layout, theta = seen.machine.layout, seen.theta
+    start = _start(seen, u, readings) if near is None else near
+    found = forward(layout, theta, readings, start)
+    poses, internal = found.T_base_platform, found.internal
+    c = closure(layout, theta, readings, poses, internal)
+    directions = np.array(np.broadcast_to(c.u, (*found.converged.shape, *c.u.shape[-2:])))
+    directions[..., seen.legs, :] = u
+    legs = _of_closure(seen, c, directions, poses[..., :3, 3])
+    return moved_to(legs, legs.b.mean(axis=-2))
+
+
+def moved_to(legs: Legs, pivot: Array) -> Legs:
+    """The same with tau taken at another point (..., 3), base frame."""
+    change = twist_change(legs.pivot - pivot)
+    return replace(
+        legs,
+        pivot=pivot,
+        b_by_pose=legs.b_by_pose @ change[..., None, :, :],
+        rows=legs.rows @ change,
+    )
+
+
+def twist_change(arm: Array) -> Array:
+    """(..., 6, 6): the twist at a point ``arm`` (..., 3) further on, from that at the first."""
+    out = np.zeros((*arm.shape[:-1], 6, 6))
+    out[...] = np.eye(6)
+    out[..., 3:, :3] = -skew(arm)
+    return out
+
+
+def _start(seen: SeenMachine, u: Array, readings: Array) -> Array:
+    """The pose that three or more seen legs of a rigid platform give, or home; u in the base."""
+    layout = seen.machine.layout
+    ends = limb_ends(layout, seen.theta, readings, np.eye(4))
+    shape = np.broadcast_shapes(ends.a.shape[:-2], u.shape[:-2])
+    known = np.flatnonzero(layout.closing[seen.legs])
+    if not seen.rigid or len(known) < 3 or layout.motion.shape[1] < 6:
+        return np.broadcast_to(seen.home, (*shape, 4, 4))
+    legs = seen.legs[known]
+    length = rod_lengths(layout, seen.theta, readings)[..., legs, None]
+    b = ends.a[..., legs, :] + length * u[..., known, :]
+    return register(np.broadcast_to(ends.b[..., legs, :], b.shape), b)
+
+
+def _by_image(seen: SeenMachine, u: Array, readings: Array) -> Legs:
+    """Every leg seen, a rigid platform: A and the length are believed, u is measured."""
+    layout, theta = seen.machine.layout, seen.theta
+    order = np.argsort(seen.legs)
+    u = u[..., order, :]
+    base = base_ends(layout, theta, readings)
+    length = np.broadcast_to(base.length, u.shape[:-1])
+    a = np.broadcast_to(base.a, u.shape)
+    b = a + length[..., None] * u
+    pivot = b.mean(axis=-2)
+    by_pose = np.zeros((*b.shape, 6))
+    by_pose[..., :3] = -skew(b - pivot[..., None, :])
+    by_pose[..., 3:] = np.eye(3)
+    by_reading = -dot(u, base.by_reading) - layout.rod_reads
+    pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
+    return Legs(
+        a, b, u, length, pivot, np.broadcast_to(base.by_reading, u.shape), by_pose,
+        np.zeros((*b.shape, 0)), along(u, by_pose), np.zeros((*length.shape, 0)),
+        np.where(pick, by_reading[..., None], 0.0),
+    )  # fmt: skip
+
+
+def _of_closure(seen: SeenMachine, c: Closure, u: Array, pivot: Array) -> Legs:
+    """The limbs of a closed machine, with the directions (..., L, 3) given."""
+    layout, ends = seen.machine.layout, c.ends
+    if u is not c.u:
+        c = _with_directions(seen, c, u)
+    shape = u.shape[:-1]
+    return Legs(
+        a=np.broadcast_to(ends.a, u.shape),
+        b=np.broadcast_to(ends.b, u.shape),
+        u=u,
+        length=np.broadcast_to(c.distance, shape),
+        pivot=pivot,
+        a_by_reading=np.broadcast_to(ends.a_by_reading, u.shape),
+        b_by_pose=np.broadcast_to(ends.b_by_pose, (*u.shape, 6)),
+        b_by_internal=np.broadcast_to(ends.b_by_internal, (*u.shape, layout.n_internal)),
+        rows=c.by_pose,
+        hinges=c.by_internal,
+        drives=readings_rows(layout, c),
+    )
+
+
+def _with_directions(seen: SeenMachine, c: Closure, u: Array) -> Closure:
+    """The rows of the lengths by measured directions; the axes' rows stay."""
+    layout, ends = seen.machine.layout, c.ends
+    keep, n = layout.closing, int(layout.closing.sum())
+    own = u[..., keep, :]
+    by_pose, by_internal, by_reading = (
+        np.array(x) for x in (c.by_pose, c.by_internal, c.by_reading)
+    )
+    by_pose[..., :n, :] = along(own, ends.b_by_pose[..., keep, :, :])
+    by_internal[..., :n, :] = along(own, ends.b_by_internal[..., keep, :, :])
+    moved = dot(own, np.broadcast_to(ends.a_by_reading, u.shape)[..., keep, :])
+    by_reading[..., :n] = -moved - layout.rod_reads[keep]
+    return replace(c, by_pose=by_pose, by_internal=by_internal, by_reading=by_reading)
+
+
+def true_edges(seen: SeenMachine, T_base_platform: Array, readings: Array | None = None) -> Array:
+    """Normals (..., s, 2, 3) of the seen legs' edges at poses (..., 4, 4), camera frame, [B] eq. 3.
+
+    readings : (..., m), of inverse kinematics unless given. NaN where the camera's centre lies in
+    a leg, and where a limb cannot reach.
+    """
+    a, b = seen_ends(seen, T_base_platform, readings)
+    u, m = line_through(a, b)
+    distance = np.sqrt(dot(m, m))
+    with np.errstate(invalid="ignore"):
+        sin = np.where(distance > seen.radius, seen.radius / distance, np.nan)[..., None, None]
+    m_unit = (m / distance[..., None])[..., None, :]
+    across = cross(u[..., None, :], m_unit)
+    return SIDE_SIGNS[:, None] * np.sqrt(1 - sin**2) * m_unit - sin * across
+
+
+def seen_ends(
+    seen: SeenMachine, T_base_platform: Array, readings: Array | None = None
+) -> tuple[Array, Array]:
+    """Ends a and b (..., s, 3) of the seen legs, camera frame, m."""
+    layout, theta = seen.machine.layout, seen.theta
+    q, internal = inverse_result(layout, theta, T_base_platform)
+    ends: LimbEnds = limb_ends(
+        layout, theta, q if readings is None else readings, T_base_platform, internal
+    )
+    T = seen.T_camera_base[..., None, :, :]
+    return apply(T, ends.a[..., seen.legs, :]), apply(T, ends.b[..., seen.legs, :])
+
+
+def directions_of(normals: Array) -> Array:
+    """Directions u (..., s, 3) of legs from their edges (..., s, 2, 3); errata, [B] eq. 11."""
+    u = cross(normals[..., 1, :], normals[..., 0, :])
+    return u / np.sqrt(dot(u, u))[..., None]
+
+
+__all__ = [
+    "Legs",
+    "SeenMachine",
+    "directions_of",
+    "legs_at",
+    "legs_from_image",
+    "moved_to",
+    "seen_ends",
+    "seen_machine",
+    "true_edges",
+    "twist_change",
+    "visible_tubes",
+]

@@ -1,0 +1,322 @@
+"""The servoing loop in simulation: a true machine, and a controller that believes another one.
+
+All runs of a study advance together, one array operation a sample. A sample: the camera measures
+the edges, the controller answers, after its delay, with the drives' rates, the drives move, and
+the true machine's platform follows by its forward kinematics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.control.ends import End
+from pkmcal.control.image import Eye
+from pkmcal.control.laws import Where, joint_velocities, law_named
+from pkmcal.control.seen import SeenMachine
+from pkmcal.control.steady import loop_factor, one_image
+from pkmcal.geometry.rigid import dot
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, forward, inverse_result
+from pkmcal.mechanisms.limbs import closure, limb_ends
+from pkmcal.simulate.edges import EdgeNoise
+
+SETTLED = 0.02
+"""Part of the way at which a platform counts as arrived, as control engineers have it."""
+LEAST_WAY = 5e-4
+"""m, of the platform's joints, within which a goal is reached however short the way was."""
+LAST = 0.1
+"""Part of a run, at its end, whose mean decides where it ended."""
+NOISY = 3.0
+"""Standard deviations of the noise at the goal within which a platform is there."""
+STILL = 0.1
+"""Part of the way beyond which a platform that trembles is not at its goal."""
+AT_REST = 0.02
+"""Part of the rate that the error would ask for, below which a run stands still."""
+AT_STOP = 1e-9
+"""m or rad by which a reading may be beyond its range: rounding."""
+SILENT = EdgeNoise(shift=0.0, tilt=0.0)
+"""A camera without errors."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A controller's settings.
+
+    gain : 1/s. rate : samples a second. delay : samples from the exposure to the drives' answer.
+    noise : of the edges, px. joint_noise : of a reading, m or rad. speed : (m,) fastest rates of
+    the drives, all scaled together. duration : s. at : where the interaction is taken.
+    """
+
+    law: str = "edges"
+    gain: float = 1.0
+    rate: float = 25.0
+    delay: int = 1
+    noise: EdgeNoise = field(default_factory=EdgeNoise)
+    joint_noise: float = 3e-6
+    speed: Array | None = None
+    duration: float = 10.0
+    at: Where = "measured"
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return max(2, round(self.duration * self.rate))
+
+
+@dataclass(frozen=True)
+class Runs:
+    """R runs of K samples.
+
+    time : (K,) s. error : (R, K) norm of e. way : (R, K) m, root mean square distance of the
+    platform's joints from the goal. past : (R, K) part of the way by which they are beyond it.
+    T_base_platform : (R, K, 4, 4). readings : (R, K, m). end : R of them. last : (R,) the sample at
+    which a run was stopped; later ones repeat it. goals : (R, 4, 4).
+    """
+
+    time: Array
+    error: Array
+    way: Array
+    past: Array
+    T_base_platform: Array
+    readings: Array
+    end: tuple[End, ...]
+    last: Integers
+    goals: Array
+
+    @property
+    def reached(self) -> Booleans:
+        """(R,) runs that ended at their goal."""
+        return np.array([end.good for end in self.end])
+
+
+def simulate(
+    eye: Eye,
+    believed: SeenMachine,
+    starts: Array,
+    goals: Array,
+    loop: Loop,
+    rng: np.random.Generator,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Runs:
+    """R runs from starts to goals (R, 4, 4), the true platform's poses.
+
+    believed : its values (R, P) or (P,), its camera's place (R, 4, 4) or (4, 4). The wanted edges
+    are the true ones at the goal, taught there without noise.
+    """
+    kind, goal_readings = law_named(loop.law), _readings(eye.true.machine, goals)
+    wanted = eye.normals(eye.points(goals, np.nan_to_num(goal_readings)), SILENT, rng)
+    now = _begin(eye, starts, goals)
+    record = _Record.empty(eye.true.machine, starts, goals, now.readings.shape[-1], loop.samples)
+    floor = _floor(eye, goals, np.nan_to_num(goal_readings), loop, rng)
+    queue: list[tuple[Array, Array]] = []
+    for k in range(loop.samples):
+        points = eye.points(now.poses, now.readings)
+        record.take(k, now, kind.error(points.normal.reshape(wanted.shape), wanted))
+        now = _stopped(now, ~_all(eye.in_view(points)), End.LOST_LEG, k)
+        noise = loop.joint_noise * rng.standard_normal(now.readings.shape)
+        queue.append((eye.normals(points, loop.noise, rng), now.readings + noise))
+        if len(queue) > loop.delay and now.active.any():
+            edges, readings = queue.pop(0)
+            speeds = joint_velocities(
+                loop.law, believed, edges, wanted, readings, loop.gain, at=loop.at,
+                goal_readings=goal_readings if loop.at != "measured" else None,
+            )  # fmt: skip
+            now = _moved(eye.true.machine, now, limited(speeds, loop.speed) / loop.rate, k)
+        if k % 16 == 0:
+            progress(k / loop.samples)
+    return record.runs(now, goals, loop, floor)
+
+
+def limited(speeds: Array, fastest: Array | None) -> Array:
+    """All drives' rates (..., m) slowed together until none is too fast: the direction stays."""
+    if fastest is None:
+        return speeds
+    with np.errstate(invalid="ignore"):
+        excess = np.max(np.abs(speeds) / fastest, axis=-1, keepdims=True, initial=1.0)
+    return speeds / excess
+
+
+@dataclass(frozen=True)
+class _Now:
+    """All runs at one sample. sign : (R,) of the start's assembly. end : (R,) place in ``_ENDS``,
+    -1 for none yet. last : (R,) sample at which it came.
+    """
+
+    poses: Array
+    readings: Array
+    sign: Array
+    end: Integers
+    last: Integers
+
+    @property
+    def active(self) -> Booleans:
+        """(R,) runs that still go."""
+        return self.end < 0
+
+
+def _readings(machine: Machine, poses: Array) -> Array:
+    return inverse_result(machine.layout, machine.values, poses)[0]
+
+
+def _begin(eye: Eye, starts: Array, goals: Array) -> _Now:
+    """All runs at their start; those that cannot begin are ended."""
+    machine = eye.true.machine
+    readings, wanted = _readings(machine, starts), _readings(machine, goals)
+    n = len(starts)
+    sign = assembly_sign(machine, starts)
+    now = _Now(starts, np.nan_to_num(readings), sign, np.full(n, -1), np.zeros(n, dtype=int))
+    out = outside(machine, readings) | outside(machine, wanted)
+    now = _stopped(now, out, End.LEFT_WORKSPACE, 0)
+    return _stopped(now, sign * assembly_sign(machine, goals) < 0, End.WRONG_ASSEMBLY, 0)
+
+
+def _stopped(now: _Now, which: Booleans, end: End, sample: int) -> _Now:
+    """The runs that still go are ended where ``which`` says so."""
+    which = which & now.active
+    return replace(
+        now,
+        end=np.where(which, _ENDS.index(end), now.end),
+        last=np.where(which, sample, now.last),
+    )
+
+
+def _moved(machine: Machine, now: _Now, step: Array, sample: int) -> _Now:
+    """Drives go by steps (R, m), and the platforms follow."""
+    step = np.where(now.active[:, None], step, 0.0)
+    now = _stopped(now, ~_all(np.isfinite(step)), End.LOST_LEG, sample)
+    wanted = now.readings + np.nan_to_num(step)
+    now = _stopped(now, outside(machine, wanted), End.LEFT_WORKSPACE, sample)
+    wanted = np.where(now.active[:, None], wanted, now.readings)
+    found = forward(machine.layout, machine.values, wanted, now.poses)
+    poses, closed = found.T_base_platform, found.converged
+    turned = assembly_sign(machine, poses) * now.sign < 0
+    now = _stopped(
+        now, closed & (turned | (found.singularity < NEAR_SINGULAR)), End.SINGULAR, sample
+    )
+    now = _stopped(now, ~closed, End.LEFT_WORKSPACE, sample)
+    return replace(
+        now,
+        readings=np.where(now.active[:, None], wanted, now.readings),
+        poses=np.where(now.active[:, None, None], poses, now.poses),
+    )
+
+
+def _all(flags: Booleans) -> Booleans:
+    return np.asarray(flags.all(axis=-1))
+
+
+def outside(machine: Machine, readings: Array) -> Booleans:
+    """(R,) True where a reading (R, m) is beyond its range, or a limb cannot reach."""
+    low, high = machine.joint_ranges.T
+    with np.errstate(invalid="ignore"):
+        beyond = (readings < low - AT_STOP) | (readings > high + AT_STOP)
+    return (beyond | ~np.isfinite(readings)).any(axis=-1)
+
+
+def assembly_sign(machine: Machine, poses: Array) -> Array:
+    """Sign (R,) of the closure's determinant at poses (R, 4, 4): it changes where a way from one
+    assembly to another crosses a singular pose. 0 where rows and freedoms differ in number.
+    """
+    layout, theta = machine.layout, machine.values
+    readings, internal = inverse_result(layout, theta, poses)
+    by_own = layout.by_own(closure(layout, theta, np.nan_to_num(readings), poses, internal))
+    if by_own.shape[-1] != by_own.shape[-2]:
+        return np.zeros(len(poses))
+    return np.sign(np.linalg.det(np.nan_to_num(by_own)))
+
+
+def platform_joints(machine: Machine, poses: Array) -> Array:
+    """The platform's joint centres (R, L, 3) at poses (R, 4, 4), m, base frame."""
+    layout, theta = machine.layout, machine.values
+    readings, internal = inverse_result(layout, theta, poses)
+    return limb_ends(layout, theta, np.nan_to_num(readings), poses, internal).b
+
+
+@dataclass(frozen=True)
+class _Record:
+    """Arrays that fill as the loop runs. goals : the platform's joints there; first : their
+    distance at the start, (R, L, 3).
+    """
+
+    machine: Machine
+    goals: Array
+    first: Array
+    error: Array
+    way: Array
+    past: Array
+    poses: Array
+    readings: Array
+
+    @classmethod
+    def empty(cls, machine: Machine, starts: Array, goals: Array, m: int, samples: int) -> _Record:
+        n, ends = len(starts), platform_joints(machine, goals)
+        first = platform_joints(machine, starts) - ends
+        shape = (n, samples)
+        return cls(
+            machine, ends, first, np.zeros(shape), np.zeros(shape), np.zeros(shape),
+            np.zeros((*shape, 4, 4)), np.zeros((*shape, m)),
+        )  # fmt: skip
+
+    def take(self, sample: int, now: _Now, error: Array) -> None:
+        """One sample of all runs."""
+        flat = error.reshape(len(error), -1)
+        off = platform_joints(self.machine, now.poses) - self.goals
+        whole = np.sum(self.first**2, axis=(-1, -2))
+        self.error[:, sample] = np.sqrt(np.sum(flat * flat, axis=-1))
+        self.way[:, sample] = np.sqrt(np.mean(dot(off, off), axis=-1))
+        ahead = np.sum(off * self.first, axis=(-1, -2))
+        self.past[:, sample] = -ahead / np.where(whole > 0, whole, np.inf)
+        self.poses[:, sample], self.readings[:, sample] = now.poses, now.readings
+
+    def runs(self, now: _Now, goals: Array, loop: Loop, floor: Array) -> Runs:
+        """What the runs were, with their ends judged."""
+        last = np.where(now.active, loop.samples - 1, now.last)
+        judged = _judged(self.error, self.way, loop, floor)
+        ends = [_ENDS[e] if e >= 0 else end for e, end in zip(now.end, judged, strict=True)]
+        time = np.arange(loop.samples) / loop.rate
+        return Runs(
+            time, self.error, self.way, self.past, self.poses, self.readings, tuple(ends), last,
+            goals,
+        )  # fmt: skip
+
+
+def _floor(eye: Eye, goals: Array, readings: Array, loop: Loop, rng: np.random.Generator) -> Array:
+    """Distance (R,) m of the platform's joints from the goal that the noise alone explains."""
+    still = one_image(eye, eye.true, loop.law, goals, readings, loop.noise, rng, draws=8)
+    part = loop_factor(loop.gain / loop.rate, loop.delay)
+    return np.nan_to_num(NOISY * still.joints * (part if np.isfinite(part) else 0.0))
+
+
+def _judged(error: Array, way: Array, loop: Loop, floor: Array) -> list[End]:
+    """Where runs (R, K) that used all their time ended, by the means over their last part.
+
+    floor : (R,) m, what noise alone explains.
+    """
+    n = max(1, round(LAST * error.shape[1]))
+    e, w = error[:, -n:].mean(axis=1), way[:, -n:].mean(axis=1)
+    before = way[:, -2 * n : -n].mean(axis=1) if error.shape[1] >= 2 * n else w
+    near = np.maximum(SETTLED * way[:, 0], LEAST_WAY)
+    arrived = w < np.maximum(near, np.minimum(floor, STILL * way[:, 0]))
+    shaken = w < floor
+    # what an exponential of this gain would still go in that time, were the control not at rest
+    rest = np.abs(before - w) < AT_REST * w * (1 - np.exp(-loop.gain * n / loop.rate))
+    alike = e < SETTLED * error[:, 0]
+    worse = w > way[:, 0]
+    return [_end(*case) for case in zip(arrived, shaken, alike, rest, worse, strict=True)]
+
+
+def _end(arrived: bool, shaken: bool, alike: bool, rest: bool, worse: bool) -> End:
+    if arrived or shaken:
+        return End.REACHED if arrived else End.UNSTEADY
+    if alike and rest:
+        return End.OTHER_POSE
+    if rest:
+        return End.STUCK
+    return End.DIVERGED if worse else End.SLOW
+
+
+_ENDS = tuple(End)

@@ -1,0 +1,187 @@
+"""What is controlled in a study: a calibration with its cameras, or a machine by its drawing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.cameras import Camera, load_camera
+from pkmcal.control.estimates import Uncertainty
+from pkmcal.control.seen import seen_machine
+from pkmcal.control.study import Scene
+from pkmcal.errors import InputError
+from pkmcal.export.source import Source, load_source
+from pkmcal.geometry.rigid import inverse, pose, rotation
+from pkmcal.mechanisms import Machine
+from pkmcal.results import SavedCalibration, SavedStation, load
+from pkmcal.simulate.demo import demo_camera
+from pkmcal.simulate.stations import default_stations
+from pkmcal.simulate.truth import stream, true_machine
+
+CALIBRATED = 1 / 30
+"""What a calibration leaves of a drawing's tolerances: 2 mm become 0.06 mm, as in the
+demonstration."""
+CAMERA_ROTATION = float(np.deg2rad(0.02))
+CAMERA_POSITION = 2e-4
+"""rad and m, standard deviations of a camera's place by the same demonstration."""
+
+
+@dataclass(frozen=True)
+class Controlled:
+    """A scene and what the user should know of it.
+
+    name : of the machine. origin : a sentence. station : the camera's, None for a drawing.
+    """
+
+    scene: Scene
+    name: str
+    origin: str
+    station: str | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def controlled(
+    what: str,
+    *,
+    session: Path | None = None,
+    station: str | None = None,
+    camera: Path | None = None,
+    legs: tuple[int, ...] | None = None,
+    seed: int = 0,
+) -> Controlled:
+    """The scene of a calibration's folder, of a mechanism file, or of a built-in machine.
+
+    legs : numbers from 0. Raises InputError for what is none of these, for a station or camera that
+    is not there, and for legs that cannot be seen.
+    """
+    source = load_source(what, session)
+    eye = load_camera(camera) if camera is not None else None
+    if source.calibrated:
+        return _of_calibration(load(what), source, station, eye, legs)
+    if station is not None or session is not None:
+        raise InputError(
+            "a machine that is not calibrated has no stations",
+            where="--station" if station is not None else "--session",
+            found=station or str(session),
+            next_step="Name a calibration's folder, or give --camera alone",
+        )
+    return _of_drawing(source, eye or demo_camera(), legs, seed)
+
+
+def _of_calibration(
+    saved: SavedCalibration,
+    source: Source,
+    station: str | None,
+    eye: Camera | None,
+    legs: tuple[int, ...] | None,
+) -> Controlled:
+    """The calibrated machine stands for the true one; estimates differ from it as it may from the
+    truth.
+    """
+    place = _station(saved, source, station, eye)
+    eye = source.cameras[place.name] if eye is None else eye
+    scene = Scene(
+        machine=saved.machine,
+        drawing=saved.drawing,
+        uncertainty=Uncertainty(saved.covariance, place.sigma_rotation, place.sigma_translation),
+        camera=eye,
+        T_camera_base=inverse(place.T_base_camera),
+        legs=legs,
+    )
+    refused = () if saved.verdict.usable else (
+        f"The calibration itself should not be used: {saved.verdict.headline}",
+    )  # fmt: skip
+    origin = (
+        f"The calibrated machine (folder {source.origin}), seen by the camera of {place.name};"
+        " every run has its own errors, drawn from the calibration's covariance."
+    )
+    return Controlled(scene, saved.machine.name, origin, place.name, refused)
+
+
+def _station(
+    saved: SavedCalibration, source: Source, name: str | None, eye: Camera | None
+) -> SavedStation:
+    """The station asked for, or the first one whose camera is known."""
+    names = [one.name for one in saved.stations]
+    if name is not None and name not in names:
+        raise InputError(
+            "the calibration has no such station",
+            where="--station",
+            found=name,
+            expected=" or ".join(names),
+        )
+    wanted = [one for one in saved.stations if name in (None, one.name)]
+    known = [one for one in wanted if eye is not None or one.name in source.cameras]
+    if not known:
+        raise InputError(
+            "the station's camera file was not found",
+            where=str(saved.path.parent),
+            expected=", ".join(sorted({one.camera for one in wanted})),
+            next_step="Name the session with --session, or the camera's file with --camera",
+        )
+    return known[0]
+
+
+def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed: int) -> Controlled:
+    """A machine built within its drawing's tolerances."""
+    machine = source.machine
+    seen_machine(machine, np.eye(4), None if legs is None else np.array(legs))  # before any place
+    rng = np.random.default_rng(stream(seed, "stations"))
+    place = default_stations(machine, (eye,), rng)[0]
+    truth = true_machine(machine, 1.0, np.random.default_rng(stream(seed, "machine")))
+    scene = Scene(
+        machine=truth,
+        drawing=np.array(machine.values),
+        uncertainty=_expected(machine),
+        camera=eye,
+        T_camera_base=place.T_camera_base(),
+        legs=legs,
+    )
+    x, y, z = place.position
+    origin = (
+        f"A {machine.name} built within its tolerances, the camera at ({x:.2f}, {y:.2f}, {z:.2f}) m"
+        " in the base frame; its calibration is taken to leave a thirtieth of the tolerances,"
+        f" {1e3 * CAMERA_POSITION:g} mm and {np.rad2deg(CAMERA_ROTATION):g}° of the camera's place."
+    )
+    return Controlled(scene, machine.name, origin)
+
+
+def _expected(machine: Machine) -> Uncertainty:
+    table = machine.parameters
+    free = table.free_matrix() * (CALIBRATED * table.tolerances_free())
+    return Uncertainty(free @ free.T, np.full(3, CAMERA_ROTATION), np.full(3, CAMERA_POSITION))
+
+
+def pose_of(text: str, where: str) -> Array:
+    """A pose (4, 4) of six numbers x,y,z,rx,ry,rz: metres and a rotation vector in radians."""
+    try:
+        numbers = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        numbers = np.zeros(0)
+    if numbers.shape != (6,) or not np.isfinite(numbers).all():
+        raise InputError(
+            "no pose of the platform",
+            where=where,
+            found=text,
+            expected="x,y,z,rx,ry,rz: metres and a rotation vector in radians",
+        )
+    return pose(rotation(numbers[3:]), numbers[:3])
+
+
+def legs_of(text: str) -> tuple[int, ...]:
+    """Numbers from 0 of legs told from 1, such as 1,3,5."""
+    try:
+        numbers = [int(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or min(numbers) < 1 or len(set(numbers)) < len(numbers):
+        raise InputError(
+            "no list of legs",
+            where="--legs",
+            found=text,
+            expected="numbers from 1, each once, such as 1,3,5",
+        )
+    return tuple(number - 1 for number in numbers)

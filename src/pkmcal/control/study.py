@@ -1,0 +1,319 @@
+"""A study of control by the legs: random ways, four estimates of the geometry, and what is wrong.
+
+The machine is controlled in simulation by what a calibration leaves its owner with. Every run has
+its own way, its own errors of the estimates, and its own noise; all estimates see the same ways.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.cameras import Camera
+from pkmcal.control.analysis import Equilibria, Subset, equilibria, matrix_at, of_legs, subsets
+from pkmcal.control.ends import End
+from pkmcal.control.estimates import (
+    HAND_POSITION,
+    HAND_ROTATION,
+    Estimate,
+    Uncertainty,
+    estimates,
+)
+from pkmcal.control.image import Eye
+from pkmcal.control.seen import SeenMachine, seen_machine
+from pkmcal.control.simulation import SETTLED, Loop, Runs, simulate
+from pkmcal.control.steady import Stillness, loop_factor, one_image
+from pkmcal.errors import InputError
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.kinematics import inverse_result
+from pkmcal.mechanisms.limbs import closure
+from pkmcal.simulate.configurations import draw_configurations
+
+INSIDE = 0.15
+"""Part of a reading's range at both ends in which no way begins or ends: a platform that is led
+by its image does not go straight in its readings."""
+WORKSPACE = 60
+"""Poses of the workspace at which visibility is judged."""
+CLOSED = 1e-6
+"""m; a pose told with six decimals leaves so much."""
+MOST_LEGS = 8
+"""Legs of which all choices are compared."""
+GOALS, STARTS = 5, 40
+"""Goals for which other equilibria are sought, and starts of the search for each."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked of a study.
+
+    runs : of every estimate. hand_position, hand_rotation : m and rad by which the camera's place
+    by hand is off. start, goal : (4, 4) of every run; drawn unless given.
+    """
+
+    loop: Loop = field(default_factory=Loop)
+    runs: int = 60
+    seed: int = 0
+    hand_position: float = HAND_POSITION
+    hand_rotation: float = HAND_ROTATION
+    start: Array | None = None
+    goal: Array | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is controlled. drawing : (P,) values. uncertainty : of its calibration. legs : numbers
+    from 0 of those seen, all with tubes unless given.
+    """
+
+    machine: Machine
+    drawing: Array
+    uncertainty: Uncertainty
+    camera: Camera
+    T_camera_base: Array
+    legs: tuple[int, ...] | None = None
+
+    def seen(self) -> SeenMachine:
+        """The true machine before the camera."""
+        legs = None if self.legs is None else np.array(self.legs, dtype=int)
+        return seen_machine(self.machine, self.T_camera_base, legs)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The runs with one estimate of the geometry.
+
+    overshoot : (R,) largest part of its way by which a platform was beyond the goal. rise : (R,)
+    largest rise of the norm of e above an earlier value, as a part of its start's. settling : (R,)
+    s after which the platform is within SETTLED of its way, NaN where it never is.
+    """
+
+    estimate: Estimate
+    runs: Runs
+    overshoot: Array
+    rise: Array
+    settling: Array
+
+    @property
+    def reached(self) -> int:
+        """Runs that ended at their goal."""
+        return int(self.runs.reached.sum())
+
+    @property
+    def ends(self) -> dict[End, int]:
+        """How many runs ended how, the most frequent first."""
+        return dict(Counter(self.runs.end).most_common())
+
+
+@dataclass(frozen=True)
+class Study:
+    """All that was found. outcomes : true, identified, cad, hand. image, held : stillness at the
+    goals, of one image and in the loop. hidden : (s,) part of starts and goals at which a leg
+    stands behind another. choices : of legs, :func:`pkmcal.control.analysis.subsets`, of all legs
+    with tubes.
+    """
+
+    scene: Scene
+    plan: Plan
+    eye: Eye
+    outcomes: tuple[Outcome, ...]
+    image: Stillness
+    held: Stillness
+    hidden: Array
+    choices: tuple[Subset, ...]
+    equilibria: Equilibria
+
+    @property
+    def own(self) -> Subset:
+        """The legs that are seen."""
+        wanted = set(self.eye.true.legs.tolist())
+        return next(choice for choice in self.choices if set(choice.legs) == wanted)
+
+    def outcome(self, name: str) -> Outcome:
+        """By the estimate's name."""
+        return next(o for o in self.outcomes if o.estimate.name == name)
+
+
+def study(
+    scene: Scene, plan: Plan, progress: Callable[[str, float], None] = lambda _text, _share: None
+) -> Study:
+    """Simulate the loop with every estimate, and analyse what the legs show.
+
+    Raises InputError where the loop would be unstable with perfect knowledge, where a start or goal
+    is unreachable, and where the camera does not see the legs.
+    """
+    check_loop(plan.loop)
+    seeds = np.random.SeedSequence(plan.seed).spawn(5)
+    eye = Eye.of(scene.seen(), scene.camera)
+    progress("Looking at the workspace", 0.02)
+    drawn = draw_configurations(scene.machine, WORKSPACE, 0.2, np.random.default_rng(seeds[0]))
+    workspace = drawn[0][:WORKSPACE]
+    starts, goals = _ways(eye, plan, np.random.default_rng(seeds[1]))
+    beliefs = estimates(
+        eye.true, scene.drawing, scene.uncertainty, plan.runs, np.random.default_rng(seeds[2]),
+        plan.hand_position, plan.hand_rotation,
+    )  # fmt: skip
+    outcomes: list[Outcome] = []
+    for k, belief in enumerate(beliefs):
+        told = _told(progress, f"Servoing: {belief.title.lower()}", 0.05 + 0.2 * k)
+        # the same noise for all, so that differences are the estimates'
+        rng = np.random.default_rng(seeds[3])
+        runs = simulate(eye, belief.seen, starts, goals, plan.loop, rng, told)
+        outcomes.append(outcome(belief, runs))
+    progress("Looking for other equilibria", 0.87)
+    rng = np.random.default_rng(seeds[4])
+    image = _still(eye, plan, goals, rng)
+    return Study(
+        scene=scene,
+        plan=plan,
+        eye=eye,
+        outcomes=tuple(outcomes),
+        image=image,
+        held=image.held(plan.loop.gain / plan.loop.rate, plan.loop.delay),
+        hidden=_hidden(eye, np.concatenate([starts, goals])),
+        choices=_choices(scene, plan, workspace),
+        equilibria=equilibria(eye.true, plan.loop.law, goals[:GOALS], workspace[:STARTS]),
+    )
+
+
+def check_loop(loop: Loop) -> None:
+    """Raise InputError where the loop is unstable even with perfect knowledge."""
+    if np.isfinite(loop_factor(loop.gain / loop.rate, loop.delay)):
+        return
+    low, high = 0.0, 3.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        stable = np.isfinite(loop_factor(middle, loop.delay))
+        low, high = (middle, high) if stable else (low, middle)
+    raise InputError(
+        "the loop is unstable with perfect knowledge of the geometry",
+        where="--gain",
+        found=f"{loop.gain:g}/s at {loop.rate:g} samples a second and a delay of {loop.delay}",
+        expected=f"less than {low * loop.rate:.3g}/s, better a quarter of it",
+    )
+
+
+def outcome(estimate: Estimate, runs: Runs) -> Outcome:
+    """The figures of an estimate's runs."""
+    last = np.arange(len(runs.time)) <= runs.last[:, None]
+    past = np.where(last, runs.past, 0.0)
+    lowest = np.minimum.accumulate(runs.error, axis=1)
+    first = np.maximum(runs.error[:, :1], 1e-300)
+    return Outcome(
+        estimate,
+        runs,
+        overshoot=np.maximum(past.max(axis=1), 0.0),
+        rise=np.max((runs.error - lowest) / first, axis=1),
+        settling=_settling(runs),
+    )
+
+
+def _settling(runs: Runs) -> Array:
+    """Time (R,) after which the platform stays within SETTLED of its way; NaN where never."""
+    far = runs.way > SETTLED * runs.way[:, :1]
+    n = far.shape[1]
+    after = n - np.argmax(far[:, ::-1], axis=1)
+    after = np.where(far.any(axis=1), after, 0)
+    time = np.append(runs.time, np.nan)[after]
+    return np.where(runs.reached, time, np.nan)
+
+
+def _told(
+    progress: Callable[[str, float], None], text: str, first: float
+) -> Callable[[float], None]:
+    return lambda share: progress(text, first + 0.2 * share)
+
+
+def _ways(eye: Eye, plan: Plan, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Starts and goals (R, 4, 4): those asked for, or drawn with all legs in view."""
+    n = plan.runs
+    given = (plan.start, plan.goal)
+    for wanted, where in zip(given, ("--start", "--goal"), strict=True):
+        if wanted is not None:
+            check_pose(eye.true.machine, wanted, where)
+    drawn = iter(_drawn(eye, n * sum(wanted is None for wanted in given), rng).reshape(-1, n, 4, 4))
+    starts, goals = (
+        next(drawn) if wanted is None else np.broadcast_to(wanted, (n, 4, 4)) for wanted in given
+    )
+    return starts, goals
+
+
+def check_pose(machine: Machine, T_base_platform: Array, where: str) -> None:
+    """Raise InputError where a machine cannot take a pose (4, 4); where : names it."""
+    layout, theta = machine.layout, machine.values
+    readings, internal = inverse_result(layout, theta, T_base_platform)
+    unreached = np.flatnonzero(~np.isfinite(readings))
+    c = closure(layout, theta, np.nan_to_num(readings), T_base_platform, internal)
+    gap = float(np.abs(c.value).max())
+    if unreached.size or gap > CLOSED:
+        raise InputError(
+            "the machine cannot take this pose",
+            where=where,
+            found=f"a gap of {1e3 * gap:.2g} mm in its limbs",
+            expected="a pose that its constant rods, axes and motion allow",
+        )
+    low, high = machine.joint_ranges.T
+    beyond = np.flatnonzero((readings < low) | (readings > high))
+    if beyond.size:
+        k = int(beyond[0])
+        raise InputError(
+            "the pose lies outside of the workspace",
+            where=where,
+            found=f"a reading of {readings[k]:.4g} {machine.joint_units[k]} for joint {k + 1}",
+            expected=f"{low[k]:.4g} to {high[k]:.4g} {machine.joint_units[k]}",
+        )
+
+
+def _drawn(eye: Eye, count: int, rng: np.random.Generator) -> Array:
+    """Poses (count, 4, 4) well inside the ranges, with all seen legs in view."""
+    machine, tried = eye.true.machine, 0
+    found: list[Array] = [np.zeros((0, 4, 4))]
+    low, high = machine.joint_ranges.T
+    for _ in range(6):
+        if sum(map(len, found)) >= count:
+            break
+        poses, joints = draw_configurations(machine, 4 * count + 20, 0.0, rng)
+        with np.errstate(invalid="ignore"):
+            edge = INSIDE * (high - low)
+            out = (joints < low + edge) | (joints > high - edge)
+        good = ~np.asarray(out.any(axis=-1)) & _in_view(eye, poses, joints)
+        found.append(poses[good])
+        tried += len(poses)
+    out = np.concatenate(found)[:count]
+    if len(out) < count:
+        raise InputError(
+            "the camera does not see all legs that it should in enough poses of the workspace",
+            found=f"{len(out)} of {tried}",
+            expected=str(count),
+            next_step="Use a wider lens, another place for the camera, or fewer --legs",
+        )
+    return out
+
+
+def _in_view(eye: Eye, poses: Array, joints: Array) -> Booleans:
+    return np.asarray(eye.in_view(eye.points(poses, joints)).all(axis=-1))
+
+
+def _readings(eye: Eye, poses: Array) -> Array:
+    return np.nan_to_num(eye.true.machine.inverse(poses))
+
+
+def _still(eye: Eye, plan: Plan, goals: Array, rng: np.random.Generator) -> Stillness:
+    joints = _readings(eye, goals)
+    return one_image(eye, eye.true, plan.loop.law, goals, joints, plan.loop.noise, rng)
+
+
+def _hidden(eye: Eye, poses: Array) -> Array:
+    """Part (s,) of the poses at which each seen leg stands behind another one."""
+    return eye.hidden(poses, _readings(eye, poses)).mean(axis=0)
+
+
+def _choices(scene: Scene, plan: Plan, workspace: Array) -> tuple[Subset, ...]:
+    """Of all legs with tubes; of those seen where there are too many to choose from."""
+    seen = seen_machine(scene.machine, scene.T_camera_base)
+    if len(seen.legs) > MOST_LEGS and scene.legs is not None:
+        seen = of_legs(seen, scene.legs)
+    return subsets(matrix_at(seen, plan.loop.law, workspace), seen.legs)

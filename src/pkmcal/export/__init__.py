@@ -1,0 +1,1 @@
+"""A machine for other programs: one format a file, behind the contract of ``contract.py``."""

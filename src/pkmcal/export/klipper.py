@@ -1,0 +1,157 @@
+"""``klipper``: [printer] and [stepper_a] to [stepper_c] of kinematics delta and rotary_delta.
+
+Meaning of the values: Klipper's configuration reference and its klippy/kinematics/delta.py,
+rotary_delta.py and chelper/kin_rotary_delta.c. A tower's carriage is at ``position_endstop +
+sqrt(arm_length^2 - delta_radius^2)`` where its switch triggers; an arm's switch is told by the
+height at which the nozzle would be in the middle if all arms were at that arm's angle.
+"""
+
+from __future__ import annotations
+
+from configparser import ConfigParser
+from typing import ClassVar, final
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.export.contract import Difference, Exporter
+from pkmcal.export.delta import DEGREE, MM, Delta, delta_of, reach
+from pkmcal.export.delta_fit import Fit, Freedoms, fitted
+from pkmcal.export.delta_text import about, degrees, end_motors, follows, mm, tool_difference
+from pkmcal.export.source import Source
+from pkmcal.export.text import commented
+from pkmcal.findings import Finding
+
+FILE = "pkmcal_printer.cfg"
+PROGRAM = "Klipper"
+LINEAR = Freedoms((210.0, 330.0, 90.0))
+ROTARY = Freedoms((30.0, 150.0, 270.0), heights=False)
+STEPPERS = "abc"
+
+
+def _fit(source: Source) -> tuple[Delta, Fit]:
+    delta = delta_of(source.machine, PROGRAM)
+    return delta, fitted(delta, LINEAR if delta.kind == "linear" else ROTARY, PROGRAM)
+
+
+@final
+class Klipper(Exporter):
+    """Sections for printer.cfg."""
+
+    name: ClassVar = "klipper"
+    title: ClassVar = "Klipper: values for printer.cfg"
+
+    def files(self, source: Source) -> dict[str, str]:
+        """One file of configuration; pins, speeds and the like are the printer's own."""
+        delta, fit = _fit(source)
+        lines = about(source, delta, fit, STEPPERS, PROGRAM)
+        lines.append("Put these values into the sections of the printer's own configuration.")
+        sections = _linear(delta, fit) if fit.kind == "linear" else _rotary(delta, fit)
+        body = "".join(
+            f"\n[{name}]\n" + "".join(f"{key}: {value}\n" for key, value in values.items())
+            for name, values in sections.items()
+        )
+        return {FILE: commented(lines, "#") + body}
+
+    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+        """Read as Klipper does, and moved by its formulas."""
+        delta, fit = _fit(source)
+        text = files[FILE]
+        found = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
+        found.read_string(text)
+        ends = fit.rate * delta.ends[fit.order]
+        move = linear_motors if fit.kind == "linear" else rotary_motors
+        zero = homed(found) - ends
+        return [tool_difference(text, delta, fit, lambda points: move(found, points), zero)]
+
+    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+        """How well the settings follow the machine."""
+        del files
+        return (follows(_fit(source)[1], PROGRAM),)
+
+
+def _linear(delta: Delta, fit: Fit) -> dict[str, dict[str, str]]:
+    endstops = end_motors(delta, fit) - np.sqrt(fit.rod**2 - fit.radius**2)
+    sections = {
+        "printer": {
+            "kinematics": "delta",
+            "delta_radius": mm(fit.radius),
+            "print_radius": mm(MM * reach(delta)),
+        }
+    }
+    for k, name in enumerate(STEPPERS):
+        sections[f"stepper_{name}"] = {
+            "arm_length": mm(fit.rod[k]),
+            "angle": degrees(fit.angle[k]),
+            "position_endstop": mm(endstops[k]),
+        }
+    return sections
+
+
+def _rotary(delta: Delta, fit: Fit) -> dict[str, dict[str, str]]:
+    angle = end_motors(delta, fit) / DEGREE
+    out = fit.radius + fit.arm * np.cos(angle)
+    below = fit.rod**2 - out**2
+    if np.any(below <= 0) or fit.radius <= 0:
+        raise InputError(
+            "Klipper tells an arm's end switch by a height in the middle, and none belongs to it",
+            found=f"an arm that reaches {out.max():.1f} mm out, a rod of {fit.rod.min():.1f} mm",
+            next_step="Give the cranks a smaller range in the mechanism file",
+        )
+    endstops = fit.height + fit.arm * np.sin(angle) - np.sqrt(below)
+    sections = {
+        "printer": {
+            "kinematics": "rotary_delta",
+            "shoulder_radius": mm(fit.radius),
+            "shoulder_height": mm(fit.height[0]),
+        }
+    }
+    for k, name in enumerate(STEPPERS):
+        sections[f"stepper_{name}"] = {
+            "upper_arm_length": mm(fit.arm[k]),
+            "lower_arm_length": mm(fit.rod[k]),
+            "angle": degrees(fit.angle[k]),
+            "position_endstop": mm(endstops[k]),
+        }
+    return sections
+
+
+def _each(found: ConfigParser, key: str) -> Array:
+    return np.array([found.getfloat(f"stepper_{name}", key) for name in STEPPERS])
+
+
+def homed(found: ConfigParser) -> Array:
+    """Motor positions (3,), mm or degrees, where the end switches trigger."""
+    ends = _each(found, "position_endstop")
+    if found.get("printer", "kinematics") == "delta":
+        radius = found.getfloat("printer", "delta_radius")
+        return ends + np.sqrt(_each(found, "arm_length") ** 2 - radius**2)
+    middle = np.zeros((3, 3))
+    middle[:, 2] = ends
+    return np.diag(rotary_motors(found, middle))
+
+
+def linear_motors(found: ConfigParser, points: Array) -> Array:
+    """Carriages' heights (n, 3) mm at points (n, 3) mm."""
+    radius = found.getfloat("printer", "delta_radius")
+    angle = _each(found, "angle") / DEGREE
+    dx = radius * np.cos(angle) - points[:, :1]
+    dy = radius * np.sin(angle) - points[:, 1:2]
+    return np.sqrt(_each(found, "arm_length") ** 2 - dx**2 - dy**2) + points[:, 2:]
+
+
+def rotary_motors(found: ConfigParser, points: Array) -> Array:
+    """Arms' angles (n, 3) degrees at points (n, 3) mm: a circle cut by a line, as Klipper does."""
+    angle = _each(found, "angle") / DEGREE
+    c, s = np.cos(angle), np.sin(angle)
+    across = points[:, 1:2] * c - points[:, :1] * s
+    dx = points[:, :1] * c + points[:, 1:2] * s - found.getfloat("printer", "shoulder_radius")
+    dy = points[:, 2:] - found.getfloat("printer", "shoulder_height")
+    upper = _each(found, "upper_arm_length") ** 2
+    lower = _each(found, "lower_arm_length") ** 2 - across**2
+    first = (dx**2 + dy**2 + upper - lower) / (2 * dy)
+    slope = dx / dy
+    scale = slope**2 + 1
+    x = first * slope + np.sqrt(scale * upper - first**2)
+    return np.arctan2(first * scale - slope * x, x) * DEGREE

@@ -1,0 +1,119 @@
+"""``yaml`` and ``json``: the machine's values with their deviations, for programs of one's own."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, ClassVar, final
+
+import numpy as np
+import yaml
+
+from pkmcal import __version__
+from pkmcal.export.contract import Difference, Exporter
+from pkmcal.export.source import Source
+from pkmcal.export.text import commented, sigma_lines
+from pkmcal.files import json_text
+from pkmcal.mechanisms import mechanism_text
+
+MECHANISM, MACHINE = "mechanism.yaml", "machine.json"
+FORMAT = 1
+CONVENTIONS = (
+    "Units: m and rad; axes are unit vectors.",
+    "T_a_b maps coordinates of frame b to frame a. length = reading + offset. Legs count from 1.",
+    "sigma is a standard deviation: of sampling, not of what the model leaves out. 0 (held): by the"
+    " choice of frames, or by the mechanism file.",
+)
+
+
+@final
+class MechanismYaml(Exporter):
+    """The mechanism file with the present values, which pkmcal reads back."""
+
+    name: ClassVar = "yaml"
+    title: ClassVar = "pkmcal's own mechanism file"
+
+    def files(self, source: Source) -> dict[str, str]:
+        """``mechanism.yaml`` with everything that is known of its values on top."""
+        lines = [*source.header(*CONVENTIONS), "", *sigma_lines(source)]
+        return {MECHANISM: commented(lines, "#") + mechanism_text(source.machine)}
+
+    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+        """Read by another YAML parser than ours, each value by its path."""
+        document = yaml.safe_load(files[MECHANISM])
+        table = source.machine.parameters
+        values = table.unit_axes(source.machine.values)
+        found = [_at(document, name) for name in table.names]
+        return [Difference(f"{len(found)} values read again", _largest(found, values), 0.0)]
+
+
+@final
+class MachineJson(Exporter):
+    """All numbers of the machine, its cameras' poses included, as JSON."""
+
+    name: ClassVar = "json"
+    title: ClassVar = "names, values, units, deviations and covariance"
+
+    def files(self, source: Source) -> dict[str, str]:
+        """``machine.json``."""
+        machine = source.machine
+        table = machine.parameters
+        values = table.unit_axes(machine.values)
+        document = {
+            "pkmcal_machine": FORMAT,
+            "pkmcal": __version__,
+            "about": source.header(),
+            "conventions": CONVENTIONS,
+            "name": machine.name,
+            "calibrated": source.calibrated,
+            "usable": source.usable,
+            "headline": source.headline,
+            "frames": source.frames,
+            "parameters": [
+                {
+                    "name": name,
+                    "value": values[k],
+                    "unit": table.units[k],
+                    "sigma": source.sigma_of(name),
+                }
+                for k, name in enumerate(table.names)
+            ],
+            "covariance": source.covariance,
+            "joints": [
+                {"unit": unit, "range": [low, high]}
+                for unit, (low, high) in zip(machine.joint_units, machine.joint_ranges, strict=True)
+            ],
+            "home_T_base_platform": machine.home(),
+            "T_base_camera": dict(source.T_base_camera),
+            "cameras": {name: camera.document() for name, camera in source.cameras.items()},
+            "mechanism": machine.to_document(),
+        }
+        return {MACHINE: json_text(document)}
+
+    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+        """Read by the standard library, values and covariance."""
+        document = json.loads(files[MACHINE])
+        table = source.machine.parameters
+        values = table.unit_axes(source.machine.values)
+        found = [p["value"] for p in document["parameters"]]
+        again = [_at(document["mechanism"], name) for name in table.names]
+        out = [
+            Difference(f"{len(found)} values read again", _largest(found, values), 0.0),
+            Difference("values in the mechanism", _largest(again, values), 0.0),
+        ]
+        if source.covariance is not None:
+            off = _largest(document["covariance"], source.covariance)
+            out.append(Difference("covariance read again", off, 0.0, "m^2"))
+        return out
+
+
+def _at(document: Any, name: str) -> float:
+    """A parameter's value at its path, which is its name: ``legs[1].base.center.x``."""
+    node = document
+    keys = name.replace("]", "").replace("[", ".").split(".")
+    for key in keys[:-1]:
+        node = node[int(key) - 1] if key.isdigit() else node[key]
+    return float(node["xyz".index(keys[-1])] if isinstance(node, list) else node[keys[-1]])
+
+
+def _largest(found: Any, values: Any) -> float:
+    return float(np.abs(np.array(found, dtype=float) - np.asarray(values)).max(initial=0.0))

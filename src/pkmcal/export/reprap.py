@@ -1,0 +1,162 @@
+"""``reprap``: RepRapFirmware's M665 and M666 for linear deltas, M669 K10 and M666 for rotary ones.
+
+Meaning of the values: Duet3D's G-code reference and the firmware's LinearDeltaKinematics and
+RotaryDeltaKinematics. Towers X, Y, Z stand at -150, -30 and 90 degrees, corrections anticlockwise;
+a homed carriage is at ``H + sqrt(L^2 - R^2)`` plus its endstop adjustment, a homed arm at the
+larger angle of A plus its own.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import ClassVar, final
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.export.contract import Difference, Exporter
+from pkmcal.export.delta import DEGREE, MM, Delta, delta_of, reach
+from pkmcal.export.delta_fit import Fit, Freedoms, fitted
+from pkmcal.export.delta_text import about, degrees, end_motors, follows, mm, tool_difference
+from pkmcal.export.source import Source
+from pkmcal.export.text import commented
+from pkmcal.findings import Finding
+
+FILE = "pkmcal_delta.g"
+PROGRAM = "RepRapFirmware"
+NOMINAL = (-150.0, -30.0, 90.0)
+STEEPEST = 90.0
+_WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
+
+
+def _fit(source: Source) -> tuple[Delta, Fit]:
+    delta = delta_of(source.machine, PROGRAM)
+    return delta, fitted(delta, Freedoms(NOMINAL), PROGRAM)
+
+
+@final
+class RepRap(Exporter):
+    """Commands for config.g."""
+
+    name: ClassVar = "reprap"
+    title: ClassVar = "RepRapFirmware: lines for config.g"
+
+    def files(self, source: Source) -> dict[str, str]:
+        """One file of G-code."""
+        delta, fit = _fit(source)
+        lines = about(source, delta, fit, "XYZ", PROGRAM)
+        commands = _linear(delta, fit) if fit.kind == "linear" else _rotary(delta, fit)
+        return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
+
+    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+        """Read as the firmware does, and moved by its formulas."""
+        delta, fit = _fit(source)
+        text = files[FILE]
+        words = read_words(text)
+        ends = fit.rate * delta.ends[fit.order]
+        linear = fit.kind == "linear"
+        homed = homed_carriages(words) if linear else words["669A"][1] + _xyz(words, "666")
+        move = linear_motors if linear else rotary_motors
+        return [tool_difference(text, delta, fit, lambda points: move(words, points), homed - ends)]
+
+    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+        """How well the settings follow the machine."""
+        del files
+        return (follows(_fit(source)[1], PROGRAM),)
+
+
+def _linear(delta: Delta, fit: Fit) -> list[str]:
+    heights = end_motors(delta, fit) - np.sqrt(fit.rod**2 - fit.radius**2)
+    homed = float(heights.mean())
+    corrections = fit.angle - np.array(NOMINAL)
+    return [
+        "M669 K3 ; linear delta",
+        f"M665 L{_three(fit.rod)} R{mm(fit.radius)} H{mm(homed)} B{mm(MM * reach(delta))}"
+        f" {_letters(corrections, degrees)} ; L rods, R radius, H homed height, B print radius",
+        f"M666 {_letters(heights - homed, mm)} A0 B0 ; endstop adjustments, mm; no tilt",
+    ]
+
+
+def _rotary(delta: Delta, fit: Fit) -> list[str]:
+    homed = end_motors(delta, fit)
+    largest = float(homed.mean())
+    ranges = delta.machine.joint_ranges[delta.joint][fit.order]
+    lowest = float((fit.rate[:, None] * ranges + fit.zero[:, None]).min())
+    if lowest < -STEEPEST or largest > STEEPEST:
+        raise InputError(
+            "RepRapFirmware's rotary delta takes arms up to 90 degrees from the horizontal",
+            found=f"arms from {lowest:.1f} to {largest:.1f} degrees",
+            next_step="Give the cranks a smaller range in the mechanism file",
+        )
+    corrections = fit.angle - np.array(NOMINAL)
+    low = float(MM * delta.positions[:, 2].min() + MM * fit.T_firmware_base[2, 3])
+    high = float(MM * delta.positions[:, 2].max() + MM * fit.T_firmware_base[2, 3])
+    return [
+        f"M669 K10 U{_three(fit.arm)} L{_three(fit.rod)} H{_three(fit.height)} R{mm(fit.radius)}"
+        f" A{degrees(lowest)}:{degrees(largest)} B{mm(MM * reach(delta))}"
+        f" {_letters(corrections, degrees)} ; U arms, L rods, H bearings' heights, R radius",
+        f"M666 {_letters(homed - largest, degrees)} ; homed angles beyond A's larger one, degrees",
+        f"; M208 Z{mm(max(low, 0.0))}:{mm(high)} ; Z of the workspace at most; set your own",
+        "; M92: microsteps per degree of the arm, on X, Y and Z",
+    ]
+
+
+def _three(values: Array) -> str:
+    return ":".join(mm(v) for v in values)
+
+
+def _letters(values: Array, number: object) -> str:
+    write = mm if number is mm else degrees
+    return " ".join(f"{letter}{write(float(v))}" for letter, v in zip("XYZ", values, strict=True))
+
+
+def read_words(text: str) -> dict[str, Array]:
+    """Values by command and letter, as ``665L``; what stands behind a semicolon is a comment."""
+    out: dict[str, Array] = {}
+    for line in text.splitlines():
+        command, _, rest = line.partition(";")[0].strip().partition(" ")
+        for letter, values in _WORD.findall(rest):
+            out[command[1:] + letter] = np.array([float(v) for v in values.split(":")])
+    return out
+
+
+def _xyz(words: dict[str, Array], command: str) -> Array:
+    return np.array([words[command + letter][0] for letter in "XYZ"])
+
+
+def homed_carriages(words: dict[str, Array]) -> Array:
+    """Carriages' heights (3,) mm at the end switches."""
+    rise = np.sqrt(words["665L"] ** 2 - words["665R"] ** 2)
+    return words["665H"] + rise + _xyz(words, "666")
+
+
+def linear_motors(words: dict[str, Array], points: Array) -> Array:
+    """Carriages' heights (n, 3) mm at points (n, 3): the firmware's linear Transform."""
+    x, y, z, tower = *_xyz(words, "665"), words["665R"][0]
+    towers = tower * np.array(
+        [
+            [-np.cos((30 + x) / DEGREE), -np.sin((30 + x) / DEGREE)],
+            [np.cos((30 - y) / DEGREE), -np.sin((30 - y) / DEGREE)],
+            [-np.sin(z / DEGREE), np.cos(z / DEGREE)],
+        ]
+    )
+    d = points[:, None, :2] - towers
+    tilt = points[:, 0] * words["666A"][0] / 100 + points[:, 1] * words["666B"][0] / 100
+    rise = np.sqrt(words["665L"] ** 2 - d[..., 0] ** 2 - d[..., 1] ** 2)
+    return rise + points[:, 2:] + tilt[:, None]
+
+
+def rotary_motors(words: dict[str, Array], points: Array) -> Array:
+    """Arms' angles (n, 3) degrees at points (n, 3) mm: the firmware's rotary Transform.
+
+    Its arc sine knows angles up to 90 degrees from the horizontal.
+    """
+    angle = (np.array(NOMINAL) + _xyz(words, "669")) / DEGREE
+    along = points[:, :1] * np.cos(angle) + points[:, 1:2] * np.sin(angle)
+    across = points[:, 1:2] * np.cos(angle) - points[:, :1] * np.sin(angle)
+    r, h = words["669R"] - along, words["669H"] - points[:, 2:]
+    a, b = 2 * words["669U"] * r, 2 * words["669U"] * h
+    c = words["669L"] ** 2 - words["669U"] ** 2 - (h**2 + r**2 + across**2)
+    square = a**2 + b**2
+    return np.arcsin((b * c - a * np.sqrt(square - c**2)) / square) * DEGREE

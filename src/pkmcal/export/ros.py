@@ -1,0 +1,179 @@
+"""``ros``: camera_info of each camera, and static transforms from the base to the cameras.
+
+A camera's frame here is ROS' optical frame (REP 103): z forward, x right, y down. Transforms are
+those of tf2_ros' static_transform_publisher, parent first, quaternion x y z w, in a ROS 2 launch
+file.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import ClassVar, final
+
+import numpy as np
+import yaml
+
+from pkmcal.arrays import Array
+from pkmcal.cameras.foreign import read_camera, write_camera
+from pkmcal.errors import InputError
+from pkmcal.export.contract import Difference, Exporter
+from pkmcal.export.source import Source
+from pkmcal.export.text import commented, exact
+from pkmcal.files import listed
+from pkmcal.findings import Finding, Level
+
+LAUNCH = "static_transforms.launch.yaml"
+BASE = "base"
+MIRROR = "unified"
+ROUNDING = 1e-12
+"""m, and elements of a rotation matrix, which a unit quaternion of 17 digits gives back."""
+
+
+@final
+class Ros(Exporter):
+    """What a ROS 2 system wants to know of the cameras that saw the machine."""
+
+    name: ClassVar = "ros"
+    title: ClassVar = "ROS 2: camera_info and static transforms"
+
+    def files(self, source: Source) -> dict[str, str]:
+        """A launch file, and a camera_info file for each camera that ROS has a model for."""
+        if not source.T_base_camera:
+            raise InputError(
+                "no camera is known to stand anywhere, so there is nothing for ROS",
+                where=source.origin,
+                expected="a folder that pkmcal calibrate wrote",
+                next_step="Calibrate first; a mechanism file alone has no cameras",
+            )
+        out = {LAUNCH: _launch(source)}
+        frames = frame_names(source)
+        for station, camera in source.cameras.items():
+            if camera.model != MIRROR:
+                name = f"camera_info_{frames[station]}.yaml"
+                out[name] = _camera_info(source, station, frames[station])
+        return out
+
+    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+        """Transforms by the quaternions' own formula, cameras by the reader of foreign files."""
+        frames = frame_names(source)
+        found = transforms(files[LAUNCH])
+        off = [float(np.abs(found[frames[s]] - T).max()) for s, T in source.T_base_camera.items()]
+        out = [Difference(f"{len(off)} transforms read again", max(off), ROUNDING)]
+        for station, camera in source.cameras.items():
+            text = files.get(f"camera_info_{frames[station]}.yaml")
+            if text is not None:
+                with TemporaryDirectory() as folder:
+                    path = Path(folder) / "camera.yaml"
+                    path.write_text(text, encoding="utf-8")
+                    again = read_camera(path)
+                worst = float(np.abs(again.parameters - camera.parameters).max())
+                limit = 1e-12 * float(np.abs(camera.parameters).max())
+                out.append(Difference(f"camera of {station} read again", worst, limit, "px"))
+        return out
+
+    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+        """Cameras that are not in the files, and why."""
+        del files
+        lost = [s for s in source.T_base_camera if s not in source.cameras]
+        out: list[Finding] = []
+        if lost:
+            text = (
+                f"No camera_info for {listed(lost)}: the camera file was not found. Name the"
+                " session with --session; trackers have none."
+            )
+            out.append(Finding(Level.DOUBTFUL, text))
+        mirrors = [s for s, camera in source.cameras.items() if camera.model == MIRROR]
+        if mirrors:
+            text = f"No camera_info for {listed(mirrors)}: ROS has no model for mirrors."
+            out.append(Finding(Level.DOUBTFUL, text))
+        out.append(Finding(Level.NOTE, f"Start it with: ros2 launch ./{LAUNCH}"))
+        return tuple(out)
+
+
+def frame_names(source: Source) -> dict[str, str]:
+    """A name that ROS takes, for each station: letters, digits and underscores, all different."""
+    out: dict[str, str] = {}
+    for station in source.T_base_camera:
+        plain = re.sub(r"[^A-Za-z0-9_]+", "_", station).strip("_") or "camera"
+        plain = plain if plain[0].isalpha() else f"camera_{plain}"
+        name, k = plain, 2
+        while name in out.values():
+            name, k = f"{plain}_{k}", k + 1
+        out[station] = name
+    return out
+
+
+def _launch(source: Source) -> str:
+    names = frame_names(source)
+    nodes: list[str] = []
+    for station, transform in source.T_base_camera.items():
+        shift = " ".join(
+            f"--{axis} {exact(v)}" for axis, v in zip("xyz", transform[:3, 3].tolist(), strict=True)
+        )
+        turn = " ".join(
+            f"--q{axis} {exact(v)}"
+            for axis, v in zip("xyzw", quaternion(transform[:3, :3]).tolist(), strict=True)
+        )
+        frame = f"--frame-id {BASE} --child-frame-id {names[station]}_optical_frame"
+        nodes.append(
+            "- node:\n    pkg: tf2_ros\n    exec: static_transform_publisher\n"
+            f"    name: {names[station]}_transform\n"
+            f'    args: "{shift} {turn} {frame}"\n'
+        )
+    about = source.header(
+        f"Transforms from {BASE} (the machine's base frame) to each camera's optical frame:"
+        " z forward, x right, y down. Metres; quaternions x y z w, which turn camera coordinates"
+        " into base coordinates.",
+        *(_sigma(source)),
+    )
+    return commented(about, "#") + "launch:\n" + "".join(nodes)
+
+
+def _sigma(source: Source) -> tuple[str, ...]:
+    return tuple(
+        f"Station {station}: sigma of rotation"
+        f" {', '.join(f'{v:.2g}' for v in sigma[:3])} rad, of translation"
+        f" {', '.join(f'{v:.2g}' for v in sigma[3:])} m, along the base's axes."
+        for station, sigma in source.sigma_camera.items()
+    )
+
+
+def _camera_info(source: Source, station: str, frame: str) -> str:
+    """The text of a ROS camera file, whose camera_name is the frame's."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{frame}.yaml"
+        write_camera(source.cameras[station], path, "ros")
+        text = path.read_text(encoding="utf-8")
+    about = source.header(
+        f"Camera of station {station}; pixels, pixel centres at integers, frame"
+        f" {frame}_optical_frame."
+    )
+    return commented(about, "#") + text
+
+
+def quaternion(rot: Array) -> Array:
+    """Unit quaternion (4,) x y z w of a rotation matrix (3, 3), w not negative."""
+    from scipy.spatial.transform import Rotation
+
+    q = Rotation.from_matrix(rot).as_quat()
+    return q if q[3] >= 0 else -q
+
+
+def transforms(text: str) -> dict[str, Array]:
+    """T_base_camera (4, 4) by frame, as tf2 makes it of a launch file's arguments."""
+    out: dict[str, Array] = {}
+    for entry in yaml.safe_load(text)["launch"]:
+        words = entry["node"]["args"].split()
+        given = dict(zip(words[::2], words[1::2], strict=True))
+        x, y, z, w = (float(given[f"--q{axis}"]) for axis in "xyzw")
+        matrix = np.eye(4)
+        matrix[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        matrix[:3, 3] = [float(given[f"--{axis}"]) for axis in "xyz"]
+        out[given["--child-frame-id"].removesuffix("_optical_frame")] = matrix
+    return out

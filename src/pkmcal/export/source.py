@@ -1,0 +1,143 @@
+"""What is exported: a machine, calibrated or drawn, with the cameras that saw it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from pkmcal import __version__
+from pkmcal.arrays import Array
+from pkmcal.cameras.contract import Camera
+from pkmcal.cameras.files import load_camera
+from pkmcal.errors import InputError
+from pkmcal.files import listed
+from pkmcal.mechanisms import Machine, catalogue, load_mechanism
+from pkmcal.results import EVERYTHING, MECHANISM, SavedCalibration, load
+
+SESSION_FILE = "session.yaml"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A machine to export, and how far to trust it.
+
+    machine : with the values to export. sigma, covariance : (P,) and (P, P) of its parameters;
+    None for a drawing. cameras, T_base_camera : intrinsics and poses (4, 4) m by station; a
+    station's camera is missing where its file was not found.
+    headline : the calibration's verdict in a sentence. usable : False for a refused one; reasons
+    : why. origin : where it was read. calibrated : False for a drawing. frames : the gauge.
+    sigma_camera : (6,) by station, of T_base_camera, rad and m, base axes.
+    """
+
+    machine: Machine
+    sigma: Array | None = None
+    cameras: Mapping[str, Camera] = field(default_factory=lambda: MappingProxyType({}))
+    T_base_camera: Mapping[str, Array] = field(default_factory=lambda: MappingProxyType({}))
+    headline: str = "Drawing only, not calibrated."
+    usable: bool = True
+    origin: str = ""
+    covariance: Array | None = None
+    reasons: tuple[str, ...] = ()
+    calibrated: bool = False
+    frames: str = "as in the mechanism file"
+    sigma_camera: Mapping[str, Array] = field(default_factory=lambda: MappingProxyType({}))
+
+    def sigma_of(self, name: str) -> float | None:
+        """A parameter's standard deviation, m or rad; None where it is not known."""
+        if self.sigma is None or name not in self.machine.parameters.names:
+            return None
+        return float(self.sigma[self.machine.parameters.index(name)])
+
+    def header(self, *conventions: str) -> tuple[str, ...]:
+        """Lines for the top of every file: what this is, of what, and in which conventions."""
+        state = "" if self.usable else "REFUSED, NOT TO BE USED: "
+        lines = (
+            f"Machine {self.machine.name}, exported by pkmcal {__version__} from {self.origin}.",
+            state + " ".join((self.headline, *self.reasons)),
+            f"Frames: {self.frames}.",
+            *conventions,
+        )
+        # A name may hold a line break; what follows it must stay a comment.
+        return tuple(" ".join(line.split()) for line in lines)
+
+
+def load_source(origin: Path | str, session: Path | None = None) -> Source:
+    """A calibration's folder, a mechanism file, or a built-in machine by its name.
+
+    session : the calibration's session, for its cameras; else it is looked for around the folder.
+    Raises InputError where `origin` is none of these.
+    """
+    path = Path(origin)
+    if str(origin) in catalogue() and not (path / EVERYTHING).is_file():
+        return Source(load_mechanism(str(origin)), origin=f"the built-in machine {origin}")
+    if path.name == MECHANISM and (path.parent / EVERYTHING).is_file():
+        path = path.parent  # a calibration's own mechanism file: the rest lies beside it
+    if path.is_dir() or path.name == EVERYTHING:
+        return _of_calibration(load(path), session)
+    if not path.exists() and path.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            "there is no such calibration and no such machine",
+            found=str(origin),
+            expected="a folder that pkmcal calibrate wrote, a mechanism file, or"
+            f" {listed(sorted(catalogue()), 20)}",
+        )
+    return Source(load_mechanism(path), origin=path.name)
+
+
+def _of_calibration(saved: SavedCalibration, session: Path | None) -> Source:
+    folder = saved.path.parent
+    files = {station.name: station.camera for station in saved.stations}
+    cameras = {
+        name: load_camera(found)
+        for name, file in files.items()
+        if (found := _camera_file(folder, file, _session_folder(saved, session))) is not None
+    }
+    return Source(
+        machine=saved.machine,
+        sigma=saved.sigma,
+        cameras=MappingProxyType(cameras),
+        T_base_camera=MappingProxyType({s.name: s.T_base_camera for s in saved.stations}),
+        sigma_camera=MappingProxyType(
+            {s.name: np.append(s.sigma_rotation, s.sigma_translation) for s in saved.stations}
+        ),
+        headline=saved.verdict.headline,
+        usable=saved.verdict.usable,
+        origin=folder.resolve().name,
+        covariance=saved.covariance,
+        reasons=() if saved.verdict.usable else saved.verdict.reasons,
+        calibrated=True,
+        frames=saved.gauge,
+    )
+
+
+def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | None:
+    """Where the session lies: as told, above the calibration, or beside it (as demo writes it)."""
+    if session is not None:
+        if not (session / SESSION_FILE).is_file():
+            raise InputError(
+                "there is no session here", where=str(session), expected=f"a {SESSION_FILE}"
+            )
+        return session
+    above = saved.path.resolve().parent.parent
+    name = str(saved.document.get("session", {}).get("folder", ""))
+    for folder in (above, above / name):
+        if folder.name == name and (folder / SESSION_FILE).is_file():
+            return folder
+    return None
+
+
+def _camera_file(folder: Path, file: str, session: Path | None) -> Path | None:
+    """A station's camera: as refined with the machine, or as the session had it; a tracker's
+    table is none.
+    """
+    if Path(file).suffix not in (".yaml", ".yml"):
+        return None
+    refined = folder / f"camera-{Path(file).stem}.yaml"
+    if refined.is_file():
+        return refined
+    given = None if session is None else session / file
+    return given if given is not None and given.is_file() else None

@@ -1,0 +1,62 @@
+"""The examples, run as a reader runs them."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def run_example(name: str, *words) -> subprocess.CompletedProcess:
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, str(EXAMPLES / name), *(str(word) for word in words)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=120, env=environment, check=False
+    )
+
+
+def test_a_folder_of_photographs_becomes_a_table(demo):
+    done = run_example("servo_from_folder.py", demo.session, demo.calibration)
+    assert done.returncode == 0, done.stderr
+    title, *lines = done.stdout.splitlines()
+    assert "station1" in title
+    photographs = sorted(p.stem for p in (demo.session / "images" / "station1").iterdir())
+    rows = [line.split() for line in lines if not line.startswith(" " * 8)]
+    assert [row[0] for row in rows] == photographs
+    speeds = [[float(v) for v in row[1:7]] for row in rows]
+    assert any(any(speed) for speed in speeds)
+    # at the goal itself, hardly anything is left to do
+    largest = [max(map(abs, speed)) for speed in speeds]
+    assert largest[-1] < 0.2 * max(largest)
+
+
+def test_what_is_not_in_the_session_is_named(demo):
+    done = run_example("servo_from_folder.py", demo.session, demo.calibration, "--station", "attic")
+    assert done.returncode == 2
+    assert "no such station; found attic" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_numbered_pictures_stand_in_for_a_camera(demo):
+    source = demo.session / "images" / "station1" / "%04d.png"
+    words = (demo.calibration, "station1", "--goal", "0000", "--source", source)
+    done = run_example("servo_live.py", *words)
+    assert done.returncode == 0, done.stderr
+    count = len(list(source.parent.iterdir()))
+    assert f"{count} frames; the source gives no more" in done.stdout
+    assert len(re.findall(r"\d ms  ", done.stdout)) == count
+    done = run_example("servo_live.py", *words, "--send")
+    assert done.returncode == 2
+    assert "no controller to send velocities to" in done.stderr
+
+
+def test_without_a_camera_one_sentence_says_so(demo):
+    words = (demo.calibration, "station1", "--goal", "0000", "--source", "nothing.mp4")
+    done = run_example("servo_live.py", *words)
+    assert done.returncode == 2
+    assert done.stderr.startswith("the source of pictures cannot be opened; found nothing.mp4")
+    assert "Traceback" not in done.stderr

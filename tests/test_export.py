@@ -1,0 +1,288 @@
+"""pkmcal export: every format with every machine, refusals, what is written, and what is not."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from conftest import run
+from export_sources import CAMERA, built, calibration, source_of
+from pkmcal.cameras.foreign import read_camera
+from pkmcal.cameras.unified import Unified
+from pkmcal.errors import InputError, ResultError
+from pkmcal.export import ros
+from pkmcal.export.contract import Difference, exporters
+from pkmcal.export.samples import samples
+from pkmcal.export.source import load_source
+from pkmcal.export.writing import export
+from pkmcal.mechanisms import catalogue, load_mechanism
+
+OURS = ("c", "json", "klipper", "linuxcnc", "reprap", "ros", "yaml")
+MACHINES = sorted(catalogue())
+DELTAS = ("delta", "linear-delta")
+HEXAPODS = ("gough-stewart", "6-spu-passive")
+EXPRESSED = {
+    "c": MACHINES,
+    "json": MACHINES,
+    "yaml": MACHINES,
+    "reprap": DELTAS,
+    "klipper": DELTAS,
+    "linuxcnc": (*DELTAS, *HEXAPODS),
+    "ros": (),
+}
+REFUSALS = {
+    "reprap": "RepRapFirmware has settings for linear and rotary deltas",
+    "klipper": "Klipper has settings for linear and rotary deltas",
+    "linuxcnc": "genhexkins moves six telescopic legs on fixed joints",
+    "ros": "no camera is known to stand anywhere",
+}
+
+
+def test_every_format_of_the_folder_is_found():
+    assert set(OURS) <= set(exporters())
+    assert all(name == exporter.name for name, exporter in exporters().items())
+    told = run("export", "--help").out
+    assert all(name in told for name in exporters())
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_a_format_expresses_a_machine_or_says_that_it_does_not(name):
+    for machine in MACHINES:
+        source = source_of(load_mechanism(machine))
+        if machine not in EXPRESSED[name]:
+            with pytest.raises(InputError, match=REFUSALS[name]):
+                export(source, name)
+            continue
+        made = export(source, name)
+        assert made.differences
+        assert not any(d.beyond for d in made.differences)
+        for text in made.files.values():
+            assert machine in text
+            assert "Drawing only, not calibrated." in text
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("c", "LENGTH[PKMCAL_RODS] = {\n    0.0", "LENGTH[PKMCAL_RODS] = {\n    0.00001"),
+        ("c", "{{0.9", "{{0.8"),
+        ("json", '"value": 0.2693,', '"value": 0.2694,'),
+        ("yaml", "center: [0.2693", "center: [0.26930001"),
+        ("linuxcnc", "base.3.y 243.", "base.3.y 244."),
+        ("linuxcnc", "HOME_OFFSET = 0\n", "HOME_OFFSET = 0.001\n"),
+    ],
+)
+def test_what_reads_back_otherwise_is_not_written(name, old, new, monkeypatch, tmp_path):
+    exporter = exporters()[name]
+    files = exporter.files(source_of(load_mechanism("gough-stewart")))
+    spoilt = {key: text.replace(old, new, 1) for key, text in files.items()}
+    assert spoilt != files
+    monkeypatch.setattr(type(exporter), "files", lambda self, source: spoilt)
+    done = run("export", "gough-stewart", "--to", name, "-o", tmp_path / "out")
+    assert done.code == 1
+    assert "read again, are not the machine" in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_difference_that_is_no_number_is_beyond():
+    assert Difference("x", float("nan"), 1.0).beyond
+    assert Difference("x", float("inf"), 1.0).beyond
+    assert not Difference("x", 1.0, 1.0).beyond
+
+
+def test_samples_need_poses_within_the_ranges():
+    machine = load_mechanism("linear-delta")
+    values = machine.values.copy()
+    names = machine.parameters.names
+    values[[k for k, n in enumerate(names) if n.endswith("length.constant")]] = 0.01
+    with pytest.raises(ResultError, match="no poses within its ranges"):
+        samples(machine.with_values(values))
+
+
+def test_samples_of_a_machine_without_ranges(tmp_path):
+    text = catalogue()["gough-stewart"].read_text().replace(", range: [0.345, 0.485]", "")
+    (tmp_path / "m.yaml").write_text(text + "home: {position: [0, 0, 0.36]}\n")
+    machine = load_mechanism(tmp_path / "m.yaml")
+    poses, joints = samples(machine)
+    assert len(poses) > 30
+    np.testing.assert_allclose(machine.inverse(poses), joints, atol=1e-12)
+    made = export(source_of(machine), "c")
+    assert "-HUGE_VAL" in made.files["pkmcal_kinematics.c"]
+    assert "MIN_LIMIT" not in export(source_of(machine), "linuxcnc").files["pkmcal_kinematics.ini"]
+
+
+# What a calibration gives
+
+
+def test_calibrated_values_are_exported(tmp_path):
+    machine = built("gough-stewart")
+    folder = calibration(tmp_path, machine)
+    source = load_source(folder)
+    np.testing.assert_array_equal(source.machine.values, machine.values)
+    text = export(source, "yaml").files["mechanism.yaml"]
+    found = yaml.safe_load(text)["legs"][3]["base"]["center"]
+    k = machine.parameters.index("legs[4].base.center.x")
+    assert found == machine.values[k : k + 3].tolist()
+    sigma = source.sigma_of("legs[4].base.center.x")
+    assert f"{sigma:.3g}" in text
+    assert "Calibrated: well." in text
+    assert "three centres: legs 1, 3, 5" in text
+    document = json.loads(export(source, "json").files["machine.json"])
+    np.testing.assert_array_equal(document["covariance"], source.covariance)
+    assert document["parameters"][k]["sigma"] == sigma
+    assert document["calibrated"]
+    assert set(document["T_base_camera"]) == {"front", "left side"}
+
+
+def test_a_calibrations_own_mechanism_file_is_the_calibration(tmp_path):
+    folder = calibration(tmp_path, built("gough-stewart"))
+    assert load_source(folder / "mechanism.yaml").calibrated
+    assert load_source(folder / "calibration.json").calibrated
+    other = tmp_path / "mechanism.yaml"
+    other.write_text((folder / "mechanism.yaml").read_text())
+    assert not load_source(other).calibrated
+
+
+def test_a_demonstration_is_exported(demo, tmp_path):
+    calibrated = json.loads((demo.calibration / "calibration.json").read_text())
+    value = {p["name"]: p["value"] for p in calibrated["parameters"]}
+    for name in ("c", "linuxcnc", "ros"):
+        done = run("export", demo.calibration, "--to", name, "-o", tmp_path / name)
+        assert done.code == 0, done.err
+    assert len(list((tmp_path / "ros").iterdir())) == 4
+    hal = (tmp_path / "linuxcnc" / "pkmcal_kinematics.hal").read_text()
+    assert f"base.3.x {1e3 * value['legs[4].base.center.x']:.17g}\n" in hal
+    source = (tmp_path / "c" / "pkmcal_kinematics.c").read_text()
+    assert f"{value['legs[4].base.center.x']:.17g}" in source
+
+
+# The command
+
+
+def test_the_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = calibration(tmp_path, built("gough-stewart"))
+    done = run("export", folder, "--to", "yaml")
+    assert done.code == 0
+    assert "Calibrated: well." in done.out
+    assert (folder.parent / "export-yaml" / "mechanism.yaml").is_file()
+    done = run("export", "h4", "--to", "json", "--json")
+    assert done.code == 0
+    assert done.json["machine"] == "h4"
+    assert not done.json["calibrated"]
+    assert (tmp_path / "export-json" / "machine.json").is_file()
+    assert all(d["largest"] <= d["limit"] for d in done.json["differences"])
+    # again, over the earlier export
+    assert run("export", "delta", "--to", "json").code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("h4", "--to", "stl"), "expected c, "),
+        (("h4", "--to", "jsn"), "expected json, or another of c, "),
+        (("h5", "--to", "c"), "there is no such calibration and no such machine"),
+        (("h4",), "Missing option '--to'"),
+        ((".", "--to", "c"), "there is no calibration here"),
+        (("nothing.yaml", "--to", "c"), "does not exist"),
+    ],
+)
+def test_wrong_words(words, told, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = run("export", *words)
+    assert done.code == 2
+    assert told in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_other_files_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("all")
+    done = run("export", "h4", "--to", "c", "-o", tmp_path)
+    assert done.code == 2
+    assert "holds something other than this export; found thesis.tex" in done.err
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_refused_calibration_is_refused(tmp_path):
+    folder = calibration(tmp_path, built("gough-stewart"), usable=False)
+    out = tmp_path / "out"
+    done = run("export", folder, "--to", "c", "-o", out)
+    assert done.code == 1
+    assert "was refused, and is not exported" in done.err
+    assert "The rods cannot be told apart." in done.err
+    assert not out.exists()
+    assert run("export", folder, "--to", "c", "-o", out, "--json").json["exit_code"] == 1
+    done = run("export", folder, "--to", "c", "-o", out, "--force")
+    assert done.code == 0
+    for path in out.iterdir():
+        assert "REFUSED, NOT TO BE USED: This calibration should not" in path.read_text()
+
+
+def test_the_session_must_be_one(tmp_path):
+    folder = calibration(tmp_path, built("gough-stewart"))
+    done = run("export", folder, "--to", "ros", "--session", tmp_path, "-o", tmp_path / "out")
+    assert done.code == 2
+    assert "there is no session here" in done.err
+
+
+# ROS
+
+
+def test_ros_gets_cameras_and_where_they_stand(tmp_path):
+    source = load_source(calibration(tmp_path, built("gough-stewart")))
+    made = export(source, "ros")
+    assert set(made.files) == {
+        "static_transforms.launch.yaml",
+        "camera_info_front.yaml",
+        "camera_info_left_side.yaml",
+    }
+    found = ros.transforms(made.files["static_transforms.launch.yaml"])
+    np.testing.assert_allclose(found["front"], source.T_base_camera["front"], atol=1e-14)
+    # its z axis, forward, points from the camera to the base's origin
+    forward = -found["left_side"][:3, 3] / np.linalg.norm(found["left_side"][:3, 3])
+    np.testing.assert_allclose(found["left_side"][:3, 2], forward, atol=1e-12)
+    path = tmp_path / "camera.yaml"
+    path.write_text(made.files["camera_info_front.yaml"])
+    np.testing.assert_array_equal(read_camera(path).parameters, CAMERA.parameters)
+
+
+def test_a_quaternion_of_half_a_turn():
+    for axis in np.eye(3):
+        rot = 2 * np.outer(axis, axis) - np.eye(3)
+        np.testing.assert_allclose(np.abs(ros.quaternion(rot)), [*axis, 0.0], atol=1e-15)
+
+
+def test_a_tampered_transform_is_found(tmp_path):
+    source = load_source(calibration(tmp_path, built("gough-stewart")))
+    exporter = exporters()["ros"]
+    files = exporter.files(source)
+    shifted = {name: text.replace("--x 0.9", "--x 0.8") for name, text in files.items()}
+    assert any(d.beyond for d in exporter.check(shifted, source))
+    other = {name: text.replace("600.0", "600.1") for name, text in files.items()}
+    assert any(d.beyond for d in exporter.check(other, source))
+
+
+def test_a_camera_that_is_not_found_is_named(tmp_path):
+    folder = calibration(tmp_path / "a", built("gough-stewart"), session=False)
+    made = export(load_source(folder), "ros")
+    assert list(made.files) == ["static_transforms.launch.yaml"]
+    assert "No camera_info for front and left side" in made.notes[0].text
+    there = calibration(tmp_path / "b", built("gough-stewart")).parent
+    assert len(export(load_source(folder, there), "ros").files) == 3
+
+
+def test_a_mirror_has_no_camera_info(tmp_path):
+    mirror = Unified((640, 480), np.array([300.0, 300, 320, 240, 0.9, 0, 0, 0, 0]))
+    made = export(load_source(calibration(tmp_path, built("gough-stewart"), camera=mirror)), "ros")
+    assert list(made.files) == ["static_transforms.launch.yaml"]
+    assert "ROS has no model for mirrors" in made.notes[0].text
+
+
+def test_frames_have_names_that_ros_takes(tmp_path):
+    source = source_of(
+        load_mechanism("h4"), T_base_camera={n: np.eye(4) for n in ("a b", "a/b", "2", "ü")}
+    )
+    assert list(ros.frame_names(source).values()) == ["a_b", "a_b_2", "camera_2", "camera"]

@@ -1,0 +1,248 @@
+"""The exported C source, compiled without a warning and held against our own kinematics."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from export_sources import built, source_of
+from pkmcal.errors import InputError
+from pkmcal.export.c import CSource
+from pkmcal.export.samples import samples
+from pkmcal.export.writing import export
+from pkmcal.geometry.rigid import perturb
+from pkmcal.mechanisms import catalogue, load_mechanism
+
+COMPILER = shutil.which("gcc") or shutil.which("cc")
+FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-shared", "-fPIC"]
+OK, NOT_CONVERGED, SINGULAR, OUT_OF_REACH, BAD_INPUT = range(5)
+needs_compiler = pytest.mark.skipif(
+    COMPILER is None, reason="NO C COMPILER (gcc or cc): the exported C source is not tested"
+)
+
+
+class Pose(ctypes.Structure):
+    _fields_ = (("R", ctypes.c_double * 9), ("t", ctypes.c_double * 3))
+
+    @classmethod
+    def of(cls, T):
+        return cls((ctypes.c_double * 9)(*T[:3, :3].ravel()), (ctypes.c_double * 3)(*T[:3, 3]))
+
+    def matrix(self):
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = np.reshape(self.R, (3, 3)), self.t
+        return out
+
+
+class Report(ctypes.Structure):
+    _fields_ = (
+        ("steps", ctypes.c_int),
+        ("error", ctypes.c_double),
+        ("pivot", ctypes.c_double),
+    )
+
+
+def compiled(machine, folder, *flags):
+    """A machine's source as a library, its functions on NumPy arrays."""
+    made = export(source_of(machine), "c")
+    for name, text in made.files.items():
+        (folder / name).write_text(text)
+    sources = [str(folder / n) for n in ("pkmcal_kinematics.c", "pkmcal_selftest.c")]
+    path = folder / "machine.so"
+    done = subprocess.run(
+        [COMPILER, *FLAGS, *flags, *sources, "-o", str(path), "-lm"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return SimpleNamespace(library=ctypes.CDLL(str(path)), machine=machine)
+
+
+def doubles(values):
+    values = np.asarray(values, dtype=float).ravel()
+    return (ctypes.c_double * values.size)(*values)
+
+
+def forward(c, joints, start):
+    """Status, pose and report."""
+    pose, report = Pose.of(start), Report()
+    status = c.library.pkmcal_forward(doubles(joints), ctypes.byref(pose), ctypes.byref(report))
+    return status, pose.matrix(), report
+
+
+def inverse(c, T):
+    out = doubles(np.zeros(c.machine.n_joints))
+    status = c.library.pkmcal_inverse(ctypes.byref(Pose.of(T)), out)
+    return status, np.array(out)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """A catalogue machine's library, off its drawing, compiled once."""
+    if COMPILER is None:
+        pytest.skip("NO C COMPILER (gcc or cc): the exported C source is not tested")
+    known = {}
+
+    def of(name):
+        if name not in known:
+            known[name] = compiled(built(name), tmp_path_factory.mktemp(name))
+        return known[name]
+
+    return of
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", sorted(catalogue()))
+def test_c_is_our_own_kinematics(name, library):
+    c = library(name)
+    poses, joints = samples(c.machine, 40, seed=5)
+    home = c.machine.home()
+    rng = np.random.default_rng(6)
+    motion = c.machine.layout.motion
+    near = perturb(poses, 0.01 * rng.normal(size=(len(poses), 6)) @ motion @ motion.T)
+    for T, q, start in zip(poses, joints, near, strict=True):
+        status, found = inverse(c, T)
+        assert status == OK
+        np.testing.assert_allclose(found, c.machine.inverse(T[None])[0], atol=1e-12, rtol=0)
+        for begin in (start, home):
+            status, pose, report = forward(c, q, begin)
+            assert status == OK
+            np.testing.assert_allclose(pose, T, atol=1e-12, rtol=0)
+            assert report.error < 1e-13
+            assert report.pivot > 0
+        assert c.library.pkmcal_out_of_range(doubles(q)) == 0
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["gough-stewart", "3-rps", "hexaglide", "6-rus", "h4", "delta"])
+def test_c_jacobian_is_ours(name, library):
+    c = library(name)
+    for T in samples(c.machine, 5)[0]:
+        out = doubles(np.zeros(6 * c.machine.n_joints))
+        assert c.library.pkmcal_inverse_jacobian(ctypes.byref(Pose.of(T)), out) == OK
+        found = np.reshape(out, (-1, 6))
+        np.testing.assert_allclose(found, c.machine.inverse_jacobian(T[None])[0], atol=1e-11)
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["gough-stewart", "3-upu", "h4-rods"])
+def test_the_self_test_passes(name, library, capfd):
+    assert library(name).library.main() == 0
+    ctypes.CDLL(None).fflush(None)
+    assert f"PASS: 12 reference poses of {name}" in capfd.readouterr().out
+
+
+@needs_compiler
+def test_the_self_test_finds_another_machine(tmp_path, capfd):
+    machine = load_mechanism("delta")
+    files = CSource().files(source_of(machine))
+    files["pkmcal_kinematics.c"] = CSource().files(source_of(built("delta")))["pkmcal_kinematics.c"]
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    program = tmp_path / "selftest"
+    sources = [str(tmp_path / n) for n in ("pkmcal_kinematics.c", "pkmcal_selftest.c")]
+    subprocess.run([COMPILER, "-std=c99", *sources, "-o", program, "-lm"], check=True)
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "FAIL" in done.stdout
+
+
+@needs_compiler
+def test_statuses(library):
+    c = library("gough-stewart")
+    home = c.machine.home()
+    q = c.machine.inverse(home[None])[0]
+    assert forward(c, np.full(6, np.nan), home)[0] == BAD_INPUT
+    assert forward(c, q, np.full((4, 4), np.inf))[0] == BAD_INPUT
+    assert forward(c, q, np.diag([1.0, 1.0, 1.01, 1.0]))[0] == BAD_INPUT
+    assert inverse(c, np.full((4, 4), np.nan))[0] == BAD_INPUT
+    status, pose, report = forward(c, [0.2, 0.8, 0.2, 0.8, 0.2, 0.8], home)
+    assert status == OUT_OF_REACH
+    assert report.error > 1e-3
+    np.testing.assert_array_equal(pose, home)  # the start stays
+    assert c.library.pkmcal_out_of_range(doubles(q + np.eye(6)[3])) == 4
+    assert c.library.pkmcal_out_of_range(doubles(q - np.eye(6)[1])) == 2
+    assert c.library.pkmcal_out_of_range(doubles(np.full(6, np.nan))) == 1
+    # a null report is none
+    pose = Pose.of(home)
+    assert c.library.pkmcal_forward(doubles(q), ctypes.byref(pose), None) == OK
+
+
+@needs_compiler
+def test_cranks_and_sliders_out_of_reach(library):
+    for name in ("delta", "linear-delta", "h4-rods"):
+        c = library(name)
+        far = c.machine.home()
+        far[:3, 3] += 5.0
+        assert inverse(c, far)[0] == OUT_OF_REACH
+
+
+@needs_compiler
+def test_a_singular_pose_is_told(tmp_path):
+    """Where the lines of a 3-RPR's three legs meet in a point, its plate can turn."""
+    machine = load_mechanism("3-rpr")
+    machine = machine.with_values(_radial(machine))
+    c = compiled(machine, tmp_path)
+    T = np.eye(4)
+    q = machine.inverse(T[None])[0]
+    status, _, report = forward(c, q, T)
+    assert status == SINGULAR
+    assert report.pivot < 1e-9
+    # and regular where the plate is turned
+    T = perturb(T, np.array([0, 0, 1.2, 0, 0, 0]))
+    status, _, report = forward(c, machine.inverse(T[None])[0], T)
+    assert status == OK
+    assert report.pivot > 0.1
+
+
+def _radial(machine):
+    """Platform joints on the rays to the base joints, with the plate not turned."""
+    values = machine.values.copy()
+    for leg in (1, 2, 3):
+        base, platform = (
+            machine.parameters.index(f"legs[{leg}].{side}.center.x")
+            for side in ("base", "platform")
+        )
+        turn = 2 * np.pi * (leg - 1) / 3
+        ray = np.array([-np.sin(turn), np.cos(turn)])
+        values[base : base + 2], values[platform : platform + 2] = 0.32 * ray, 0.1 * ray
+    return values
+
+
+@needs_compiler
+def test_the_limit_of_steps_and_a_name_that_cannot_leave_its_comment(tmp_path):
+    machine = load_mechanism("delta")
+    name = 'evil */ int x; /* "\\\n#error ??/'
+    machine = replace(machine, document=machine.document.model_copy(update={"name": name}))
+    c = compiled(machine, tmp_path, "-DPKMCAL_MOST_STEPS=2")
+    readings = samples(machine, 20)[1]
+    statuses = {forward(c, q, machine.home())[0] for q in readings}
+    assert statuses == {NOT_CONVERGED}
+    text = c.library.pkmcal_status_text
+    text.restype = ctypes.c_char_p
+    told = [text(k) for k in range(6)]
+    assert told[0] == b"ok"
+    assert len(set(told)) == 6
+
+
+def test_as_many_equations_as_unknowns(tmp_path):
+    text = catalogue()["6-spu-passive"].read_text()
+    driven = text.replace("{passive: true}", "{actuated: true, range: [0.3, 0.5]}")
+    assert driven != text
+    (tmp_path / "m.yaml").write_text(driven + "home: {position: [0, 0, 0.36]}\n")
+    with pytest.raises(InputError, match="do not just hold its platform; found 7 equations for 6"):
+        CSource().files(source_of(load_mechanism(tmp_path / "m.yaml")))
+
+
+def test_notes_say_what_is_left_out():
+    notes = export(source_of(load_mechanism("6-spu-passive")), "c").notes
+    assert any("Passive legs (7)" in note.text for note in notes)
+    notes = export(source_of(load_mechanism("h4-rods")), "c").notes
+    assert any("no pkmcal_inverse_jacobian" in note.text for note in notes)

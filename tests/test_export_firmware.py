@@ -1,0 +1,288 @@
+"""Settings of firmwares: ideal deltas recovered, others told how far off, programs' formulas."""
+
+from __future__ import annotations
+
+from configparser import ConfigParser
+
+import numpy as np
+import pytest
+
+from export_sources import built, source_of
+from pkmcal.errors import InputError
+from pkmcal.export import klipper, linuxcnc, reprap
+from pkmcal.export.contract import exporters
+from pkmcal.export.delta import DEGREE, MM, delta_of, reach
+from pkmcal.export.delta_fit import Freedoms, fitted
+from pkmcal.export.linuxcnc_delta import linear_joints, rotary_joints
+from pkmcal.export.samples import samples
+from pkmcal.export.writing import export
+from pkmcal.findings import Level
+from pkmcal.geometry.rigid import perturb, rotation
+from pkmcal.mechanisms import catalogue, load_mechanism
+
+FIRMWARES = ("reprap", "klipper", "linuxcnc")
+SMALL = np.array([0.004, -0.003, 0.002])
+
+
+def put(machine, leg, **values):
+    """A machine's values with some of one leg's changed: paths with __ for a dot."""
+    out = machine.values.copy()
+    for path, value in values.items():
+        name = f"legs[{leg}].{path.replace('__', '.')}"
+        if np.ndim(value):
+            k = machine.parameters.index(f"{name}.x")
+            out[k : k + 3] = value
+        else:
+            out[machine.parameters.index(name)] = value
+    return machine.with_values(out)
+
+
+def ideal_linear(radius=0.11, angles=(211.0, 328.5, 90.7), rods=(0.27, 0.2712, 0.2695)):
+    """Parallel towers on a circle, in a base frame that is tilted and shifted."""
+    machine, tilt = load_mechanism("linear-delta"), rotation(SMALL)
+    for leg, (angle, rod) in enumerate(zip(angles, rods, strict=True), start=1):
+        out = np.array([np.cos(angle / DEGREE), np.sin(angle / DEGREE), 0.0])
+        at = tilt @ ((radius + 0.035) * out + [0, 0, 1e-3 * leg]) + [0.002, -0.001, 0.003]
+        machine = put(
+            machine,
+            leg,
+            base__center=at,
+            base__axis=tilt @ [0, 0, 1],
+            platform__center=tilt @ (0.035 * out),
+            length__constant=rod,
+        )
+    return machine
+
+
+def ideal_rotary(radius=0.052, angles=(90.4, 209.5, 330.8)):
+    """Arms in vertical planes through one axis, each of its own length and height."""
+    machine = load_mechanism("delta")
+    for leg, angle in enumerate(angles, start=1):
+        out = np.array([np.cos(angle / DEGREE), np.sin(angle / DEGREE), 0.0])
+        machine = put(
+            machine,
+            leg,
+            base__center=(radius + 0.035) * out + [0.001, 0.0005, 1e-3 * leg],
+            base__axis=np.cross([0.0, 0.0, 1.0], out),
+            base__arm=0.1 + 5e-4 * leg,
+            base__angle=0.01 * leg,
+            platform__center=0.035 * out,
+            length__constant=0.22 + 3e-4 * leg,
+        )
+    return machine
+
+
+def test_an_ideal_linear_delta_is_recovered():
+    machine = ideal_linear()
+    fit = fitted(delta_of(machine, "x"), klipper.LINEAR, "x")
+    assert fit.largest < 1e-4
+    assert fit.radius == pytest.approx(110, abs=1e-3)
+    # turned by the base frame's tilt about z, to first order
+    np.testing.assert_allclose(fit.angle, np.array([211, 328.5, 90.7]) + 0.002 * DEGREE, atol=2e-3)
+    np.testing.assert_allclose(fit.rod, [270, 271.2, 269.5], atol=1e-3)
+    text = export(source_of(machine), "klipper").files["pkmcal_printer.cfg"]
+    found = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
+    found.read_string(text)
+    assert found.getfloat("stepper_b", "arm_length") == pytest.approx(271.2, abs=1e-3)
+    assert found.getfloat("printer", "delta_radius") == pytest.approx(110, abs=1e-3)
+
+
+def test_an_ideal_rotary_delta_is_recovered():
+    machine = ideal_rotary()
+    fit = fitted(delta_of(machine, "x"), Freedoms(reprap.NOMINAL), "x")
+    assert fit.largest < 1e-4
+    assert fit.order.tolist() == [1, 2, 0]
+    assert fit.radius == pytest.approx(52, abs=1e-3)
+    np.testing.assert_allclose(fit.angle, [-150.5, -29.2, 90.4], atol=1e-3)
+    np.testing.assert_allclose(fit.arm, [101, 101.5, 100.5], atol=1e-3)
+    np.testing.assert_allclose(fit.rod, [220.6, 220.9, 220.3], atol=1e-3)
+    # Klipper has one height for all, so that it cannot follow
+    made = export(source_of(machine), "klipper")
+    assert made.notes[0].level is Level.DOUBTFUL
+    assert "tilted arms" in made.notes[0].text
+
+
+@pytest.mark.parametrize("name", ["delta", "linear-delta"])
+@pytest.mark.parametrize("to", FIRMWARES)
+def test_a_machine_off_its_drawing_is_followed_as_far_as_said(name, to):
+    machine = built(name, seed=4)
+    made = export(source_of(machine), to)
+    (difference,) = made.differences
+    assert "off by" in made.notes[0].text
+    assert not difference.beyond
+    # what is said is what happens, not a multiple of it
+    assert difference.largest > 0.9 * (difference.limit - 2e-6) / 1.02
+    drawn = export(source_of(load_mechanism(name)), to)
+    assert drawn.differences[0].largest < 5e-5
+    assert drawn.notes[0].level is Level.NOTE
+
+
+def test_parallel_towers_are_followed_where_leaning_ones_are_not():
+    leaning = put(ideal_linear(), 1, base__axis=[0.004, 0.0, 1.0])
+    for to in ("reprap", "klipper"):
+        assert export(source_of(ideal_linear()), to).differences[0].largest < 1e-6
+        made = export(source_of(leaning), to)
+        assert made.notes[0].level is Level.DOUBTFUL
+        assert "towers that are not parallel" in made.notes[0].text
+        assert 5e-5 < made.differences[0].largest < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("to", "file", "old", "new"),
+    [
+        ("reprap", "pkmcal_delta.g", "R104.9", "R104.8"),
+        ("reprap", "pkmcal_delta.g", "M666 X0.0000", "M666 X0.0100"),
+        ("reprap", "pkmcal_delta.g", "A0 B0", "A0.1 B0"),
+        ("klipper", "pkmcal_printer.cfg", "angle: 210.0", "angle: 210.1"),
+        ("klipper", "pkmcal_printer.cfg", "endstop: 301.2", "endstop: 301.3"),
+        ("linuxcnc", "pkmcal_kinematics.hal", "lineardeltakins.R 10", "lineardeltakins.R 11"),
+        ("linuxcnc", "pkmcal_kinematics.ini", "HOME_OFFSET = -0.0", "HOME_OFFSET = 1.0"),
+    ],
+)  # fmt: skip
+def test_tampered_settings_are_found(to, file, old, new):
+    source = source_of(load_mechanism("linear-delta"))
+    files = exporters()[to].files(source)
+    spoilt = {**files, file: files[file].replace(old, new, 1)}
+    assert spoilt != files
+    assert any(d.beyond for d in exporters()[to].check(spoilt, source))
+
+
+# The firmwares' formulas, at places where the answer is known
+
+
+def test_reprap_carriages_at_home():
+    text = "M665 L250:251:252 R100 H300 B90 X0 Y0 Z0\nM666 X1 Y-1 Z0.5 A0 B0"
+    words = reprap.read_words(text)
+    homed = 300 + np.sqrt(np.array([250, 251, 252]) ** 2 - 100.0**2) + [1, -1, 0.5]
+    np.testing.assert_allclose(reprap.homed_carriages(words), homed)
+    middle = reprap.linear_motors(words, np.array([[0.0, 0.0, 300.0]]))[0]
+    np.testing.assert_allclose(middle, homed - [1, -1, 0.5])
+    # towards the X tower, at the front left, its carriage rises
+    left = reprap.linear_motors(words, np.array([[-10.0, -10 / np.sqrt(3), 300.0]]))[0]
+    assert left[0] > middle[0]
+    assert left[1] < middle[1]
+
+
+def test_arms_of_all_programs_in_the_middle():
+    """Arm 100, rod 200, radius 40: horizontal arms hold the tool sqrt(200^2 - 140^2) below."""
+    below = np.sqrt(200.0**2 - 140.0**2)
+    text = "M669 K10 U100:100:100 L200:200:200 H300:300:300 R40 A-60:30 B80 X0 Y0 Z0"
+    words = reprap.read_words(text)
+    point = np.array([[0.0, 0.0, 300 - below], [0.0, 0.0, 320 - below]])
+    found = reprap.rotary_motors(words, point)
+    np.testing.assert_allclose(found[0], 0, atol=1e-12)
+    assert (found[1] > 1).all()  # upwards counts up
+    config = ConfigParser(delimiters=(":",))
+    stepper = "upper_arm_length: 100\nlower_arm_length: 200\nposition_endstop: 1\n"
+    config.read_string(
+        "[printer]\nkinematics: rotary_delta\nshoulder_radius: 40\nshoulder_height: 300\n"
+        + "".join(
+            f"[stepper_{n}]\n{stepper}angle: {a}\n"
+            for n, a in zip("abc", (210, 330, 90), strict=True)
+        )
+    )
+    np.testing.assert_allclose(klipper.rotary_motors(config, point), found, atol=1e-9)
+    side = np.array([[20.0, -10.0, 150.0]])
+    np.testing.assert_allclose(
+        klipper.rotary_motors(config, side), reprap.rotary_motors(words, side), atol=1e-9
+    )
+    pins = {"platformradius": 50.0, "footradius": 10.0, "thighlength": 100.0, "shinlength": 200.0}
+    mid = rotary_joints(pins, point - [0, 0, 300])
+    np.testing.assert_allclose(mid, -found, atol=1e-9)
+    # joint 0 at -90 degrees, 1 at 30: the arm that the tool goes to goes up, its angle falls
+    for k, angle in enumerate((-90, 30, 150)):
+        p = np.array([[20 * np.cos(angle / DEGREE), 20 * np.sin(angle / DEGREE), -150.0]])
+        assert np.argmin(rotary_joints(pins, p)[0]) == k
+
+
+def test_lineardeltakins_joint_0_is_the_tower_behind():
+    joints = linear_joints({"R": 100.0, "L": 250.0}, np.array([[0.0, 30.0, 10.0]]))[0]
+    assert joints[0] == pytest.approx(10 + np.sqrt(250**2 - 70**2))
+    assert joints[1] == pytest.approx(joints[2])
+
+
+def test_genhexkins_angles_are_roll_pitch_yaw():
+    machine = built("gough-stewart")
+    poses = samples(machine, 8)[0]
+    found = linuxcnc.world(poses)
+    for T, (a, b, c) in zip(poses, found[:, 3:] / DEGREE, strict=True):
+        rot = rotation(np.array([0, 0, c])) @ rotation(np.array([0, b, 0]))
+        np.testing.assert_allclose(rot @ rotation(np.array([a, 0, 0])), T[:3, :3], atol=1e-12)
+    made = export(source_of(machine), "linuxcnc")
+    assert "setp genhexkins.max-error 29" in made.files["pkmcal_kinematics.hal"]
+    offset = machine.values[machine.parameters.index("legs[2].length.offset")]
+    ini = made.files["pkmcal_kinematics.ini"]
+    word = "TYPE = LINEAR\nHOME_ABSOLUTE_ENCODER = 2\nHOME_OFFSET = "
+    assert f"[JOINT_1]\n{word}{1e3 * offset:.17g}\n" in ini
+
+
+# Machines that are no firmware's
+
+
+def test_ranges_are_needed(tmp_path):
+    text = catalogue()["linear-delta"].read_text().replace(", range: [0.25, 0.55]", "")
+    (tmp_path / "m.yaml").write_text(text)
+    with pytest.raises(InputError, match="gives no range for a motor"):
+        export(source_of(load_mechanism(tmp_path / "m.yaml")), "klipper")
+
+
+def test_towers_lean_too_much():
+    machine = put(load_mechanism("linear-delta"), 1, base__axis=[0.7, 0.0, 0.7])
+    with pytest.raises(InputError, match="is neither; found towers that lean"):
+        delta_of(machine, "Klipper")
+
+
+def test_arms_swing_sideways():
+    machine = put(load_mechanism("delta"), 1, base__axis=[0.0, 1.0, 0.1])
+    with pytest.raises(InputError, match="found arms that do not swing outwards"):
+        delta_of(machine, "Klipper")
+
+
+def test_a_machine_that_no_settings_follow_is_refused():
+    machine = put(load_mechanism("linear-delta"), 1, base__axis=[0.1, 0.1, 1.0])
+    with pytest.raises(InputError, match=r"RepRapFirmware cannot follow this machine.*found \d+"):
+        export(source_of(machine), "reprap")
+
+
+def test_four_towers_are_no_delta(tmp_path):
+    text = catalogue()["linear-delta"].read_text()
+    fourth = text[text.index("  - base") : text.index("  - base", text.index("  - base") + 1)]
+    fourth = fourth.replace("-0.1212, -0.07", "0.14, 0.1")
+    (tmp_path / "m.yaml").write_text(text.replace("home:", fourth + "home:"))
+    with pytest.raises(InputError, match="do not just hold"):
+        delta_of(load_mechanism(tmp_path / "m.yaml"), "Klipper")
+
+
+def test_arms_beyond_the_arc_sine(tmp_path):
+    text = catalogue()["delta"].read_text().replace("range: [-0.6, 1.3]", "range: [-0.6, 1.6]")
+    (tmp_path / "m.yaml").write_text(text)
+    with pytest.raises(InputError, match="takes arms up to 90 degrees"):
+        export(source_of(load_mechanism(tmp_path / "m.yaml")), "reprap")
+
+
+def test_klipper_end_switch_without_a_height(tmp_path):
+    text = catalogue()["delta"].read_text().replace("constant: 0.22", "constant: 0.13")
+    (tmp_path / "m.yaml").write_text(text.replace("-0.22]", "-0.1]"))
+    with pytest.raises(InputError, match="none belongs to it; found an arm that reaches"):
+        export(source_of(load_mechanism(tmp_path / "m.yaml")), "klipper")
+
+
+def test_nothing_closes_within_the_ranges():
+    machine = load_mechanism("linear-delta")
+    for leg in (1, 2, 3):
+        machine = put(machine, leg, length__constant=0.01)
+    with pytest.raises(InputError, match="closes nowhere within its ranges"):
+        delta_of(machine, "Klipper")
+
+
+def test_the_reach_is_within_the_ranges():
+    machine = load_mechanism("linear-delta")
+    radius = reach(delta_of(machine, "x"))
+    turns = np.linspace(0, 2 * np.pi, 200)
+    for r, inside in ((radius, True), (radius + 0.003, False)):
+        shift = np.zeros((200, 6))
+        shift[:, 3], shift[:, 4] = r * np.cos(turns), r * np.sin(turns)
+        q = machine.inverse(perturb(machine.home(), shift))
+        low, high = machine.joint_ranges.T
+        assert bool(((q >= low - 1e-4) & (q <= high + 1e-4)).all()) is inside
+    assert 0.1 * MM < radius * MM < 150

@@ -1,0 +1,168 @@
+"""``pkmcal servo``: options, files, sentences and the page."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from conftest import run
+from pkmcal.cameras.files import camera_text
+from pkmcal.simulate.demo import demo_camera
+
+QUICK = ("--runs", 3, "--rate", 6, "--noise", 0, "--joint-noise", 0, "--duration", 8, "--delay", 0)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+HOME = "0,0,0.3567,0,0,0"
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("servo") / "out"
+    return run("servo", "gough-stewart", *QUICK, "-o", folder, "--json"), folder
+
+
+def test_a_built_in_machine(studied):
+    done, folder = studied
+    assert done.code == 0, done.out
+    assert done.json["usable"] is True
+    assert done.json["estimates"]["identified"]["reached"] == 3
+    assert sorted(p.name for p in folder.iterdir()) == ["servo.html", "servo.json"]
+    document = json.loads((folder / "servo.json").read_text())
+    assert document["estimates"] == done.json["estimates"]
+    assert document["settings"]["legs"] == [1, 2, 3, 4, 5, 6]
+    curves = document["curves"]
+    assert {len(values) for values in curves.values()} == {48}
+    assert curves["identified"][0] == 1.0
+    assert curves["identified"][-1] < 0.01
+
+
+def test_the_page_is_whole(studied):
+    page = (studied[1] / "servo.html").read_text(encoding="utf-8")
+    for name in ("curves", "tail", "space", "image"):
+        text = re.search(rf'id="figure-{name}">(.*?)</script>', page, re.DOTALL)
+        assert text
+        figure = json.loads(text[1], parse_constant=pytest.fail)
+        assert figure["data"]
+    frames = json.loads(re.search(r'id="frames">(.*?)</script>', page, re.DOTALL)[1])
+    assert len(frames) == 48
+    assert frames[0]["traces"] == list(range(7))
+    moved = frames[0]["data"][0]["x"] != frames[-1]["data"][0]["x"]
+    assert moved
+    assert "Play" in page
+    assert "http://" not in re.sub(r'id="plotly">.*?</script>', "", page, flags=re.DOTALL)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="NO CHROMIUM: the animation was not played")
+def test_the_animation_has_its_pictures(studied, tmp_path):
+    """In a browser; the last one has the platform at the goal."""
+    page = (studied[1] / "servo.html").read_text(encoding="utf-8")
+    # no timer, and no wait for a frame of the screen: the browser's virtual time has neither
+    script = """<script>new MutationObserver((_, watch) => {
+      watch.disconnect();
+      const plot = document.getElementById("plot-space");
+      const frames = plot._transitionData._frames;
+      const last = frames[frames.length - 1];
+      Plotly.animate(plot, [last.name], plot.layout.updatemenus[0].buttons[1].args[1]);
+      const platform = last.data[plot.data.findIndex((trace) => trace.name === "platform")];
+      const goal = plot.data.find((trace) => trace.name === "goal");
+      document.title = `frames ${frames.length} ${platform.z[0]} ${goal.z[0]}`;
+    }).observe(document.getElementById("plot-space"), { attributeFilter: ["data-drawn"] });
+    </script></body>"""
+    changed = tmp_path / "servo.html"
+    changed.write_text(page.replace("</body>", script), encoding="utf-8")
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom",
+               f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=20000",
+               changed.as_uri()]  # fmt: skip
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    title = re.search(r"<title>frames (\d+) ([\d.]+) ([\d.]+)</title>", shown.stdout)
+    assert title, shown.stdout[:500]
+    assert int(title[1]) == 48
+    assert float(title[2]) == pytest.approx(float(title[3]), abs=0.5)
+
+
+def test_words_for_people(tmp_path):
+    done = run("servo", "gough-stewart", *QUICK, "--legs", "1,2,3", "--law", "directions",
+               "-o", tmp_path / "out")  # fmt: skip
+    assert done.code == 1
+    assert "should not be used" in done.out
+    assert "Identified" in done.out
+    assert "servo.html" in done.out
+
+
+def test_a_calibration_with_its_camera(demo, tmp_path):
+    done = run("servo", demo.calibration, *QUICK, "-o", tmp_path / "out", "--json")
+    assert done.code in (0, 1), done.out
+    found = done.json
+    assert found["station"] == "station1"
+    assert found["estimates"]["identified"]["reached"] >= 2
+    assert "calibration's covariance" in found["origin"]
+    other = run("servo", demo.calibration, *QUICK, "--station", "station9", "-o", tmp_path / "two")
+    assert other.code == 2
+    assert "no such station" in other.err
+
+
+def test_another_camera(tmp_path):
+    file = tmp_path / "camera.yaml"
+    file.write_text(camera_text(demo_camera()))
+    done = run("servo", "gough-stewart", *QUICK, "--camera", file, "-o", tmp_path / "out", "--json")
+    assert done.code == 0
+
+
+def test_one_way(tmp_path):
+    """Start and goal as asked for: the same for every run."""
+    done = run("servo", "gough-stewart", *QUICK, "--start", HOME, "--goal", "0.02,0,0.36,0,0,0.1",
+               "-o", tmp_path / "out", "--json")  # fmt: skip
+    assert done.code == 0, done.out
+    ways = {round(r["way"], 9) for r in done.json["estimates"]["true"]["runs"]}
+    assert len(ways) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--law", "points"), "no such law of control; found points, expected edges or directions"),
+        (("--gain", 0), "--gain: a loop cannot have this"),
+        (("--gain", 30, "--delay", 3), "--gain: the loop is unstable"),
+        (("--rate", -5), "--rate: a loop cannot have this"),
+        (("--speed", 0), "--speed: a loop cannot have this"),
+        (("--duration", 3000), "--duration: the runs would have too many samples"),
+        (("--legs", "1,1"), "--legs: no list of legs; found 1,1"),
+        (("--legs", "x"), "--legs: no list of legs; found x"),
+        (("--legs", "1,2,9"), "needs legs with tubes, each once; found legs 1, 2, 9"),
+        (("--start", "1,2"), "--start: no pose of the platform; found 1,2"),
+        (("--goal", "0,0,0.6,0,0,0"), "--goal: the pose lies outside of the workspace"),
+        (("--station", "front"), "--station: a machine that is not calibrated has no stations"),
+    ],
+)
+def test_wrong_options(tmp_path, options, sentence):
+    done = run("servo", "gough-stewart", "--runs", 2, *options, "-o", tmp_path / "out")
+    assert done.code == 2, done.out
+    assert sentence in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_such_machine(tmp_path):
+    done = run("servo", "nothing", "-o", tmp_path / "out")
+    assert done.code == 2
+    assert "there is no such calibration and no such machine" in done.err
+
+
+def test_a_machine_without_tubes(tmp_path):
+    done = run("servo", "delta", "-o", tmp_path / "out")
+    assert done.code == 2
+    assert "needs legs with tubes" in done.err
+
+
+def test_foreign_folders_stay(tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "letter.txt").write_text("mine")
+    done = run("servo", "gough-stewart", "-o", folder)
+    assert done.code == 2
+    assert "something other than a study of servoing" in done.err
+    assert [p.name for p in folder.iterdir()] == ["letter.txt"]

@@ -1,0 +1,266 @@
+"""Edges of legs from one photograph: fast, and lost rather than guessed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.control.laws import task_of
+from pkmcal.control.seen import legs_at, seen_machine, true_edges
+from pkmcal.control.track import Sight, start_state, track
+from pkmcal.control.track_fit import corrected_pose, edge_rows, leg_lines, weighted
+from pkmcal.errors import InputError
+from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
+from pkmcal.geometry.rigid import apply, perturb, pose_difference
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.observe.edges import EdgeSet
+from pkmcal.observe.predict import tubes_of
+from servo_lab import BESIDE, MIRROR, PERSPECTIVE, WITHIN, Lab
+
+MACHINE = load_mechanism("gough-stewart")
+AT = perturb(MACHINE.home(), np.array([0.03, -0.02, 0.05, 0.01, -0.008, 0.01]))
+READINGS = MACHINE.inverse(AT[None])[0]
+PIXEL = 1 / 564.0
+
+
+@pytest.fixture(scope="module", params=["perspective", "mirror"])
+def view(request):
+    """A lab, its photograph at AT, and what is looked for."""
+    camera, T = (PERSPECTIVE, BESIDE) if request.param == "perspective" else (MIRROR, WITHIN)
+    lab = Lab(MACHINE, camera, T)
+    return lab, lab.photograph(AT, READINGS), Sight(seen_machine(MACHINE, T), camera)
+
+
+# ------------------------------------------------------------------ from photographs
+
+
+def test_edges_are_found_within_their_sigma(view):
+    lab, image, sight = view
+    found = track(sight, start_state(sight.seen), image, READINGS)
+    assert found.found.sum() >= 5
+    truth = true_edges(sight.seen, AT)[found.found]
+    lines = found.lines
+    turn = np.swapaxes(lines.basis[found.found], -1, -2) @ truth[..., None]
+    whitened = np.linalg.solve(np.linalg.cholesky(lines.covariance[found.found]), turn)[..., 0]
+    assert np.abs(whitened).max() < 4.5
+    assert np.sqrt(np.mean(whitened**2)) < 1.5
+    # no more than a pixel and a half, where a leg was seen at all
+    focal = lab.camera.parameters[0]
+    assert np.abs(turn[..., 0, 0]).max() * focal < 1.5
+    off = pose_difference(found.T_base_platform, AT)
+    assert np.linalg.norm(off[3:]) < 1.2e-3
+    assert np.rad2deg(np.linalg.norm(off[:3])) < 0.3
+
+
+def test_a_photograph_late_by_a_millimetre_is_followed(view):
+    """The readings have gone on; the next photograph profits from what this one showed."""
+    _, image, sight = view
+    later = READINGS + np.array([1, -1, 1, 1, -1, 1]) * 1.5e-3
+    first = track(sight, start_state(sight.seen), image, later)
+    second = track(sight, first.state, image, later)
+    truth = true_edges(sight.seen, AT)
+    for at in (first, second):
+        assert at.found.sum() >= 4
+        turn = np.swapaxes(at.lines.basis, -1, -2) @ truth[..., None]
+        whitened = np.linalg.solve(
+            np.linalg.cholesky(at.lines.covariance[at.found]), turn[at.found]
+        )
+        assert np.abs(whitened).max() < 4.5
+    miss, start = (
+        np.linalg.norm(MACHINE.inverse(T[None])[0] - READINGS)
+        for T in (second.T_base_platform, second.state.T_base_platform)
+    )
+    assert miss < 0.7 * start
+
+
+def test_a_first_photograph_several_pixels_off_is_searched():
+    lab = Lab(MACHINE, PERSPECTIVE, BESIDE)
+    image = lab.photograph(AT, READINGS)
+    sight = Sight(seen_machine(MACHINE, BESIDE), PERSPECTIVE)
+    # a centimetre and two degrees aside: up to nine pixels
+    moved = MACHINE.inverse(perturb(AT, np.array([0, 0, 0.03, 0.01, 0.008, 0]))[None])[0]
+    found = track(sight, start_state(sight.seen), image, moved)
+    assert found.state.searched
+    assert found.found.sum() >= 4
+    assert found.beside > 2e-3  # and said
+    truth = true_edges(sight.seen, AT)
+    off = np.linalg.norm((found.lines.normal - truth)[found.found], axis=-1)
+    assert np.median(off) < 1.5 * PIXEL
+
+
+def test_a_leg_painted_over_is_lost_and_the_others_are_not(view):
+    lab, image, sight = view
+    whole = track(sight, start_state(sight.seen), image, READINGS)
+    leg = int(np.flatnonzero(whole.found)[0])
+    painted = lab.painted(image, AT, READINGS, [leg])
+    found = track(sight, whole.state, painted, READINGS)
+    assert not found.found[leg]
+    assert found.found.sum() >= whole.found.sum() - 2  # painting may cover a neighbour
+    assert "clear edge" in found.reasons[leg] or "one edge" in found.reasons[leg]
+    assert np.isnan(found.lines.normal[leg]).all()
+
+
+def test_an_empty_photograph_finds_nothing_and_keeps_to_the_readings(view):
+    _, image, sight = view
+    state = track(sight, start_state(sight.seen), image, READINGS).state
+    empty = np.full_like(image, 90)
+    found = track(sight, state, empty, READINGS)
+    assert not found.found.any()
+    assert all(found.reasons)
+    np.testing.assert_allclose(found.T_base_platform, AT, atol=1e-9)
+    again = track(sight, found.state, image, READINGS)
+    assert again.found.sum() >= 4
+
+
+def test_readings_that_close_no_machine_are_no_edges(view):
+    _, image, sight = view
+    found = track(sight, start_state(sight.seen), image, READINGS * [2, 1, 1, 0.2, 1, 1])
+    assert not found.closed
+    assert not found.found.any()
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (np.zeros((480, 640, 3), np.uint8), "grey levels"),
+        (np.zeros((480, 640)), "float64"),
+        (np.zeros((240, 320), np.uint8), "320x240"),
+    ],
+)
+def test_images_that_are_none_are_named(image, words):
+    sight = Sight(seen_machine(MACHINE, BESIDE), PERSPECTIVE)
+    with pytest.raises(InputError, match=words):
+        track(sight, start_state(sight.seen), image, READINGS)
+
+
+# ------------------------------------------------------------------ edges to lines, exactly
+
+
+def edges_of(T_base_platform, readings, rng=None, sigma=2e-4):
+    """All edges that MACHINE shows at a pose, with the tangent noise of their covariance."""
+    tubes = tubes_of(MACHINE)
+    ends = limb_ends(MACHINE.layout, MACHINE.values, readings, T_base_platform)
+    a, b = (apply(BESIDE, p)[tubes.leg] for p in (ends.a, ends.b))
+    normal = edge_normal_jacobians(a, b, MACHINE.values[tubes.radius], tubes.side).n
+    middle = (a + b) / 2
+    basis = tangent_basis(normal, middle / np.linalg.norm(middle, axis=1)[:, None])
+    count = len(tubes)
+    covariance = np.tile(np.diag([sigma**2, (4 * sigma) ** 2]), (count, 1, 1))
+    zeros = np.zeros(count, dtype=int)
+    shift = np.tile([PIXEL, 0.0], (count, 1))
+    edges = EdgeSet(
+        zeros, zeros, tubes.leg, tubes.tube, tubes.side, normal, basis, covariance, shift,
+        np.zeros((count, 2)),
+    )  # fmt: skip
+    if rng is None:
+        return edges
+    return turned(edges, rng.normal(size=(count, 2)) * np.array([1, 4]) * sigma)
+
+
+def turned(edges, turn):
+    """The edges with their normals turned by (M, 2) in their bases, rad."""
+    normal = edges.normal + (edges.basis @ turn[..., None])[..., 0]
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    return replace(edges, normal=normal, basis=tangent_basis(normal, edges.basis[..., 0]))
+
+
+SEEN = seen_machine(MACHINE, BESIDE)
+NEAR = perturb(AT, np.array([1e-3, -1e-3, 1e-3, 5e-4, -5e-4, 3e-4]))
+NEAR_READINGS = MACHINE.inverse(NEAR[None])[0]
+
+
+def test_lines_of_exact_edges_are_exact_to_second_order():
+    rows = edge_rows(SEEN, NEAR_READINGS, NEAR, edges_of(AT, READINGS, sigma=1e-7), 0.0)
+    rows = replace(rows, information=np.tile(np.eye(2) / 1e-14, (len(rows.leg), 1, 1)))
+    lines = leg_lines(SEEN, rows)
+    assert lines.found.all()
+    np.testing.assert_allclose(lines.normal, true_edges(SEEN, AT), atol=1e-5)
+
+
+def test_lines_scatter_as_their_covariance_says():
+    rng = np.random.default_rng(0)
+    truth, whitened = true_edges(SEEN, AT), []
+    for _ in range(60):
+        rows = edge_rows(SEEN, READINGS, AT, edges_of(AT, READINGS, rng), 0.0)
+        rows = replace(rows, information=np.linalg.inv(edges_of(AT, READINGS).covariance))
+        lines = leg_lines(SEEN, rows)
+        turn = np.swapaxes(lines.basis, -1, -2) @ truth[..., None]
+        whitened.append(np.linalg.solve(np.linalg.cholesky(lines.covariance), turn))
+    assert np.mean(np.square(whitened)) == pytest.approx(1.0, abs=0.12)
+    assert lines.agrees.all()
+
+
+def test_an_edge_of_something_else_costs_the_leg_and_not_the_truth():
+    edges = edges_of(AT, READINGS)
+    turn = np.zeros((len(edges), 2))
+    turn[0, 0] = 3 * PIXEL  # leg 1, one of its four edges
+    rows = edge_rows(SEEN, READINGS, AT, turned(edges, turn), 0.0)
+    lines = leg_lines(SEEN, rows)
+    assert not lines.agrees[0]
+    assert lines.found.tolist() == [False, True, True, True, True, True]
+    assert np.isnan(lines.normal[0]).all()
+
+
+def test_one_side_alone_is_no_leg():
+    edges = edges_of(AT, READINGS)
+    rows = edge_rows(SEEN, READINGS, AT, edges.select((edges.leg != 2) | (edges.side == 0)), 0.0)
+    assert leg_lines(SEEN, rows).found.tolist() == [True, True, False, True, True, True]
+
+
+def test_only_the_legs_that_count_are_answered():
+    seen = seen_machine(MACHINE, BESIDE, np.array([4, 1]))
+    lines = leg_lines(seen, edge_rows(seen, READINGS, AT, edges_of(AT, READINGS), 0.0))
+    np.testing.assert_allclose(lines.normal, true_edges(SEEN, AT)[[4, 1]], atol=1e-6)
+
+
+def test_the_constant_shift_of_a_camera_is_taken_off():
+    edges = edges_of(AT, READINGS)
+    outward = turned(edges, 0.3 * edges.shift)
+    rows = edge_rows(SEEN, READINGS, AT, outward, 0.3)
+    np.testing.assert_allclose(leg_lines(SEEN, rows).normal, true_edges(SEEN, AT), atol=1e-6)
+    raw = leg_lines(SEEN, edge_rows(SEEN, READINGS, AT, outward, 0.0))
+    assert np.abs(raw.normal - true_edges(SEEN, AT)).max() > 1e-4
+
+
+def test_the_pose_of_exact_edges_is_found_with_and_without_one_bad_leg():
+    every = np.ones(6, dtype=bool)
+    edges = edges_of(AT, READINGS)
+    for bad in (False, True):
+        if bad:
+            sides = np.where(edges.side == 0, 3 * PIXEL, -3 * PIXEL)  # leg 4 as a whole aside
+            turn = np.stack([sides * (edges.leg == 3), 0 * sides], axis=1)
+            edges = turned(edges, turn)
+        T = NEAR
+        for _ in range(4):
+            T = corrected_pose(SEEN, T, edge_rows(SEEN, READINGS, T, edges, 0.0), every)
+        # a leg of six that is 3 px aside would carry the pose along by ten times as much
+        limit = 3e-3 if bad else 1e-6
+        assert np.abs(pose_difference(T, AT)).max() < limit
+
+
+def test_a_pose_without_edges_stays():
+    rows = edge_rows(SEEN, READINGS, AT, edges_of(AT, READINGS), 0.0)
+    assert corrected_pose(SEEN, AT, rows, np.zeros(6, dtype=bool)) is AT
+
+
+@pytest.mark.parametrize("law", ["edges", "directions"])
+def test_weights_make_errors_white(law):
+    """Errors of measured edges, drawn with their covariance, come out of one size in all rows."""
+    rng = np.random.default_rng(3)
+    goal, legs, every = true_edges(SEEN, AT), legs_at(SEEN, AT), np.ones(6, dtype=bool)
+    lines = leg_lines(SEEN, edge_rows(SEEN, READINGS, AT, edges_of(AT, READINGS), 0.0))
+    factor = 1e-2 * np.linalg.cholesky(lines.joint)  # small, so that all is linear
+    rows = []
+    for _ in range(400):
+        turn = (factor @ rng.normal(size=(6, 4, 1))).reshape(6, 2, 2, 1)
+        normals = lines.normal + (lines.basis @ turn)[..., 0]
+        normals /= np.linalg.norm(normals, axis=-1)[..., None]
+        task, noise = weighted(law, task_of(law, SEEN, normals, goal, legs), lines, every)
+        rows.append(task.error / (1e-2 * noise))
+    spread = np.cov(np.array(rows).T)
+    assert len(spread) == (24 if law == "edges" else 12)
+    np.testing.assert_allclose(spread, np.eye(len(spread)), atol=0.25)
+    assert np.mean(np.diag(spread)) == pytest.approx(1.0, abs=0.05)

@@ -1,0 +1,490 @@
+"""Watching a calibrated machine: false alarms as promised, changes found and named, and words."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.errors import ResultError
+from pkmcal.geometry.rigid import perturb
+from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.gauge import freedoms, generators
+from pkmcal.identify.problem import Measurements
+from pkmcal.identify.solver import Solution, Stop
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.simulate import Settings
+from pkmcal.simulate.demo import demo_camera
+from pkmcal.simulate.edges import EdgeNoise, simulate_edges
+from pkmcal.simulate.truth import draw_truth, true_machine
+from pkmcal.watching.causes import (
+    Cause,
+    arms,
+    common_scale,
+    joined,
+    part_of,
+    single_causes,
+    whole_legs,
+    whole_machine,
+    zeros,
+)
+from pkmcal.watching.chances import (
+    POWER,
+    change,
+    chi_square,
+    detectable,
+    likelihood,
+    together,
+)
+from pkmcal.watching.evidence import Evidence, Trust, evidence
+from pkmcal.watching.figures import judgement_document
+from pkmcal.watching.judged import explained, family, judge
+from pkmcal.watching.words import Circumstances, verdict_of
+from pose_sessions import T_CAMERA_BASE, measured, papers_case, papers_poses
+
+ALPHA = 0.01
+CAMERA = demo_camera()
+SESSIONS = 50
+FEW = 4
+"""Configurations of a session that watches."""
+
+
+class Watched:
+    """A hexapod with a calibration from three stations, and places to photograph it anew.
+
+    Calibrations are drawn about the true machine by the covariance of one that was made.
+    """
+
+    def __init__(self):
+        drawing = load_mechanism("gough-stewart")
+        truth = draw_truth(drawing, (CAMERA,) * 3, Settings(stations=3, configurations=8), 1)
+        edges, readings = simulate_edges(
+            truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
+            np.random.default_rng(1), photographs=truth.photographs,
+        )  # fmt: skip
+        data = Measurements(edges, readings, 3e-6, 3, np.zeros(3, dtype=int))
+        start = start_state(drawing, data, truth.T_camera_base)
+        made = bundle(drawing, data, start, robust=False, scale_noise=False)
+        self.true, self.covariance = made.machine, made.covariance
+        values, vectors = np.linalg.eigh(made.covariance)
+        self.half = vectors * np.sqrt(np.maximum(values, 0.0))
+        settings = Settings(stations=1, configurations=30, tolerance=0.0)
+        self.pool = draw_truth(self.true, (CAMERA,), settings, 5)
+
+    def calibrated(self, rng):
+        """The true machine with a calibration's errors."""
+        return self.true.with_values(self.true.values + self.half @ rng.standard_normal(54))
+
+    def seen(self, machine, rng, few=FEW):
+        """New measurements of a machine by one camera."""
+        rows = rng.choice(30, few, replace=False)
+        edges, readings = simulate_edges(
+            machine, self.pool.T_camera_base, CAMERA, self.pool.T_base_platform[rows],
+            EdgeNoise(), rng,
+        )  # fmt: skip
+        return Measurements(edges, readings, 3e-6, 1, np.zeros(1, dtype=int))
+
+    def evidence(self, machine, rng, few=FEW):
+        """Of one session of ``machine``, held against a calibration of the true one."""
+        calibrated, data = self.calibrated(rng), self.seen(machine, rng, few)
+        start = start_state(calibrated, data, self.pool.T_camera_base)
+        return evidence(calibrated, self.covariance, data, start, Trust.full(data))
+
+
+@pytest.fixture(scope="module")
+def watched():
+    return Watched()
+
+
+@pytest.fixture(scope="module")
+def unchanged(watched):
+    """Evidence of sessions of a machine that did not change."""
+    return [watched.evidence(watched.true, np.random.default_rng([k, 7])) for k in range(SESSIONS)]
+
+
+def moved(machine, **by):
+    """A machine with parameters changed; names with __ for dots, after a leg's number."""
+    values = machine.values.copy()
+    for name, size in by.items():
+        leg, _, path = name.removeprefix("leg").partition("_")
+        values[machine.parameters.index(f"legs[{leg}].{path.replace('__', '.')}")] += size
+    return machine.with_values(values)
+
+
+def looked(n=FEW):
+    """The circumstances of n new configurations."""
+    return Circumstances(tuple("abcdefghijkl"[:n]), np.zeros(n, bool), np.ones(n, bool), 1.0)
+
+
+def board_case(name, rng, **model):
+    """A machine calibrated by a board on its platform: its truth and the estimate."""
+    drawing = load_mechanism(name, **model)
+    true = true_machine(drawing, 1.0, rng)
+    case = papers_case(true, rng)
+    start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
+    return true, bundle(drawing, case.measurements, start)
+
+
+def by_board(estimate, machine, poses, rng):
+    """Evidence of a board on a machine's platform in some poses."""
+    data = measured(machine, poses, rng).measurements
+    start = start_state(estimate.machine, data, T_CAMERA_BASE[None])
+    return evidence(estimate.machine, estimate.covariance, data, start, Trust.full(data))
+
+
+@pytest.fixture(scope="module")
+def h4():
+    rng = np.random.default_rng(3)
+    return (*board_case("h4", rng, model="calibration"), rng)
+
+
+# false alarms
+
+
+def test_an_unchanged_machine_gives_unit_noise(unchanged, watched):
+    """w is noise of unit variance, calibration's errors included: chi-square as it should be."""
+    every = whole_machine(watched.true)
+    tests = [chi_square(found, every) for found in unchanged]
+    dof = sum(t.dof for t in tests)
+    assert dof > SESSIONS * 20
+    assert abs(sum(t.chi2 for t in tests) - dof) < 4 * np.sqrt(2 * dof)
+    chances = np.array([t.chance for t in tests])
+    assert abs(chances.mean() - 0.5) < 4 * np.sqrt(1 / 12 / SESSIONS)
+
+
+def test_each_legs_test_is_uniform_in_chance(unchanged, watched):
+    legs = [*whole_legs(watched.true), *zeros(watched.true), common_scale(watched.true)]
+    chances = np.array([[chi_square(f, c).chance for c in legs] for f in unchanged])
+    assert np.abs(chances.mean(axis=0) - 0.5).max() < 4 * np.sqrt(1 / 12 / SESSIONS)
+    for share in (0.1, 0.5):
+        sigma = np.sqrt(share * (1 - share) / SESSIONS)
+        assert np.abs((chances < share).mean(axis=0) - share).max() < 4 * sigma
+
+
+def test_false_alarms_of_all_tests_together(unchanged, watched):
+    """At a level of 0.2, of 50 machines that did not change 10 are flagged, give or take."""
+    asked = [whole_machine(watched.true), *whole_legs(watched.true), *zeros(watched.true)]
+    level = together(unchanged[0], asked)
+    least = np.array([min(chi_square(f, c).chance for c in asked) for f in unchanged])
+    flagged = int(np.sum(least < level.single(0.2)))
+    assert abs(flagged - 10) < 4 * np.sqrt(SESSIONS * 0.2 * 0.8)
+    assert level.single(0.2) > 0.2 / level.count  # Bonferroni would be too careful
+
+
+def test_the_calibrations_errors_must_be_in_the_noise(watched):
+    """Held against a calibration that were exact, an unchanged machine is flagged again and again:
+    what the covariance of the calibration is for.
+    """
+    every, factor = whole_machine(watched.true), []
+    for k in range(8):
+        rng = np.random.default_rng([k, 8])
+        calibrated, data = watched.calibrated(rng), watched.seen(watched.true, rng)
+        start = start_state(calibrated, data, watched.pool.T_camera_base)
+        exact = evidence(calibrated, 0 * watched.covariance, data, start, Trust.full(data))
+        found = chi_square(exact, every)
+        factor.append(found.chi2 / found.dof)
+    assert np.mean(factor) > 1.4
+
+
+def test_other_frames_and_cameras_change_nothing(watched):
+    """A test knows neither where the base frame is nor where the camera stands."""
+    rng = np.random.default_rng(2)
+    data, calibrated = watched.seen(watched.true, rng), watched.calibrated(rng)
+    start = start_state(calibrated, data, watched.pool.T_camera_base)
+    first = evidence(calibrated, watched.covariance, data, start, Trust.full(data))
+    away = replace(start, T_camera_base=perturb(start.T_camera_base, 0.01 * rng.normal(size=6)))
+    again = evidence(calibrated, watched.covariance, data, away, Trust.full(data))
+    every = whole_machine(calibrated)
+    assert chi_square(again, every).chi2 == pytest.approx(chi_square(first, every).chi2, abs=1e-4)
+    frames = generators(calibrated.layout, calibrated.values) @ freedoms(calibrated)
+    assert np.abs(first.by @ frames).max() < 1e-4 * np.abs(first.by).max()
+
+
+# changes
+
+
+@pytest.mark.parametrize("by", [2e-5, 1e-3])
+def test_the_regression_predicts_what_a_change_does(watched, by):
+    """The same data, seen with a machine that has changed: w moves by X times the change."""
+    rng = np.random.default_rng(6)
+    data = watched.seen(watched.true, rng)
+    start = start_state(watched.true, data, watched.pool.T_camera_base)
+    seen = [
+        evidence(machine, watched.covariance, data, start, Trust.full(data))
+        for machine in (watched.true, moved(watched.true, leg3_length__offset=-by))
+    ]
+    cause = whole_legs(watched.true)[2]
+    changes = [change(found, cause) for found in seen]
+    off = changes[1].value - changes[0].value
+    expected = by * np.eye(len(off))[-1]
+    worst = np.sqrt(np.diag(changes[0].covariance))
+    assert (np.abs(off - expected) < 0.02 * worst + 0.02 * by).all()
+
+
+def test_a_changed_offset_is_found_and_named(watched):
+    rng = np.random.default_rng(21)
+    judged = judge(
+        watched.evidence(moved(watched.true, leg3_length__offset=1e-3), rng), watched.true, ALPHA
+    )
+    verdict = verdict_of(judged, looked())
+    assert judged.changed
+    first = judged.findings[0].suspect
+    assert (first.cause.part, first.cause.legs) == ("zero", (2,))
+    assert abs(first.change.value[0] - 1e-3) < 4 * first.change.sigma[0]
+    assert judged.left.chance > 1e-3
+    assert not verdict.usable
+    assert "leg 3 has changed" in verdict.headline
+    assert "the zero of leg 3's reading by +" in verdict.reasons[0]
+    assert "encoder" in verdict.reasons[0]
+
+
+def test_a_joint_that_moved(watched):
+    rng = np.random.default_rng(22)
+    now = moved(watched.true, leg2_base__center__x=2e-3, leg2_base__center__y=-1e-3)
+    found = watched.evidence(now, rng, few=8)
+    judged = judge(found, watched.true, ALPHA)
+    first = judged.findings[0].suspect
+    assert (first.cause.part, first.cause.legs) == ("base", (1,))
+    off = first.change.value - [2e-3, -1e-3, 0]
+    assert off @ np.linalg.solve(first.change.covariance, off) < 20
+    text = verdict_of(judged, looked(8)).reasons[0]
+    assert "the base joint of leg 2 by 2." in text
+    assert "mm in the base frame" in text
+
+
+def test_two_changes_are_both_named(watched):
+    """The first single cause that is found resembles both; all pairs tell."""
+    rng = np.random.default_rng(23)
+    now = moved(watched.true, leg3_length__offset=1.5e-3, leg5_length__offset=-1.5e-3)
+    judged = judge(watched.evidence(now, rng, few=8), watched.true, ALPHA)
+    causes = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
+    assert causes == {("zero", (2,)), ("zero", (4,))}
+    verdict = verdict_of(judged, looked(8))
+    assert "legs 3 and 5 have changed" in verdict.headline
+    assert verdict.reasons[1].startswith("Besides, the zero of")
+
+
+def test_warming_is_told_from_a_leg(watched):
+    machine = watched.true
+    lengths = np.array([k != "radius" for k in machine.parameters.kinds])
+    warm = machine.with_values(machine.values * np.where(lengths, 1 + 2e-3, 1.0))
+    judged = judge(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
+    assert judged.findings[0].suspect.cause.part == "scale"
+    assert abs(judged.scale_change.value[0] - 2e-3) < 4 * judged.scale_change.sigma[0]
+    verdict = verdict_of(judged, looked())
+    assert "all its lengths have another scale" in verdict.headline
+    assert "K warmer" in verdict.reasons[0]
+
+
+def test_causes_that_look_alike_are_all_named(watched):
+    """Three configurations hardly tell a leg's zero from its joints."""
+    rng = np.random.default_rng(26)
+    now = moved(watched.true, leg4_platform__center__z=1.2e-3)
+    judged = judge(watched.evidence(now, rng, few=3), watched.true, ALPHA)
+    finding = judged.findings[0]
+    alike = {(s.cause.part, s.cause.legs) for s in (finding.suspect, *finding.others)}
+    assert ("platform", (3,)) in alike
+    assert len(alike) > 1
+    assert "These data cannot tell that from" in verdict_of(judged, looked(3)).reasons[0]
+
+
+def test_detectable_changes_are_detected_so_often(watched):
+    """Power by simulation of the regression: as many as promised."""
+    found = watched.evidence(watched.true, np.random.default_rng(31))
+    leg = whole_legs(watched.true)[2]
+    along = zeros(watched.true)[2].columns[:, 0]
+    level = ALPHA / 14
+    size = detectable(found, leg, along, level)
+    rng = np.random.default_rng(32)
+    count = 400
+    draws = [
+        replace(found, w=found.by @ (size * along) + rng.standard_normal(len(found.w)))
+        for _ in range(count)
+    ]
+    share = np.mean([chi_square(draw, leg).chance < level for draw in draws])
+    assert abs(share - POWER) < 4 * np.sqrt(POWER * (1 - POWER) / count)
+
+
+def test_what_is_not_seen_is_not_detected(watched):
+    found = watched.evidence(watched.true, np.random.default_rng(31))
+    frames = generators(watched.true.layout, watched.true.values)[:, 0]
+    blind = Cause("zero", (0,), frames[:, None], np.array([1e-3]), "m")
+    assert chi_square(found, blind).dof == 0
+    assert chi_square(found, blind).chance == 1.0
+    assert detectable(found, blind, frames, ALPHA) == np.inf
+    assert change(found, blind).sigma[0] == np.inf
+
+
+# tests made together
+
+
+def flat(n=6, p=3):
+    """Evidence of p parameters, each seen in a row of its own."""
+    return Evidence(np.zeros(n), np.eye(n, p) * 1e6, np.zeros(1), None)
+
+
+def test_chances_of_several_tests():
+    one = [Cause("zero", (k,), np.eye(3)[:, [k]], np.array([1e-3]), "m") for k in range(3)]
+    level = together(flat(), one)
+    # of three independent tests: 1 - (1 - p)^3
+    for p in (0.01, 0.1, 0.5):
+        assert level.adjusted(p) == pytest.approx(1 - (1 - p) ** 3, rel=0.15)
+        assert level.single(1 - (1 - p) ** 3) == pytest.approx(p, rel=0.15)
+    assert level.adjusted(1e-9) == pytest.approx(3e-9)
+    same = together(flat(), [one[0]] * 3)  # one test made three times is one test
+    assert same.adjusted(0.1) == pytest.approx(0.1, rel=0.15)
+
+
+def test_likelihood_prefers_the_usual_size():
+    """Two causes that explain the same, one by 0.8 tolerances and one by 8."""
+    found = replace(flat(), w=np.array([25.0, 0, 0, 0, 0, 0]))
+    near = Cause("zero", (0,), np.eye(3)[:, [0]] * 3e-2, np.array([1e-3]), "m")
+    far = Cause("zero", (1,), np.eye(3)[:, [0]] * 3e-3, np.array([1e-3]), "m")
+    assert chi_square(found, near).chi2 == chi_square(found, far).chi2 == 625.0
+    assert change(found, far).value[0] == pytest.approx(10 * change(found, near).value[0])
+    assert likelihood(found, near) > likelihood(found, far) + 5
+    wide = joined([near, Cause("zero", (2,), np.eye(3)[:, [2]], np.array([1e-3]), "m")])
+    assert likelihood(found, wide) < likelihood(found, near)
+
+
+def test_nothing_explains_noise():
+    causes = [Cause("zero", (k,), np.eye(3)[:, [k]], np.array([1e-3]), "m") for k in range(3)]
+    assert explained(replace(flat(), w=np.full(6, 1.0)), causes, ALPHA) == ()
+
+
+# machines
+
+
+def test_parts_of_a_leg():
+    machine = load_mechanism("h4")
+    known = {part_of(name) for name in machine.parameters.names}
+    assert known == {"zero", "rod", "arm", "base", "platform", "hinge"}
+    hexapod = load_mechanism("gough-stewart")
+    assert part_of("legs[1].tubes[1].radius") is None
+    assert arms(hexapod) == tuple((k,) for k in range(6))
+    pairs = {c.legs for c in single_causes(hexapod) if len(c.legs) == 2}
+    assert len(pairs) == 6  # three mounts on the base, three on the platform
+
+
+def test_rods_on_one_motor_are_one_arm():
+    machine = load_mechanism("h4-rods")
+    assert arms(machine) == ((0, 1), (2, 3), (4, 5), (6, 7))
+    assert all(zero.columns.shape[1] == 1 for zero in zeros(machine))
+
+
+def test_passive_legs_have_no_zero():
+    machine = load_mechanism("6-spu-passive")
+    own = zeros(machine)
+    passive = [k for k, zero in enumerate(own) if zero is None]
+    assert passive == np.flatnonzero(machine.layout.actuated < 0).tolist()
+
+
+def test_an_h4_by_its_board(h4):
+    true, estimate, rng = h4
+    poses = papers_poses()[rng.permutation(81)]
+    same = judge(by_board(estimate, true, poses[:5], rng), estimate.machine, ALPHA)
+    verdict = verdict_of(same, looked(5))
+    assert verdict.usable, verdict
+    assert "motor's zero by 0." in verdict.headline
+    assert "°" in verdict.headline
+    now = moved(true, leg2_base__angle=0.02)
+    judged = judge(by_board(estimate, now, poses[5:10], rng), estimate.machine, ALPHA)
+    first = judged.findings[0].suspect
+    assert (first.cause.part, first.cause.legs) == ("zero", (1,))
+    assert abs(first.change.value[0] - 0.02) < 4 * first.change.sigma[0]
+
+
+def test_too_few_poses_of_a_board(h4):
+    """One pose of a board tells no more than where camera and board are."""
+    true, estimate, rng = h4
+    judged = judge(by_board(estimate, true, papers_poses()[:1], rng), estimate.machine, ALPHA)
+    verdict = verdict_of(judged, looked(1))
+    assert not verdict.usable
+    assert "too few to tell" in verdict.headline
+    assert "Of legs 1 to 4 these data tell nothing." in verdict.reasons
+    document = judgement_document(judged, estimate.machine)
+    assert not document["changed"]
+    assert len(document["legs"]) == 4
+
+
+def test_a_planar_machine_by_its_board():
+    rng = np.random.default_rng(12)
+    drawing = load_mechanism("3-rpr")
+    true = true_machine(drawing, 1.0, rng)
+    truth = draw_truth(true, (CAMERA,), Settings(stations=1, configurations=60, tolerance=0.0), 2)
+    poses = truth.T_base_platform
+    case = measured(true, poses[:50], rng)
+    start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
+    estimate = bundle(drawing, case.measurements, start)
+    same = judge(by_board(estimate, true, poses[50:58], rng), estimate.machine, ALPHA)
+    assert not same.changed
+    now = moved(true, leg2_length__offset=3e-3)
+    judged = judge(by_board(estimate, now, poses[50:58], rng), estimate.machine, ALPHA)
+    first = judged.findings[0]
+    alike = {(s.cause.part, s.cause.legs) for s in (first.suspect, *first.others)}
+    assert ("zero", (1,)) in alike
+
+
+def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
+    """They are said to be too few, with what would have been found."""
+    rng = np.random.default_rng(5)
+    drawing = load_mechanism("gough-stewart")
+    true = true_machine(drawing, 1.0, rng)
+    settings = Settings(stations=1, configurations=43, tolerance=0.0)
+    poses = draw_truth(true, (CAMERA,), settings, 3).T_base_platform
+    case = measured(true, poses[:40], rng)
+    start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
+    estimate = bundle(drawing, case.measurements, start)
+    judged = judge(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
+    verdict = verdict_of(judged, looked(3))
+    assert not verdict.usable
+    assert not judged.changed
+    assert "which is more than the drawing's tolerance" in verdict.reasons[0]
+
+
+def test_poses_that_cannot_be_found(watched, monkeypatch):
+    rng = np.random.default_rng(1)
+    data = watched.seen(watched.true, rng)
+    start = start_state(watched.true, data, watched.pool.T_camera_base)
+    module = "pkmcal.watching.evidence.minimise"
+    monkeypatch.setattr(module, lambda *_, **__: Solution(None, None, None, (Stop.STALLED,)))
+    with pytest.raises(ResultError, match="poses were not found with the calibrated machine"):
+        evidence(watched.true, watched.covariance, data, start, Trust.full(data))
+
+
+def test_a_family_that_sees_nothing():
+    machine = load_mechanism("gough-stewart")
+    blind = Evidence(np.zeros(3), np.zeros((3, 54)), np.zeros(1), None)
+    assert family(blind, machine).chance == 1.0
+    judged = judge(blind, machine, ALPHA)
+    assert not judged.changed
+    verdict = verdict_of(judged, looked(1))
+    assert not verdict.usable
+    assert "Of legs 1 to 6 these data tell nothing." in verdict.reasons
+
+
+# studies
+
+
+@pytest.mark.slow
+def test_false_alarms_and_power_of_many_sessions(watched, capsys):
+    """Of 1000 unchanged machines, alpha are flagged; changes by 0.1 to 1 mm ever more often."""
+    lines: list[str] = []
+    for off, count in ((0.0, 1000), (1e-4, 200), (2e-4, 200), (5e-4, 200), (1e-3, 200)):
+        now = moved(watched.true, leg3_length__offset=off)
+        least = np.array(
+            [
+                family(watched.evidence(now, np.random.default_rng([k, 77])), watched.true).chance
+                for k in range(count)
+            ]
+        )
+        shares = {alpha: float(np.mean(least < alpha)) for alpha in (0.01, 0.05, 0.1)}
+        lines.append(f"{off * 1e3:.1f} mm: {shares}")
+        if off == 0.0:
+            for alpha, share in shares.items():
+                assert abs(share - alpha) < 4 * np.sqrt(alpha * (1 - alpha) / count)
+    with capsys.disabled():
+        sys.stdout.write("\n" + "\n".join(lines) + "\n")
+    assert shares[0.01] > 0.95

@@ -1,0 +1,268 @@
+"""``pkmcal watch`` from photographs: verdicts, files, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.calibration import calibrate
+from pkmcal.cameras import load_camera
+from pkmcal.files import csv_text, read_csv
+from pkmcal.geometry.cylinders import tangent_basis
+from pkmcal.identify.bundle import start_state
+from pkmcal.identify.problem import Measurements
+from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.observe.edges import Observation
+from pkmcal.results import load, save
+from pkmcal.session import load_session
+from pkmcal.simulate import Settings, load_truth, simulate_session
+from pkmcal.simulate.demo import demo_camera
+from pkmcal.simulate.edges import EdgeNoise, simulate_edges
+from pkmcal.simulate.truth import draw_truth
+from pkmcal.validate.independence import digests
+from pkmcal.watch import watch
+from pkmcal.watching.causes import magnification
+from pkmcal.watching.chances import change
+from pkmcal.watching.evidence import Trust, evidence
+from pkmcal.watching.lens import magnified
+
+
+def photographed(folder, drawing, machine, camera, seed, **settings):
+    """New photographs of a machine, beside its drawing: truth reaches nothing."""
+    wanted = {"stations": 1, "configurations": 4, "tolerance": 0.0, **settings}
+    simulate_session(folder, machine, camera, Settings(**wanted), seed=seed)
+    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
+    (folder / "truth.json").unlink()
+    return folder
+
+
+def changed(machine, name, by):
+    values = machine.values.copy()
+    values[machine.parameters.index(name)] += by
+    return machine.with_values(values)
+
+
+@pytest.fixture(scope="module")
+def later(demo, tmp_path_factory):
+    """The demonstration's machine photographed again, as it was and with leg 3's zero off.
+
+    Photographs do not show a zero: with 2.5 mm more offset the same poses have readings that are as
+    much less.
+    """
+    folder = tmp_path_factory.mktemp("watch")
+    drawing = load_mechanism(demo.session / "mechanism.yaml")
+    true = load_truth(demo.session, drawing).machine
+    camera = load_camera(next((demo.session / "cameras").iterdir()))
+    same = photographed(folder / "same", drawing, true, camera, 33)
+    off = shutil.copytree(same, folder / "off")
+    table = read_csv(same / "joints.csv")
+    readings = table.values - 2.5e-3 * (np.arange(6) == 2)
+    (off / "joints.csv").write_text(csv_text(table.columns, table.names, readings))
+    return SimpleNamespace(folder=folder, same=same, off=off)
+
+
+@pytest.fixture
+def again(later, tmp_path):
+    """A copy of the unchanged session, to spoil."""
+    return shutil.copytree(later.same, tmp_path / "again")
+
+
+@pytest.fixture
+def calibration(demo, tmp_path):
+    """A copy of the calibration, to spoil."""
+    return shutil.copytree(demo.calibration, tmp_path / "calibration")
+
+
+def spoiled(folder, what):
+    """Change a calibration's document."""
+    path = folder / "calibration.json"
+    document = json.loads(path.read_text())
+    what(document)
+    path.write_text(json.dumps(document))
+
+
+def test_an_unchanged_machine(demo, later):
+    done = run("watch", demo.calibration, later.same, "-o", later.folder / "w", "--json")
+    assert done.err == ""
+    assert done.code == done.json["exit_code"] == 0
+    assert done.json["verdict"]["headline"].startswith(
+        "Still as calibrated, as far as 4 new configurations can tell: a change of any leg's length"
+    )
+    assert not done.json["changed"]
+    assert [leg["legs"] for leg in done.json["legs"]] == [[k] for k in range(1, 7)]
+    for leg in done.json["legs"]:
+        assert 3 <= leg["dof"] <= 7
+        assert leg["adjusted"] >= done.json["alpha"]
+        assert 1e-4 < leg["detectable"]["zero"] < 2e-3
+        assert leg["zero"]["unit"] == "m"
+    assert done.json["known_configurations"] == []
+    assert len(done.json["configurations"]) == 4
+    page = (later.folder / "w" / "watch.html").read_text()
+    assert done.json["verdict"]["headline"] in page.replace("&#39;", "'")
+    assert "Still as calibrated" in page
+    assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org", "")
+    kept = json.loads((later.folder / "w" / "watch.json").read_text())
+    assert kept["pkmcal_watch"] == 1
+    assert kept["legs"] == done.json["legs"]
+
+
+def test_a_changed_machine_in_words(demo, later):
+    done = run("watch", demo.calibration, later.off)
+    assert done.code == 1
+    text = " ".join(done.out.split())
+    assert "The machine is not as calibrated: leg 3 has changed" in text
+    assert "zero of leg 3's reading by +2." in text
+    assert "found from" in text
+    page = (later.off / "watch" / "watch.html").read_text()
+    assert "What explains it" in page
+    assert "Changed" in page
+
+
+def test_configurations_that_the_calibration_used_are_left_out(demo, later, calibration):
+    """Two of four are known by the content of their photographs."""
+    session = load_session(later.same)
+    known = list(session.configurations[:2])
+
+    def listed(document):
+        for entry, name in zip(document["configurations"], known, strict=False):
+            entry["photographs"] = digests(session)[name]
+
+    spoiled(calibration, listed)
+    found = watch(calibration, session)
+    assert found.document()["known_configurations"] == known
+    assert found.document()["configurations"] == list(session.configurations[2:])
+    assert f"made from configuration {known[0]} and {known[1]}" in found.verdict.warnings[0]
+
+
+def test_the_calibrations_own_session(demo, session):
+    done = run("watch", demo.calibration, session)
+    assert done.code == 2
+    assert "there is nothing new in this session" in done.err
+    assert "Take three to five new photographs" in done.err
+
+
+def test_a_calibration_that_was_refused(again, calibration):
+    def refused(document):
+        document["verdict"] |= {"usable": False, "reasons": ["The lens is not this camera's."]}
+
+    spoiled(calibration, refused)
+    done = run("watch", calibration, again)
+    assert done.code == 2
+    assert "this calibration should not be used" in done.err
+    assert "The lens is not this camera's" in done.err
+
+
+def test_another_machine(demo, again):
+    other = load_mechanism(again / "mechanism.yaml")
+    far = changed(other, "legs[3].base.center.x", 0.05)
+    (again / "mechanism.yaml").write_text(mechanism_text(far))
+    done = run("watch", demo.calibration, again)
+    assert done.code == 2
+    assert "the calibration is of another machine than the session" in done.err
+
+
+def test_other_joints(demo, again):
+    text = (again / "joints.csv").read_text()
+    (again / "joints.csv").write_text(text.replace("leg", "axis"))
+    done = run("watch", demo.calibration, again)
+    assert done.code == 2
+    assert "have no joint in common" in done.err
+
+
+@pytest.mark.parametrize("alpha", ["0", "0.5", "nan"])
+def test_a_share_of_false_alarms_that_makes_no_sense(demo, again, alpha):
+    done = run("watch", demo.calibration, again, "--alpha", alpha)
+    assert done.code == 2
+    assert "this share of false alarms is not possible" in done.err
+    assert "0.2" in done.err
+
+
+def test_an_output_folder_with_other_things(demo, again):
+    done = run("watch", demo.calibration, again, "-o", again)
+    assert done.code == 2
+    assert "the output folder holds something other than what watch writes" in done.err
+
+
+def test_no_calibration_there(again):
+    done = run("watch", again, again)
+    assert done.code == 2
+    assert "there is no calibration here" in done.err
+
+
+# the lens
+
+
+def seen_through(camera, wrong, edges):
+    """Edges as a camera shows them that another is taken for, with the pixels on them."""
+    # the tangent plane at a normal is the plane of the edge's rays
+    one, other = edges.basis[..., 0], edges.basis[..., 1]
+    first = (np.abs(one[:, 2]) > np.abs(other[:, 2]))[:, None]
+    ahead, aside = np.where(first, one, other), np.where(first, other, one)
+    ahead = ahead * np.sign(ahead[:, 2:])
+    rays = ahead[:, None] + np.array([-0.1, 0.0, 0.1])[:, None] * aside[:, None]
+    pixels = camera.project(rays)
+    told = wrong.ray(pixels)
+    normal = np.cross(told[:, 0], told[:, 2])
+    normal = normal / np.linalg.norm(normal, axis=1)[:, None]
+    normal = normal * np.sign(np.sum(normal * edges.normal, axis=1))[:, None]
+    shown = replace(edges, normal=normal, basis=tangent_basis(normal, told[:, 1]))
+    at = np.repeat(np.arange(len(edges)), 3)
+    none = np.zeros((1, 4, 4))
+    return Observation(shown, (), pixels.reshape(-1, 2), at, none)
+
+
+def test_a_cameras_magnification_is_told():
+    """Photographs by a lens that is 0.5 % longer than its file says: the change comes back."""
+    drawing, camera, longer = load_mechanism("gough-stewart"), demo_camera(), 5e-3
+    focal = camera.parameters.copy()
+    focal[:2] *= 1 + longer
+    real = replace(camera, parameters=focal)
+    settings = Settings(stations=2, configurations=6, tolerance=0.0)
+    truth = draw_truth(drawing, (camera,) * 2, settings, 4)
+    edges, readings = simulate_edges(
+        truth.machine, truth.T_camera_base, camera, truth.T_base_platform, EdgeNoise(),
+        np.random.default_rng(4), photographs=truth.photographs,
+    )  # fmt: skip
+    cause, got = magnification(drawing, 0, 1), []
+    for through in (camera, real):
+        observed = seen_through(through, camera, edges)
+        data = Measurements(observed.edges, readings, 3e-6, 2, np.zeros(2, dtype=int))
+        start = start_state(drawing, data, truth.T_camera_base)
+        wide = magnified(data, observed, (camera, camera))
+        exact = np.diag(np.full(len(drawing.parameters), 1e-12))
+        found = evidence(drawing, exact, data, start, Trust.full(data), wide)
+        assert found.by.shape[1] == len(drawing.parameters) + 1
+        got.append(change(found, cause))
+    assert got[1].sigma[0] < longer / 4
+    assert got[1].value[0] - got[0].value[0] == pytest.approx(longer, rel=0.05)
+
+
+# photographs as large as a user's
+
+
+@pytest.mark.slow
+def test_half_a_millimetre_in_five_photographs(tmp_path):
+    """Rendered at 800x600: five machines that did not change, and a leg's zero off by 0.5 mm."""
+    drawing, camera = load_mechanism("gough-stewart"), demo_camera()
+    settings = Settings(stations=3, configurations=8)
+    truth = simulate_session(tmp_path / "before", drawing, camera, settings, seed=11)
+    save(calibrate(tmp_path / "before"), tmp_path / "calibration")
+    kept = load(tmp_path / "calibration")
+    for seed in range(5):
+        folder = tmp_path / f"same{seed}"
+        photographed(folder, drawing, truth.machine, camera, 100 + seed, configurations=5)
+        assert watch(kept, folder).verdict.usable
+    off = changed(truth.machine, "legs[3].length.offset", 0.5e-3)
+    folder = photographed(tmp_path / "off", drawing, off, camera, 303, stations=2, configurations=5)
+    found = watch(kept, folder)
+    first = found.judged.findings[0].suspect
+    assert not found.verdict.usable
+    assert "leg 3 has changed" in found.verdict.headline
+    assert (first.cause.part, first.cause.legs) == ("zero", (2,))
+    assert abs(first.change.value[0] - 0.5e-3) < 3 * first.change.sigma[0]
