@@ -23,7 +23,10 @@ from pkmcal.mechanisms import load_mechanism
 from pkmcal.results import load
 from pkmcal.starter import TO_FILL, template_files
 
-COMMANDS = ("demo", "new", "check", "camera", "calibrate", "validate", "simulate", "reproduce")
+COMMANDS = (
+    *("demo", "new", "check", "camera", "calibrate", "validate", "servo", "export", "watch"),
+    *("simulate", "reproduce"),
+)
 
 
 def python(*words, **options):

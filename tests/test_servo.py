@@ -12,12 +12,11 @@ from pkmcal.control.analysis import equilibria, matrix_at, of_legs, subsets, vis
 from pkmcal.control.ends import End
 from pkmcal.control.estimates import Uncertainty, estimates
 from pkmcal.control.image import Eye, responses
-from pkmcal.control.laws import task_of
+from pkmcal.control.laws import limited, task_of
 from pkmcal.control.seen import legs_at, seen_machine, true_edges
 from pkmcal.control.simulation import (
     Loop,
     assembly_sign,
-    limited,
     outside,
     platform_joints,
     simulate,

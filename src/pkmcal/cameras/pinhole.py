@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, final
 
 import numpy as np
@@ -16,12 +17,11 @@ _TABLE = 513
 """Radii of the table that Newton starts from: its steps are a thousandth of the picture."""
 
 
-def distort(xy: Array, k: Array) -> tuple[Array, Array, Array]:
+def distort(xy: Array, k: Array) -> tuple[Array, Array]:
     """OpenCV's radial and tangential distortion of normalised image points.
 
     xy : (..., 2); k : (5,) k1 k2 p1 p2 k3.
-    Returns the distorted points (..., 2), their derivatives by xy (..., 2, 2) and by k
-    (..., 2, 5).
+    Returns the distorted points (..., 2) and their derivatives by xy (..., 2, 2).
     """
     x, y = xy[..., 0], xy[..., 1]
     k1, k2, p1, p2, k3 = k
@@ -40,6 +40,13 @@ def distort(xy: Array, k: Array) -> tuple[Array, Array, Array]:
     by_xy[..., 0, 1] = x * y * slope + 2 * p1 * x + 2 * p2 * y
     by_xy[..., 1, 0] = x * y * slope + 2 * p1 * x + 2 * p2 * y
     by_xy[..., 1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return out, by_xy
+
+
+def distort_by_coefficients(xy: Array) -> Array:
+    """Derivatives (..., 2, 5) of :func:`distort` by k1 k2 p1 p2 k3, which it is linear in."""
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
     by_k = np.empty((*xy.shape, 5))
     for row, (own, other) in enumerate(((x, y), (y, x))):
         by_k[..., row, 0] = own * r2
@@ -47,7 +54,7 @@ def distort(xy: Array, k: Array) -> tuple[Array, Array, Array]:
         by_k[..., row, 2 + row] = 2 * own * other
         by_k[..., row, 3 - row] = r2 + 2 * own * own
         by_k[..., row, 4] = own * r2 * r2 * r2
-    return out, by_xy, by_k
+    return by_k
 
 
 def undistort(target: Array, k: Array) -> Array:
@@ -57,7 +64,7 @@ def undistort(target: Array, k: Array) -> Array:
     xy = _undistort_radially(target, k)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for _ in range(_NEWTON_STEPS):
-            value, slope, _ = distort(xy, k)
+            value, slope = distort(xy, k)
             error = value - target
             det = slope[..., 0, 0] * slope[..., 1, 1] - slope[..., 0, 1] * slope[..., 1, 0]
             step = np.stack(
@@ -70,7 +77,7 @@ def undistort(target: Array, k: Array) -> Array:
             xy = xy - step / det[..., None]
             if np.nanmax(np.abs(error), initial=0.0) < 1e-14:
                 break
-        value, slope, _ = distort(xy, k)
+        value, slope = distort(xy, k)
         good = (np.max(np.abs(value - target), axis=-1) < 1e-11) & unfolded(xy, slope, k)
     return np.where(good[..., None], xy, np.nan)
 
@@ -108,7 +115,11 @@ def _radial(r2: Any, k: Array) -> Any:
 
 def _fold(k: Array) -> float:
     """Square of the radius where the radial polynomial stops growing; inf where it never does."""
-    k1, k2, k3 = k[0], k[1], k[4]
+    return _radial_fold(float(k[0]), float(k[1]), float(k[4]))
+
+
+@lru_cache(maxsize=64)  # a camera asks with every projection
+def _radial_fold(k1: float, k2: float, k3: float) -> float:
     if k1 >= 0 and k2 >= 0 and k3 >= 0:
         return np.inf
     # first zero of d(r radial)/dr = 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 with s = r^2
@@ -137,13 +148,13 @@ class Pinhole(Camera):
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold."""
-        _, good, distorted, _, _ = self._imaged(points)
+        _, good, distorted, _ = self._imaged(points)
         focal, center = self.parameters[:2], self.parameters[2:4]
         return np.where(good[..., None], focal * distorted + center, np.nan)
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
-        xy, good, distorted, by_xy, by_k = self._imaged(points)
+        xy, good, distorted, by_xy = self._imaged(points)
         focal = self.parameters[:2, None]
         z = np.where(good, points[..., 2], 1.0)
         dxy = np.zeros((*points.shape[:-1], 2, 3))
@@ -152,7 +163,7 @@ class Pinhole(Camera):
         by_parameters = np.zeros((*points.shape[:-1], 2, 9))
         by_parameters[..., 0, 0], by_parameters[..., 1, 1] = distorted[..., 0], distorted[..., 1]
         by_parameters[..., 0, 2] = by_parameters[..., 1, 3] = 1.0
-        by_parameters[..., 4:] = focal * by_k
+        by_parameters[..., 4:] = focal * distort_by_coefficients(xy)
         bad = ~good[..., None, None]
         return (
             np.where(bad, np.nan, focal * (by_xy @ dxy)),
@@ -169,14 +180,14 @@ class Pinhole(Camera):
         """In front of the camera, and before the lens polynomial folds back; (...)."""
         return self._imaged(points)[1]
 
-    def _imaged(self, points: Array) -> tuple[Array, Booleans, Array, Array, Array]:
+    def _imaged(self, points: Array) -> tuple[Array, Booleans, Array, Array]:
         """x/z and y/z (..., 2), where they have an image (...), and :func:`distort` of them."""
         z = points[..., 2]
         front = z > 1e-9
         xy = points[..., :2] / np.where(front, z, 1.0)[..., None]
-        distorted, by_xy, by_k = distort(xy, self.parameters[4:])
+        distorted, by_xy = distort(xy, self.parameters[4:])
         good = front & unfolded(xy, by_xy, self.parameters[4:])
-        return xy, good, distorted, by_xy, by_k
+        return xy, good, distorted, by_xy
 
     @classmethod
     def from_document(cls, document: PinholeSchema) -> Pinhole:

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
-from pkmcal.cameras.pinhole import distort, undistort, unfolded
+from pkmcal.cameras.pinhole import distort, distort_by_coefficients, undistort, unfolded
 
 _LEAST = 1e-9
 """Cosine by which a ray must lie inside the field's border, where the image runs to infinity."""
@@ -53,7 +53,7 @@ class Unified(Camera):
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
-        (distance, depth), xy, distorted, good, by_xy, by_k = self._imaged(points)
+        (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
         focal = self.parameters[:2, None]
         # d(x / w) = (dx - (x / w) dw) / w with w = z + xi r and dw = (xi X / r + e_z) . dX
         slope = self.xi * points / distance[..., None]
@@ -67,7 +67,7 @@ class Unified(Camera):
         by_parameters[..., 0, 2] = by_parameters[..., 1, 3] = 1.0
         by_xi = -xy * (distance / depth)[..., None]
         by_parameters[..., 4] = (focal * (by_xy @ by_xi[..., None]))[..., 0]
-        by_parameters[..., 5:] = focal * by_k[..., :4]
+        by_parameters[..., 5:] = focal * distort_by_coefficients(xy)[..., :4]
         bad = ~good[..., None, None]
         return (
             np.where(bad, np.nan, focal * (by_xy @ dxy)),
@@ -93,11 +93,9 @@ class Unified(Camera):
         """Distortion in the pinhole's order, without a third radial term."""
         return np.append(self.parameters[5:], 0.0)
 
-    def _imaged(
-        self, points: Array
-    ) -> tuple[tuple[Array, Array], Array, Array, Booleans, Array, Array]:
+    def _imaged(self, points: Array) -> tuple[tuple[Array, Array], Array, Array, Booleans, Array]:
         """Distance r and depth z + xi r (...); x and y over the depth (..., 2); :func:`distort`
-        of these; where they have an image (...); the distortion's two derivatives.
+        of these; where they have an image (...); the distortion's derivative by these.
         """
         distance = np.sqrt(np.sum(points * points, axis=-1))
         there = distance > 0
@@ -108,9 +106,9 @@ class Unified(Camera):
         inside = there & (points[..., 2] > (edge + _LEAST) * distance)
         depth = np.where(inside, depth, 1.0)
         xy = points[..., :2] / depth[..., None]
-        distorted, by_xy, by_k = distort(xy, self._five())
+        distorted, by_xy = distort(xy, self._five())
         good = inside & unfolded(xy, by_xy, self._five())
-        return (distance, depth), xy, distorted, good, by_xy, by_k
+        return (distance, depth), xy, distorted, good, by_xy
 
     @classmethod
     def from_document(cls, document: UnifiedSchema) -> Unified:

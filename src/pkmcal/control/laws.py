@@ -316,3 +316,12 @@ def joint_velocities(
         goal_legs = legs_from_image(seen, directions_of(goal), goal_readings, near)
     task = task_of(law, seen, measured, goal, legs, goal_legs, at)
     return -gain * (task.readings @ solution(task)[..., None])[..., 0]
+
+
+def limited(speeds: Array, fastest: Array | float | None) -> Array:
+    """All drives' rates (..., m) slowed together until none is too fast: the direction stays."""
+    if fastest is None:
+        return speeds
+    with np.errstate(invalid="ignore"):
+        excess = np.max(np.abs(speeds) / fastest, axis=-1, keepdims=True, initial=1.0)
+    return speeds / excess

@@ -19,7 +19,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.control.laws import BLIND, Task, law_named, solution, task_of
+from pkmcal.control.laws import BLIND, Task, law_named, limited, solution, task_of
 from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image, seen_machine
 from pkmcal.control.track import Sight, check_image, start_state, track
 from pkmcal.control.track_fit import LAG, LegLines, weighted
@@ -37,7 +37,6 @@ from pkmcal.control.track_status import (
     Step,
     leaving,
     leg_list,
-    limited,
     missing_clauses,
     motor_name,
     range_sentence,
@@ -232,7 +231,8 @@ class VisualServo:
         self._started = True
         off = task.readings @ solution(task)
         wanted = -self.gain * off
-        velocities, slowed = limited(wanted, self.rate_limits)
+        velocities = limited(wanted, self.rate_limits)
+        slowed = bool(np.any(velocities != wanted))
         leaves, outside = leaving(self._ranges, sample.readings, velocities, self.period)
         if leaves.any():
             why = range_sentence(self.machine, self._ranges, sample.readings, leaves)

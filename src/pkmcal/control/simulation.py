@@ -15,7 +15,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.control.ends import End
 from pkmcal.control.image import Eye
-from pkmcal.control.laws import Where, joint_velocities, law_named
+from pkmcal.control.laws import Where, joint_velocities, law_named, limited
 from pkmcal.control.seen import SeenMachine
 from pkmcal.control.steady import loop_factor, one_image
 from pkmcal.geometry.rigid import dot
@@ -129,15 +129,6 @@ def simulate(
         if k % 16 == 0:
             progress(k / loop.samples)
     return record.runs(now, goals, loop, floor)
-
-
-def limited(speeds: Array, fastest: Array | None) -> Array:
-    """All drives' rates (..., m) slowed together until none is too fast: the direction stays."""
-    if fastest is None:
-        return speeds
-    with np.errstate(invalid="ignore"):
-        excess = np.max(np.abs(speeds) / fastest, axis=-1, keepdims=True, initial=1.0)
-    return speeds / excess
 
 
 @dataclass(frozen=True)

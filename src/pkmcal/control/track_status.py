@@ -116,14 +116,3 @@ def leaving(
         high = (after > ranges[:, 1]) & (velocities > 0)
         outside = (readings < ranges[:, 0]) | (readings > ranges[:, 1])
     return low | high, outside
-
-
-def limited(velocities: Array, limits: Array | None) -> tuple[Array, bool]:
-    """Velocities (m,) slowed down together until none is above its limit, so the way stays.
-
-    Also whether they were.
-    """
-    if limits is None:
-        return velocities, False
-    worst = float(np.max(np.abs(velocities) / limits, initial=0.0))
-    return (velocities / worst, True) if worst > 1 else (velocities, False)
