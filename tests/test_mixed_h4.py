@@ -1,10 +1,12 @@
-"""One camera that sees an H4's forearms and the board on its platform, in one estimate."""
+"""One camera that sees an H4's forearms and the board on its platform, in one estimate.
+
+Without photographs; with them in test_simulate_driven.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import yaml
 
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.bundle import bundle, start_state
@@ -12,7 +14,7 @@ from pkmcal.identify.problem import Measurements, Mount
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.poses import PoseSet
-from pkmcal.simulate import EdgeNoise, simulate_edges, true_machine
+from pkmcal.simulate import EdgeNoise, simulate_edges, true_machine, with_forearms
 from test_joint_machines import camera
 
 READING = 1e-5
@@ -20,14 +22,9 @@ POSE = np.array([3e-4] * 3 + [1e-4] * 3)
 
 
 @pytest.fixture(scope="module")
-def machine(tmp_path_factory):
+def machine():
     """The H4 with forearms that a camera can see."""
-    document = load_mechanism("h4").to_document()
-    for leg in document["legs"]:
-        leg["tubes"] = [{"radius": 0.008, "from": 0.03, "to": 0.45}]
-    path = tmp_path_factory.mktemp("h4") / "h4.yaml"
-    path.write_text(yaml.safe_dump(document))
-    return load_mechanism(path)
+    return with_forearms(load_mechanism("h4"))
 
 
 def estimates(machine, seed):

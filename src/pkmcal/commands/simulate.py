@@ -62,7 +62,7 @@ def simulate(
     """Simulate a session with photographs and known truth."""
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import load_mechanism
-    from pkmcal.simulate import Sensor, Settings, board_for, simulate_session
+    from pkmcal.simulate import Sensor, Settings, board_for, simulate_session, with_forearms
     from pkmcal.simulate.demo import camera_of_size
 
     if not 0 < joint_noise < 1:
@@ -71,7 +71,8 @@ def simulate(
             expected="more than 0 and less than 1, such as 3e-6",
         )  # fmt: skip
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
-    machine = load_mechanism(mechanism, label=None)
+    drawing = load_mechanism(mechanism, label=None)
+    machine = with_forearms(drawing)
     place = "platform" if on_platform else "base"
     settings = Settings(
         stations=stations,
@@ -96,16 +97,22 @@ def simulate(
         return 0
     out = console.out()
     places = "1 place" if stations == 1 else f"{stations} places"
-    console.print_points(
-        out,
-        [
+    points = [
+        (
+            console.MARKS["good"],
+            f"{count} photographs of {machine.name} from {places} in {folder}; the"
+            " truth is in its truth.json, which no calibration reads.",
+        )
+    ]
+    if machine is not drawing:
+        points.append(
             (
-                console.MARKS["good"],
-                f"{count} photographs of {machine.name} from {places} in {folder}; the"
-                " truth is in its truth.json, which no calibration reads.",
+                console.MARKS["note"],
+                f"The drawing of {machine.name} gives its rods no visible cylinders, so they are"
+                " drawn as such; see tubes in the session's mechanism.yaml.",
             )
-        ],
-    )
+        )
+    console.print_points(out, points)
     out.print(f"\nNext: pkmcal calibrate {shlex.quote(str(folder))}", markup=False)
     return 0
 

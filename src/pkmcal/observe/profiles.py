@@ -38,6 +38,9 @@ BLURS = np.arange(0.45, 1.5, 0.1)
 """Blurs (px, standard deviation, lens and pixel and interpolation together) that are tried."""
 ENOUGH_FOR_BLUR = 500
 """Profiles that tell the blur to a hundredth of a pixel; more only take time."""
+FEWEST_FOR_BLUR = 100
+"""Profiles without which no blur is told: where fewer are whole, as those of the one wide leg among
+slim ones, others tell it with them."""
 GREY_NOISE = 0.6
 """Least standard deviation (grey levels) believed of a profile's samples: 8-bit rounding and
 what the model leaves out; keeps a chance perfect fit from counting for everything."""
@@ -186,9 +189,11 @@ def estimate_blur(profiles: Profiles) -> float:
     """The blur (px) with which the model leaves least, over the profiles of one camera.
 
     Contrast differs by edge, so each profile's residual is taken relative to its best; the
-    median over profiles decides, so that half of them may be anything.
+    median over profiles decides, so that half of them may be anything. Those of which least is
+    cut off are looked at.
     """
-    whole = np.flatnonzero(profiles.cut == profiles.cut.min(initial=99))
+    few = min(FEWEST_FOR_BLUR, len(profiles.cut))
+    whole = np.flatnonzero(profiles.cut <= np.sort(profiles.cut)[few - 1]) if few else np.array([])
     if whole.size:
         profiles = profiles.select(whole[:: max(whole.size // ENOUGH_FOR_BLUR, 1)])
     costs = np.stack([residual_curves(profiles, b).min(axis=-1) for b in BLURS], axis=-1)

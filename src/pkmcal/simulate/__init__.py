@@ -1,12 +1,15 @@
 """Sessions with known truth: photographs, edges, joint readings; for tests, studies, demos.
 
-Modules from bottom to top: shapes, surfaces, casting, render and scene make one photograph;
-stations, configurations and truth draw what is in a session; session writes it; edges gives
-measurements without photographs; demo holds the demonstration's settings.
+Modules from bottom to top: shapes, surfaces, casting and render make one photograph; drives says
+where motors and guides are, driven_parts draws them, and scene the whole machine in its room;
+stations, configurations and truth draw what is in a session; session writes it; forearms gives
+cylinders to drawings without any; edges gives measurements without photographs; demo holds the
+demonstration's settings.
 """
 
 from pkmcal.simulate.board import board_for
 from pkmcal.simulate.edges import EdgeNoise, simulate_edges
+from pkmcal.simulate.forearms import with_forearms
 from pkmcal.simulate.render import Sensor
 from pkmcal.simulate.session import simulate_session
 from pkmcal.simulate.stations import StationPose
@@ -24,4 +27,5 @@ __all__ = [
     "simulate_edges",
     "simulate_session",
     "true_machine",
+    "with_forearms",
 ]

@@ -22,20 +22,24 @@ from pkmcal.observe.board_finders import dictionary, marker_bits
 from pkmcal.observe.boards import Board, board_from_document
 from pkmcal.session_schema import Body
 from pkmcal.simulate.casting import Part
+from pkmcal.simulate.drives import reaches
 from pkmcal.simulate.scene import Discs, Finish, discs_of, machine_parts
-from pkmcal.simulate.shapes import Box, Shape, turned
+from pkmcal.simulate.shapes import Box, Cylinder, Shape, turned
 from pkmcal.simulate.surfaces import Material, Pattern, SmoothNoise
 
 THICKNESS = 0.004
 """m."""
+HOLDER = 0.08
+"""Radius of the rod that holds a board on the platform, in the platform's radius."""
 BLACK = 0.06
 """Light that printed black sends back, as a share of white's."""
-SQUARES = (6, 5)
+SQUARES = {"base": (6, 5), "platform": (5, 4)}
 """Of the board made to measure: large squares are read from afar."""
 SIZE = 1.4
 """Diagonal of that board with its margin, in radii of the base."""
-ON_PLATFORM = 2.0
-"""Diagonal of a board on the platform with its margin, in radii of that."""
+ON_PLATFORM, IN_PICTURE = 2.0, 0.75
+"""Diagonal of a board on the platform with its margin, in radii of that; and at least, in radii of
+the space that the machine needs: cameras stand so far away that they see all of it."""
 LOOKED_AT = 6
 """Configurations at which the places for a board are tried."""
 SLANTED = 0.6
@@ -179,17 +183,35 @@ def board_part(board: Board, T_base_board: Array) -> Part:
     return Part(sheet, Material(0.75, Printed(sheet.print)))
 
 
+def holder_part(
+    board: Board, T_platform_board: Array, T_base_platform: Array, discs: Discs
+) -> Part:
+    """The rod that holds a board on the platform, from under its plate to the board's back."""
+    low, high = board.points.min(axis=0), board.points.max(axis=0)
+    back = (low + high) / 2 + np.array([0.0, 0.0, THICKNESS])
+    lift = discs.platform_side * discs.thickness * np.array([0.0, 0.0, 1.0])
+    start = apply(T_base_platform, discs.platform + lift)
+    end = apply(T_base_platform @ T_platform_board, back)
+    length = float(np.linalg.norm(end - start))
+    shape = Cylinder(start, (end - start) / length, HOLDER * discs.platform_radius, length)
+    return Part(shape, Material(0.05))
+
+
 def board_for(machine: Machine, on: Body = "base") -> Board:
-    """A ChArUco board in proportion to the machine, its diagonal SIZE radii of the base, or
-    ON_PLATFORM radii of the platform.
-    """
+    """A ChArUco board in proportion to the machine: SIZE, or ON_PLATFORM and IN_PICTURE."""
     discs = discs_of(machine)
-    diagonal = SIZE * discs.base_radius if on == "base" else ON_PLATFORM * discs.platform_radius
-    square = round(diagonal / float(np.hypot(SQUARES[0] + 1, SQUARES[1] + 1)), 3)
+    diagonal = SIZE * discs.base_radius
+    if on == "platform":
+        points = np.concatenate([ends.reshape(-1, 3) for ends in reaches(machine)])
+        centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        space = float(np.linalg.norm(points - centre, axis=1).max())
+        diagonal = max(ON_PLATFORM * discs.platform_radius, IN_PICTURE * space)
+    squares = SQUARES[on]
+    square = round(diagonal / float(np.hypot(squares[0] + 1, squares[1] + 1)), 3)
     return board_from_fields(
         {
             "type": "charuco",
-            "squares": list(SQUARES),
+            "squares": list(squares),
             "square": square,
             "marker": round(0.75 * square, 4),
             "dictionary": "DICT_4X4_50",
@@ -291,6 +313,8 @@ def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Arra
     low, high = board.points.min(axis=0), board.points.max(axis=0)
     reach = 0.6 * float(np.linalg.norm(high - low))
     up = np.array([0.0, 0.0, discs.platform_side])
+    # below a plate, the board would stand in its shadow
+    out_of = discs.platform_radius if discs.platform_side < 0 else 0.0
     out: list[Array] = []
     for way, lean in product(2 * np.pi * (np.arange(12) + rng.random()) / 12, (0.3, 0.8, 1.3)):
         side = np.array([np.cos(way), np.sin(way), 0.0])
@@ -299,7 +323,9 @@ def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Arra
         right = right / np.linalg.norm(right)
         rot = np.stack([right, cross(into, right), into], axis=-1)
         rot = rotation(rng.normal(0, 0.05, 3)) @ rot
-        centre = discs.platform + (discs.thickness + np.sin(lean) * reach + 0.01) * up
+        centre = (
+            discs.platform + (discs.thickness + np.sin(lean) * reach + 0.01) * up + out_of * side
+        )
         out.append(pose(rot, centre - rot @ ((low + high) / 2)))
     return out
 

@@ -10,12 +10,18 @@ from pkmcal.geometry.rigid import dot, perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import on_manifold, singularity
 from pkmcal.mechanisms.limbs import closure, limb_ends
-from pkmcal.simulate.stations import joints_at_home
+from pkmcal.simulate.drives import drives_of, reaches, side_bars
 
 FARTHEST_TILT = np.deg2rad(35)
 """More than universal joints of this kind allow."""
+FARTHEST_TURN = np.deg2rad(70)
+"""Of an articulated platform about z; at a right angle its side bars lie on each other."""
 LEAST_SINGULAR = 0.12
 """Smallest singular value of the scaled inverse Jacobian: a reading's error grows by eight."""
+GUIDE = 4.0
+"""What a guide and its carriage need on the side of the leg, in radii of the leg on it."""
+BESIDE = 0.9
+"""Cosine of the angle between two guides' backs above which they lie side by side."""
 _INSIDE = (0.03, 0.97)
 
 
@@ -58,7 +64,16 @@ def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     if jac.shape[-1] == jac.shape[-2]:
         good &= np.sign(np.linalg.det(jac)) == np.sign(np.linalg.det(home_jac))
     good &= T_base_platform[..., 2, 2] * np.sign(home[2, 2]) > np.cos(FARTHEST_TILT)
+    good &= unfolded(machine, T_base_platform)
     return good & _legs_apart(machine, T_base_platform, joints)
+
+
+def unfolded(machine: Machine, T_base_platform: Array) -> Booleans:
+    """(n,) True where the side bars of an articulated platform, if it is one, stand apart."""
+    if not side_bars(machine):
+        return np.ones(T_base_platform.shape[:-2], dtype=bool)
+    turn = np.arctan2(T_base_platform[..., 1, 0], T_base_platform[..., 0, 0])
+    return np.abs(turn) < FARTHEST_TURN
 
 
 def _candidates(
@@ -86,7 +101,7 @@ def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:
 
     Only those that constant rods and joints' axes allow.
     """
-    a, b = joints_at_home(machine)
+    a, b = (ends[0] for ends in reaches(machine))
     size = float(np.linalg.norm(np.concatenate([a, b]) - a.mean(axis=0), axis=1).max())
     scale = np.array([0.26, 0.26, 0.26, *np.full(3, 0.125 * size)])
     motion = machine.layout.motion
@@ -96,14 +111,25 @@ def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:
 
 
 def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
-    """(n,) True where no two legs come nearer than their tubes are thick."""
+    """(n,) True where no two legs come nearer than their tubes are thick, nor a leg to a guide of
+    another.
+    """
     ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
     along = np.linspace(0.06, 0.97, 24)[:, None]
     points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
     widths = np.array([r.max() if len(r) else 0.0 for r in machine.radii()])
+    drives = drives_of(machine)
     apart = np.ones(T_base_platform.shape[0], dtype=bool)
-    for i in range(machine.n_legs):
-        for j in range(i):
+    for i, j in np.ndindex(machine.n_legs, machine.n_legs):
+        if j < i:
             gap = points[:, i, :, None] - points[:, j, None, :]
             apart &= np.sqrt(dot(gap, gap).min(axis=(-1, -2))) > widths[i] + widths[j]
+        if j != i and drives.slider[j]:
+            start, axis = drives.ends[j, 0], drives.axis[j]
+            length = float((drives.ends[j, 1] - start) @ axis)
+            s = np.clip((points[:, i] - start) @ axis, min(0, length), max(0, length))
+            gap = points[:, i] - start - s[..., None] * axis
+            clear = np.sqrt(dot(gap, gap).min(axis=-1)) > widths[i] + GUIDE * widths[j]
+            # carriages side by side on one guide have their own legs beside it
+            apart &= clear | (dot(drives.away[i], drives.away[j]) > BESIDE)
     return apart

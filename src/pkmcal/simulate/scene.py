@@ -10,15 +10,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import limb_ends
 from pkmcal.simulate.casting import Part, Scene
+from pkmcal.simulate.driven_parts import (
+    beams,
+    crank_parts,
+    motor_radius,
+    nacelle_parts,
+    slider_parts,
+)
+from pkmcal.simulate.drives import Drives, drives_of, reaches, side_bars
 from pkmcal.simulate.shapes import Ball, Box, Cylinder, Wall
 from pkmcal.simulate.surfaces import (
     Checks,
     Clouds,
+    Finish,
     Lamp,
     Lighting,
     Material,
@@ -32,7 +41,7 @@ Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Discs:
-    """The two plates that carry the joints.
+    """The two plates that carry the joints, and what moves the legs' ends on the base.
 
     base, platform : (3,) centre of the face towards the joints; base frame, platform frame.
     base_radius, platform_radius : m. side : +1 where the platform stands above the base along
@@ -47,11 +56,25 @@ class Discs:
     side: float
     platform_side: float
     thickness: float
+    drives: Drives
 
 
 _POSTS = 3.5, 7.5
 """Heights of the posts on a planar machine's plates, platform and base, in radii of a joint. A
 plate over the legs would hide them; one close below them would show their shadows for edges."""
+_COLUMN = 0.12, 12.0
+"""Radius and length of what a hanging machine hangs on, in radii of its base; the room ends it."""
+_BED = 4.0
+"""Height of what guides stand on below the platform's lowest joints, in the platform's radius:
+a tool or a board has room under the platform."""
+_AROUND = {False: (0.26, 0.13), True: (0.42, 0.28)}
+_DIRECT = 0.7
+"""Light from above and below, and the share of the lamps' that is left where it is soft, round
+machines with thin rods: in hard light these end, for a camera, where their lit side does."""
+_ASIDE = 1.2
+"""rad; how far a lamp that lights a board stands to either side of the cameras, at most."""
+_FLANGE = 0.3
+"""Radius of an articulated platform's tool flange, in that of a rigid one's plate."""
 
 
 def discs_of(machine: Machine) -> Discs:
@@ -63,45 +86,41 @@ def discs_of(machine: Machine) -> Discs:
     a, b = np.array(ends.a), np.array(ends.b)
     rise = float(apply(machine.home(), b)[:, 2].mean() - a[:, 2].mean())
     side = -1.0 if rise < -1e-3 else 1.0
-    ball = float(_ball_radii(machine).max())
+    balls, drives = _ball_radii(machine), drives_of(machine)
+    ball = float(balls.max())
+    held, room = _held(machine, drives, balls[:, 0])
     width_a, width_b = (
-        float(np.linalg.norm(p[:, :2] - p[:, :2].mean(axis=0), axis=1).max()) for p in (a, b)
+        float(np.linalg.norm(p[..., :2] - p[..., :2].mean(axis=0), axis=1).max())
+        for p in (held[:, :2], b)
     )
-    base, platform = a.mean(axis=0), b.mean(axis=0)
+    base, platform = held.mean(axis=0), b.mean(axis=0)
     planar = machine.document.motion == "planar"
+    near, far = (p[0, :, 2].mean() for p in reaches(machine))
     lift, drop = _POSTS if planar else (2.2, 2.2)
-    over = -side if planar else side
-    base[2] = (side * a[:, 2]).min() * side - side * drop * ball
+    over = -side if planar else -1.0 if far - near < -1e-3 else 1.0
+    drop = max(drop * ball, room, _BED * width_b if drives.upright.any() else 0.0)
+    base[2] = (side * held[:, 2]).min() * side - side * drop
     platform[2] = (over * b[:, 2]).max() * over + over * lift * ball
     thickness = max(0.012, 0.8 * ball)
-    return Discs(base, platform, width_a + 3.5 * ball, width_b + 2.0 * ball, side, over, thickness)
+    return Discs(
+        base, platform, width_a + max(3.5 * ball, room), width_b + 2.0 * ball, side, over,
+        thickness, drives,
+    )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Finish:
-    """Materials of the machine's parts; tubes from the base end to the platform end."""
+def _held(machine: Machine, drives: Drives, balls: Array) -> tuple[Array, float]:
+    """Points (n, 3) beyond which the base plate lies, and by how much at least, m.
 
-    paint: Material
-    steel: Material
-    joint: Material
-    base: Material
-    platform: Material
-
-    @classmethod
-    def from_noise(cls, noise: SmoothNoise, flat: bool = False) -> Finish:
-        """White paint, turned steel, blackened joints, a stained base, a milled platform.
-
-        flat : the legs lie open to the lamps above, and white ones would be overexposed.
-        """
-        return cls(
-            paint=Material(
-                0.42 if flat else 0.8, Clouds(noise, 0.012, 0.03), gloss=0.3, sharpness=40.0
-            ),
-            steel=Material(0.38, Clouds(noise, 0.004, 0.05), gloss=0.45, brushed=True, mirror=0.3),
-            joint=Material(0.035, gloss=0.45, sharpness=60.0, mirror=0.06),
-            base=Material(0.16, Clouds(noise, 0.015, 0.25), gloss=0.05, sharpness=12.0),
-            platform=Material(0.27, Clouds(noise, 0.02, 0.08), gloss=0.12, sharpness=10.0),
-        )
+    Of joints and cranks where they are; of guides all that their carriages and the platform reach.
+    """
+    if drives.slider.any():
+        a, b = reaches(machine)
+        reached = (a, b) if drives.upright.any() else (a,)
+        points = np.concatenate([drives.ends.reshape(-1, 3), *(p.reshape(-1, 3) for p in reached)])
+        return points, 6.0 * float(balls.max())
+    cranks = zip(drives.arm[drives.crank], balls[drives.crank], strict=True)
+    sizes = [motor_radius(arm, ball) for arm, ball in cranks]
+    return drives.foot, 1.3 * max(sizes, default=0.0)
 
 
 def machine_parts(
@@ -110,28 +129,62 @@ def machine_parts(
     """The machine at one pose (4, 4) and its readings (m,)."""
     ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
     balls = _ball_radii(machine)
-    up_base, up_platform = discs.side * Z, discs.platform_side * T_base_platform[:3, 2]
-    centre = apply(T_base_platform, discs.platform)
-    parts = [
-        Part(Cylinder(discs.base, -up_base, discs.base_radius, discs.thickness), finish.base),
-        Part(
-            Cylinder(centre, up_platform, discs.platform_radius, discs.thickness), finish.platform
-        ),
-        Part(
-            Cylinder(
-                centre + discs.thickness * up_platform,
-                up_platform,
-                0.28 * discs.platform_radius,
-                1.5 * discs.thickness,
-            ),
-            finish.joint,
-        ),
-    ]
+    bars = side_bars(machine)
+    parts = _base(discs, balls[:, 0], finish)
+    parts += _platform(discs, bars, np.array(ends.b), balls[:, 1], T_base_platform, finish)
     for j in range(machine.n_legs):
-        a, b = ends.a[j], ends.b[j]
-        parts += _leg(machine, j, a, b, finish)
-        parts += _joint(a, -up_base, float((a - discs.base) @ up_base), balls[j, 0], finish)
-        parts += _joint(b, up_platform, float((centre - b) @ up_platform), balls[j, 1], finish)
+        driven = bool(discs.drives.crank[j] or discs.drives.slider[j])
+        bare = finish.forearm if driven else finish.steel
+        parts += _leg(machine, j, ends.a[j], ends.b[j], finish, bare)
+        parts += _base_end(discs, j, ends.a[j], balls[:, 0], finish)
+    return parts
+
+
+def _base(discs: Discs, balls: Array, finish: Finish) -> list[Part]:
+    """The base plate, and what it hangs on; or beams in its place, for guides that lie."""
+    up = discs.side * Z
+    parts = beams(discs.drives, balls, finish)
+    if not parts:
+        parts = [Part(Cylinder(discs.base, -up, discs.base_radius, discs.thickness), finish.base)]
+    if discs.side < 0 and discs.drives.any:
+        radius, length = (size * discs.base_radius for size in _COLUMN)
+        parts.append(Part(Cylinder(discs.base - discs.thickness * up, -up, radius, length),
+                          finish.base))  # fmt: skip
+    return parts
+
+
+def _base_end(discs: Discs, j: int, a: Array, balls: Array, finish: Finish) -> list[Part]:
+    """What holds leg j's end at a (3,) on the base."""
+    drives, up = discs.drives, discs.side * Z
+    if drives.crank[j]:
+        return crank_parts(drives, j, a, balls, discs.base, up, finish)
+    if drives.slider[j]:
+        return slider_parts(drives, j, a, balls, discs.base, finish)
+    return _joint(a, -up, float((a - discs.base) @ up), balls[j], finish)
+
+
+def _platform(
+    discs: Discs,
+    bars: tuple[Integers, ...],
+    b: Array,
+    balls: Array,
+    T_base_platform: Array,
+    finish: Finish,
+) -> list[Part]:
+    """The platform's plate with the tool's holder, and its joints b (L, 3) or the bars to them."""
+    up = discs.platform_side * T_base_platform[:3, 2]
+    centre = apply(T_base_platform, discs.platform)
+    radius = discs.platform_radius * (_FLANGE if bars else 1.0)
+    top = centre + discs.thickness * up
+    parts = [
+        Part(Cylinder(centre, up, radius, discs.thickness), finish.platform),
+        Part(Cylinder(top, up, 0.28 * discs.platform_radius, 1.5 * discs.thickness), finish.joint),
+    ]
+    if bars:
+        parts += nacelle_parts(bars, b, balls, centre, up, finish)
+        return parts + [Part(Ball(p, r), finish.joint) for p, r in zip(b, balls, strict=True)]
+    for p, r in zip(b, balls, strict=True):
+        parts += _joint(p, up, float((centre - p) @ up), float(r), finish)
     return parts
 
 
@@ -141,8 +194,13 @@ def _joint(centre: Array, way: Array, height: float, radius: float, finish: Fini
     return [Part(Ball(centre, radius), finish.joint), Part(post, finish.joint)]
 
 
-def _leg(machine: Machine, j: int, a: Array, b: Array, finish: Finish) -> list[Part]:
-    """The leg's tubes, cut off where the leg ends, and the neck between joint and first tube."""
+def _leg(
+    machine: Machine, j: int, a: Array, b: Array, finish: Finish, bare: Material
+) -> list[Part]:
+    """The leg's tubes, cut off where the leg ends, and the neck between joint and first tube.
+
+    bare : of all but the first of several tubes.
+    """
     length = float(np.linalg.norm(b - a))
     u = (b - a) / length
     tubes = machine.document.legs[j].tubes
@@ -150,7 +208,7 @@ def _leg(machine: Machine, j: int, a: Array, b: Array, finish: Finish) -> list[P
     for t, (tube, radius) in enumerate(zip(tubes, machine.radii()[j], strict=True)):
         stop = min(tube.stop, length)
         if stop > tube.start:
-            material = finish.paint if t == 0 and len(tubes) > 1 else finish.steel
+            material = finish.paint if t == 0 and len(tubes) > 1 else bare
             shape = Cylinder(a + tube.start * u, u, float(radius), stop - tube.start)
             parts.append(Part(shape, material))
     if tubes and tubes[0].start > 0:
@@ -179,8 +237,17 @@ class Room:
         return Scene((*parts, *self.parts), self.lighting)
 
 
-def room_of(discs: Discs, reach: float, noise: SmoothNoise, rng: np.random.Generator) -> Room:
-    """A room around a machine; cameras stand within ``reach`` (m) of the base disc's centre."""
+def room_of(
+    discs: Discs,
+    reach: float,
+    noise: SmoothNoise,
+    rng: np.random.Generator,
+    lit_from: float | None = None,
+) -> Room:
+    """A room around a machine; cameras stand within ``reach`` (m) of the base disc's centre.
+
+    lit_from : azimuth (rad) about which the key lamp stands, where a plate would shade a board.
+    """
     size = max(discs.base_radius, discs.platform_radius)
     reach = max(reach, 2.5 * size)
     middle = discs.base - discs.side * discs.thickness * Z
@@ -191,11 +258,11 @@ def room_of(discs: Discs, reach: float, noise: SmoothNoise, rng: np.random.Gener
     parts += _walls(middle, floor, reach, noise, rng)
     for azimuth in 2 * np.pi * (np.arange(11) + rng.uniform(-0.4, 0.4, 11)) / 11:
         parts.append(_furniture(middle, floor, size, reach, azimuth, noise, rng))
-    lamps = _lamps(middle, size, reach, rng)
+    lamps = _lamps(middle, size, reach, rng, lit_from, discs.drives.any)
     bulbs = [
         Part(Ball(lamp.place, lamp.radius), Material(0.0, emission=3.0), False) for lamp in lamps
     ]
-    return Room((*parts, *bulbs), Lighting(lamps, sky=0.26, ground=0.13))
+    return Room((*parts, *bulbs), Lighting(lamps, *_AROUND[discs.drives.any]))
 
 
 def _table(middle: Array, size: float, noise: SmoothNoise, rng: np.random.Generator) -> list[Part]:
@@ -269,9 +336,19 @@ def _furniture(
     return Part(Box(place + lean.T @ (half[2] * Z), lean, half), material, False)
 
 
-def _lamps(middle: Array, size: float, reach: float, rng: np.random.Generator) -> tuple[Lamp, ...]:
+def _lamps(
+    middle: Array,
+    size: float,
+    reach: float,
+    rng: np.random.Generator,
+    lit_from: float | None,
+    soft: bool,
+) -> tuple[Lamp, ...]:
     """A key lamp with shadows, a weaker one across, one from above and behind."""
     azimuth = rng.uniform(0, 2 * np.pi)
+    if lit_from is not None:
+        azimuth = lit_from + _ASIDE * (azimuth / np.pi - 1)
+    share = _DIRECT if soft else 1.0
     lamps: list[Lamp] = []
     for turn, elevation, distance, power in (
         (0.0, rng.uniform(40, 60), 1.8, 1.25),
@@ -284,7 +361,7 @@ def _lamps(middle: Array, size: float, reach: float, rng: np.random.Generator) -
             Lamp(
                 middle + (distance * reach) * way + size * Z,
                 0.16 * size,
-                power,
+                share * power,
                 distance * reach,
                 shadows=not lamps,
             )

@@ -18,7 +18,7 @@ from pkmcal.files import csv_text, staged_folder, yaml_text
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.observe.boards import Board
-from pkmcal.simulate.board import board_part
+from pkmcal.simulate.board import board_part, holder_part
 from pkmcal.simulate.casting import Part
 from pkmcal.simulate.render import Sensor, View, photograph, render
 from pkmcal.simulate.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
@@ -75,7 +75,10 @@ class Studio:
         discs = discs_of(truth.machine)
         places = np.array([pose.position for pose in truth.rough])
         reach = float(np.linalg.norm(places - discs.base, axis=1).max())
-        room = room_of(discs, reach, noise, np.random.default_rng(seeds[1]))
+        way = (places - discs.base).mean(axis=0)
+        read = truth.T_platform_board is not None and discs.drives.any
+        lit_from = float(np.arctan2(way[1], way[0])) if read else None
+        room = room_of(discs, reach, noise, np.random.default_rng(seeds[1]), lit_from)
         known = {id(camera): View.of(camera) for camera in {id(c): c for c in cameras}.values()}
         views = tuple(known[id(camera)] for camera in cameras)
         fixed: tuple[Part, ...] = ()
@@ -108,7 +111,8 @@ class Studio:
         parts = machine_parts(self.truth.machine, self.discs, self.finish, poses[k], joints[k])
         on_platform = self.truth.T_platform_board
         if on_platform is not None and self.board is not None:
-            parts = [*parts, board_part(self.board, poses[k] @ on_platform)]
+            parts.append(board_part(self.board, poses[k] @ on_platform))
+            parts.append(holder_part(self.board, on_platform, poses[k], self.discs))
         scene = self.room.with_machine([*parts, *self.fixed])
         return render(scene, self.views[station], T_camera_base, rng)
 
@@ -146,6 +150,13 @@ def _check(folder: Path, drawing: Machine) -> None:
             what=f"mechanism {drawing.name!r} has no tubes, so its photographs would show no legs",
             expected="tubes: [{radius: ..., from: ..., to: ...}] on its legs",
         )
+    if drawing.layout.n_internal:
+        raise InputError(
+            what=f"mechanism {drawing.name!r} has side bars that turn on hinges, and how far they"
+            " turn is not known where it is drawn",
+            expected="platform joints other than hinged-bar",
+            next_step="simulate the machine with one rod a forearm, such as h4",
+        )
     try:
         drawing.home()
     except GeometryError as error:  # the drawing is the user's: it is at fault
@@ -164,6 +175,8 @@ def _write_texts(
     }
     driven = np.flatnonzero(drawing.layout.actuated >= 0)
     columns = [f"leg{j + 1}" for j in driven]
+    if drawing.layout.shares_motors:
+        columns = [f"motor{k + 1}" for k in range(drawing.n_joints)]
     texts = {
         "mechanism.yaml": mechanism_text(drawing),
         "session.yaml": yaml_text(_session_document(settings, truth, files)),

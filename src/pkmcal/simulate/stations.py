@@ -12,6 +12,8 @@ from pkmcal.geometry.rigid import apply, inverse, look_at, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import limb_ends
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.session_schema import Body
+from pkmcal.simulate.drives import reaches
 
 _PANORAMIC = np.deg2rad(95)
 """A camera that sees more than this off its axis sees all legs from their middle."""
@@ -25,6 +27,11 @@ _ARC = np.deg2rad(80)
 """Between the first and the last camera that see the same face of a board."""
 _BESIDE = {False: 1.45, True: 1.6}
 """Distance that leaves room for a board, in the machine's own, upright and flat."""
+
+_SPARE = 1.18
+"""Distance in the machine's own at home: platforms move, and plates reach beyond joints."""
+_FULL = 1.1
+"""The same where the machine's own takes in where its motors move it."""
 
 Vector = tuple[float, float, float]
 
@@ -42,51 +49,53 @@ class StationPose:
         return look_at(np.array(self.position), np.array(self.look_at), np.array(self.up))
 
 
-def joints_at_home(machine: Machine) -> tuple[Array, Array]:
-    """Joint centres A and B (L, 3) with the platform at home, base frame, m."""
-    home = machine.home()
-    ends = limb_ends(machine.layout, machine.values, machine.inverse(home[None])[0], home)
-    return np.array(ends.a), np.array(ends.b)
-
-
 def default_stations(
     machine: Machine,
     cameras: tuple[Camera, ...],
     rng: np.random.Generator,
-    on_base: bool = False,
+    board: Body | None = None,
 ) -> tuple[StationPose, ...]:
     """One place for each camera: evenly round the machine, not quite regular, as by hand.
 
-    A camera that is alone goes where it sees most of every leg.
-    on_base : so that all see one board fixed to the base: to one side of a machine that stands,
-    round one that lies flat, and with room beside the machine.
+    A camera that is alone goes where it sees most of every leg, unless it sees a board on the base.
+    board : what a board is fixed to that all see: they stand to one side of a machine that stands,
+    round one that lies flat, and with room beside the machine for a board on the base.
     """
-    a, b = joints_at_home(machine)
+    space = np.concatenate(_space(machine))
     start = rng.uniform(0, 2 * np.pi)
     poses: list[StationPose] = []
-    arc = on_base and not _is_flat(np.concatenate([a, b]))
+    arc = board is not None and not _is_flat(space)
     for k, camera in enumerate(cameras):
         half = view_angle(camera)
+        away = _distance(machine, min(half, _NEAREST), board)
         if half > _PANORAMIC:
-            poses.append(_inside(a, b, rng))
-        elif len(cameras) == 1 and not on_base:
-            poses.append(_clearest(machine, camera, min(half, _NEAREST), start, rng))
+            poses.append(_inside(*_space(machine), rng))
+        elif len(cameras) == 1 and board != "base":
+            poses.append(_clearest(machine, camera, away, start, rng))
         else:
             turn = (
                 _ARC * (k / max(len(cameras) - 1, 1) - 0.5) if arc else 2 * np.pi * k / len(cameras)
             )
             azimuth = start + turn + np.deg2rad(rng.uniform(-8, 8))
-            poses.append(_outside(a, b, min(half, _NEAREST), azimuth, rng, on_base))
+            poses.append(_outside(space, away, azimuth, rng))
     return tuple(poses)
 
 
+def _space(machine: Machine) -> tuple[Array, Array]:
+    """Legs' ends A and B (n, 3), base frame, m, that a picture of the machine has to hold."""
+    a, b = reaches(machine)
+    return a.reshape(-1, 3), b.reshape(-1, 3)
+
+
 def _clearest(
-    machine: Machine, camera: Camera, half: float, start: float, rng: np.random.Generator
+    machine: Machine, camera: Camera, away: float, start: float, rng: np.random.Generator
 ) -> StationPose:
-    """The place on the ring from which the leg that is seen least is seen best."""
-    a, b = joints_at_home(machine)
+    """The place on the ring, ``away`` from the machine in its own radius, from which the leg that
+    is seen least is seen best.
+    """
+    space = np.concatenate(_space(machine))
     azimuths = start + 2 * np.pi * np.arange(_TRIED) / _TRIED
-    poses = [_outside(a, b, half, azimuth, rng, False) for azimuth in azimuths]
+    poses = [_outside(space, away, azimuth, rng) for azimuth in azimuths]
     tubes, home = tubes_of(machine), machine.home()[None]
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
     legs = legs_in_camera(machine, T_camera_base, home, machine.inverse(home))
@@ -138,24 +147,34 @@ def _rounded(v: Array) -> Vector:
     return x, y, z
 
 
+def _distance(machine: Machine, half: float, board: Body | None) -> float:
+    """From which the machine, and the board, fill the picture, in the machine's own radius.
+
+    half : of the view, rad.
+    """
+    if len(reaches(machine)[0]) > 1 and board != "base":
+        share = _FULL
+    else:
+        share = _SPARE if board is None else _BESIDE[_is_flat(np.concatenate(_space(machine)))]
+    return float(share / np.sin(half))
+
+
 def _outside(
-    a: Array, b: Array, half: float, azimuth: float, rng: np.random.Generator, on_base: bool
+    points: Array, distance: float, azimuth: float, rng: np.random.Generator
 ) -> StationPose:
-    """On a ring from which the machine fills the picture, low, or high for a flat machine."""
-    points = np.concatenate([a, b])
+    """On a ring round the machine's points (n, 3), low, or high for a flat machine."""
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = float(np.linalg.norm(points - centre, axis=1).max())
     flat = _is_flat(points)
     elevation = np.deg2rad(rng.uniform(42, 55) if flat else rng.uniform(7, 17))
-    # more than the machine at home, because the platform moves and plates reach beyond joints
-    distance = (_BESIDE[flat] if on_base else 1.18) * radius / np.sin(half)
     way = np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
          np.sin(elevation)]
     )  # fmt: skip
     target = centre + rng.uniform(-0.03, 0.03, 3) * radius
     up = np.array([*rng.normal(0, 0.04, 2), 1.0])
-    return StationPose(_rounded(centre + distance * way), _rounded(target), _rounded(up))
+    position = centre + distance * radius * way
+    return StationPose(_rounded(position), _rounded(target), _rounded(up))
 
 
 def _inside(a: Array, b: Array, rng: np.random.Generator) -> StationPose:

@@ -140,6 +140,38 @@ class Material:
 
 
 @dataclass(frozen=True)
+class Finish:
+    """Materials of the machine's parts; telescopic tubes from the base end to the platform end.
+
+    forearm : of rods that a motor on the base moves, dull as drawn aluminium or glass fibre are.
+    """
+
+    paint: Material
+    steel: Material
+    forearm: Material
+    joint: Material
+    base: Material
+    platform: Material
+
+    @classmethod
+    def from_noise(cls, noise: SmoothNoise, flat: bool = False) -> Finish:
+        """White paint, turned steel, blackened joints, a stained base, a milled platform.
+
+        flat : the legs lie open to the lamps above, and white ones would be overexposed.
+        """
+        return cls(
+            paint=Material(
+                0.42 if flat else 0.8, Clouds(noise, 0.012, 0.03), gloss=0.3, sharpness=40.0
+            ),
+            steel=Material(0.38, Clouds(noise, 0.004, 0.05), gloss=0.45, brushed=True, mirror=0.3),
+            forearm=Material(0.5, Clouds(noise, 0.008, 0.04), gloss=0.08, sharpness=15.0),
+            joint=Material(0.035, gloss=0.45, sharpness=60.0, mirror=0.06),
+            base=Material(0.16, Clouds(noise, 0.015, 0.25), gloss=0.05, sharpness=12.0),
+            platform=Material(0.27, Clouds(noise, 0.02, 0.08), gloss=0.12, sharpness=10.0),
+        )
+
+
+@dataclass(frozen=True)
 class Lamp:
     """A round lamp: place (3,) and radius (m), radiance given to a white surface facing it at
     distance ``reach`` (m), and whether it casts shadows.

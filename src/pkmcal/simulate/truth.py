@@ -23,7 +23,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe.boards import Board
 from pkmcal.session_schema import Body
 from pkmcal.simulate.board import place_board, place_on_platform
-from pkmcal.simulate.configurations import draw_configurations
+from pkmcal.simulate.configurations import draw_configurations, unfolded
 from pkmcal.simulate.render import Sensor
 from pkmcal.simulate.stations import StationPose, default_stations, rough_pose, share_in_image
 
@@ -118,7 +118,8 @@ def draw_truth(
     machine = true_machine(drawing, settings.tolerance, rngs["machine"])
     poses = settings.stations
     if isinstance(poses, int):
-        poses = default_stations(drawing, cameras, rngs["stations"], settings.board is not None)
+        seen = settings.board_on if settings.board is not None else None
+        poses = default_stations(drawing, cameras, rngs["stations"], seen)
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
     rough = tuple(
         rough_pose(
@@ -131,7 +132,7 @@ def draw_truth(
         for T, pose in zip(T_camera_base, poses, strict=True)
     )
     T_base_platform, joints, photographs = _configurations(
-        machine, cameras, T_camera_base, settings, rngs["configurations"]
+        drawing, machine, cameras, T_camera_base, settings, rngs["configurations"]
     )
     board = None
     if settings.board is not None:
@@ -157,16 +158,23 @@ def draw_truth(
 
 
 def _configurations(
+    drawing: Machine,
     machine: Machine,
     cameras: tuple[Camera, ...],
     T_camera_base: Array,
     settings: Settings,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Integers]:
-    """Poses, readings, and which station photographs which: legs must be in the picture."""
+    """Poses, readings, and which station photographs which: legs must be in the picture.
+
+    A controller that moves the machine by its drawing only goes where that closes.
+    """
     n = settings.configurations
     wanted = n if settings.shared else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
+    by_drawing = drawing.forward_result(joints)
+    reached = by_drawing.converged & unfolded(drawing, by_drawing.T_base_platform)
+    poses, joints = poses[reached], joints[reached]
     share = np.stack(
         [
             share_in_image(machine, camera, T, poses, joints)

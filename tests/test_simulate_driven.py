@@ -1,0 +1,342 @@
+"""Photographs of machines with cranks, guides and side bars, and what is recognised in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+import pkmcal
+from conftest import run
+from pkmcal.commands.comparison import compare
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import apply, inverse
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.observe.profiles import Profiles, estimate_blur, profile_offsets
+from pkmcal.simulate import (
+    Settings,
+    board_for,
+    draw_truth,
+    load_truth,
+    simulate_session,
+    with_forearms,
+)
+from pkmcal.simulate.board import board_from_fields
+from pkmcal.simulate.configurations import FARTHEST_TURN, unfolded
+from pkmcal.simulate.demo import camera_of_size
+from pkmcal.simulate.drives import drives_of, reaches, side_bars
+from pkmcal.simulate.scene import Finish, discs_of, machine_parts
+from pkmcal.simulate.shapes import Cylinder
+from pkmcal.simulate.surfaces import SmoothNoise
+from test_catalogue import whitened
+
+NAMES = ("h4", "delta", "6-rus", "linear-delta", "hexaglide")
+CRANKS = NAMES[:3]
+SMALL = camera_of_size((320, 240))
+
+
+@pytest.fixture(params=NAMES, scope="module")
+def machine(request):
+    return with_forearms(load_mechanism(request.param))
+
+
+@pytest.fixture(scope="module")
+def h4():
+    return with_forearms(load_mechanism("h4"))
+
+
+def parts_of(machine, T, joints):
+    finish = Finish.from_noise(SmoothNoise.from_rng(np.random.default_rng(0)))
+    return machine_parts(machine, discs_of(machine), finish, T, joints)
+
+
+def seen_along(parts, origin, targets):
+    """Distances to the first part, and its number, along rays to targets (n, 3)."""
+    rays = (targets - origin).T
+    rays = rays / np.linalg.norm(rays, axis=0)
+    hits = np.array([part.shape.enter(origin, rays) for part in parts])
+    return hits.min(axis=0), hits.argmin(axis=0)
+
+
+# drawings
+
+
+def test_rods_without_cylinders_get_one(machine):
+    drawing = load_mechanism(machine.name)
+    assert not any(leg.tubes for leg in drawing.document.legs)
+    length = machine.document.legs[0].length.constant
+    for leg in machine.document.legs:
+        (tube,) = leg.tubes
+        assert 0 < tube.start < 0.1 * length
+        assert 0.9 * length < tube.stop < length
+        assert tube.radius == pytest.approx(0.02 * length, abs=0.00026)
+    assert machine.layout.motion.shape == drawing.layout.motion.shape
+    assert len(machine.parameters) == len(drawing.parameters) + machine.n_legs
+    assert with_forearms(machine) is machine
+
+
+def test_a_cylinder_that_is_drawn_stays():
+    gough = load_mechanism("gough-stewart")
+    assert with_forearms(gough) is gough
+
+
+# where motors are
+
+
+@pytest.mark.parametrize("name", CRANKS)
+def test_a_cranks_axis_is_where_its_arm_turns_about(name):
+    machine = with_forearms(load_mechanism(name))
+    drives = drives_of(machine)
+    assert drives.crank.all()
+    for q in (-0.4, 0.9):
+        a = limb_ends(machine.layout, machine.values, np.full(machine.n_joints, q), np.eye(4)).a
+        arm = a - drives.foot
+        np.testing.assert_allclose(np.linalg.norm(arm, axis=1), drives.arm, atol=1e-12)
+        np.testing.assert_allclose(np.sum(arm * drives.axis, axis=1), 0, atol=1e-12)
+    told = [leg.base.arm for leg in machine.document.legs]
+    np.testing.assert_allclose(drives.arm, told, atol=1e-12)
+    np.testing.assert_allclose(np.abs(np.sum(drives.axis * machine.base_axes(), axis=1)), 1)
+
+
+@pytest.mark.parametrize("name", ["linear-delta", "hexaglide"])
+def test_guides_reach_as_far_as_their_carriages(name):
+    machine = with_forearms(load_mechanism(name))
+    drives = drives_of(machine)
+    assert drives.slider.all()
+    assert drives.upright.all() == (name == "linear-delta")
+    for share in (0, 1):
+        readings = machine.joint_ranges[:, share]
+        a = limb_ends(machine.layout, machine.values, readings, np.eye(4)).a
+        np.testing.assert_allclose(drives.ends[:, share], a, atol=1e-12)
+    np.testing.assert_allclose(np.sum(drives.away * drives.axis, axis=1), 0, atol=1e-12)
+    # the platform, at home and at either stop, is before the guides and not behind
+    b = reaches(machine)[1].reshape(-1, 3)
+    assert np.all(np.einsum("lni,li->ln", b[None] - drives.foot[:, None], drives.away) < 0)
+
+
+def test_guides_of_a_file_without_ranges(tmp_path):
+    document = load_mechanism("linear-delta").to_document()
+    for leg in document["legs"]:
+        del leg["base"]["range"]
+    (tmp_path / "m.yaml").write_text(yaml.safe_dump(document))
+    machine = load_mechanism(tmp_path / "m.yaml")
+    drives = drives_of(machine)
+    home = machine.inverse(machine.home()[None])[0]
+    np.testing.assert_allclose(drives.foot[:, 2], home, atol=1e-9)
+    assert np.all(np.ptp(drives.ends[:, :, 2], axis=1) > 0.1)
+
+
+def test_only_machines_with_side_bars_have_them(machine):
+    bars = [legs.tolist() for legs in side_bars(machine)]
+    assert bars == ([[0, 3], [1, 2]] if machine.name == "h4" else [])
+
+
+# the scene
+
+
+def test_forearms_are_drawn_from_arm_to_platform(machine):
+    T = machine.home()
+    joints = machine.inverse(T[None])[0]
+    ends = limb_ends(machine.layout, machine.values, joints, T)
+    cylinders = [p.shape for p in parts_of(machine, T, joints) if isinstance(p.shape, Cylinder)]
+    for j, leg in enumerate(machine.document.legs):
+        u = (ends.b[j] - ends.a[j]) / np.linalg.norm(ends.b[j] - ends.a[j])
+        (tube,) = (
+            c for c in cylinders
+            if abs(c.axis @ u) > 1 - 1e-12
+            and np.linalg.norm(c.start - ends.a[j] - leg.tubes[0].start * u) < 1e-9
+        )  # fmt: skip
+        assert tube.radius == leg.tubes[0].radius
+        assert tube.length == pytest.approx(leg.tubes[0].stop - leg.tubes[0].start)
+
+
+def test_little_of_a_machine_hides_its_own_forearms(machine):
+    """From where the simulation puts a camera, on average over what it photographs."""
+    truth = draw_truth(machine, (SMALL,), Settings(stations=1, configurations=6), 0)
+    eye = inverse(truth.T_camera_base[0])[:3, 3]
+    shares = []
+    for T, joints in zip(truth.T_base_platform, truth.joints, strict=True):
+        parts = parts_of(truth.machine, T, joints)
+        ends = limb_ends(machine.layout, truth.machine.values, joints, T)
+        s = np.linspace(0.1, 0.9, 20)[:, None, None]
+        axis = (ends.a + s * (ends.b - ends.a)).reshape(-1, 3)
+        near, _ = seen_along(parts, eye, axis)
+        wide = max(r.max() for r in machine.radii())
+        # the first hit is the forearm's own skin, a radius before its axis, more on a slant
+        shares.append(np.mean(near > np.linalg.norm(axis - eye, axis=1) - 6 * wide))
+    assert np.mean(shares) > 0.7
+
+
+def test_an_arm_is_as_long_as_the_drawing_says(h4):
+    T = h4.home()
+    for q in (0.2, 0.9):
+        parts = parts_of(h4, T, np.full(4, q))
+        drives = drives_of(h4)
+        a = limb_ends(h4.layout, h4.values, np.full(4, q), T).a
+        middle = (a[0] + drives.foot[0]) / 2
+        above = middle + np.array([1e-4, 2e-4, 0.2])
+        near, which = seen_along(parts, above, middle[None])
+        # the arm's web is less than a forearm thick on either side
+        assert abs(near[0] - 0.2) < 0.03
+        assert parts[which[0]].shape.half[0] == pytest.approx(0.13, abs=1e-9)
+
+
+# what is drawn of a session
+
+
+def test_platforms_with_side_bars_do_not_fold(h4):
+    turns = np.deg2rad([0.0, 60.0, -60.0, 80.0, 140.0])
+    T = np.broadcast_to(np.eye(4), (5, 4, 4)).copy()
+    T[:, 0, 0] = T[:, 1, 1] = np.cos(turns)
+    T[:, 1, 0], T[:, 0, 1] = np.sin(turns), -np.sin(turns)
+    assert unfolded(h4, T).tolist() == [True, True, True, False, False]
+    assert unfolded(load_mechanism("gough-stewart"), T).all()
+    truth = draw_truth(h4, (SMALL,), Settings(stations=1, configurations=20), 1)
+    for machine in (h4, truth.machine):  # as it is, and as its controller believes
+        poses = machine.forward(truth.joints)
+        turn = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+        assert np.abs(turn).max() < FARTHEST_TURN
+
+
+def test_the_drawing_takes_the_readings(machine):
+    truth = draw_truth(machine, (SMALL,), Settings(stations=1, configurations=20), 2)
+    assert machine.forward_result(truth.joints).converged.all()
+    assert np.isfinite(truth.joints).all()
+
+
+def test_all_stations_see_the_board_on_the_platform(h4):
+    board = board_for(h4, "platform")
+    settings = Settings(stations=2, configurations=4, shared=True, board=board, board_on="platform")
+    truth = draw_truth(h4, (SMALL,) * 2, settings, 0)
+    eyes = inverse(truth.T_camera_base)[:, :3, 3]
+    places = truth.T_base_platform @ truth.T_platform_board
+    for eye in eyes:
+        into = apply(inverse(places), eye)[:, 2]
+        assert np.mean(into < 0) > 0.7  # the printed side
+
+
+def test_hinges_of_side_bars_cannot_be_drawn(tmp_path):
+    with pytest.raises(InputError, match="turn on hinges"):
+        simulate_session(tmp_path / "s", with_forearms(load_mechanism("h4-rods")), SMALL)
+
+
+# by the command
+
+
+def test_the_command_writes_cylinders_into_the_sessions_drawing(tmp_path):
+    done = run(
+        "simulate", tmp_path / "s", "--mechanism", "h4", "--stations", "1", "--configurations", "2",
+        "--size", "96x72",
+    )  # fmt: skip
+    assert done.code == 0
+    assert "gives its rods no visible cylinders" in " ".join(done.out.split())
+    document = yaml.safe_load((tmp_path / "s" / "mechanism.yaml").read_text())
+    assert all(len(leg["tubes"]) == 1 for leg in document["legs"])
+    table = (tmp_path / "s" / "joints.csv").read_text()
+    assert table.startswith("configuration,leg1,leg2,leg3,leg4\n")
+
+
+# in photographs
+
+
+def photographed(folder, name, camera, configurations, board, seed):
+    settings = Settings(
+        stations=1, configurations=configurations, joint_noise=1e-5, board=board,
+        board_on="platform",
+    )  # fmt: skip
+    drawing = with_forearms(load_mechanism(name))
+    simulate_session(folder, drawing, camera, settings, seed=seed)
+    return folder
+
+
+def observing(folder, words):
+    path = folder / "session.yaml"
+    document = yaml.safe_load(path.read_text())
+    document["stations"]["station1"]["observe"] = words
+    path.write_text(yaml.safe_dump(document))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """An H4 whose forearms and board one camera sees; few photographs, and small ones."""
+    fields = {"type": "charuco", "squares": [5, 4], "square": 0.065, "marker": 0.05,
+              "dictionary": "DICT_4X4_50"}  # fmt: skip
+    folder = tmp_path_factory.mktemp("mixed") / "session"
+    camera = camera_of_size((560, 420))
+    return photographed(folder, "h4", camera, 8, board_from_fields(fields), 1)
+
+
+def test_forearms_and_board_in_photographs(mixed):
+    found = pkmcal.calibrate(observing(mixed, ["legs", "board"]))
+    errors = compare(found, mixed)
+    assert found.verdict.usable
+    assert found.estimate.statistics.n_poses >= 6 * 2
+    assert len(found.observation.edges) > 40
+    assert errors.calibrated.position < errors.drawing.position / 10
+    assert errors.calibrated.orientation < errors.drawing.orientation / 10
+
+
+def test_forearms_alone_in_photographs(mixed):
+    found = pkmcal.calibrate(observing(mixed, "legs"))
+    errors = compare(found, mixed)
+    assert found.estimate.statistics.n_poses == 0
+    assert errors.calibrated.position < errors.drawing.position / 5
+
+
+def test_the_board_says_where_the_camera_stands(mixed):
+    """With it, no pose by hand is needed to find the forearms."""
+    path = observing(mixed, ["legs", "board"]) / "session.yaml"
+    text = path.read_text()
+    document = yaml.safe_load(text)
+    del document["stations"]["station1"]["pose"]
+    path.write_text(yaml.safe_dump(document))
+    edges = pkmcal.calibrate(mixed).observation.edges
+    path.write_text(text)
+    assert len(edges) > 40
+
+
+def test_the_blur_is_not_told_by_a_few_odd_profiles():
+    """Of slim legs few profiles are whole; a highlight on these said nothing of the rest."""
+    from test_profiles import make
+
+    slim, wide = make(6, 300, blur=0.7).profiles, make(7, 5, blur=0.7).profiles
+    step = np.where(profile_offsets() < 0, 200.0, 20.0)
+    sharp = replace(wide, grey=np.broadcast_to(step, wide.grey.shape))
+    cut = np.r_[np.full(5, 0), np.full(len(slim.grey), 1)]
+    both = Profiles(
+        np.concatenate([sharp.grey, slim.grey]),
+        np.concatenate([sharp.count, slim.count]),
+        np.concatenate([sharp.half_width, slim.half_width]),
+        cut,
+    )
+    assert estimate_blur(both) == pytest.approx(0.7, abs=0.06)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_legs_and_board_know_more_than_each(name, tmp_path):
+    """Twenty photographs, 800x600, one place: errors as large as said, and least together.
+
+    Platform at the readings, mm, by legs, board and both: h4 0.07, 0.18, 0.04; delta 0.19, 0.14,
+    0.03; linear-delta 0.06, 0.08, 0.04; 6-rus 0.22, 0.58, 0.04; hexaglide 0.64, 0.83, 0.47.
+    """
+    board = board_for(with_forearms(load_mechanism(name)), "platform")
+    camera = camera_of_size((800, 600))
+    folder = photographed(tmp_path / "s", name, camera, 20, board, 1)
+    sigma = []
+    for words in ("legs", "board", ["legs", "board"]):
+        found = pkmcal.calibrate(observing(folder, words))
+        drawing = found.session.machine
+        z = whitened(drawing, found.estimate, load_truth(folder, drawing))
+        assert np.sqrt(np.mean(z**2)) < 1.3
+        errors = compare(found, folder)
+        assert errors.calibrated.position < errors.drawing.position
+        sigma.append(np.sqrt(np.diag(found.estimate.covariance)))
+    kinematic = np.array(drawing.parameters.kinds) != "radius"
+    legs, board, both = (np.median(s[kinematic & (s > 1e-9)]) for s in sigma)
+    assert both < min(legs, board)
+    assert errors.calibrated.position < errors.drawing.position / 3
