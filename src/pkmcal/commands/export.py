@@ -47,14 +47,13 @@ def export(
 ) -> int:
     """Write the machine for a controller, a firmware or a simulator."""
     from pkmcal.export.source import load_source
-    from pkmcal.export.writing import check_output, exporter_of, write
     from pkmcal.export.writing import export as run
+    from pkmcal.export.writing import exporter_of, write
 
     exporter_of(to)
     source = load_source(calibration, session)
     folder = out or _beside(calibration, to)
     made = run(source, to, force=force)
-    check_output(folder, made.files)
     write(made, folder)
     if as_json:
         console.print_json(summary(made, source, folder))

@@ -48,10 +48,12 @@ def reproduce(
     as_json: console.Json = False,
 ) -> int:
     """Compute the papers' tables and figures again."""
+    from pkmcal.files import check_own_folder
     from pkmcal.reproduce import Options
     from pkmcal.reproduce import reproduce as computed
 
-    check_output(out)
+    ours = {f"paper-{paper.value}{ending}" for paper in Paper for ending in WHAT}
+    check_own_folder(out, ours, "reproductions", "earlier reproductions")
     wanted = list(dict.fromkeys(papers or list(Paper)))
     with console.progress(as_json) as told:
         options = Options(runs, seed, long, photographs, told)
@@ -69,38 +71,17 @@ def reproduce(
     return code
 
 
-def check_output(folder: Path) -> None:
-    """Raise `InputError` where the folder holds something other than reproductions."""
-    from pkmcal.errors import InputError
-    from pkmcal.files import check_writable, listed
-
-    check_writable(folder)
-    entries = sorted(e.name for e in folder.iterdir()) if folder.is_dir() else []
-    ours = {f"paper-{paper.value}{ending}" for paper in Paper for ending in WHAT}
-    foreign = [name for name in entries if name not in ours]
-    if foreign:
-        raise InputError(
-            "the output folder holds something other than reproductions",
-            where=str(folder),
-            found=listed(foreign, 4),
-            expected="a new or empty folder, or earlier reproductions to replace",
-            next_step="Name another folder with -o, or move these files away",
-        )
-
-
 def save(found: list[Reproduction], folder: Path) -> list[str]:
     """Write a page and a JSON file a paper; returns their paths."""
-    from pkmcal.files import json_text, staged_folder
+    from pkmcal.files import json_text, write_folder
     from pkmcal.report.reproduction import reproduction_html
 
-    names: list[str] = []
-    with staged_folder(folder) as stage:
-        for one in found:
-            texts = {"html": reproduction_html(one), "json": json_text(one.document())}
-            for ending, text in texts.items():
-                names.append(f"paper-{one.letter}.{ending}")
-                (stage / names[-1]).write_text(text, encoding="utf-8", newline="\n")
-    return [str(folder / name) for name in names]
+    texts: dict[str, str] = {}
+    for one in found:
+        texts[f"paper-{one.letter}.html"] = reproduction_html(one)
+        texts[f"paper-{one.letter}.json"] = json_text(one.document())
+    write_folder(folder, texts)
+    return [str(folder / name) for name in texts]
 
 
 def tell(out: Console, found: Reproduction) -> None:

@@ -89,6 +89,7 @@ def servo(
 ) -> int:
     """Simulate control by the legs in the image."""
     from pkmcal.control.source import controlled, legs_of
+    from pkmcal.files import check_own_folder
     from pkmcal.report.servo_page import servo_of
 
     plan = _plan(
@@ -97,7 +98,7 @@ def servo(
         hand=(hand_position, hand_rotation), ends=(start, goal),
     )  # fmt: skip
     folder = out or Path("servo")
-    check_output(folder)
+    check_own_folder(folder, WHAT, "a study of servoing", "an earlier study")
     numbers = None if legs is None else legs_of(legs)
     subject = controlled(
         machine, session=session, station=station, camera=camera, legs=numbers, seed=seed
@@ -181,32 +182,13 @@ def exit_code(found: Servo) -> int:
     return 0 if found.judgement.usable else 1
 
 
-def check_output(folder: Path) -> None:
-    """Raise `InputError` where the folder holds something other than a study of servoing."""
-    from pkmcal.files import check_writable, listed
-
-    check_writable(folder)
-    entries = sorted(e.name for e in folder.iterdir()) if folder.is_dir() else []
-    foreign = [name for name in entries if name not in WHAT]
-    if foreign:
-        raise InputError(
-            "the output folder holds something other than a study of servoing",
-            where=str(folder),
-            found=listed(foreign, 4),
-            expected="a new or empty folder, or an earlier study to replace",
-            next_step="Name another folder with -o, or move these files away",
-        )
-
-
 def save(found: Servo, folder: Path) -> None:
     """Write both files, whole or not at all."""
-    from pkmcal.files import json_text, staged_folder
+    from pkmcal.files import json_text, write_folder
     from pkmcal.report.servo_page import servo_html
 
     texts = {"servo.html": servo_html(found), "servo.json": json_text(found.document())}
-    with staged_folder(folder) as stage:
-        for name, text in texts.items():
-            (stage / name).write_text(text, encoding="utf-8", newline="\n")
+    write_folder(folder, texts)
 
 
 def summary(found: Servo, folder: Path) -> dict[str, Any]:

@@ -41,12 +41,13 @@ def validate(
     as_json: console.Json = False,
 ) -> int:
     """Errors on data that the calibration did not see."""
+    from pkmcal.files import check_own_folder
     from pkmcal.session import load_session
     from pkmcal.validation import validate as run
 
     loaded = load_session(session)
     folder = out or loaded.folder / "validation"
-    check_output(folder)
+    check_own_folder(folder, WHAT, "a validation")
     with console.progress(as_json) as told:
         found = run(calibration, loaded, regions=regions, seed=seed, progress=told)
         told("Writing the report", 0.97)
@@ -63,36 +64,16 @@ def exit_code(found: Validation) -> int:
     return 0 if found.verdict.usable else 1
 
 
-def check_output(folder: Path) -> None:
-    """Raise `InputError` where the folder holds something other than a validation."""
-    from pkmcal.errors import InputError
-    from pkmcal.files import check_writable, listed
-
-    check_writable(folder)
-    entries = sorted(e.name for e in folder.iterdir()) if folder.is_dir() else []
-    foreign = [name for name in entries if name not in WHAT]
-    if foreign:
-        raise InputError(
-            "the output folder holds something other than a validation",
-            where=str(folder),
-            found=listed(foreign, 4),
-            expected="a new or empty folder, or an earlier validation to replace",
-            next_step="Name another folder with -o, or move these files away",
-        )
-
-
 def save(found: Validation, folder: Path) -> None:
     """Write both files, whole or not at all."""
-    from pkmcal.files import json_text, staged_folder
+    from pkmcal.files import json_text, write_folder
     from pkmcal.report.validation_page import validation_html
 
     texts = {
         "validation.html": validation_html(found),
         "validation.json": json_text(found.document()),
     }
-    with staged_folder(folder) as stage:
-        for name, text in texts.items():
-            (stage / name).write_text(text, encoding="utf-8", newline="\n")
+    write_folder(folder, texts)
 
 
 def summary(found: Validation, folder: Path) -> dict[str, Any]:

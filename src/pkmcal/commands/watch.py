@@ -37,6 +37,7 @@ def watch(
     as_json: console.Json = False,
 ) -> int:
     """Is the machine still as calibrated? Tests each leg."""
+    from pkmcal.files import check_own_folder
     from pkmcal.session import load_session
     from pkmcal.watch import check_alpha
     from pkmcal.watch import watch as run
@@ -44,7 +45,7 @@ def watch(
     check_alpha(alpha)
     loaded = load_session(session)
     folder = out or loaded.folder / "watch"
-    check_output(folder)
+    check_own_folder(folder, WHAT, "what watch writes", "an earlier look")
     with console.progress(as_json) as told:
         found = run(calibration, loaded, alpha=alpha, seed=seed, progress=told)
         told("Writing the report", 0.97)
@@ -61,33 +62,13 @@ def exit_code(found: Watch) -> int:
     return 0 if found.verdict.usable else 1
 
 
-def check_output(folder: Path) -> None:
-    """Raise `InputError` where the folder holds something other than an earlier look."""
-    from pkmcal.errors import InputError
-    from pkmcal.files import check_writable, listed
-
-    check_writable(folder)
-    entries = sorted(e.name for e in folder.iterdir()) if folder.is_dir() else []
-    foreign = [name for name in entries if name not in WHAT]
-    if foreign:
-        raise InputError(
-            "the output folder holds something other than what watch writes",
-            where=str(folder),
-            found=listed(foreign, 4),
-            expected="a new or empty folder, or an earlier look to replace",
-            next_step="Name another folder with -o, or move these files away",
-        )
-
-
 def save(found: Watch, folder: Path) -> None:
     """Write both files, whole or not at all."""
-    from pkmcal.files import json_text, staged_folder
+    from pkmcal.files import json_text, write_folder
     from pkmcal.report.watch_page import watch_html
 
     texts = {"watch.html": watch_html(found), "watch.json": json_text(found.document())}
-    with staged_folder(folder) as stage:
-        for name, text in texts.items():
-            (stage / name).write_text(text, encoding="utf-8", newline="\n")
+    write_folder(folder, texts)
 
 
 def summary(found: Watch, folder: Path) -> dict[str, Any]:

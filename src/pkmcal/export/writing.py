@@ -8,7 +8,7 @@ from pathlib import Path
 from pkmcal.errors import InputError, ResultError
 from pkmcal.export.contract import Difference, Exporter, exporters
 from pkmcal.export.source import Source
-from pkmcal.files import check_writable, closest, listed, staged_folder
+from pkmcal.files import check_own_folder, closest, listed, write_folder
 from pkmcal.findings import Finding
 
 
@@ -69,24 +69,7 @@ def export(source: Source, name: str, *, force: bool = False) -> Export:
     return Export(exporter, files, differences, tuple(exporter.notes(files, source)))
 
 
-def check_output(folder: Path, files: dict[str, str]) -> None:
-    """Raise `InputError` where the folder holds something other than this export's files."""
-    check_writable(folder)
-    entries = sorted(e.name for e in folder.iterdir()) if folder.is_dir() else []
-    foreign = [entry for entry in entries if entry not in files]
-    if foreign:
-        raise InputError(
-            "the output folder holds something other than this export",
-            where=str(folder),
-            found=listed(foreign, 4),
-            expected="a new or empty folder, or an earlier export to replace",
-            next_step="Name another folder with -o, or move these files away",
-        )
-
-
 def write(made: Export, folder: Path) -> None:
     """Write the files, whole or not at all."""
-    check_output(folder, made.files)
-    with staged_folder(folder) as stage:
-        for name, text in made.files.items():
-            (stage / name).write_text(text, encoding="utf-8", newline="\n")
+    check_own_folder(folder, made.files, "this export", "an earlier export")
+    write_folder(folder, made.files)

@@ -4,7 +4,14 @@ from pkmcal.files.json_files import json_text, plain, read_json
 from pkmcal.files.tables import Table, csv_text, read_csv
 from pkmcal.files.text import closest, listed, read_text, shown, wanted_file
 from pkmcal.files.validation import Schema, field_path, validate
-from pkmcal.files.writing import check_writable, staged_folder, write_bytes, write_text
+from pkmcal.files.writing import (
+    check_own_folder,
+    check_writable,
+    staged_folder,
+    write_bytes,
+    write_folder,
+    write_text,
+)
 from pkmcal.files.yaml_files import Document, Keys, parse_yaml, read_yaml, yaml_text
 
 __all__ = [
@@ -12,6 +19,7 @@ __all__ = [
     "Keys",
     "Schema",
     "Table",
+    "check_own_folder",
     "check_writable",
     "closest",
     "csv_text",
@@ -29,6 +37,7 @@ __all__ = [
     "validate",
     "wanted_file",
     "write_bytes",
+    "write_folder",
     "write_text",
     "yaml_text",
 ]

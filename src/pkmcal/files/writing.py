@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-from collections.abc import Generator
+from collections.abc import Collection, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from pkmcal.errors import InputError
+from pkmcal.files.text import listed
 
 
 def check_writable(folder: Path | str) -> None:
@@ -33,6 +34,34 @@ def check_writable(folder: Path | str) -> None:
         probe.rmdir()
     except OSError as error:
         raise _unwritable(folder, error) from None
+
+
+def check_own_folder(
+    folder: Path, names: Collection[str], what: str, earlier: str | None = None
+) -> None:
+    """Raise `InputError` where a folder holds anything but our own files of these names.
+
+    what : such as "a validation"; earlier : "an earlier validation" unless given.
+    """
+    check_writable(folder)
+    entries = sorted(e.name for e in folder.iterdir()) if folder.is_dir() else []
+    foreign = [name for name in entries if name not in names]
+    if foreign:
+        raise InputError(
+            f"the output folder holds something other than {what}",
+            where=str(folder),
+            found=listed(foreign, 4),
+            expected=f"a new or empty folder, or {earlier or what.replace('a ', 'an earlier ', 1)}"
+            " to replace",
+            next_step="Name another folder with -o, or move these files away",
+        )
+
+
+def write_folder(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write texts by their files' names, all of them or none."""
+    with staged_folder(folder) as stage:
+        for name, text in texts.items():
+            (stage / name).write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_text(path: Path | str, text: str) -> None:
