@@ -16,9 +16,9 @@ from pkmcal.export.delta_fit import Freedoms, fitted
 from pkmcal.export.linuxcnc_delta import linear_joints, rotary_joints
 from pkmcal.export.samples import samples
 from pkmcal.export.writing import export
-from pkmcal.findings import Level
 from pkmcal.geometry.rigid import perturb, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
+from pkmcal.outcome import Level
 
 FIRMWARES = ("reprap", "klipper", "linuxcnc")
 SMALL = np.array([0.004, -0.003, 0.002])

@@ -1,6 +1,6 @@
 """What the program gives, in one file of numbers, to be compared before and after a change.
 
-    python tools/figures.py run OUT.json --data FOLDER --render FOLDER [--only NAME …] [--quick]
+    python tools/figures.py run OUT.json --data FOLDER --render FOLDER [--only NAME …]
     python tools/figures.py compare BEFORE.json AFTER.json [--within 1e-9]
 
 ``--data`` holds sessions with their truth apart (h4-board, hexapod-pinhole, hexapod-mirror),
@@ -36,8 +36,11 @@ EXPORTS = ("json", "klipper", "linuxcnc", "mujoco", "reprap", "ros", "yaml")
 def pkmcal(*words: Any, expect: tuple[int, ...] = (0, 1)) -> tuple[int, str]:
     """One command; its exit code and what it printed."""
     done = subprocess.run(
-        [sys.executable, "-m", "pkmcal", *map(str, words)], capture_output=True, text=True, check=False
-    )
+        [sys.executable, "-m", "pkmcal", *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )  # fmt: skip
     if done.returncode not in expect:
         raise SystemExit(f"pkmcal {' '.join(map(str, words))}: {done.returncode}\n{done.stderr}")
     return done.returncode, done.stdout
@@ -151,10 +154,11 @@ def measure(data: Path, render: Path, work: Path, only: set[str]) -> dict[str, A
     take("check", lambda: command("check", data / "hexapod-pinhole"))
     take("camera", lambda: _camera(data, work))
     calibration = work / "hexapod-pinhole"
+    part = work / "hexapod-pinhole-holdout-5"  # five configurations are new to this one
     take("watch", lambda: command(
-        "watch", calibration, data / "hexapod-pinhole", "-o", work / "watch"))  # fmt: skip
+        "watch", part, data / "hexapod-pinhole", "-o", work / "watch"))  # fmt: skip
     take("validate", lambda: command(
-        "validate", calibration, data / "hexapod-pinhole", "-o", work / "validate",
+        "validate", part, data / "hexapod-pinhole", "-o", work / "validate",
         "--regions", "2"))  # fmt: skip
     take("servo", lambda: command("servo", "gough-stewart", "-o", work / "servo"))
     take("servo calibrated", lambda: command(
@@ -244,6 +248,8 @@ def main() -> int:
         work = options.work or Path(folder)
         work.mkdir(parents=True, exist_ok=True)
         found = measure(options.data.resolve(), options.render.resolve(), work, set(options.only))
+    if options.only and options.out.is_file():
+        found = json.loads(options.out.read_text(encoding="utf-8")) | found
     options.out.write_text(json.dumps(found, indent=1), encoding="utf-8")
     return 0
 

@@ -20,13 +20,13 @@ from pkmcal.check_joints import JointCheck, joint_checks, joint_findings
 from pkmcal.check_poses import pose_findings
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import listed, plain
-from pkmcal.findings import Finding, Level, wrong
 from pkmcal.gathering import known_stations
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.observe import legs
 from pkmcal.observe.images import decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
+from pkmcal.outcome import Finding, Level, wrong
 from pkmcal.photographs import label_of
 from pkmcal.recognition import (
     Recognition,

@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Integers
 from pkmcal.boards import Boards, StationBoard, board_of, station_board
 from pkmcal.errors import InputError
-from pkmcal.findings import Finding, Level, wrong
+from pkmcal.outcome import Finding, Level, wrong
 from pkmcal.session import Session
 
 POOR = 0.5

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.files import listed
-from pkmcal.findings import Finding, Level
+from pkmcal.outcome import Finding, Level
 from pkmcal.session import Session
 
 LITTLE_USED = 0.5

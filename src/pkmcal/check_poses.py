@@ -5,9 +5,9 @@ from __future__ import annotations
 from pkmcal.boards import Boards
 from pkmcal.doubts import check_poses, richer_models
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.findings import Finding, Level, wrong
 from pkmcal.gathering import known_stations, measurements_of, with_poses
 from pkmcal.identify.verdict import POOR
+from pkmcal.outcome import Finding, Level, wrong
 from pkmcal.refinement import refinement_of
 from pkmcal.session import Session
 from pkmcal.turning import turning

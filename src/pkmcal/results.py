@@ -23,8 +23,8 @@ from pkmcal.files import (
     staged_folder,
     validate,
 )
-from pkmcal.identify.verdict import Verdict
 from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document, mechanism_text
+from pkmcal.outcome import Verdict
 from pkmcal.result_document import FORMAT, document_of
 
 if TYPE_CHECKING:

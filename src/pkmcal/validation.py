@@ -18,8 +18,8 @@ from pkmcal.calibration import Calibration, Progress, calibrate
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import plain
 from pkmcal.identify.problem import Measurements
-from pkmcal.identify.verdict import Verdict
 from pkmcal.mechanisms import Machine
+from pkmcal.outcome import Verdict
 from pkmcal.results import SavedCalibration, load
 from pkmcal.session import Session, load_session
 from pkmcal.validate.figures import holdout_document, judged_document, reading_units

@@ -19,7 +19,7 @@ from pkmcal.calibration import Calibration, Progress, calibrate
 from pkmcal.errors import InputError
 from pkmcal.files import listed, plain
 from pkmcal.identify.assembly import seen_configurations
-from pkmcal.identify.verdict import Verdict
+from pkmcal.outcome import Verdict
 from pkmcal.results import SavedCalibration, load
 from pkmcal.session import Session, load_session
 from pkmcal.validate.holdouts import select

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
-from pkmcal.report.headline import Headline, headlines
+from pkmcal.outcome import Figure
+from pkmcal.report.headline import headlines
 from pkmcal.report.toolpoint import ToolPoint, tool_point
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ class Figures:
     centres: tuple[Centres, ...]
     tool: ToolPoint
 
-    def headlines(self) -> tuple[Headline, ...]:
+    def headlines(self) -> tuple[Figure, ...]:
         """As in the report."""
         c = self.calibration
         return headlines(c.session, c.observation, c.estimate, self.centres, self.tool)

@@ -13,7 +13,8 @@ from pkmcal.commands import console
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.report.reproduction import Reproduction, Table
+    from pkmcal.outcome import Table
+    from pkmcal.report.reproduction import Reproduction
 
 MARKED = {True: "good", False: "wrong"}
 WHAT = {".html": "open it in a browser", ".json": "everything, for programs"}

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pkmcal.control.study import Plan
-    from pkmcal.report.reproduction import Table
+    from pkmcal.outcome import Table
     from pkmcal.report.servo_page import Servo
 
 WHAT = {

@@ -12,7 +12,7 @@ from pkmcal.commands import console
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.report.reproduction import Table
+    from pkmcal.outcome import Table
     from pkmcal.validation import Validation
 
 WHAT = {

@@ -14,8 +14,8 @@ from pkmcal.export.c_tables import tables_of
 from pkmcal.export.contract import Difference, Exporter
 from pkmcal.export.samples import samples
 from pkmcal.export.source import Source
-from pkmcal.findings import Finding, Level
 from pkmcal.mechanisms.kinematics import inverse_result
+from pkmcal.outcome import Finding, Level
 
 PAIRS = 12
 ROUNDING = 1e-12

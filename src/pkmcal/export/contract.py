@@ -15,7 +15,7 @@ from functools import cache
 from typing import ClassVar
 
 from pkmcal.export.source import Source
-from pkmcal.findings import Finding
+from pkmcal.outcome import Finding
 
 
 @dataclass(frozen=True)

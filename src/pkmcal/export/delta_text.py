@@ -13,8 +13,8 @@ from pkmcal.export.contract import Difference
 from pkmcal.export.delta import MM, Delta
 from pkmcal.export.delta_fit import FOLLOWS, Fit
 from pkmcal.export.source import Source
-from pkmcal.findings import Finding, Level
 from pkmcal.geometry.rigid import apply
+from pkmcal.outcome import Finding, Level
 
 ROUNDING = 2e-6
 """m at the tool: settings have 0.1 µm and 0.00001 degrees, and weak poses enlarge that by eight."""

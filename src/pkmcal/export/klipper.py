@@ -21,7 +21,7 @@ from pkmcal.export.delta_fit import Fit, Freedoms, fitted
 from pkmcal.export.delta_text import about, degrees, end_motors, follows, mm, tool_difference
 from pkmcal.export.source import Source
 from pkmcal.export.text import commented
-from pkmcal.findings import Finding
+from pkmcal.outcome import Finding
 
 FILE = "pkmcal_printer.cfg"
 PROGRAM = "Klipper"

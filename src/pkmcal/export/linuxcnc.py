@@ -22,8 +22,8 @@ from pkmcal.export.linuxcnc_delta import delta_check, delta_files, delta_notes
 from pkmcal.export.samples import samples
 from pkmcal.export.source import Source
 from pkmcal.export.text import commented, exact, sigma_lines
-from pkmcal.findings import Finding, Level
 from pkmcal.mechanisms import Machine
+from pkmcal.outcome import Finding, Level
 
 HAL, INI = "pkmcal_kinematics.hal", "pkmcal_kinematics.ini"
 STRUTS = 6

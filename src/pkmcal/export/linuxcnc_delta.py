@@ -19,7 +19,7 @@ from pkmcal.export.delta_fit import Fit, Freedoms, fitted
 from pkmcal.export.delta_text import about, degrees, follows, mm, tool_difference
 from pkmcal.export.source import Source
 from pkmcal.export.text import commented
-from pkmcal.findings import Finding
+from pkmcal.outcome import Finding
 
 PROGRAM = "LinuxCNC"
 LINEAR = Freedoms((90.0, 210.0, 330.0), angles=False, rods=False)

@@ -22,10 +22,10 @@ from pkmcal.export.mujoco_read import (
 )
 from pkmcal.export.samples import samples
 from pkmcal.export.source import Source
-from pkmcal.findings import Finding, Level
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.outcome import Finding, Level
 
 POSES = 8
 ROUNDING = 1e-12

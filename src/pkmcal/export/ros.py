@@ -22,7 +22,7 @@ from pkmcal.export.contract import Difference, Exporter
 from pkmcal.export.source import Source
 from pkmcal.export.text import commented, exact
 from pkmcal.files import listed
-from pkmcal.findings import Finding, Level
+from pkmcal.outcome import Finding, Level
 
 LAUNCH = "static_transforms.launch.yaml"
 BASE = "base"

@@ -9,7 +9,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.export.contract import Difference, Exporter, exporters
 from pkmcal.export.source import Source
 from pkmcal.files import check_own_folder, closest, listed, write_folder
-from pkmcal.findings import Finding
+from pkmcal.outcome import Finding
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from pkmcal.identify.words_effect import platform_by_parameters
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.observe.edges import Observation
+from pkmcal.outcome import Verdict
 
 FAR = 5.0
 """Tolerances by which a value may leave the drawing before a person should look."""
@@ -46,22 +47,6 @@ class RicherModel:
 
     name: str
     scale: float
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What a person should know first.
-
-    usable : whether the result may be loaded into a controller.
-    headline : one sentence. reasons : why not usable. warnings : what to look at. advice : what
-    would make it better.
-    """
-
-    usable: bool
-    headline: str
-    reasons: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
 
 
 def judge(

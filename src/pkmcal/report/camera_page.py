@@ -16,8 +16,8 @@ from pkmcal.cameras.calibrate import CameraCalibration
 from pkmcal.cameras.calibration_checks import CELLS, coverage, tilts
 from pkmcal.errors import InputError
 from pkmcal.observe.images import decode
+from pkmcal.outcome import Figure
 from pkmcal.report import charts, templating
-from pkmcal.report.headline import Headline
 from pkmcal.report.wording import brief, count, decimals, number
 
 LARGEST_WIDTH = 640
@@ -130,11 +130,11 @@ def parameter_rows(c: CameraCalibration) -> tuple[Row, ...]:
     return tuple(out)
 
 
-def _cards(c: CameraCalibration) -> tuple[Headline, ...]:
+def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
     focal, sigma = c.camera.parameters[:2], c.sigma[:2]
     share = float(np.max(sigma / focal)) * 100
     return (
-        Headline(
+        Figure(
             "How sure is the focal length?",
             ((brief(share), "%"),),
             f"1σ, from {count(len(c.views), 'photograph')}; "
@@ -144,13 +144,13 @@ def _cards(c: CameraCalibration) -> tuple[Headline, ...]:
                 else "the views agree as far as the corners' noise lets them"
             ),
         ),
-        Headline(
+        Figure(
             "How well does it predict other photographs?",
             ((brief(c.held_out.rms), "px"),),
             f"length of a residual, root mean square, camera fitted to the other views;"
             f" {brief(c.rms)} px on the views that it was fitted to",
         ),
-        Headline(
+        Figure(
             "Are straight lines straight?",
             ((brief(c.held_out.straightness), "px"),),
             "distance of corners from their board line's great circle, on held-out views; no pose"
@@ -160,22 +160,22 @@ def _cards(c: CameraCalibration) -> tuple[Headline, ...]:
     )
 
 
-def _data_cards(c: CameraCalibration) -> tuple[Headline, ...]:
+def _data_cards(c: CameraCalibration) -> tuple[Figure, ...]:
     tilt = tilts(c.T_camera_board, c.board.points)
     covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
     seen = int(np.isfinite(c.residuals).all(axis=-1).sum())
     return (
-        Headline(
+        Figure(
             "What is it based on?",
             ((f"{len(c.views)} of {len(c.detections)}", "photographs"),),
             f"{count(seen, 'corner')}, {seen - int(c.kept.sum())} of them put aside",
         ),
-        Headline(
+        Figure(
             "How different are the views?",
             ((f"{tilt.min():.0f} to {tilt.max():.0f}", "°"),),
             "tilt of the board from facing the camera; 20 to 45° to all sides tell most",
         ),
-        Headline(
+        Figure(
             "How much of the picture was tested?",
             ((f"{covered:.0f}", "%"),),
             f"of {CELLS[0]}×{CELLS[1]} cells hold corners; elsewhere the lens is extrapolated",

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pkmcal.arrays import Integers
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.observe.edges import Observation
+from pkmcal.outcome import Figure
 from pkmcal.report.residuals import KEPT
 from pkmcal.report.toolpoint import ToolPoint
 from pkmcal.report.wording import brief, count, number
@@ -19,22 +18,13 @@ NO_TURN = 1e-9
 """rad; what rounding leaves."""
 
 
-@dataclass(frozen=True)
-class Headline:
-    """One number that answers a question; ``values`` are (number, unit) pairs."""
-
-    question: str
-    values: tuple[tuple[str, str], ...]
-    note: str
-
-
 def headlines(
     session: Session,
     observation: Observation,
     estimate: Estimate,
     centres: tuple[Centres, ...],
     tool: ToolPoint,
-) -> tuple[Headline, ...]:
+) -> tuple[Figure, ...]:
     """The cards in their order; those that have nothing to tell are left out."""
     cards = (
         _joint_sigma(centres) if len(observation.edges) else None,
@@ -47,11 +37,11 @@ def headlines(
     return tuple(card for card in cards if card)
 
 
-def _joint_sigma(centres: tuple[Centres, ...]) -> Headline:
+def _joint_sigma(centres: tuple[Centres, ...]) -> Figure:
     """Standard deviation of a coordinate of a joint centre."""
     sigma = np.concatenate([side.sigma for side in centres]) * 1e3
     worst = int(np.argmax(sigma))
-    return Headline(
+    return Figure(
         "How well are the joint centres known?",
         ((brief(float(np.median(sigma))), "mm"),),
         f"1σ of a coordinate, median of {len(sigma)} centres; the least certain, "
@@ -59,12 +49,12 @@ def _joint_sigma(centres: tuple[Centres, ...]) -> Headline:
     )
 
 
-def _tool_sigma(session: Session, tool: ToolPoint) -> Headline | None:
+def _tool_sigma(session: Session, tool: ToolPoint) -> Figure | None:
     """Uncertainty of the platform's pose from that of the geometry."""
     if not tool.configurations.size:
         return None
     where = session.configurations[tool.configurations[int(np.argmax(tool.position))]]
-    return Headline(
+    return Figure(
         "How well is the platform's pose known?",
         _pose_values(tool.position.mean(), tool.orientation.mean()),
         f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
@@ -73,11 +63,11 @@ def _tool_sigma(session: Session, tool: ToolPoint) -> Headline | None:
     )
 
 
-def _change(centres: tuple[Centres, ...]) -> Headline:
+def _change(centres: tuple[Centres, ...]) -> Figure:
     """How far the joint centres are from the drawing."""
     change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres]) * 1e3
     worst = int(np.argmax(change))
-    return Headline(
+    return Figure(
         "How far is the machine from its drawing?",
         ((brief(float(change.mean())), "mm"),),
         "mean distance of the joint centres, drawing and result laid over each other; largest "
@@ -85,14 +75,14 @@ def _change(centres: tuple[Centres, ...]) -> Headline:
     )
 
 
-def _tool_change(session: Session, tool: ToolPoint) -> Headline | None:
+def _tool_change(session: Session, tool: ToolPoint) -> Figure | None:
     """What the drawing's errors did to the platform's pose."""
     good = np.isfinite(tool.off_position)
     if not good.any():
         return None
     off, turn = tool.off_position[good], tool.off_orientation[good]
     where = session.configurations[tool.configurations[good][int(np.argmax(off))]]
-    return Headline(
+    return Figure(
         "What did the drawing do to the platform's pose?",
         _pose_values(off.mean(), turn.mean()),
         "mean error of the drawing's pose at the same readings; worst "
@@ -100,7 +90,7 @@ def _tool_change(session: Session, tool: ToolPoint) -> Headline | None:
     )
 
 
-def _data(session: Session, observation: Observation, estimate: Estimate) -> Headline:
+def _data(session: Session, observation: Observation, estimate: Estimate) -> Figure:
     """Photographs and edges, used and not."""
     taken = sum(len(station.photographs) for station in session.stations)
     if not taken:
@@ -117,25 +107,25 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Hea
         for thing, weights in (("edge", estimate.edge_weights), ("pose", estimate.pose_weights))
         if len(weights)
     ]
-    return Headline(
+    return Figure(
         "What is it based on?",
         ((f"{used} of {taken}", "photographs"),),
         f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected",
     )
 
 
-def _tables(session: Session, observation: Observation, estimate: Estimate) -> Headline:
+def _tables(session: Session, observation: Observation, estimate: Estimate) -> Figure:
     """The same of a session without photographs."""
     quiet = int(np.sum(estimate.pose_weights < KEPT))
     kinds = sorted({table.kind for table in session.trackers})
-    return Headline(
+    return Figure(
         "What is it based on?",
         ((f"{len(observation.poses) - quiet} of {len(observation.poses)}", " and ".join(kinds)),),
         f"measured without a camera; {quiet} of them given less than half their weight",
     )
 
 
-def _fit(estimate: Estimate) -> Headline:
+def _fit(estimate: Estimate) -> Figure:
     """Chi-square per degree of freedom."""
     s = estimate.statistics
     value = s.chi2 / s.dof if s.dof > 0 else float("nan")
@@ -144,7 +134,7 @@ def _fit(estimate: Estimate) -> Headline:
         for what, scale in (("edges", s.noise_scale), ("poses", s.pose_scale))
         if np.isfinite(scale) and abs(scale - 1) > 0.005
     ]
-    return Headline(
+    return Figure(
         "Does the model explain the data?",
         ((number(value, 2), "χ² per degree of freedom"),),
         f"1 is expected, over {count(s.dof, 'degree')} of freedom"

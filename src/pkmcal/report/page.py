@@ -29,8 +29,8 @@ from pkmcal.report import (
 from pkmcal.session import Session
 
 if TYPE_CHECKING:
-    from pkmcal.identify.verdict import Verdict
     from pkmcal.identify.words import Findings
+    from pkmcal.outcome import Verdict
     from pkmcal.validate.holdouts import HoldOut
 
 

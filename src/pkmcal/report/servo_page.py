@@ -11,9 +11,8 @@ import numpy as np
 from pkmcal.control.source import Controlled
 from pkmcal.control.study import Outcome, Plan, Study, study
 from pkmcal.control.words import Judgement, judgement, named
+from pkmcal.outcome import Figure, Plot, Row, Table
 from pkmcal.report import figure, servo_figures, templating
-from pkmcal.report.headline import Headline
-from pkmcal.report.reproduction import Plot, Row, Table
 from pkmcal.report.wording import brief, number
 
 MOST_CHOICES = 2
@@ -174,29 +173,29 @@ def _run_plots(s: Study, run: int) -> tuple[Plot, ...]:
     )
 
 
-def cards(found: Servo) -> tuple[Headline, ...]:
+def cards(found: Servo) -> tuple[Figure, ...]:
     """The main numbers."""
     s = found.study
     good, hand = s.outcome("identified"), s.outcome("hand")
     n = s.plan.runs
     return (
-        Headline(
+        Figure(
             "How many runs reach their goal?",
             ((f"{good.reached}", f"of {n}"),),
             f"with the identified geometry; by hand {hand.reached}",
         ),
-        Headline(
+        Figure(
             "How fast?",
             ((_seconds(good), "s"),),
             f"until the platform stays within 2 % of its way, median; by hand {_seconds(hand)} s,"
             f" an exponential {np.log(50) / s.plan.loop.gain:.1f} s",
         ),
-        Headline(
+        Figure(
             "Does it pass its goal?",
             ((_percent(good.overshoot, good), "%"),),
             f"of the way, the farthest of all runs; by hand {_percent(hand.overshoot, hand)} %",
         ),
-        Headline(
+        Figure(
             "How still is it held?",
             (
                 (_magnitude(1e3 * _rms(s.held.position)), "mm"),

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pkmcal.outcome import Figure, Row, Table
 from pkmcal.report import charts, templating
-from pkmcal.report.headline import Headline
-from pkmcal.report.reproduction import Row, Table
 from pkmcal.report.wording import SCALES, brief, count, decimals, number
 from pkmcal.session import Session
 from pkmcal.validate.figures import Figures, figures, promised, reading_units
@@ -58,7 +57,7 @@ def validation_html(v: Validation) -> str:
     )
 
 
-def cards(v: Validation) -> tuple[Headline, ...]:
+def cards(v: Validation) -> tuple[Figure, ...]:
     """The main numbers."""
     judged = v.judged
     if judged is None:
@@ -73,23 +72,23 @@ def cards(v: Validation) -> tuple[Headline, ...]:
         else ""
     )
     return (
-        Headline(
+        Figure(
             "How many times better than the drawing?",
             ((times(gain), ""),),
             f"in predicting readings, 95 %: {_factor(gain.low)} to {_factor(gain.high)}{against}",
         ),
-        Headline(
+        Figure(
             "Where is the tool, by the readings?",
             (_pair(new.position, "m"), _pair(new.orientation, "rad")),
             "root mean square distance from where the photographs see it, their noise included; by"
             f" the drawing {_text(old.position, 'm')} and {_text(old.orientation, 'rad')}",
         ),
-        Headline(
+        Figure(
             "Is the promise kept?",
             ((number(test.factor, 2), "× the deviations"),),
             f"1 is expected; χ² {number(test.chi2, 0)} for {count(test.dof, 'degree')} of freedom",
         ),
-        Headline(
+        Figure(
             "What is it based on?",
             ((str(len(judged.rows)), "configurations"),),
             "seen by the session, not used by the calibration",

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pkmcal.identify.words_names import named
+from pkmcal.outcome import Figure, Row, Table
 from pkmcal.report import charts, templating
-from pkmcal.report.headline import Headline
-from pkmcal.report.reproduction import Row, Table
 from pkmcal.report.wording import SCALES, brief, count, number
 from pkmcal.watching.chances import POWER, ChiSquare
 from pkmcal.watching.judged import LegTest, Suspect
@@ -48,7 +47,7 @@ def stamp(w: Watch) -> str:
     return "Changed" if w.judged.changed and parts != {"camera"} else "Cannot be told"
 
 
-def cards(w: Watch) -> tuple[Headline, ...]:
+def cards(w: Watch) -> tuple[Figure, ...]:
     """The main numbers."""
     judged = w.judged
     named_tests = [(named(leg.legs), leg.chance) for leg in judged.legs]
@@ -56,7 +55,7 @@ def cards(w: Watch) -> tuple[Headline, ...]:
     seen = [(name, chance) for name, chance in named_tests if np.isfinite(chance)]
     who, least = min(seen, key=lambda item: item[1], default=("nothing", 1.0))
     out = [
-        Headline(
+        Figure(
             "How likely by chance alone?",
             ((chance_text(least), ""),),
             f"of {who}, the least of {count(len(judged.tests), 'test')},"
@@ -68,7 +67,7 @@ def cards(w: Watch) -> tuple[Headline, ...]:
         unit = SCALES[sizes[0].unit]
         low, high = (f(leg.detects_zero for leg in sizes) * unit[0] for f in (min, max))
         out.append(
-            Headline(
+            Figure(
                 "What would have been found?",
                 ((brief(low) if low == high else f"{brief(low)} to {brief(high)}", unit[1]),),
                 f"of the zero of a leg's reading, depending on the leg, with {POWER:.0%}"
@@ -76,7 +75,7 @@ def cards(w: Watch) -> tuple[Headline, ...]:
             )
         )
     out.append(
-        Headline(
+        Figure(
             "What is it based on?",
             ((str(int(w.seen.sum())), "configurations"),),
             "seen by the session, not used by the calibration",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.identify.axis_measurements import AxisNoise
-from pkmcal.report.headline import Headline
+from pkmcal.outcome import Figure
 from pkmcal.report.reproduction import Reproduction
 from pkmcal.report.wording import brief, joined, number
 from pkmcal.reproduce import Options
@@ -131,39 +131,39 @@ def _headline(s: Study) -> str:
     )
 
 
-def _cards(s: Study) -> tuple[Headline, ...]:
+def _cards(s: Study) -> tuple[Figure, ...]:
     a, e = s.accuracy, s.error
     ratio = a[JOINT].parameters / a[BOUND].parameters
     return (
-        Headline(
+        Figure(
             "How far is the end-effector off after the joint estimate?",
             ((mm(a[JOINT].displacement), "mm"), (deg(a[JOINT].orientation), "°")),
             f"± {mm(e[JOINT].displacement)} mm and {deg(e[JOINT].orientation)}° of Monte-Carlo"
             f" error; the paper: {mm(AFTER[0], 2)} mm, {deg(AFTER[1], 3)}°",
         ),
-        Headline(
+        Figure(
             "Could any method do better?",
             ((number(ratio, 2), "of the bound"),),
             "RMSE of all thirty parameters, joint estimate over Cramér-Rao",
         ),
-        Headline(
+        Figure(
             "What do the four steps lose?",
             ((number(a[CORRECTED].parameters / a[JOINT].parameters, 1), "times"),
              (number(a[PRINTED].parameters / a[JOINT].parameters, 0), "times")),
             "RMSE over the joint estimate's: corrected, and as printed",
         ),
-        Headline(
+        Figure(
             "Why as printed?",
             ((brief(1e3 * a[PRINTED].base_z), "mm"),),
             f"in base z, where the drawing was {brief(1e3 * a[DRAWING].base_z)} mm off: products"
             " of distances between joints in one plane do not tell depth",
         ),
-        Headline(
+        Figure(
             "Does it always converge?",
             ((f"{s.converged} of {s.runs}", "runs"),),
             f"χ² per degree of freedom {number(float(s.chi2_per_dof.mean()), 3)}, 1 expected",
         ),
-        Headline(
+        Figure(
             "How long does it take?",
             ((number(s.wall, 1), "s"),),
             f"four steps in both forms and joint estimate of {s.runs} runs;"

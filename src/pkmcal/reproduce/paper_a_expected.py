@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.identify.axis_measurements import AxisNoise
-from pkmcal.report.reproduction import Check
+from pkmcal.outcome import Check
 from pkmcal.report.wording import number
 from pkmcal.reproduce.paper_a_study import (
     BOUND,

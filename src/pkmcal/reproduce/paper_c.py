@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.report.headline import Headline
+from pkmcal.outcome import Figure
 from pkmcal.report.reproduction import Reproduction
 from pkmcal.report.wording import number
 from pkmcal.reproduce import Options
@@ -86,23 +86,23 @@ def _headline(s: Study, start: Before) -> str:
     )
 
 
-def _cards(s: Study, start: Before) -> tuple[Headline, ...]:
+def _cards(s: Study, start: Before) -> tuple[Figure, ...]:
     a = s.accuracy
     printed = a["calibration", "calibration", EQ5]
     best = a["calibration", "calibration", JOINT]
     least = a["calibration", "calibration", BOUND]
     return (
-        Headline(
+        Figure(
             "How far off is the nacelle before?",
             ((mm(start.shift, 1), "mm"), (number(start.turn, 4), "rad")),
             "the paper: 26 mm, 0.022 rad",
         ),
-        Headline(
+        Figure(
             "What do the equations as printed leave?",
             ((mm(printed.shift), "mm"), (mm(printed.turn), "mrad")),
             f"Model 31, equation 5; the joint estimate {mm(best.shift)} mm, {mm(best.turn)} mrad",
         ),
-        Headline(
+        Figure(
             "Could any method do better?",
             ((number(best.larger_shift / least.larger_shift, 2), "of the bound"),),
             "Model 31, joint estimate over Cramér-Rao",
@@ -111,24 +111,24 @@ def _cards(s: Study, start: Before) -> tuple[Headline, ...]:
     )
 
 
-def _more_cards(s: Study) -> tuple[Headline, ...]:
+def _more_cards(s: Study) -> tuple[Figure, ...]:
     """What models leave out, and the time."""
     a = s.accuracy
     poor, right = (a["calibration", name, JOINT] for name in MODELS_31)
     rods = a["rods", "rods", JOINT]
     return (
-        Headline(
+        Figure(
             "What if the model is too poor?",
             ((mm(poor.shift), "mm"),),
             f"Model 12 on a machine whose arms differ; its χ² per degree of freedom,"
             f" {number(poor.chi2, 1)} for {number(right.chi2, 2)}, tells it",
         ),
-        Headline(
+        Figure(
             "And rods that differ by 0.3 mm?",
             ((mm(rods.shift), "mm"),),
             f"with the model with rods; Model 31 {mm(a['rods', 'calibration', JOINT].shift)} mm",
         ),
-        Headline(
+        Figure(
             "How long does it take?",
             ((number(s.wall, 0), "s"),),
             f"{s.runs} runs, all models and methods, on {s.threads} threads",

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.report.reproduction import Check
+from pkmcal.outcome import Check
 from pkmcal.report.wording import number
 from pkmcal.reproduce.paper_c_simulation import Kind
 from pkmcal.reproduce.paper_c_study import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.report.reproduction import Part, Row, Table
+from pkmcal.outcome import Part, Row, Table
 from pkmcal.report.wording import number
 from pkmcal.reproduce.paper_c_expected import (
     BEFORE,

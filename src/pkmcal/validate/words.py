@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.verdict import Verdict
 from pkmcal.mechanisms import Machine
+from pkmcal.outcome import Verdict
 from pkmcal.report.wording import SCALES, brief, count
 from pkmcal.validate.figures import figures, promised, reading_units
 from pkmcal.validate.holdouts import HoldOut, Judged

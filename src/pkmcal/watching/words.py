@@ -9,8 +9,8 @@ import numpy as np
 
 from pkmcal.arrays import Booleans
 from pkmcal.files import listed
-from pkmcal.identify.verdict import Verdict
 from pkmcal.identify.words_names import named
+from pkmcal.outcome import Verdict
 from pkmcal.report.wording import SCALES, brief, count, decimals, number
 from pkmcal.session import Session
 from pkmcal.watching.chances import POWER
