@@ -8,10 +8,11 @@ import numpy as np
 
 from pkmcal.geometry.rigid import inverse, look_at, perturb, pose, pose_difference, rotation
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import information
+from pkmcal.identify.estimate import Measurements, Mount
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Measurements, Mount
+from pkmcal.identify.start import start_state
 from pkmcal.mechanisms import kinematics
 from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.poses import PoseSet

@@ -15,12 +15,12 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
 from pkmcal.identify import paper_methods
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Measurements, Mount, State
 from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import centre_index, default_gauge
-from pkmcal.identify.problem import Measurements, Mount, State
-from pkmcal.identify.start import better_start, misfit
+from pkmcal.identify.start import misfit, start_state
 from pkmcal.mechanisms import (
     Machine,
     catalogue,
@@ -30,6 +30,7 @@ from pkmcal.mechanisms import (
 from pkmcal.mechanisms.limbs import limb_ends
 from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.poses import PoseSet
+from pkmcal.turns import better_start
 
 MACHINES = ("gough-stewart", "3-rpr", "3-rps", "3-upu", "6-spu-passive", "constant-legs")
 NOISE = 1e-4

@@ -9,8 +9,8 @@ import pytest
 
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
+from pkmcal.identify.estimate import Measurements, Mount
 from pkmcal.identify.hand_eye import matrix, quaternion, size_of, solve_pairs, start_from_poses
-from pkmcal.identify.problem import Measurements, Mount
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.observe.edges import EdgeSet

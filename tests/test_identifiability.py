@@ -14,11 +14,12 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, start_state, what_data_tell
+from pkmcal.identify.bundle import bundle, what_data_tell
 from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.estimate import Measurements, State
 from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import apply, default_gauge, freedoms, generators
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.start import start_state
 from pkmcal.identify.verdict import judge
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.limbs import limb_ends

@@ -10,9 +10,10 @@ import pytest
 from pkmcal.cameras import camera_models
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Measurements, Mount, State
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.identify.problem import Measurements, Mount, State
+from pkmcal.identify.start import start_state
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.observe.poses import PoseSet
 from pkmcal.simulate import EdgeNoise, Settings, draw_truth, simulate_edges

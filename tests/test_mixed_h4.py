@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from pkmcal.geometry.rigid import look_at, perturb
-from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.problem import Measurements, Mount
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Measurements, Mount
+from pkmcal.identify.start import start_state
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.poses import PoseSet

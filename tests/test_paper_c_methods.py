@@ -10,6 +10,7 @@ import pytest
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Mount
 from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.inverse_kinematic import (
     fit_session,
@@ -19,7 +20,6 @@ from pkmcal.identify.inverse_kinematic import (
     unknown_names,
 )
 from pkmcal.identify.measured_platform import seen_platform, taken
-from pkmcal.identify.problem import Mount
 from pkmcal.identify.rotation_axis import facing, rotation_axis
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.limbs import MOTIONS
@@ -164,7 +164,7 @@ def test_whitened_rows_have_unit_variance():
 
 def replace_start(machine, truth):
     """A state with camera and board where they truly are: to look at rows, not to estimate."""
-    from pkmcal.identify.problem import State
+    from pkmcal.identify.estimate import State
 
     return State(
         machine.parameters.drawing,

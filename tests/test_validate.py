@@ -12,8 +12,9 @@ import pytest
 from conftest import run
 from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
-from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.problem import Measurements
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Measurements
+from pkmcal.identify.start import start_state
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.simulate import Settings
 from pkmcal.simulate.demo import demo_camera

@@ -10,9 +10,10 @@ import pytest
 
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Measurements
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.identify.problem import Measurements
+from pkmcal.identify.start import start_state
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.simulate import Settings
 from pkmcal.simulate.demo import demo_camera

@@ -15,8 +15,8 @@ from pkmcal.calibration import calibrate
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
-from pkmcal.identify.bundle import start_state
-from pkmcal.identify.problem import Measurements
+from pkmcal.identify.estimate import Measurements
+from pkmcal.identify.start import start_state
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.observe.edges import Observation
 from pkmcal.results import load, save

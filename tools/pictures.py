@@ -25,9 +25,10 @@ import pkmcal
 from pkmcal.arrays import Array
 from pkmcal.calibration import Calibration
 from pkmcal.commands.comparison import compare
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
-from pkmcal.identify.problem import Measurements
+from pkmcal.identify.estimate import Measurements
+from pkmcal.identify.start import start_state
 from pkmcal.observe import legs
 from pkmcal.recognition import platform_poses, read_photographs, recognise
 from pkmcal.report import page, templating

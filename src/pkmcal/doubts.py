@@ -6,9 +6,10 @@ import numpy as np
 
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import rotation_vector
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Estimate, Measurements
 from pkmcal.identify.pose_doubts import BAD, Doubt, find_doubt, in_doubt, wrong_scale
-from pkmcal.identify.problem import Estimate, Measurements
+from pkmcal.identify.start import start_state
 from pkmcal.identify.verdict import POOR, RicherModel
 from pkmcal.session import Session
 

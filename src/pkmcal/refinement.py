@@ -14,7 +14,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.session import Session
 
 

@@ -17,12 +17,14 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards import Boards
-from pkmcal.errors import InputError, ResultError
+from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.files import listed
 from pkmcal.gathering import measurements_of
-from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.problem import Estimate, Measurements, State
-from pkmcal.identify.start import better_start
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Estimate, Measurements, State
+from pkmcal.identify.four_step import four_step
+from pkmcal.identify.start import misfit, start_state
+from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.edges import EdgeSet, Observation, Rejection, concatenate
 from pkmcal.observe.repeats import combined
@@ -98,6 +100,20 @@ def take_turns(
             break
     observation = observation_of(session, looks, boards, measurements, estimate)
     return Turns(observation, measurements, estimate, cameras)
+
+
+def better_start(machine: Machine, measurements: Measurements, known: State) -> State:
+    """``known``, or [A]'s four steps on the edges where these explain the edges better.
+
+    The four steps need no first guess, so they find the way back when the drawing or an earlier
+    estimate has gone astray. Judged by the median misfit, which wrong edges do not move. Any
+    machine: the steps refuse in words where the data do not allow them, and ``known`` remains.
+    """
+    try:
+        steps = four_step(machine, measurements, T_camera_base_guess=known.T_camera_base)
+    except (PkmcalError, np.linalg.LinAlgError):  # too few legs, directions or configurations
+        return known
+    return min(known, steps, key=lambda state: misfit(machine, measurements, state))
 
 
 def identify_poses(

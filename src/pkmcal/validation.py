@@ -17,7 +17,7 @@ from pkmcal.arrays import Booleans, Integers
 from pkmcal.calibration import Calibration, Progress, calibrate
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import plain
-from pkmcal.identify.problem import Measurements
+from pkmcal.identify.estimate import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.results import SavedCalibration, load

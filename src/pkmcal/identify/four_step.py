@@ -27,6 +27,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify import four_step_checks as checks
 from pkmcal.identify import linear
+from pkmcal.identify.estimate import Measurements, State
 from pkmcal.identify.four_step_axes import (
     Axes,
     axes_from_edges,
@@ -64,7 +65,6 @@ from pkmcal.identify.four_step_platform import (
 )
 from pkmcal.identify.gauge import BestFit, centre_index, default_gauge
 from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.problem import Measurements, State
 from pkmcal.identify.registration import Body, fixes_pose, laid
 from pkmcal.mechanisms import Machine
 

@@ -16,7 +16,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.identify import linear
-from pkmcal.identify.problem import Measurements
+from pkmcal.identify.estimate import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import leg_readings
 from pkmcal.observe.edges import EdgeSet

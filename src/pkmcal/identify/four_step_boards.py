@@ -12,7 +12,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.estimate import Measurements, State
 from pkmcal.observe.poses import PoseSet
 
 

@@ -29,9 +29,9 @@ from pkmcal.geometry.rigid import (
     rotation_vector,
     skew,
 )
-from pkmcal.identify.mounts import mean_pose
-from pkmcal.identify.pose_rows import turn_jacobian
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.estimate import Measurements, State
+from pkmcal.identify.rows import turn_jacobian
+from pkmcal.identify.start import mean_pose
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import limb_ends
 from pkmcal.solver import Linear, Values, minimise, take

@@ -16,15 +16,15 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, pose, rotation
+from pkmcal.identify.estimate import Measurements, State
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.implicit import Form, ImplicitProblem, ImplicitState
-from pkmcal.identify.problem import Measurements, State
 from pkmcal.identify.rotation_axis import axis_frames
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.solver import RESTART_DAMPING, Solution, Stop, eliminate, minimise
+from pkmcal.solver import RESTART_DAMPING, Solution, Stop, eliminate, minimise, take
 
 ROUNDS = 2
 """Whitening again, at the solution: it changes by a thousandth after the second."""
@@ -248,7 +248,7 @@ def unknowns_kept(
     By the first run. As printed, the tilts of a board against the axis of rotation have only a
     second-order influence ([C] III.C) and are held.
     """
-    first, begin = problem.select(np.array([0])), problem.take(state, np.array([0]))
+    first, begin = problem.select(np.array([0])), take(state, np.array([0]))
     jac = scaled_jacobian(first.ideal(begin), begin)
     sizes = np.concatenate([
         machine.parameters.tolerances_free(),

@@ -17,7 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot
-from pkmcal.identify.problem import Measurements
+from pkmcal.identify.estimate import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.edges import EdgeSet
 

@@ -19,13 +19,13 @@ from pkmcal.geometry.rigid import inverse, perturb, pose_difference, register
 from pkmcal.identify import linear
 from pkmcal.identify.assembly import Assembled, assemble, batch_of
 from pkmcal.identify.covariance import data_share
+from pkmcal.identify.estimate import Estimate, Measurements, State, Statistics
 from pkmcal.identify.four_step import four_step
 from pkmcal.identify.four_step_boards import mount_poses
 from pkmcal.identify.gauge import apply, centre_index, default_gauge
 from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.inverse_kinematic import inverse_kinematic
-from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
-from pkmcal.identify.residuals import BatchState
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 
 Method = Literal["four-step", "linear", "inverse-kinematic"]
@@ -148,7 +148,7 @@ def _estimate(
     """The method's result with its residuals; edges far off the rest have weight 0."""
     assembled = assemble(machine, measurements, default_gauge(machine), use_drawing=False)
     batch = batch_of(machine, assembled, state)
-    rows = assembled.problem.block_residuals(batch)[0][assembled.row, assembled.place]
+    rows = assembled.problem.block_residuals(batch)[0][assembled.edges.row, assembled.edges.place]
     rows = np.nan_to_num(rows)
     distance = np.sqrt(np.sum(rows**2, axis=-1))
     middle = float(np.median(distance)) if distance.size else 0.0
@@ -185,7 +185,7 @@ def _estimate(
 def _pose_residuals(assembled: Assembled, batch: BatchState) -> Array:
     """Whitened residuals of the boards' poses, (N, 6)."""
     rows = assembled.problem.pose_residuals(batch)
-    return rows[0, assembled.pose_row, assembled.pose_place]
+    return rows[0, assembled.poses.row, assembled.poses.place]
 
 
 def _joint_residuals(machine: Machine, measurements: Measurements, state: State) -> Array:

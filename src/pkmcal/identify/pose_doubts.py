@@ -17,10 +17,10 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Estimate, Measurements, State
 from pkmcal.identify.hand_eye import start_from_poses
-from pkmcal.identify.mounts import mean_pose
-from pkmcal.identify.problem import Estimate, Measurements, State
+from pkmcal.identify.start import mean_pose, start_state
 from pkmcal.mechanisms import Machine
 
 BAD = 2.0

@@ -15,7 +15,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import cross, dot, rotation, rotation_vector, skew
 from pkmcal.identify.measured_platform import taken
-from pkmcal.identify.pose_rows import turn_jacobian
+from pkmcal.identify.rows import turn_jacobian
 from pkmcal.mechanisms.limbs import MOTIONS
 from pkmcal.observe.poses import PoseSet
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words_advice import advice_on
 from pkmcal.identify.words_driven import conventions_held
 from pkmcal.identify.words_effect import platform_by_parameters
@@ -28,7 +28,7 @@ from pkmcal.mechanisms import Machine
 if TYPE_CHECKING:
     from pkmcal.identify.conditions import Condition
     from pkmcal.identify.covariance import Direction, Identifiability
-    from pkmcal.identify.problem import Measurements
+    from pkmcal.identify.estimate import Measurements
     from pkmcal.observe.edges import EdgeSet
 
 INSIDE = (0.999, 0.95)

@@ -6,7 +6,7 @@ import numpy as np
 
 from pkmcal.arrays import Integers
 from pkmcal.identify.centres import Centres
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.observe.edges import Observation
 from pkmcal.outcome import Figure
 from pkmcal.report.residuals import KEPT

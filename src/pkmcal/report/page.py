@@ -9,7 +9,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.observe.edges import Observation
 from pkmcal.report import (
     figure,

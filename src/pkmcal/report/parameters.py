@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.words import Findings
 from pkmcal.identify.words_names import named
 from pkmcal.mechanisms import Machine, ParameterTable

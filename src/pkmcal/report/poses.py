@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import rotation_vector
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.observe.edges import Observation
 from pkmcal.observe.poses import PoseSet
 from pkmcal.report.charts import (

@@ -12,7 +12,7 @@ from pkmcal.arrays import Array
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.report.charts import WIDTH
 from pkmcal.report.wording import brief, number
 from pkmcal.session import Session

@@ -12,7 +12,8 @@ from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.covariance import information
 from pkmcal.identify.four_step import Form, FourSteps, centres_from_axes, solve
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
-from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.reproduce.paper_a_simulation import Settings, Truth, measured_axes

@@ -19,7 +19,9 @@ from pkmcal.identify.assembly import prior_rows
 from pkmcal.identify.axis_measurements import AxisNoise, as_edges, from_coordinates, to_coordinates
 from pkmcal.identify.four_step import Axes
 from pkmcal.identify.gauge import ThreeCentres, freedoms
-from pkmcal.identify.residuals import Blocks, Data, Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.rows import Blocks, Data
+from pkmcal.identify.unknowns import Unknowns
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.mechanisms.limbs import limb_ends
@@ -155,16 +157,16 @@ def joint_problem(machine: Machine, settings: Settings, truth: Truth) -> Problem
         truth.axis, settings.noise.sigma(), np.broadcast_to(radius, truth.axis.shape[:-1])
     )
     data = Data(basis, whiten, np.zeros((1, *shape, 4, 1)), truth.joints, np.ones((1, *shape)))
-    prior, target, _ = prior_rows(machine, ThreeCentres(), 3, 1, use_drawing=False)
+    unknowns = Unknowns(machine.parameters.free_matrix().shape[1], n_stations=3, n_cameras=1)
+    prior, target, _ = prior_rows(machine, ThreeCentres(), unknowns, use_drawing=False)
     return Problem(
         layout=machine.layout,
         drawing=machine.parameters.drawing,
         free=machine.parameters.free_matrix(),
+        unknowns=unknowns,
         blocks=blocks,
         data=data,
         joint_noise=settings.joint_noise,
-        n_stations=3,
-        n_cameras=1,
         prior=prior,
         prior_target=target,
         frames=freedoms(machine),

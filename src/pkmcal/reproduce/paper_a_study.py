@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.identify.residuals import Problem
+from pkmcal.identify.problem import Problem
 from pkmcal.mechanisms import Machine
 from pkmcal.reproduce.paper_a_methods import (
     Errors,
@@ -289,6 +289,6 @@ def _mean_error(name: str, errors: Errors) -> Array:
 def degrees_of_freedom(problem: Problem) -> int:
     """Residuals less unknowns of a study's problem; the gauge's rows fix twelve of them."""
     n_configurations = problem.blocks.leg.shape[0]
-    data = n_configurations * (problem.n_edge_rows + problem.layout.n_legs)
-    shared = problem.free.shape[1] - 12 + 6 * problem.n_stations
+    data = n_configurations * (problem.edge_rows.stop + problem.layout.n_legs)
+    shared = problem.unknowns.stations.stop - 12
     return data - shared - 6 * n_configurations

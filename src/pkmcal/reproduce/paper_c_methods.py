@@ -7,20 +7,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.assembly import assemble
 from pkmcal.identify.bundle import BatchResult, solve_batch
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.hand_eye import Pair, PairProblem, size_of, solve_pairs
 from pkmcal.identify.implicit import Form
 from pkmcal.identify.inverse_kinematic import PoseFit, fit_poses, pose_problem
-from pkmcal.identify.problem import State
-from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.reproduce.paper_c_simulation import Settings, Truth, measurements, workspace
-from pkmcal.solver import eliminate, minimise
+from pkmcal.solver import eliminate, inverse_root, minimise
 
 POSES = 100
 """Poses at which a run's machine is held against the truth."""
@@ -138,12 +139,8 @@ def _drawn(problem: Problem, state: BatchState, rng: np.random.Generator) -> Arr
     """
     reduced = eliminate(problem.linearize(state), np.zeros(len(state.z)))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
-    scale = np.sqrt(np.sum(rows**2, axis=1))
-    scale = np.where(scale > 0, scale, 1.0)
-    s, vt = np.linalg.svd(np.linalg.qr(rows / scale[:, None], mode="r"))[1:]
-    known: Booleans = s > LOOSE * s[:, :1]
-    draw = rng.normal(size=s.shape) * np.where(known, 1 / np.where(known, s, 1.0), 0.0)
-    return (np.swapaxes(vt, -1, -2) @ draw[..., None])[..., 0] / scale
+    half = inverse_root(rows, LOOSE, loose=False)
+    return (half @ rng.normal(size=(*half.shape[:1], half.shape[-1], 1)))[..., 0]
 
 
 class Errors(NamedTuple):

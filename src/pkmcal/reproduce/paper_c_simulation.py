@@ -16,7 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import look_at, perturb, pose, rotation
-from pkmcal.identify.problem import Measurements, Mount
+from pkmcal.identify.estimate import Measurements, Mount
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.kinematics import inverse, on_manifold
 from pkmcal.observe.edges import EdgeSet

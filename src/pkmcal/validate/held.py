@@ -23,16 +23,16 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.assembly import assemble, batch_of, state_of
-from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.bundle import BatchResult, solve_batch
-from pkmcal.identify.closure_noise import PERFECT
+from pkmcal.identify.estimate import Measurements, State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Measurements, State
-from pkmcal.identify.residuals import Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.rows import PERFECT
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.mechanisms.limbs import closure
-from pkmcal.solver import Linear, Reduced, Stop, eliminate, transposed
+from pkmcal.solver import Linear, Reduced, Stop, eliminate, inverse_root, stacked, transposed
 
 SOFT = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a
@@ -128,7 +128,7 @@ def _check_enough(problem: Problem, state: BatchState) -> None:
     """Raise ResultError where there are fewer rows than unknowns."""
     linear = problem.linearize(state)
     rows = int(linear.usable.sum()) + len(linear.shared_by)
-    if rows < problem.n_shared + linear.by_own.shape[1] * linear.by_own.shape[-1]:
+    if rows < problem.unknowns.count + linear.by_own.shape[1] * linear.by_own.shape[-1]:
         raise _too_little()
 
 
@@ -161,7 +161,8 @@ def _fit(result: BatchResult) -> _Fit:
     linear = problem.linearize(state)
     reduced = eliminate(linear, np.zeros(1))
     s, q = reduced.rows[0], reduced.q[0]
-    inverse = _inverse(s, linear.shared_by)
+    half = inverse_root(stacked(linear, reduced)[0][0], KNOWN, loose=False)
+    inverse = half @ half.T
     picks = _picks(problem, state, s.shape[1])
     along, shared = picks @ q, picks @ s
     left = np.eye(picks.shape[1]) - along @ transposed(along)
@@ -170,17 +171,6 @@ def _fit(result: BatchResult) -> _Fit:
     if least < ALONE:
         raise _too_little()
     return _Fit(linear, reduced, inverse, picks, np.linalg.inv(left), _size(problem, state))
-
-
-def _inverse(rows: Array, priors: Array) -> Array:
-    """N^+ (a, a) from rows (K', r, a) and priors' (c, a); open directions count as exact."""
-    stacked = np.concatenate([rows.reshape(-1, rows.shape[-1]), priors])
-    scale = np.sqrt(np.sum(stacked**2, axis=0))
-    scale = np.where(scale > 0, scale, 1.0)
-    _, s, vt = np.linalg.svd(np.linalg.qr(stacked / scale, mode="r"))
-    known = s > KNOWN * s.max(initial=0.0)
-    half = vt[: len(s)][known].T / s[known] / scale[:, None]
-    return half @ half.T
 
 
 def _picks(problem: Problem, state: BatchState, n_rows: int) -> Array:
@@ -254,11 +244,8 @@ def _flat(parts: Array) -> Array:
 def _by_machine(result: BatchResult) -> Array:
     """All rows (K', r) by all parameters of the machine but the radii, (K', r, P)."""
     problem, state = result.problem, result.solution.state
-    n = problem.drawing.size
-    wide = replace(problem, free=np.eye(n), prior=np.zeros((0, 0)), prior_target=np.zeros(0))
-    wide = replace(wide, prior=np.zeros((0, wide.n_shared)))
-    values = problem.theta(state) - problem.drawing
-    rows = wide.linearize(replace(state, z=values)).by_shared[0, ..., :n].copy()
+    wide, there = problem.opened(state)
+    rows = wide.linearize(there).by_shared[0, ..., wide.unknowns.machine].copy()
     rows[..., np.any(problem.free != 0, axis=1)] = 0.0
     return rows
 

@@ -21,13 +21,13 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import ResultError
 from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
-from pkmcal.identify.blocks import BatchState
-from pkmcal.identify.covariance import RANK_TOLERANCE
+from pkmcal.identify.covariance import reduced_rows
+from pkmcal.identify.estimate import Estimate, Measurements, State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Estimate, Measurements, State
-from pkmcal.identify.residuals import Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
-from pkmcal.solver import RESTART_DAMPING, Stop, eliminate, minimise, transposed
+from pkmcal.solver import RANK_TOLERANCE, RESTART_DAMPING, Stop, minimise
 
 SIZE = 1e-3
 """Of a magnification, relative: the size against which it counts as seen."""
@@ -132,11 +132,7 @@ def _still(machine: Machine) -> Machine:
 
 def _trusted(assembled: Assembled, trust: Trust) -> Problem:
     """The problem with the weights of :class:`Trust`."""
-    problem = assembled.problem
-    edges, poses = problem.data.weight.copy(), problem.pose_data.weight.copy()
-    edges[0, assembled.row, assembled.place] = trust.edges / trust.noise_scale**2
-    poses[0, assembled.pose_row, assembled.pose_place] = trust.poses / trust.pose_scale**2
-    return problem.weighted(edges, poses)
+    return assembled.trusting(trust.edges / trust.noise_scale**2, trust.poses / trust.pose_scale**2)
 
 
 def _with_magnification(state: BatchState) -> BatchState:
@@ -147,28 +143,11 @@ def _with_magnification(state: BatchState) -> BatchState:
 def _reduced(problem: Problem, state: BatchState, machine: Machine) -> tuple[Array, Array]:
     """A (n, P + C) and -y (n,), independent rows of unit variance, nuisances taken out."""
     n = problem.drawing.size
-    wide = replace(problem, free=np.eye(n))
-    wide = replace(wide, prior=np.pad(problem.prior, ((0, 0), (n, 0))))
-    linear = wide.linearize(replace(state, z=problem.theta(state) - problem.drawing))
-    reduced = eliminate(linear, np.zeros(1))
-    value = linear.value[0, ..., None]
-    value = value - reduced.q[0] @ (transposed(reduced.q[0]) @ value)
-    rows = np.concatenate([reduced.rows[0].reshape(-1, wide.n_shared), linear.shared_by])
-    left = np.concatenate([value.reshape(-1), linear.shared_value[0]])
-    lens = n + 6 * wide.n_stations + wide.n_optics * np.arange(wide.n_cameras) + 1
-    lens = lens if wide.n_optics > 1 else lens[:0]
-    asked = np.zeros(wide.n_shared, dtype=bool)
-    asked[:n] = asked[lens] = True
-    # what is known beforehand of a magnification is what this asks
-    kept = np.r_[
-        np.ones(len(rows) - len(linear.shared_by), bool), ~linear.shared_by[:, asked].any(1)
-    ]
-    rows, left = rows[kept], left[kept]
-    q = _column_space(rows[:, ~asked])
-    size = np.append(machine.parameters.tolerance, np.full(len(lens), SIZE))
-    by = rows[:, asked] * size
+    wide, there = problem.opened(state)
+    rows, left = reduced_rows(wide, there, ("machine", "intrinsics"))
+    size = np.append(machine.parameters.tolerance, np.full(rows.shape[1] - n, SIZE))
+    by = rows * size
     by[:, :n] = rows[:, :n] @ _across_axes(machine) * size[:n]
-    by, left = by - q @ (q.T @ by), left - q @ (q.T @ left)
     u, s, vt = np.linalg.svd(by, full_matrices=False)
     known = s > RANK_TOLERANCE * s.max(initial=0.0)
     return s[known, None] * vt[known] / size, -u[:, known].T @ left
@@ -183,19 +162,12 @@ def _across_axes(machine: Machine) -> Array:
     return out
 
 
-def _column_space(columns: Array) -> Array:
-    """An orthonormal basis of what columns can make."""
-    norm = np.linalg.norm(columns, axis=0)
-    u, s, _ = np.linalg.svd(columns[:, norm > 0] / norm[norm > 0], full_matrices=False)
-    return u[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
-
-
 def _residuals(problem: Problem, assembled: Assembled, state: BatchState) -> Array:
     """Root mean squares of the rows in use of each configuration, (K,)."""
     linear = problem.linearize(state)
     weight = np.repeat(problem.data.weight[0], problem.data.whiten.shape[-1], axis=-1)
     count = np.sum(weight > 0, axis=1) + problem.layout.n_equations
-    if problem.pose_blocks.count:
+    if problem.pose_blocks.present.size:
         measured = np.any(problem.pose_data.whiten[0] != 0, axis=-1) & (
             problem.pose_data.weight[0, ..., None] > 0
         )
