@@ -305,7 +305,7 @@ class Problem:
         motion = own @ layout.own_motion.T
         on_platform = self.pose_blocks.on_platform
         inner = BatchState(
-            state.z + z - (by_moves @ moves)[..., 0],
+            state.z + (z - (by_moves @ moves)[..., 0]),
             perturb(
                 state.T_camera_base, less_frames(camera, station_generators(state.T_camera_base))
             ),

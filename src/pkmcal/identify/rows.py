@@ -78,15 +78,16 @@ class Data:
 class EdgeRows:
     """The edges' rows at a state, and how they answer to what they depend on.
 
-    rot : (B, K, G, 3, 3) of their stations. a, b : (B, K, G, 3) both ends of their limbs, turned
-    into the camera's axes. normals : predicted in the camera frame, [B] eq. 3, with derivatives,
-    last axes (K, G, g).
+    rot, origin : (B, K, G, 3, 3) and (..., 3) of T_camera_base. a, b : (B, K, G, 3) both ends of
+    their limbs in the camera frame. normals : predicted there, [B] eq. 3, with derivatives, last
+    axes (K, G, g).
     """
 
     blocks: Blocks
     data: Data
     ends: LimbEnds
     rot: Array
+    origin: Array
     a: Array
     b: Array
     normals: EdgeNormals
@@ -120,7 +121,8 @@ class EdgeRows:
     @property
     def by_station(self) -> Array:
         """By their station's (omega, tau), (B, K, G, 2g, 6)."""
-        by_turn = -self._by_a @ skew(self.a) - self._by_b @ skew(self.b)
+        a, b = self.a - self.origin, self.b - self.origin
+        by_turn = -self._by_a @ skew(a) - self._by_b @ skew(b)
         return np.concatenate([by_turn, self._by_a + self._by_b], axis=-1)
 
     def by_own(self, ends_by_own: Array) -> Array:
@@ -156,11 +158,12 @@ def edge_rows(
     """
     k = np.arange(len(blocks.leg))[:, None]
     station = T_camera_base[:, blocks.station]
-    rot, t = station[..., :3, :3], station[..., :3, 3]
-    a, b = ((rot @ end[:, k, blocks.leg, :, None])[..., 0] for end in (ends.a, ends.b))
-    a_camera, b_camera = (a + t)[..., None, :], (b + t)[..., None, :]
-    normals = edge_normal_jacobians(a_camera, b_camera, radius[..., None], blocks.side)
-    return EdgeRows(blocks, data, ends, rot, a, b, normals)
+    rot, origin = station[..., :3, :3], station[..., :3, 3]
+    a, b = ((rot @ end[:, k, blocks.leg, :, None])[..., 0] + origin for end in (ends.a, ends.b))
+    normals = edge_normal_jacobians(
+        a[..., None, :], b[..., None, :], radius[..., None], blocks.side
+    )
+    return EdgeRows(blocks, data, ends, rot, origin, a, b, normals)
 
 
 def by_noise(layout: LimbLayout, joint_noise: float, by_reading: Array, rows: Array) -> Array:
