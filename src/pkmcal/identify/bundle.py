@@ -27,7 +27,7 @@ from pkmcal.identify.covariance import (
 )
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.mounts import start_mounts
-from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
+from pkmcal.identify.problem import Estimate, State, Statistics
 from pkmcal.identify.residuals import Problem
 from pkmcal.identify.robust import Both
 from pkmcal.identify.solver import (
@@ -38,6 +38,7 @@ from pkmcal.identify.solver import (
     eliminate,
     minimise,
 )
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 LEAST_SCALE = 1.0

@@ -31,8 +31,9 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.mounts import mean_pose
 from pkmcal.identify.pose_rows import turn_jacobian
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.solver import Linear, Values, minimise
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import limb_ends
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from pkmcal.errors import InputError
 from pkmcal.files import listed
-from pkmcal.files.yaml_files import field_path
+from pkmcal.files.documents import field_path
 from pkmcal.mechanisms.carriers.contract import platform_carriers
 from pkmcal.mechanisms.driven_checks import check_driven
 from pkmcal.mechanisms.joints import equations

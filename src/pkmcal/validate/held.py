@@ -27,9 +27,10 @@ from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.closure_noise import PERFECT
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import Problem
 from pkmcal.identify.solver import Linear, Reduced, Stop, eliminate, transposed
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.mechanisms.limbs import closure
