@@ -7,7 +7,7 @@ import numpy as np
 from pkmcal.cameras import Camera, camera_models
 from pkmcal.geometry.rigid import apply, look_at
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.simulate.casting import Part
 from pkmcal.simulate.demo import camera_of_size
 from pkmcal.simulate.render import Sensor, View, photograph, render

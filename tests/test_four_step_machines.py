@@ -27,7 +27,7 @@ from pkmcal.mechanisms import (
     load_mechanism,
     mechanism_text,
 )
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.poses import PoseSet
 

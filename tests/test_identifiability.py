@@ -21,7 +21,7 @@ from pkmcal.identify.gauge import apply, default_gauge, freedoms, generators
 from pkmcal.identify.problem import Measurements, State
 from pkmcal.identify.verdict import judge
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.edges import Observation
 from pkmcal.simulate import EdgeNoise, Settings, simulate_edges, true_machine
 from pkmcal.simulate.stations import default_stations

@@ -17,7 +17,7 @@ from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.problem import Measurements, State
 from pkmcal.identify.residuals import BatchState, Data
 from pkmcal.mechanisms import Machine, load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.edges import EdgeSet
 
 FOCAL = 889.0

@@ -14,7 +14,7 @@ from pkmcal.arrays import Array
 from pkmcal.control.seen import SeenMachine
 from pkmcal.geometry.rigid import apply, inverse, perturb, pose, register, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 
 HAND_POSITION = 0.03
 HAND_ROTATION = float(np.deg2rad(3))

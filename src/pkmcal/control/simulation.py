@@ -20,8 +20,8 @@ from pkmcal.control.seen import SeenMachine
 from pkmcal.control.steady import loop_factor, one_image
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, forward, inverse_result
-from pkmcal.mechanisms.limbs import closure, limb_ends
 from pkmcal.simulate.edges import EdgeNoise
 
 SETTLED = 0.02

@@ -29,8 +29,8 @@ from pkmcal.control.simulation import SETTLED, Loop, Runs, simulate
 from pkmcal.control.steady import Stillness, loop_factor, one_image
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.mechanisms.limbs import closure
 from pkmcal.simulate.configurations import draw_configurations
 
 INSIDE = 0.15

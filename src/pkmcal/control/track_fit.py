@@ -11,7 +11,7 @@ from pkmcal.control.laws import Task
 from pkmcal.control.seen import SeenMachine
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, perturb, skew
-from pkmcal.mechanisms.limbs import Closure, closure
+from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe.edges import EdgeSet
 
 SHADING = 0.1

@@ -18,7 +18,7 @@ from pkmcal.geometry.rigid import cross, dot
 from pkmcal.identify import linear
 from pkmcal.identify.problem import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import leg_readings
+from pkmcal.mechanisms.closure import leg_readings
 from pkmcal.observe.edges import EdgeSet
 
 ONE_DIRECTION = 1e-6

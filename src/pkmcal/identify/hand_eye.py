@@ -34,7 +34,7 @@ from pkmcal.identify.pose_rows import turn_jacobian
 from pkmcal.identify.problem import Measurements, State
 from pkmcal.identify.solver import Linear, Values, minimise
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 
 TURN = 0.03
 """Standard deviation (rad) that the drawing's poses are given: two degrees."""

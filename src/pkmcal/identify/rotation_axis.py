@@ -16,7 +16,7 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import cross, dot, rotation, rotation_vector, skew
 from pkmcal.identify.measured_platform import taken
 from pkmcal.identify.pose_rows import turn_jacobian
-from pkmcal.mechanisms.limbs import MOTIONS
+from pkmcal.mechanisms.document import MOTIONS
 from pkmcal.observe.poses import PoseSet
 
 Turning = Literal["none", "one axis", "any"]

@@ -14,7 +14,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.images import decode
 from pkmcal.observe.predict import legs_in_camera

@@ -22,7 +22,7 @@ from pkmcal.geometry.cylinders import (
 )
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.edges import EdgeSet, concatenate
 
 PLACES = 48
