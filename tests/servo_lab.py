@@ -7,7 +7,7 @@ import numpy as np
 from pkmcal.cameras import Camera, camera_models
 from pkmcal.geometry.rigid import apply, look_at
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.simulation.casting import Part
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.render import Sensor, View, photograph, render

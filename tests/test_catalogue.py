@@ -28,7 +28,7 @@ from pkmcal.mechanisms import (
     machine_from_document,
     mechanism_text,
 )
-from pkmcal.mechanisms.limbs import closure, dense
+from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.simulation import (
     EdgeNoise,
     Settings,

@@ -28,7 +28,7 @@ from pkmcal.mechanisms import (
     load_mechanism,
     mechanism_text,
 )
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 
 MACHINES = ("gough-stewart", "3-rpr", "3-rps", "3-upu", "6-spu-passive", "constant-legs")
 NOISE = 1e-4

@@ -304,7 +304,7 @@ def constant_legs(rng):
     """Three legs of constant length 1 about fixed centres: a body that they carry."""
     scene = make_scene("constant-legs", rng, 30)
     machine = scene.machine
-    from pkmcal.mechanisms.limbs import leg_readings, limb_ends
+    from pkmcal.mechanisms.closure import leg_readings, limb_ends
 
     ends = limb_ends(
         machine.layout, machine.values, scene.measurements.joints, scene.truth.T_base_platform

@@ -22,7 +22,7 @@ from pkmcal.identify.problem import State
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.simulation import EdgeNoise, Settings, simulate_edges, true_machine
 from pkmcal.simulation.stations import default_stations
 from test_joint_machines import JOINT_NOISE, Session, camera

@@ -18,7 +18,7 @@ from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import BatchState, Data
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine, load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 
 FOCAL = 889.0
 JOINT_NOISE = 3e-6

@@ -14,7 +14,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import contour_point, edge_normals
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose_difference
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import closure
+from pkmcal.mechanisms.closure import closure
 from pkmcal.session.load import load_session, look_at_pose
 from pkmcal.simulation import (
     EdgeNoise,
@@ -221,7 +221,7 @@ def test_edges_have_the_stated_noise(setting):
 
 def _check_exact(machine, T_camera_base, poses, edges, e):
     """One edge's normal is the geometry's."""
-    from pkmcal.mechanisms.limbs import limb_ends
+    from pkmcal.mechanisms.closure import limb_ends
 
     ends = limb_ends(machine.layout, machine.values, np.zeros(6), poses[edges.configuration[e]])
     T, leg = T_camera_base[edges.station[e]], edges.leg[e]

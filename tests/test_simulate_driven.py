@@ -14,7 +14,7 @@ from pkmcal.commands.comparison import compare
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.profiles import Profiles, estimate_blur, profile_offsets
 from pkmcal.simulation import (
     Settings,

@@ -23,7 +23,7 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.predict import tubes_of
 from servo_lab import BESIDE, MIRROR, PERSPECTIVE, WITHIN, Lab
 

@@ -15,7 +15,7 @@ from pkmcal.identify.words import MOST, describe, joined_by_boards, seen_legs, v
 from pkmcal.identify.words_effect import platform_by_parameters, pose_by_parameters
 from pkmcal.identify.words_families import circumstances, families, groups, hanging_together
 from pkmcal.mechanisms import kinematics, load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from test_identify_scene import Scene, _edges, _index, stations
 
 

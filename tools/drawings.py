@@ -16,7 +16,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.cylinders import edge_normals
 from pkmcal.geometry.rigid import apply, inverse, look_at
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe import legs, profiles
 from pkmcal.observe.legs import sample
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed

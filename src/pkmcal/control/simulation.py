@@ -14,8 +14,8 @@ from pkmcal.control.laws import Where, joint_velocities, law_named, limited, sol
 from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, forward, inverse_result
-from pkmcal.mechanisms.limbs import closure, limb_ends
 from pkmcal.simulation.edges import EdgeNoise
 
 

@@ -30,8 +30,8 @@ from pkmcal.control.simulation import (
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb, pose, register, rotation
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.mechanisms.limbs import closure, limb_ends
 from pkmcal.simulation.configurations import draw_configurations
 
 HAND_POSITION = 0.03

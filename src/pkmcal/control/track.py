@@ -14,7 +14,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, perturb, pose_difference, skew
 from pkmcal.measurements import EdgeSet
-from pkmcal.mechanisms.limbs import Closure, closure
+from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
 from pkmcal.observe.legs import Photographs, StationEdges, measure, search
 from pkmcal.observe.stations import DistanceTables

@@ -18,7 +18,7 @@ from pkmcal.geometry.rigid import cross, dot
 from pkmcal.identify import linear
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import leg_readings
+from pkmcal.mechanisms.closure import leg_readings
 
 ONE_DIRECTION = 1e-6
 """Ratio of eigenvalues below which a leg counts as seen in one direction only, for its centre."""

@@ -35,7 +35,7 @@ from pkmcal.identify.problem import State
 from pkmcal.identify.solver import Linear, Values, minimise
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 
 TURN = 0.03
 """Standard deviation (rad) that the drawing's poses are given: two degrees."""

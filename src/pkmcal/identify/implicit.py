@@ -20,7 +20,7 @@ from pkmcal.geometry.rigid import inverse, perturb
 from pkmcal.identify.measured_platform import Seen, Taken, seen_platform, taken
 from pkmcal.identify.solver import Linear, Values, transposed
 from pkmcal.mechanisms import kinematics
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, dense
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense
 
 Form = Literal["joint", "implicit"]
 PRINTED = 1e-4

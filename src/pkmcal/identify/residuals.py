@@ -30,7 +30,7 @@ from pkmcal.identify.closure_noise import by_noise, joint_rows
 from pkmcal.identify.pose_rows import PoseBlocks, PoseData, PoseRows, no_poses, pose_rows
 from pkmcal.identify.solver import Linear, Values
 from pkmcal.identify.steps import moved
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure
 
 SHADING_SIGMA = 0.03
 """Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,

@@ -17,7 +17,7 @@ from pkmcal.geometry.rigid import cross, dot, rotation, rotation_vector, skew
 from pkmcal.identify.measured_platform import taken
 from pkmcal.identify.pose_rows import turn_jacobian
 from pkmcal.measurements import PoseSet
-from pkmcal.mechanisms.limbs import MOTIONS
+from pkmcal.mechanisms.document import MOTIONS
 
 Turning = Literal["none", "one axis", "any"]
 TURNS: dict[str, Turning] = {

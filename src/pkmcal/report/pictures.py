@@ -15,7 +15,7 @@ from pkmcal.geometry.rigid import apply, dot, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.measurements import EdgeSet
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report.residuals import KEPT, SIDES, radius_positions, rms

@@ -8,8 +8,8 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import dot, perturb
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import on_manifold, singularity
-from pkmcal.mechanisms.limbs import closure, limb_ends
 from pkmcal.simulation.drives import drives_of, reaches, side_bars
 
 FARTHEST_TILT = np.deg2rad(35)

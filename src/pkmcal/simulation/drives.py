@@ -9,7 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import leg_readings, limb_ends
+from pkmcal.mechanisms.closure import leg_readings, limb_ends
 
 INSET = 0.1
 """Share of its range that a motor stays from its stops where reaches are compared."""

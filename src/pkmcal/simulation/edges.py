@@ -23,7 +23,7 @@ from pkmcal.geometry.cylinders import (
 from pkmcal.geometry.rigid import apply, dot
 from pkmcal.measurements import EdgeSet, concatenate
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 
 PLACES = 48
 """Places looked at along each tube: a hidden stretch is found to a fiftieth of the tube."""

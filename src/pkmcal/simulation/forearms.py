@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.mechanisms import Machine, machine_from_document
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.mechanisms.schema import Tube
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.mechanisms.document import Tube
 
 RADIUS = 0.02
 """Of a rod, in its length: 10 mm for half a metre, as carbon tubes of such machines have."""

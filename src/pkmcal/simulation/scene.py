@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.simulation.casting import Part, Scene
 from pkmcal.simulation.driven_parts import (
     beams,

@@ -10,7 +10,7 @@ from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, inverse, look_at, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.session.schema import Body
 from pkmcal.simulation.drives import reaches

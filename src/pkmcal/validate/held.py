@@ -32,8 +32,8 @@ from pkmcal.identify.residuals import Problem
 from pkmcal.identify.solver import Linear, Reduced, Stop, eliminate, transposed
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.mechanisms.limbs import closure
 
 SOFT = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a

@@ -1,19 +1,84 @@
-"""The schema of ``mechanism.yaml``; docs/files.md spells it out for people."""
+"""The schema of ``mechanism.yaml``; docs/files.md spells it out for people.
+
+A limb in it: what carries its two ends (a carrier's own schema), the rod between them, and what a
+camera sees of it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
-from pydantic import AfterValidator, Field
+import numpy as np
+from pydantic import AfterValidator, Discriminator, Field, Tag
 from pydantic_core import PydanticKnownError
 
+from pkmcal.arrays import Array
 from pkmcal.files import Schema
-from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
 from pkmcal.mechanisms.parameters import EVERY
-from pkmcal.mechanisms.rods import ActuatedLength, Rod
+
+
+def _increasing(value: tuple[float, float]) -> tuple[float, float]:
+    if not 0 < value[0] < value[1]:
+        raise ValueError("should be two increasing positive lengths [min, max]")
+    return value
+
+
+class ActuatedLength(Schema):
+    """``length: {actuated: true, offset: 0.0, range: [min, max]}``; length = reading + offset."""
+
+    actuated: Literal[True]
+    offset: float = 0.0
+    range: Annotated[tuple[float, float], AfterValidator(_increasing)] | None = None
+
+
+class ConstantLength(Schema):
+    """``length: {actuated: false, constant: 0.48}``: a rod of one length, metres."""
+
+    actuated: Literal[False]
+    constant: Annotated[float, Field(gt=0, description="the rod's length in metres")]
+
+
+class PassiveLength(Schema):
+    """``length: {passive: true}``: free to change, nobody reads it; it adds no equation."""
+
+    passive: Literal[True]
+
+
+def rod_kind(value: Any) -> str:
+    """Which of the three a ``length`` in the file is, told apart so that errors name its fields.
+
+    Tags are no keys of a file, or an error's place would be taken for the key.
+    """
+    if isinstance(value, Schema):
+        value = value.model_dump()
+    if not isinstance(value, dict):
+        return "actuated rod"
+    if value.get("passive"):
+        return "passive rod"
+    return "constant rod" if value.get("actuated") is False else "actuated rod"
+
+
+Rod = Annotated[
+    Annotated[ActuatedLength, Tag("actuated rod")]
+    | Annotated[ConstantLength, Tag("constant rod")]
+    | Annotated[PassiveLength, Tag("passive rod")],
+    Discriminator(rod_kind),
+]
+
+OFFSET = ParameterKind("offset", "m", "offset")
+CONSTANT = ParameterKind("constant", "m", "offset")
+
 
 Motion = Literal["spatial", "planar", "translation", "schoenflies"]
+MOTIONS: dict[str, Array] = {
+    "spatial": np.eye(6),
+    "planar": np.eye(6)[:, [2, 3, 4]],
+    "translation": np.eye(6)[:, 3:],
+    "schoenflies": np.eye(6)[:, 2:],
+}
+"""Columns: the directions (omega, tau) in which the platform can move, base frame; neighbours."""
 
 
 def _one_of(schemas: Iterable[type[Schema]], key: str) -> Any:
