@@ -11,7 +11,14 @@ import numpy as np
 from pkmcal.errors import InputError
 from pkmcal.files import listed
 from pkmcal.files.documents import field_path
-from pkmcal.mechanisms.carriers.contract import platform_carriers
+from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.document import (
+    MOTIONS,
+    ConstantLength,
+    Leg,
+    MechanismDocument,
+    PassiveLength,
+)
 from pkmcal.mechanisms.joints import equations
 from pkmcal.mechanisms.motors import motor_columns, sharing
 
