@@ -13,7 +13,7 @@ from conftest import run
 from pkmcal.calibration import calibrate
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.hand_eye import solve_pairs
+from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.recognition import boards_of, read_photographs
 from pkmcal.session import load_session
 from pkmcal.simulate import load_truth

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pkmcal.identify.bundle import solve_batch
-from pkmcal.identify.registration import Dense, minimise_dense
 from pkmcal.identify.solver import (
     Linear,
     Stop,
@@ -17,6 +16,7 @@ from pkmcal.identify.solver import (
     minimise,
     reduced_normal,
 )
+from pkmcal.papers.registration import Dense, minimise_dense
 from test_identify_scene import guess, make_scene
 
 

@@ -13,15 +13,15 @@ from pkmcal.boards import Boards
 from pkmcal.doubts import check_poses, richer_models, scale_doubt
 from pkmcal.gathering import known_stations, with_poses
 from pkmcal.identify.bundle import what_data_tell
-from pkmcal.identify.conditions import conditions
-from pkmcal.identify.paper_methods import Method as PaperMethod
-from pkmcal.identify.paper_methods import by_paper
 from pkmcal.identify.problem import Estimate, Measurements
 from pkmcal.identify.verdict import judge
 from pkmcal.identify.words import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.edges import Observation
 from pkmcal.outcome import Verdict
+from pkmcal.papers.conditions import conditions
+from pkmcal.papers.methods import Method as PaperMethod
+from pkmcal.papers.methods import by_paper
 from pkmcal.recognition import (
     boards_of,
     check_observable,

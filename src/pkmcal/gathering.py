@@ -9,10 +9,10 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.boards import Boards
 from pkmcal.errors import GeometryError, InputError, ResultError
-from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.problem import Measurements, Mount
 from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.poses import PoseSet, concatenate_poses
+from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.pose_tables import check_lengths
 from pkmcal.refinement import CameraRefinement
 from pkmcal.session import Session

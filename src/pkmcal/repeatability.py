@@ -18,7 +18,6 @@ from pkmcal.calibration import Calibration, Progress, calibrate
 from pkmcal.check import Finding, Level
 from pkmcal.errors import InputError
 from pkmcal.files import plain
-from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.observe import legs
 from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.motions import (
@@ -39,6 +38,7 @@ from pkmcal.observe.repeats import (
     pixel_units,
     same_edges,
 )
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.recognition import read_photographs
 from pkmcal.session import Session, Station, load_session
 

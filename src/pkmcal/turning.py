@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Booleans
-from pkmcal.identify.rotation_axis import RotationAxis, rotation_axis
 from pkmcal.identify.verdict import POOR
 from pkmcal.observe.poses import PoseSet
+from pkmcal.papers.rotation_axis import RotationAxis, rotation_axis
 from pkmcal.session import Session
 
 FEWEST = 4

@@ -18,10 +18,10 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference
 from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.mounts import mean_pose
 from pkmcal.identify.problem import Estimate, Measurements, State
 from pkmcal.mechanisms import Machine
+from pkmcal.papers.hand_eye import start_from_poses
 
 BAD = 2.0
 """Factor on the poses' noise, from which mistakes are looked for."""

@@ -6,11 +6,11 @@ import numpy as np
 
 from pkmcal.errors import PkmcalError
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Measurements, State
 from pkmcal.identify.robust import norms
 from pkmcal.mechanisms import Machine
+from pkmcal.papers.four_step import four_step
 
 
 def better_start(machine: Machine, measurements: Measurements, known: State) -> State:

@@ -12,23 +12,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Booleans, Integers
-from pkmcal.identify.four_step_checks import listed
 from pkmcal.mechanisms import Machine
+from pkmcal.papers.four_step_checks import listed
+from pkmcal.papers.legs import legs_of
 
 
 @dataclass(frozen=True)
 class Condition:
     """One condition of [A].
 
-    equation : its number in the paper. needed, available : counts. met : needed <= available.
+    equation : its number in the paper. needed, available : counts.
     text : what is counted, a sentence for people.
     """
 
     equation: str
     needed: int
     available: int
-    met: bool
     text: str
+
+    @property
+    def met(self) -> bool:
+        """Whether the counts suffice."""
+        return self.needed <= self.available
 
 
 def conditions(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
@@ -46,7 +51,7 @@ def every_leg(seen: Booleans) -> Condition:
     text = "every leg is seen by a station"
     if lost.size:
         text += f"; none sees {'leg' if lost.size == 1 else 'legs'} {listed(lost)}"
-    return _condition("3.3", seen.shape[1], int(seen.any(axis=0).sum()), text)
+    return Condition("[A] 3.3", seen.shape[1], int(seen.any(axis=0).sum()), text)
 
 
 def base(machine: Machine, seen: Booleans) -> Condition:
@@ -57,18 +62,17 @@ def base(machine: Machine, seen: Booleans) -> Condition:
     Equations: sum over stations of C(n, 2) + C(r, 2) + r(n - 1). A planar machine's axes are
     all its normal; their products say nothing of the plane's points and are not counted.
     """
-    n = seen.shape[1]
+    n, legs = seen.shape[1], legs_of(machine)
     count = seen.sum(axis=1)
-    if _planar(machine):
+    if legs.planar:
         text = "products of vectors between base joints, for their places in the plane"
-        return _condition("10, 12", 1 + 2 * (n - 2), int(_pairs(count).sum()), text)
-    revolute = np.array([leg.base.joint == "revolute" for leg in machine.document.legs])
-    revolute &= machine.layout.base_axis[:, 0] >= 0
+        return Condition("[A] 10, 12", 1 + 2 * (n - 2), int(_pairs(count).sum()), text)
+    revolute = legs.base_revolute
     r = (seen & revolute).sum(axis=1)
     available = _pairs(count) + _pairs(r) + r * np.maximum(count - 1, 0)
     needed = 3 + 3 * (n - 3) + 2 * int(revolute.sum())
     text = "products of vectors between base joints and revolute axes, for centres and axes"
-    return _condition("11, 12", needed, int(available.sum()), text)
+    return Condition("[A] 11, 12", needed, int(available.sum()), text)
 
 
 def offsets(machine: Machine, seen: Booleans) -> Condition:
@@ -76,7 +80,7 @@ def offsets(machine: Machine, seen: Booleans) -> Condition:
     closing = machine.layout.closing
     available = int(_pairs((seen & closing).sum(axis=1)).sum())
     text = "distances between platform joints of legs with a length, for their offsets"
-    return _condition("15", int(closing.sum()), available, text)
+    return Condition("[A] 15", int(closing.sum()), available, text)
 
 
 def platform(machine: Machine, seen: Booleans) -> Condition:
@@ -87,10 +91,10 @@ def platform(machine: Machine, seen: Booleans) -> Condition:
     """
     closing = machine.layout.closing
     n = int(closing.sum())
-    needed = 1 + 2 * (n - 2) if _planar(machine) else 3 + 3 * (n - 3)
+    needed = 1 + 2 * (n - 2) if legs_of(machine).planar else 3 + 3 * (n - 3)
     available = int(_pairs((seen & closing).sum(axis=1)).sum())
     text = "distances between platform joints of legs with a length, for their places"
-    return _condition("17", needed, available, text)
+    return Condition("[A] 17", needed, available, text)
 
 
 def at_once(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
@@ -98,29 +102,18 @@ def at_once(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
 
     Legs with a revolute joint count among the three themselves, passive ones do not.
     """
-    closing = machine.layout.closing
-    count = (seen & closing).sum(axis=1)
+    legs = legs_of(machine)
+    count = (seen & legs.closing).sum(axis=1)
     out: list[Condition] = []
-    for j, leg in enumerate(machine.document.legs):
-        passive = not closing[j]
-        revolute = leg.platform.joint == "revolute" and machine.layout.platform_axis[j, 0] >= 0
-        if not passive and not revolute:
-            continue
+    for j in np.flatnonzero(~legs.closing | legs.platform_revolute):
+        passive = not legs.closing[j]
         most = int(np.max(np.where(seen[:, j], count, 0), initial=0))
         what = f"passive leg {j + 1}" if passive else f"the revolute axis of leg {j + 1}"
         text = f"legs with a length seen at once, for {what} on the platform"
-        out.append(_condition("19" if passive else "18", 3, most, text))
+        out.append(Condition("[A] 19" if passive else "[A] 18", 3, most, text))
     return tuple(out)
-
-
-def _condition(equation: str, needed: int, available: int, text: str) -> Condition:
-    return Condition(f"[A] {equation}", needed, available, available >= needed, text)
 
 
 def _pairs(n: Integers) -> Integers:
     """C(n, 2)."""
     return n * (n - 1) // 2
-
-
-def _planar(machine: Machine) -> bool:
-    return machine.document.motion == "planar"

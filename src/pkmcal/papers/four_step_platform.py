@@ -1,4 +1,8 @@
-"""[A] 3.5, step 4 of four: the platform's joints.
+"""[A] 3.4-3.5, steps 3 and 4 of four: offsets and constant lengths, then the platform's joints.
+
+The platform is rigid, so the distances between its joints do not change:
+``B = A + (q + q0) u`` ([A] 13) for each leg with a length, q = 0 and q0 the length where it is
+constant. Passive legs take no part.
 
 Centres of legs with a length come from their ends (16), then each photograph's platform pose
 (18); with it, a leg's axis told in the platform frame gives a revolute axis (7) and the
@@ -7,21 +11,67 @@ centre of a passive leg (19), and the joints' equations give universal axes.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, inverse
-from pkmcal.identify.four_step_axes import across, nearest_points, revolute_axes
-from pkmcal.identify.registration import ANY_MOTION, SCALE, fit_body, minimise_dense
+from pkmcal.papers.leg_axes import Axes, across, nearest_points, revolute_axes
+from pkmcal.papers.registration import ANY_MOTION, SCALE, fit_body, minimise_dense
 
+COLLAPSED = 0.5
+"""A constant length below this part of its drawing is the false minimum B = A."""
 WIDE = 20.0
 """Tolerances within which the torsion's noise is looked for."""
 TORSION_STEPS, SETTLED = 40, 1e-13
 ROUNDING = 1e-12
 """Share of the best known direction's information below which a direction is rounding."""
+
+
+def offsets(axes: Axes, a_photo: Array, start: Array, form: str) -> Array:
+    """Step 3, [A] 13-14: offsets (B, L) that keep the distances between platform joints.
+
+    axes : only legs with a length in ``seen``. a_photo : (B, C, L, 3) base centres in each
+    photograph's frame. start : (L,) m, the drawing's: a length of zero is a false minimum.
+    """
+
+    def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
+        value, jac = deviations(axes.of_runs(runs), a_photo[runs], x, form)
+        return value / SCALE, jac / SCALE
+
+    return minimise_dense(rows, np.broadcast_to(start, (len(a_photo), len(start))).copy()).state
+
+
+def deviations(axes: Axes, a_photo: Array, at: Array, form: str) -> tuple[Array, Array]:
+    """The criterion's rows (B, r) m at offsets (B, L), and their derivatives (B, r, L).
+
+    printed: differences of consecutive photographs of a station, C_2 as [A] 14 has it. corrected
+    (errata): deviations from each pair's mean, sum (d_k - mean d)^2.
+    """
+    j, g = np.triu_indices(axes.seen.shape[1], 1)
+    both = axes.seen[:, j] & axes.seen[:, g]
+    used = both.sum(axis=0) > 1
+    j, g, both = j[used], g[used], both[:, used]
+    b = a_photo + (axes.readings + at[:, None])[..., None] * axes.u
+    d = b[:, :, j] - b[:, :, g]
+    distance = np.sqrt(np.maximum(dot(d, d), 1e-300))
+    e = d / distance[..., None]
+    slope = np.zeros((*distance.shape, at.shape[-1]))
+    pair = np.arange(len(j))
+    slope[:, :, pair, j] = dot(e, axes.u[:, :, j])
+    slope[:, :, pair, g] = -dot(e, axes.u[:, :, g])
+    rows = np.concatenate([distance[..., None], slope], axis=-1)
+    if form == "printed":
+        same = axes.station[1:] == axes.station[:-1]
+        use = both[1:] & both[:-1] & same[:, None]
+        rows = np.where(use[..., None], rows[:, 1:] - rows[:, :-1], 0.0)
+    else:
+        mean = np.einsum("cp,bcpl->bpl", both / both.sum(axis=0), rows)
+        rows = np.where(both[..., None], rows - mean[:, None], 0.0)
+    rows = rows.reshape(len(rows), -1, rows.shape[-1])
+    return rows[..., 0], rows[..., 1:]
 
 
 def platform_by_registration(
@@ -128,81 +178,57 @@ def universal_axes(
     u : (B, K, L, 3) base frame. rot : (B, K, 3, 3) platform to base. seen : (K, L).
     drawn : axes v, w (B, L, 3). tolerance : (L,). Returns v, w (B, L, 3) unit.
     """
-    legs = _Torsions(u, rot, seen, drawn, (_tangents(drawn[0]), _tangents(drawn[1])))
-    x, variance = _settled(legs, np.zeros((len(u), u.shape[2], 4)), WIDE * tolerance)
-    x, _ = _settled(legs, x, tolerance, variance)
-    v, w, _ = legs.axes(x)
-    return v, w
+
+    def rows(x: Array) -> tuple[Array, Array]:
+        """Torsions (B, K, L) of axes tilted by x (B, L, 4), and their derivatives."""
+        (v, v_by), (w, w_by) = _tilted(drawn[0], x[..., :2]), _tilted(drawn[1], x[..., 2:])
+        value, by_v, by_w = torsion(u, rot[:, :, None], v[:, None], w[:, None])
+        jac = [by_v[..., None, :] @ v_by[:, None], by_w[..., None, :] @ w_by[:, None]]
+        slope = np.concatenate(jac, axis=-1)[..., 0, :]
+        return np.where(seen, value, 0.0), np.where(seen[..., None], slope, 0.0)
+
+    count = np.maximum(seen.sum(axis=0), 5)
+    start = np.zeros((len(u), u.shape[2], 4))
+    x, variance = _beside_drawing(rows, start, count, WIDE * tolerance)
+    x, _ = _beside_drawing(rows, x, count, tolerance, variance)
+    return _tilted(drawn[0], x[..., :2])[0], _tilted(drawn[1], x[..., 2:])[0]
 
 
-class _Torsions(NamedTuple):
-    """What the torsions of :func:`universal_axes` depend on; tangents (B, L, 3, 2) each."""
-
-    u: Array
-    rot: Array
-    seen: Booleans
-    drawn: tuple[Array, Array]
-    tangents: tuple[Array, Array]
-
-    def axes(self, x: Array) -> tuple[Array, Array, tuple[Array, Array]]:
-        """Unit axes moved by x (B, L, 4) in their tangents, and derivatives (B, L, 3, 4)."""
-        axes, slopes = [], []
-        for side in (0, 1):
-            part = slice(2 * side, 2 * side + 2)
-            tangents = self.tangents[side]
-            long = self.drawn[side] + (tangents @ x[..., part, None])[..., 0]
-            size = np.sqrt(dot(long, long))[..., None]
-            unit = long / size
-            by_x = np.zeros((*x.shape[:-1], 3, 4))
-            by_x[..., part] = across(unit) @ tangents / size[..., None]
-            axes.append(unit)
-            slopes.append(by_x)
-        return axes[0], axes[1], (slopes[0], slopes[1])
-
-    def rows(self, x: Array) -> tuple[Array, Array]:
-        """Torsions (B, K, L) and their derivatives (B, K, L, 4) by x."""
-        v, w, (v_by, w_by) = self.axes(x)
-        value, by_v, by_w = torsion(self.u, self.rot[:, :, None], v[:, None], w[:, None])
-        jac = by_v[..., None, :] @ v_by[:, None] + by_w[..., None, :] @ w_by[:, None]
-        mask = self.seen
-        return np.where(mask, value, 0.0), np.where(mask[..., None], jac[..., 0, :], 0.0)
+def _tilted(axis: Array, x: Array) -> tuple[Array, Array]:
+    """Unit axes (..., 3) moved by x (..., 2) across themselves, and derivatives (..., 3, 2)."""
+    tangents = tangent_basis(axis, np.eye(3)[np.argmin(np.abs(axis), axis=-1)])
+    moved = axis + (tangents @ x[..., None])[..., 0]
+    size = np.sqrt(dot(moved, moved))[..., None]
+    return moved / size, across(moved / size) @ tangents / size[..., None]
 
 
-def _settled(
-    legs: _Torsions, x: Array, tolerance: Array, variance: Array | None = None
+def _beside_drawing(
+    rows: Callable[[Array], tuple[Array, Array]],
+    x: Array,
+    count: Integers,
+    tolerance: Array,
+    variance: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Gauss-Newton from x with the drawing beside; the torsion's variance (B, L) from its
-    residuals where it is not given.
+    """Gauss-Newton from x (B, L, 4), the drawing x = 0 beside with its tolerance (L,).
+
+    Returns x and the torsion's variance (B, L): as given, or from the residuals of count (L,)
+    photographs, of which a direction that the data know takes one, and the drawing's none.
     """
-    count = np.maximum(np.broadcast_to(legs.seen, legs.u.shape[:-1]).sum(axis=1), 5)
-    share, found = np.zeros(x.shape), variance
+    share = np.zeros(x.shape)
+    noise = np.zeros(x.shape[:-1]) if variance is None else variance
     for _ in range(TORSION_STEPS):
-        value, jac = legs.rows(x)
-        found = np.sum(value**2, axis=1) / (count - share.sum(axis=-1))
-        found = found if variance is None else variance
-        new, share = _beside_drawing(value, jac, x, found / tolerance**2)
-        done = np.max(np.abs(new - x), initial=0.0) < SETTLED
-        x = new
-        if done:
+        value, jac = rows(x)
+        if variance is None:
+            noise = np.sum(value**2, axis=1) / (count - share.sum(axis=-1))
+        normal = np.einsum("bkli,bklj->blij", jac, jac)
+        values, vectors = np.linalg.eigh(normal)
+        values = np.maximum(values, 0.0)
+        right = (normal @ x[..., None])[..., 0] - np.einsum("bkli,bkl->bli", jac, value)
+        along = (np.swapaxes(vectors, -1, -2) @ right[..., None])[..., 0]
+        # directions that the data do not know at all stay as drawn even without noise
+        hold = noise / tolerance**2 + ROUNDING * values[..., -1] + 1e-300
+        share = values / (values + hold[..., None])
+        before, x = x, (vectors @ (along / (values + hold[..., None]))[..., None])[..., 0]
+        if np.max(np.abs(x - before), initial=0.0) < SETTLED:
             break
-    return x, np.zeros(x.shape[:-1]) if found is None else found
-
-
-def _beside_drawing(value: Array, jac: Array, x: Array, ridge: Array) -> tuple[Array, Array]:
-    """Gauss-Newton's next x (B, L, 4) with the drawing x = 0 weighted by ridge (B, L).
-
-    Also the share of the data in each direction, (B, L, 4): 0 is the drawing's.
-    """
-    values, vectors = np.linalg.eigh(np.einsum("bkli,bklj->blij", jac, jac))
-    values = np.maximum(values, 0.0)
-    target = np.einsum("bkli,bklj,blj->bli", jac, jac, x) - np.einsum("bkli,bkl->bli", jac, value)
-    along = (np.swapaxes(vectors, -1, -2) @ target[..., None])[..., 0]
-    # directions that the data do not know at all stay as drawn even without noise
-    total = values + (ridge + ROUNDING * values[..., -1] + 1e-300)[..., None]
-    return (vectors @ (along / total)[..., None])[..., 0], values / total
-
-
-def _tangents(axis: Array) -> Array:
-    """Two unit directions (..., 3, 2) across each axis (..., 3)."""
-    other = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
-    return tangent_basis(axis, other)
+    return x, noise

@@ -151,22 +151,29 @@ def laid(
     centred[..., :n, :] -= mean[..., None, :]
     target[..., :n, :] -= seen[..., None, :]
     h = np.swapaxes(target, -1, -2) @ (w[..., None] * centred)
-    rot = _rotation_within(h, motion)
+    if motion.shape[1] == 6:
+        rot = nearest_rotation(h)
+    else:
+        omega = np.zeros(h.shape[:-1])
+        if motion[2].any():  # about z
+            omega[..., 2] = np.arctan2(h[..., 1, 0] - h[..., 0, 1], h[..., 0, 0] + h[..., 1, 1])
+        rot = rotation(omega)
     shift = seen - (rot @ mean[..., None])[..., 0]
     return pose(rot, shift @ motion[3:] @ motion[3:].T)
 
 
-def _rotation_within(h: Array, motion: Array) -> Array:
-    """The rotation (..., 3, 3) that maximises tr(R^T H) and that the motion allows."""
-    if motion.shape[1] == 6:
-        u, _, vt = np.linalg.svd(h)
-        u = u.copy()
-        u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-        return u @ vt
-    omega = np.zeros(h.shape[:-1])
-    if motion[2].any():  # planar, about z
-        omega[..., 2] = np.arctan2(h[..., 1, 0] - h[..., 0, 1], h[..., 0, 0] + h[..., 1, 1])
-    return rotation(omega)
+def nearest_rotation(h: Array) -> Array:
+    """The rotations R (..., 3, 3) that maximise tr(R^T H); reflections are excluded."""
+    u, _, vt = np.linalg.svd(h)
+    u = u.copy()
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
+
+
+def extent(points: Array) -> float:
+    """Root mean square distance (m) of points (n, 3) from their mean."""
+    away = points - points.mean(axis=0)
+    return float(np.sqrt(np.mean(dot(away, away))))
 
 
 def loose(items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY_MOTION) -> Array:

@@ -16,17 +16,17 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference, register
-from pkmcal.identify import linear
 from pkmcal.identify.assembly import Assembled, assemble, batch_of
 from pkmcal.identify.covariance import data_share
-from pkmcal.identify.four_step import four_step
-from pkmcal.identify.four_step_boards import mount_poses
 from pkmcal.identify.gauge import apply, centre_index, default_gauge
-from pkmcal.identify.hand_eye import start_from_poses
-from pkmcal.identify.inverse_kinematic import inverse_kinematic
 from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
 from pkmcal.identify.residuals import BatchState
 from pkmcal.mechanisms import Machine
+from pkmcal.papers import linear
+from pkmcal.papers.four_step import four_step
+from pkmcal.papers.four_step_base import with_boards
+from pkmcal.papers.hand_eye import start_from_poses
+from pkmcal.papers.inverse_kinematic import inverse_kinematic
 
 Method = Literal["four-step", "linear", "inverse-kinematic"]
 REPETITIONS = 60
@@ -118,10 +118,7 @@ def linear_state(machine: Machine, measurements: Measurements) -> State:
         rise = theta[base_index[:, 2]] - drawing[:, 2]
         theta[platform_index[:, 2]] = machine.platform_centers()[:, 2] + rise
     poses = machine.with_values(theta).forward_result(measurements.joints, machine.home())
-    n_cameras = int(np.max(measurements.camera_of_station)) + 1
-    state = State(theta, stations, poses.T_base_platform, np.zeros(n_cameras))
-    boards = mount_poses(measurements, state)
-    return replace(state, T_mount=boards, on_platform=measurements.on_platform)
+    return with_boards(measurements, theta, stations, poses.T_base_platform)
 
 
 def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements:
