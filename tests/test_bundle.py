@@ -15,8 +15,8 @@ from pkmcal.identify.covariance import identifiability, machine_covariance
 from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.problem import Measurements
-from pkmcal.identify.solver import Stop
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.solver import Stop
 from test_identify_scene import JOINT_NOISE, guess, make_scene
 
 

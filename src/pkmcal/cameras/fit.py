@@ -3,7 +3,7 @@
 Unknowns: the free intrinsics, and six numbers a view (left perturbation of ``T_camera_board``).
 A corner's residual is divided by sqrt(sigma^2 + tau^2): sigma is what its own fit in the picture
 says, tau what the model leaves out, estimated so that chi square is what it should be. Corners
-far off lose their weight. The poses are eliminated view by view (:mod:`pkmcal.identify.solver`).
+far off lose their weight. The poses are eliminated view by view (:mod:`pkmcal.solver`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras.contract import Camera
 from pkmcal.geometry.rigid import apply, perturb, skew
-from pkmcal.identify.solver import Linear, Values, eliminate, minimise, own_factors, transposed
+from pkmcal.solver import Linear, Values, eliminate, minimise, own_factors, transposed
 
 FULL, NONE = 4.0, 6.5
 """A corner counts fully up to FULL and not at all from NONE standard deviations on."""
@@ -52,9 +52,11 @@ class Views(NamedTuple):
 
 
 class State(NamedTuple):
-    """Intrinsics (n,) and poses ``T_camera_board`` (B, K, 4, 4)."""
+    """Free intrinsics (B, k), of one run where there are any, and poses ``T_camera_board``
+    (B, K, 4, 4).
+    """
 
-    parameters: Array
+    intrinsics: Array
     T_camera_board: Array
 
 
@@ -75,7 +77,7 @@ class Problem:
 
     def residuals(self, state: State) -> Values:
         """Whitened residuals, NaN where the camera does not see a corner that was seen."""
-        camera = replace(self.camera, parameters=state.parameters)
+        camera = with_free(self.camera, self.free, state)
         there = apply(state.T_camera_board[..., None, :, :], self.points)
         off = (camera.project(there) - self.pixels) * self.scale[..., None]
         off = np.where(self.scale[..., None] > 0, off, 0.0)
@@ -83,7 +85,7 @@ class Problem:
 
     def linearize(self, state: State) -> Linear:
         """Whitened residuals and their exact derivatives."""
-        camera = replace(self.camera, parameters=state.parameters)
+        camera = with_free(self.camera, self.free, state)
         rotated = apply(state.T_camera_board[..., None, :, :], self.points)
         turned = rotated - state.T_camera_board[..., None, :3, 3]
         by_point, by_parameters = camera.project_jacobians(rotated)
@@ -113,27 +115,26 @@ class Problem:
 
     def moved(self, state: State, shared: Array, own: Array) -> State:
         """The state after a step; xi stays at 0 or above."""
-        parameters = state.parameters.copy()
+        intrinsics = state.intrinsics
         if len(self.free):
-            parameters[self.free] += shared[0]
+            intrinsics = intrinsics + shared
             if "xi" in self.camera.parameter_names:
-                k = self.camera.parameter_names.index("xi")
-                parameters[k] = max(parameters[k], 0.0)
-        return State(parameters, perturb(state.T_camera_board, own))
+                xi = self.free == self.camera.parameter_names.index("xi")
+                intrinsics[:, xi] = np.maximum(intrinsics[:, xi], 0.0)
+        return State(intrinsics, perturb(state.T_camera_board, own))
 
     def select(self, runs: Integers) -> Problem:
         """The problem of some runs."""
         return replace(self, pixels=self.pixels[runs], scale=self.scale[runs])
 
-    def take(self, state: State, runs: Integers) -> State:
-        """The state of some runs; intrinsics go along only where there is something to take."""
-        return State(state.parameters, state.T_camera_board[runs])
 
-    def put(self, state: State, runs: Integers, part: State) -> State:
-        """The state with some runs' poses (and, of one run, the intrinsics) replaced."""
-        poses = state.T_camera_board.copy()
-        poses[runs] = part.T_camera_board
-        return State(part.parameters if len(runs) else state.parameters, poses)
+def with_free(camera: Camera, free: Integers, state: State) -> Camera:
+    """The camera with its free intrinsics as the state has them."""
+    if not len(free):
+        return camera
+    parameters = camera.parameters.copy()
+    parameters[free] = state.intrinsics[0]
+    return replace(camera, parameters=parameters)
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ class Fit:
     @property
     def state(self) -> State:
         """The fit as the solver's state."""
-        return State(self.camera.parameters, self.T_camera_board[None])
+        return State(self.camera.parameters[None, self.free], self.T_camera_board[None])
 
 
 def fit_camera(
@@ -169,13 +170,13 @@ def fit_camera(
     """Fit intrinsics and poses from a start; weights and noise alternate with the search."""
     seen = views.seen
     weight = seen.astype(float)
-    state = State(camera.parameters, T_camera_board[None])
+    state = State(camera.parameters[None, free], T_camera_board[None])
     tau, cut, converged, off = 1.0, 4.0, True, views.pixels
     for _ in range(rounds):
         problem = _problem(camera, free, views, weight, tau)
         found = minimise(problem, state, max_steps=STEPS)
         state, converged = found.state, "converged" in found.stop[0].value
-        off = _off(camera, state, views)
+        off = _off(with_free(camera, free, state), state, views)
         dof = max(2 * weight.sum() - 6 * len(seen) - len(free), 1.0)
         new_tau = noise_beyond(off, views.sigma, weight, dof)
         robust = _robust_scale(off, views.sigma, seen)
@@ -185,17 +186,18 @@ def fit_camera(
         weight, tau, cut = new_weight, new_tau, max(cut / 2, 1.0)
         if done:
             break
-    fitted = replace(camera, parameters=state.parameters)
-    return Fit(fitted, free, state.T_camera_board[0], off, weight, tau, converged)
+    return Fit(
+        with_free(camera, free, state), free, state.T_camera_board[0], off, weight, tau, converged
+    )
 
 
 def refit(fit: Fit, views: Views, kept: Integers) -> Fit:
     """The camera from some of the views, from the fit to all, with its weights and noise."""
     part = views.take(kept)
     problem = _problem(fit.camera, fit.free, part, fit.weight[kept], fit.tau)
-    state = State(fit.camera.parameters, fit.T_camera_board[kept][None])
+    state = State(fit.camera.parameters[None, fit.free], fit.T_camera_board[kept][None])
     found = minimise(problem, state, max_steps=15)
-    camera = replace(fit.camera, parameters=found.state.parameters)
+    camera = with_free(fit.camera, fit.free, found.state)
     off = _off(camera, found.state, part)
     return replace(
         fit, camera=camera, T_camera_board=found.state.T_camera_board[0], residuals=off,
@@ -210,7 +212,9 @@ def fit_poses(
     problem = Problem(
         camera, np.zeros(0, dtype=int), views.points, views.pixels[:, None], scale[:, None]
     )
-    found = minimise(problem, State(camera.parameters, T_camera_board[:, None]), max_steps=STEPS)
+    found = minimise(
+        problem, State(np.zeros((len(scale), 0)), T_camera_board[:, None]), max_steps=STEPS
+    )
     return found.state.T_camera_board[:, 0], found.cost
 
 
@@ -271,8 +275,7 @@ def _problem(camera: Camera, free: Integers, views: Views, weight: Array, tau: f
 
 def _off(camera: Camera, state: State, views: Views) -> Array:
     """Predicted minus seen, (V, N, 2) px; far away where the camera cannot see the corner."""
-    fitted = replace(camera, parameters=state.parameters)
-    off = fitted.project(apply(state.T_camera_board[0][:, None], views.points)) - views.pixels
+    off = camera.project(apply(state.T_camera_board[0][:, None], views.points)) - views.pixels
     lost = views.seen[..., None] & ~np.isfinite(off)
     return np.where(lost, 1e3, off)
 

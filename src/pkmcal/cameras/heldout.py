@@ -10,7 +10,7 @@ from pkmcal.arrays import Array
 from pkmcal.cameras.fit import Fit, Views, fit_poses, inverted, refit
 from pkmcal.cameras.resection import line_offsets
 from pkmcal.geometry.rigid import apply
-from pkmcal.identify.solver import eliminate, transposed
+from pkmcal.solver import eliminate, transposed
 
 FOLDS = 10
 """Parts that the views are dealt into; each is predicted by a camera fitted to the others."""

@@ -28,7 +28,12 @@ from pkmcal.identify.closure_noise import PERFECT
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Measurements, State
-from pkmcal.identify.solver import (
+from pkmcal.mechanisms import Machine, kinematics
+from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, dense
+from pkmcal.papers.hand_eye import start_from_poses
+from pkmcal.papers.measured_platform import Seen, Taken, seen_platform, taken
+from pkmcal.papers.rotation_axis import axis_frames
+from pkmcal.solver import (
     RESTART_DAMPING,
     Linear,
     Solution,
@@ -36,13 +41,10 @@ from pkmcal.identify.solver import (
     Values,
     eliminate,
     minimise,
+    of_runs,
+    take,
     transposed,
 )
-from pkmcal.mechanisms import Machine, kinematics
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, dense
-from pkmcal.papers.hand_eye import start_from_poses
-from pkmcal.papers.measured_platform import Seen, Taken, seen_platform, taken
-from pkmcal.papers.rotation_axis import axis_frames
 
 Form = Literal["joint", "implicit"]
 PRINTED = 1e-4
@@ -217,22 +219,9 @@ class ImplicitProblem:
 
     def select(self, runs: Integers) -> ImplicitProblem:
         """Some runs only."""
-        weigh = self.weigh if len(self.weigh) == 1 else self.weigh[runs]
+        weigh = of_runs(self.weigh, runs)
         poses, readings = self.T_camera_board[runs], self.readings[runs]
         return replace(self, T_camera_board=poses, readings=readings, weigh=weigh)
-
-    @staticmethod
-    def take(state: ImplicitState, runs: Integers) -> ImplicitState:
-        """Some runs' states."""
-        return ImplicitState(*(part[runs] for part in state))
-
-    @staticmethod
-    def put(state: ImplicitState, runs: Integers, part: ImplicitState) -> ImplicitState:
-        """Some runs' states replaced."""
-        out = [array.copy() for array in state]
-        for array, new in zip(out, part, strict=True):
-            array[runs] = new
-        return ImplicitState(*out)
 
 
 def _placed(values: Array, which: Array) -> Array:
@@ -436,7 +425,7 @@ def unknowns_kept(
     By the first run. As printed, the tilts of a board against the axis of rotation have only a
     second-order influence ([C] III.C) and are held.
     """
-    first, begin = problem.select(np.array([0])), problem.take(state, np.array([0]))
+    first, begin = problem.select(np.array([0])), take(state, np.array([0]))
     jac = reduced_jacobian(first.ideal(begin), begin)
     sizes = np.concatenate([
         machine.parameters.tolerances_free(),

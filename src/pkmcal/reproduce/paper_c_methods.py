@@ -14,12 +14,12 @@ from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import BatchState, Problem
-from pkmcal.identify.solver import eliminate, minimise
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.papers.hand_eye import Pair, PairProblem, size_of, solve_pairs
 from pkmcal.papers.inverse_kinematic import Form, PoseFit, fit_poses, pose_problem
 from pkmcal.reproduce.paper_c_simulation import Settings, Truth, measurements, workspace
+from pkmcal.solver import eliminate, minimise
 
 POSES = 100
 """Poses at which a run's machine is held against the truth."""

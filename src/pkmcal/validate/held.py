@@ -29,10 +29,10 @@ from pkmcal.identify.closure_noise import PERFECT
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Measurements, State
 from pkmcal.identify.residuals import Problem
-from pkmcal.identify.solver import Linear, Reduced, Stop, eliminate, transposed
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.mechanisms.limbs import closure
+from pkmcal.solver import Linear, Reduced, Stop, eliminate, transposed
 
 SOFT = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a

@@ -1,4 +1,6 @@
-"""Batched Levenberg-Marquardt with the own unknowns of each configuration eliminated.
+"""Least squares: batched Levenberg-Marquardt, robust weights, scaled ranks and inverses.
+
+**Search.** The own unknowns of each configuration are eliminated.
 
 A problem has unknowns that all configurations share, x_a (na), and unknowns of each
 configuration alone, x_b (d each). Residual rows are grouped by configuration, so the Jacobian
@@ -9,13 +11,23 @@ acceptance and stop, and no loop goes over runs or configurations.
 The Schur complement is formed as a square root: with ``by_own = Q R`` the reduced rows are
 ``(I - Q Q^T) by_shared``. Subtracting normal matrices instead would cancel half the digits,
 since readings a thousand times sharper than edges dominate both terms.
+
+**States and data of many runs** are arrays, or frozen dataclasses or named tuples of arrays, whose
+leading axis counts the runs; see :func:`take`, :func:`put` and :func:`of_runs`.
+
+**Robust weights**, one for a search that lets go of what does not fit (:func:`soft_weights`), one
+for its end (:func:`final_weights`).
+
+**Ranks and inverses** are those of matrices whose columns are scaled to length one first: unknowns
+in metres, radians and pixels are not to be compared otherwise.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from enum import Enum
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 import numpy as np
 
@@ -36,6 +48,16 @@ is its rounding, where a direction is a millionth as well known as the others.""
 
 ROUNDING = 1e-13
 """Of the cost, relative."""
+
+FULL, NONE = 4.0, 6.5
+"""Final weights are 1 up to FULL and 0 from NONE standard deviations: of clean pairs of residuals
+3 in 10^4 lose part of their weight and none all of it, so efficiency is above 0.999."""
+RANK_TOLERANCE = 1e-9
+"""Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14
+there with exact derivatives, and real directions are many orders above."""
+
+Runs = TypeVar("Runs")
+"""An array, or a frozen dataclass or named tuple of arrays, with a leading axis of runs."""
 
 
 class Stop(Enum):
@@ -93,13 +115,40 @@ class LeastSquares(Protocol):
         """The problem of some runs only."""
         ...
 
-    def take(self, state: Any, runs: Integers) -> Any:
-        """The state of some runs."""
-        ...
 
-    def put(self, state: Any, runs: Integers, part: Any) -> Any:
-        """The state with some runs' values replaced."""
-        ...
+def take(state: Runs, runs: Integers) -> Runs:
+    """The state of some runs."""
+    return _each(lambda array: array[runs], state)
+
+
+def put(state: Runs, runs: Integers, part: Runs) -> Runs:
+    """The state with some runs' values replaced by those of ``part``."""
+
+    def replaced(array: Array, new: Array) -> Array:
+        out = array.copy()
+        out[runs] = new
+        return out
+
+    return _each(replaced, state, part)
+
+
+def of_runs(data: Runs, runs: Integers) -> Runs:
+    """The measured numbers of some runs; what all runs share (a leading axis of 1) stays."""
+    return _each(lambda array: array if len(array) == 1 else array[runs], data)
+
+
+def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
+    """A function of the arrays of states, array by array."""
+    if isinstance(first, np.ndarray):
+        return cast(Runs, function(first, *others))
+    parts = zip(*(_arrays(state) for state in (first, *others)), strict=True)
+    return type(first)(*(function(*part) for part in parts))
+
+
+def _arrays(state: Any) -> tuple[Array, ...]:
+    if isinstance(state, tuple):
+        return cast("tuple[Array, ...]", state)
+    return tuple(getattr(state, field.name) for field in fields(state))
 
 
 class Reduced(NamedTuple):
@@ -197,8 +246,8 @@ def minimise(
     for _ in range(max_steps):
         new, gain = _try(part, here, dampings[active])
         steps[active] += 1
-        here = problem.put(here, np.flatnonzero(gain.accepted), new)
-        state = problem.put(state, active, here)
+        here = put(here, np.flatnonzero(gain.accepted), new)
+        state = put(state, active, here)
         cost[active] = gain.cost
         dampings[active] = gain.damping
         for run, reason in zip(active, gain.stop, strict=True):
@@ -208,7 +257,7 @@ def minimise(
             break
         if keep.size < active.size:
             active = active[keep]
-            part, here = problem.select(active), problem.take(state, active)
+            part, here = problem.select(active), take(state, active)
     final = tuple(Stop.STEPS if s is Stop.RUNNING else s for s in stop)
     return Solution(state, cost, steps, final)
 
@@ -248,7 +297,7 @@ def _try(problem: LeastSquares, state: Any, damping: Array) -> tuple[Any, _Gain]
     next_damping = np.clip(next_damping, LEAST_DAMPING, MOST_DAMPING)
     any_usable = np.sum(usable, axis=(1, 2)) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
-    new = problem.take(trial, np.flatnonzero(accepted))
+    new = take(trial, np.flatnonzero(accepted))
     return new, _Gain(accepted, np.where(accepted, cost_trial, cost), next_damping, stop)
 
 
