@@ -21,19 +21,15 @@ from pkmcal.papers.legs import legs_of
 class Condition:
     """One condition of [A].
 
-    equation : its number in the paper. needed, available : counts.
+    equation : its number in the paper. needed, available : counts. met : needed <= available.
     text : what is counted, a sentence for people.
     """
 
     equation: str
     needed: int
     available: int
+    met: bool
     text: str
-
-    @property
-    def met(self) -> bool:
-        """Whether the counts suffice."""
-        return self.needed <= self.available
 
 
 def conditions(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
@@ -51,7 +47,7 @@ def every_leg(seen: Booleans) -> Condition:
     text = "every leg is seen by a station"
     if lost.size:
         text += f"; none sees {'leg' if lost.size == 1 else 'legs'} {listed(lost)}"
-    return Condition("[A] 3.3", seen.shape[1], int(seen.any(axis=0).sum()), text)
+    return _condition("3.3", seen.shape[1], int(seen.any(axis=0).sum()), text)
 
 
 def base(machine: Machine, seen: Booleans) -> Condition:
@@ -66,13 +62,13 @@ def base(machine: Machine, seen: Booleans) -> Condition:
     count = seen.sum(axis=1)
     if legs.planar:
         text = "products of vectors between base joints, for their places in the plane"
-        return Condition("[A] 10, 12", 1 + 2 * (n - 2), int(_pairs(count).sum()), text)
+        return _condition("10, 12", 1 + 2 * (n - 2), int(_pairs(count).sum()), text)
     revolute = legs.base_revolute
     r = (seen & revolute).sum(axis=1)
     available = _pairs(count) + _pairs(r) + r * np.maximum(count - 1, 0)
     needed = 3 + 3 * (n - 3) + 2 * int(revolute.sum())
     text = "products of vectors between base joints and revolute axes, for centres and axes"
-    return Condition("[A] 11, 12", needed, int(available.sum()), text)
+    return _condition("11, 12", needed, int(available.sum()), text)
 
 
 def offsets(machine: Machine, seen: Booleans) -> Condition:
@@ -80,7 +76,7 @@ def offsets(machine: Machine, seen: Booleans) -> Condition:
     closing = machine.layout.closing
     available = int(_pairs((seen & closing).sum(axis=1)).sum())
     text = "distances between platform joints of legs with a length, for their offsets"
-    return Condition("[A] 15", int(closing.sum()), available, text)
+    return _condition("15", int(closing.sum()), available, text)
 
 
 def platform(machine: Machine, seen: Booleans) -> Condition:
@@ -94,7 +90,7 @@ def platform(machine: Machine, seen: Booleans) -> Condition:
     needed = 1 + 2 * (n - 2) if legs_of(machine).planar else 3 + 3 * (n - 3)
     available = int(_pairs((seen & closing).sum(axis=1)).sum())
     text = "distances between platform joints of legs with a length, for their places"
-    return Condition("[A] 17", needed, available, text)
+    return _condition("17", needed, available, text)
 
 
 def at_once(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
@@ -110,8 +106,12 @@ def at_once(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
         most = int(np.max(np.where(seen[:, j], count, 0), initial=0))
         what = f"passive leg {j + 1}" if passive else f"the revolute axis of leg {j + 1}"
         text = f"legs with a length seen at once, for {what} on the platform"
-        out.append(Condition("[A] 19" if passive else "[A] 18", 3, most, text))
+        out.append(_condition("19" if passive else "18", 3, most, text))
     return tuple(out)
+
+
+def _condition(equation: str, needed: int, available: int, text: str) -> Condition:
+    return Condition(f"[A] {equation}", needed, available, needed <= available, text)
 
 
 def _pairs(n: Integers) -> Integers:

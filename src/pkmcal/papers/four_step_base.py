@@ -22,13 +22,12 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe.poses import PoseSet
 from pkmcal.papers.leg_axes import Axes
 from pkmcal.papers.registration import (
-    SCALE,
     extent,
     fit_body,
     fixes_pose,
     laid,
-    minimise_dense,
     nearest_rotation,
+    points_by,
 )
 
 
@@ -262,18 +261,12 @@ def base_by_products(items: Items, gauge: Array) -> Base:
     measured = items.measured[:, np.concatenate(view)]
     known = dot(*(np.einsum("kn,bknc->bkc", by, measured) for by in (by_p, by_q)))
 
-    def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
-        points = x.reshape(len(x), n, 3)
+    def products(points: Array, runs: Integers) -> tuple[Array, Array]:
         vp, vq = by_p @ points, by_q @ points
         jac = by_p[..., None] * vq[:, :, None] + by_q[..., None] * vp[:, :, None]
-        held = (x - items.drawing.ravel()) @ gauge.T
-        value = np.concatenate([dot(vp, vq) - known[runs], held], axis=1)
-        gauge_rows = np.broadcast_to(gauge, (len(x), *gauge.shape))
-        jac = np.concatenate([jac.reshape(len(x), -1, 3 * n), gauge_rows], axis=1)
-        return value / SCALE, jac / SCALE
+        return dot(vp, vq) - known[runs], jac
 
-    start = np.broadcast_to(items.drawing.ravel(), (len(known), 3 * n)).copy()
-    return _base(items, minimise_dense(rows, start).state.reshape(-1, n, 3))
+    return _base(items, points_by(products, items.drawing, gauge, len(known)))
 
 
 def _base(items: Items, points: Array) -> Base:

@@ -19,7 +19,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import apply, cross, dot, inverse
 from pkmcal.papers.leg_axes import Axes, across, nearest_points, revolute_axes
-from pkmcal.papers.registration import ANY_MOTION, SCALE, fit_body, minimise_dense
+from pkmcal.papers.registration import ANY_MOTION, SCALE, fit_body, minimise_dense, points_by
 
 COLLAPSED = 0.5
 """A constant length below this part of its drawing is the false minimum B = A."""
@@ -103,21 +103,15 @@ def platform_by_distances(
     j, g, known = j[pair], g[pair], known[:, k, pair]
     row = np.arange(len(j))
 
-    def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
-        points = x.reshape(len(x), -1, 3)
+    def distances(points: Array, runs: Integers) -> tuple[Array, Array]:
         v = points[:, j] - points[:, g]
         distance = np.sqrt(dot(v, v))
-        jac = np.zeros((len(x), len(j), points.shape[1], 3))
+        jac = np.zeros((*distance.shape, *points.shape[1:]))
         jac[:, row, j] = v / distance[..., None]
         jac[:, row, g] = -v / distance[..., None]
-        held = (x - drawing.ravel()) @ gauge.T
-        value = np.concatenate([distance - known[runs], held], axis=1)
-        gauge_rows = np.broadcast_to(gauge, (len(x), *gauge.shape))
-        jac = np.concatenate([jac.reshape(len(x), len(j), -1), gauge_rows], axis=1)
-        return value / SCALE, jac / SCALE
+        return distance - known[runs], jac
 
-    start = np.broadcast_to(drawing.ravel(), (len(b), drawing.size)).copy()
-    return minimise_dense(rows, start).state.reshape(-1, *drawing.shape)
+    return points_by(distances, drawing, gauge, len(b))
 
 
 def platform_axes(

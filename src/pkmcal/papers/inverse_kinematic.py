@@ -199,11 +199,6 @@ class ImplicitProblem:
         seen = state.T_camera_base[:, self.station] @ poses @ state.T_mount[:, self.mount]
         return replace(self, T_camera_board=seen, readings=readings)
 
-    def plain(self) -> Array:
-        """The matrix (1, 1, r, r) of rows that count alike, and not at all where they are off."""
-        off = 6 - self.layout.motion.shape[1]
-        return np.diag(np.repeat([1 / PRINTED, 0.0], [self.layout.n_equations, off]))[None, None]
-
     def moved(self, state: ImplicitState, shared: Array, own: Array) -> ImplicitState:
         """The state after a step."""
         shared = shared * self.keep
@@ -325,6 +320,7 @@ def pose_problem(
     camera = np.broadcast_to(start.T_camera_base, (runs, *start.T_camera_base.shape[-3:]))
     mount = np.broadcast_to(start.T_mount, (runs, *start.T_mount.shape[-3:]))
     n_shared = z.shape[-1] + 6 * camera.shape[1] + 6 * mount.shape[1]
+    off = 6 - layout.motion.shape[1]  # rows that do not count as printed
     problem = ImplicitProblem(
         layout=layout,
         drawing=table.drawing,
@@ -334,11 +330,10 @@ def pose_problem(
         T_camera_board=T_camera_board,
         readings=readings,
         form=form,
-        weigh=np.zeros((1, 1, 1, 1)),
+        weigh=np.diag(np.repeat([1 / PRINTED, 0.0], [layout.n_equations, off]))[None, None],
         prior=np.zeros((0, z.shape[-1])),
         keep=np.ones(n_shared, dtype=bool),
     )
-    problem = replace(problem, weigh=problem.plain())
     state = ImplicitState(
         np.broadcast_to(z, (runs, z.shape[-1])).copy(),
         camera.copy(),
@@ -498,20 +493,19 @@ def _session_state(
     theta = fit.problem.theta(found)[0]
     solved = machine.with_values(theta)
     poses = solved.forward_result(measurements.joints, start.T_base_platform)
+    cameras, mounts = start.T_camera_base.copy(), start.T_mount.copy()
+    for before, after, told in (
+        (cameras, found.T_camera_base[0], fit.problem.station),
+        (mounts, found.T_mount[0], fit.problem.mount),
+    ):
+        before[told] = after[told]  # the others have no pose among the data
     state = replace(
         start,
         theta=theta,
-        T_camera_base=_updated(start.T_camera_base, found.T_camera_base[0], fit.problem.station),
-        T_mount=_updated(start.T_mount, found.T_mount[0], fit.problem.mount),
+        T_camera_base=cameras,
+        T_mount=mounts,
         T_base_platform=poses.T_base_platform,
         internal=poses.internal,
     )
     state = in_gauge(machine, state, default_gauge(machine))
     return replace(state, theta=machine.parameters.unit_axes(state.theta))
-
-
-def _updated(before: Array, after: Array, seen: Integers) -> Array:
-    """Poses (n, 4, 4), the new ones where something was seen."""
-    out = before.copy()
-    out[seen] = after[seen]
-    return out

@@ -264,3 +264,26 @@ def minimise_dense(
 ) -> Solution:
     """Batched Levenberg-Marquardt on plain vectors (B, n)."""
     return minimise(Dense(rows, np.arange(len(start))), start)
+
+
+def points_by(
+    criterion: Callable[[Array, Integers], tuple[Array, Array]],
+    drawing: Array,
+    gauge: Array,
+    n_runs: int,
+) -> Array:
+    """Points (B, n, 3) by a criterion on them, their frame held by the gauge's rows (c, 3 n).
+
+    criterion : function of points (b, n, 3) and the runs' numbers (b,), gives values (b, r) in m
+    (or m^2) and their derivatives (b, r, n, 3). drawing : (n, 3), the start.
+    """
+
+    def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
+        value, jac = criterion(x.reshape(len(x), *drawing.shape), runs)
+        held = (x - drawing.ravel()) @ gauge.T
+        by_gauge = np.broadcast_to(gauge, (len(x), *gauge.shape))
+        jac = np.concatenate([jac.reshape(*value.shape, drawing.size), by_gauge], axis=1)
+        return np.concatenate([value, held], axis=1) / SCALE, jac / SCALE
+
+    start = np.broadcast_to(drawing.ravel(), (n_runs, drawing.size)).copy()
+    return minimise_dense(rows, start).state.reshape(-1, *drawing.shape)
