@@ -61,7 +61,7 @@ def demo(tmp_path_factory) -> Demo:
 @pytest.fixture(scope="session")
 def calibrated(demo):
     """The demonstration's session, calibrated from Python."""
-    from pkmcal.calibration import calibrate
+    from pkmcal.calibration.calibrate import calibrate
 
     return calibrate(demo.session)
 

@@ -10,7 +10,7 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import load_mechanism, machine_from_document
-from pkmcal.mechanisms.schema import MechanismDocument
+from pkmcal.mechanisms.document import MechanismDocument
 from pkmcal.papers import four_step_checks as checks
 from pkmcal.papers.conditions import Condition, conditions
 from pkmcal.papers.four_step import four_step

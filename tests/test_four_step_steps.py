@@ -9,7 +9,7 @@ import pytest
 
 from pkmcal.geometry.rigid import apply, dot, perturb, pose, rotation
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.observe.poses import PoseSet
+from pkmcal.measurements import PoseSet
 from pkmcal.papers.four_step_base import (
     Items,
     base_by_products,
@@ -302,7 +302,7 @@ def constant_legs(rng):
     """Three legs of constant length 1 about fixed centres: a body that they carry."""
     scene = make_scene("constant-legs", rng, 30)
     machine = scene.machine
-    from pkmcal.mechanisms.limbs import leg_readings, limb_ends
+    from pkmcal.mechanisms.closure import leg_readings, limb_ends
 
     ends = limb_ends(
         machine.layout, machine.values, scene.measurements.joints, scene.truth.T_base_platform

@@ -10,10 +10,9 @@ import pytest
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.problem import Mount
+from pkmcal.measurements import Mount, PoseSet
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import MOTIONS
-from pkmcal.observe.poses import PoseSet
+from pkmcal.mechanisms.document import MOTIONS
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.inverse_kinematic import (
     fit_session,

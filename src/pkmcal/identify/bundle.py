@@ -27,9 +27,10 @@ from pkmcal.identify.covariance import (
 )
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.mounts import start_mounts
-from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
+from pkmcal.identify.problem import Estimate, State, Statistics
 from pkmcal.identify.residuals import Problem
 from pkmcal.identify.robust import Both
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import (
     FIRST_DAMPING,

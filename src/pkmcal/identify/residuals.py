@@ -29,7 +29,7 @@ from pkmcal.identify.blocks import BatchState, Blocks, Data
 from pkmcal.identify.closure_noise import by_noise, joint_rows
 from pkmcal.identify.pose_rows import PoseBlocks, PoseData, PoseRows, no_poses, pose_rows
 from pkmcal.identify.steps import moved
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure
 from pkmcal.solver import Linear, Values, of_runs
 
 SHADING_SIGMA = 0.03

@@ -27,8 +27,7 @@ from pkmcal.mechanisms import Machine
 
 if TYPE_CHECKING:
     from pkmcal.identify.covariance import Direction, Identifiability
-    from pkmcal.identify.problem import Measurements
-    from pkmcal.observe.edges import EdgeSet
+    from pkmcal.measurements import EdgeSet, Measurements
     from pkmcal.papers.conditions import Condition
 
 INSIDE = (0.999, 0.95)

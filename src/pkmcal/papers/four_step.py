@@ -26,7 +26,8 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.gauge import BestFit, centre_index, default_gauge
 from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import four_step_checks as checks
 from pkmcal.papers import linear

@@ -31,9 +31,10 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.mounts import mean_pose
 from pkmcal.identify.pose_rows import PoseBlocks, PoseData, pose_rows
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.solver import Linear, Values, minimise, take
 
 TURN = 0.03

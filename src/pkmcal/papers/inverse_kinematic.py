@@ -27,9 +27,10 @@ from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rot
 from pkmcal.identify.closure_noise import PERFECT
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, kinematics
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, dense
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.measured_platform import Seen, Taken, seen_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames

@@ -27,7 +27,7 @@ LOOSE = 1e-4
 """Eigenvalue below which a body's items count as loose, of 1 for an item that one frame holds:
 a shape error is then seen a hundredth of its size."""
 ANY_MOTION = np.eye(6)
-"""Motion (6, d) of a body that is free; columns as in :data:`pkmcal.mechanisms.limbs.MOTIONS`."""
+"""Motion (6, d) of a free body; columns as in :data:`pkmcal.mechanisms.document.MOTIONS`."""
 
 
 class Body(NamedTuple):

@@ -24,8 +24,9 @@ from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
 from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.covariance import RANK_TOLERANCE
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Estimate, Measurements, State
+from pkmcal.identify.problem import Estimate, State
 from pkmcal.identify.residuals import Problem
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import RESTART_DAMPING, Stop, eliminate, minimise, transposed
 
