@@ -451,6 +451,19 @@ def stacked(first: Array, second: Array) -> Array:
     return out
 
 
+def skeletons(layout: LimbLayout, theta: Array, leg_reading: Array) -> tuple[Array, ...]:
+    """What carries each leg's end on the base, for pictures: L arrays (..., k, 3), m, base frame.
+
+    From where a motor holds an arm to the end A, which is the last point; A alone where there is
+    no arm. leg_reading : (..., L).
+    """
+    out: dict[int, Array] = {}
+    for g in layout.base:
+        points = g.carrier.skeleton(g.of(theta), leg_reading[..., g.legs])
+        out |= {int(j): points[..., k, :, :] for k, j in enumerate(g.legs)}
+    return tuple(out[j] for j in range(layout.n_legs))
+
+
 @dataclass(frozen=True)
 class LimbEnds:
     """Both ends of all limbs with derivatives; leading axes broadcast, then L legs.

@@ -118,10 +118,10 @@ class _OneOfTheCarriers:
 
 @cache
 def _union(schemas: tuple[type[Schema], ...]) -> TypeAdapter[Any]:
-    if len(schemas) == 1:
-        return TypeAdapter(schemas[0])
-    union: Any = Union[schemas]  # noqa: UP007 - made at run time
-    return TypeAdapter(Annotated[union, Field(discriminator="joint")])
+    one: Any = schemas[0]
+    if len(schemas) > 1:
+        one = Annotated[Union[schemas], Field(discriminator="joint")]  # noqa: UP007 - at run time
+    return TypeAdapter(one)
 
 
 BaseNode = Annotated[Any, _OneOfTheCarriers(base_carriers)]
