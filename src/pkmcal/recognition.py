@@ -158,7 +158,8 @@ def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
         f"{in_the_way}",
         where=f"{session.document['joints']['file']}, configuration"
         f" {listed([session.configurations[k] for k in bad])}",
-        found=f"{np.rad2deg(turn[worst]):.1f} degrees (configuration {session.configurations[worst]})",
+        found=f"{np.rad2deg(turn[worst]):.1f} degrees "
+        f"(configuration {session.configurations[worst]})",
         expected=f"less than {np.rad2deg(most):.0f} degrees to either side",
         next_step="Check these readings, and the zero of the motors",
     )
