@@ -19,8 +19,9 @@ from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import centre_index, default_gauge
-from pkmcal.identify.problem import Measurements, Mount, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.start import better_start, misfit
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import (
     Machine,
     catalogue,
@@ -28,8 +29,6 @@ from pkmcal.mechanisms import (
     mechanism_text,
 )
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.observe.edges import EdgeSet
-from pkmcal.observe.poses import PoseSet
 
 MACHINES = ("gough-stewart", "3-rpr", "3-rps", "3-upu", "6-spu-passive", "constant-legs")
 NOISE = 1e-4

@@ -33,7 +33,7 @@ from pkmcal.identify.four_step_platform import (
 )
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.registration import fixes_pose, laid, loose
-from pkmcal.observe.poses import PoseSet
+from pkmcal.measurements import PoseSet
 from test_four_step_machines import make_scene
 
 SPATIAL, PLANAR, TRANSLATION = np.eye(6), np.eye(6)[:, [2, 3, 4]], np.eye(6)[:, 3:]

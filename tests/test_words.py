@@ -383,8 +383,7 @@ def test_groups_follow_what_stations_share():
 
 
 def test_a_board_on_the_base_joins_stations():
-    from pkmcal.identify.problem import Measurements, Mount
-    from pkmcal.observe.poses import PoseSet
+    from pkmcal.measurements import Measurements, Mount, PoseSet
 
     edges = make("gough-stewart", n=1).measurements(np.random.default_rng(0)).edges
     poses = PoseSet(

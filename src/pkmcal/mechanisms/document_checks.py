@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.errors import InputError
 from pkmcal.files import listed
-from pkmcal.files.yaml_files import field_path
+from pkmcal.files.documents import field_path
 from pkmcal.mechanisms.carriers.contract import IN_PLANE, Site, base_carriers, platform_carriers
 from pkmcal.mechanisms.document import (
     MOTIONS,
