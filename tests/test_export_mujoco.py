@@ -15,8 +15,7 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.export.contract import exporters
 from pkmcal.export.mujoco_home import home_state
 from pkmcal.export.mujoco_read import closed, constraints, moved, read
-from pkmcal.export.samples import samples
-from pkmcal.export.source import Source
+from pkmcal.export.source import Source, samples
 from pkmcal.geometry.rigid import pose, pose_difference
 from pkmcal.mechanisms import catalogue
 from pkmcal.mechanisms.kinematics import forward

@@ -20,8 +20,7 @@ from pkmcal.export.mujoco_read import (
     site_places,
     with_platform,
 )
-from pkmcal.export.samples import samples
-from pkmcal.export.source import Source
+from pkmcal.export.source import Source, samples
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.limbs import limb_ends

@@ -12,7 +12,6 @@ from pkmcal.export.mujoco_legs import STIFF, add_legs, lever
 from pkmcal.export.mujoco_platform import add_platform
 from pkmcal.export.mujoco_xml import numbers, plain
 from pkmcal.export.source import Source
-from pkmcal.export.text import sigma_lines
 
 STEP = "0.001"
 """s; the loops' time constant is twice that, the shortest that MuJoCo allows."""
@@ -96,5 +95,5 @@ def _header(source: Source) -> str:
     """A comment on what this is, with every parameter and its standard deviation."""
     lines = [plain(line) for line in (*source.header(*CONVENTIONS), "Parameters:")]
     lines = [part for line in lines for part in wrap(line, 96, break_on_hyphens=False)]
-    lines += [plain(line) for line in sigma_lines(source)]
+    lines += [plain(line) for line in source.sigma_lines()]
     return "\n".join(["<!--", *(f"  {line}" for line in lines), "-->"])

@@ -18,9 +18,8 @@ import yaml
 from pkmcal.arrays import Array
 from pkmcal.cameras.foreign import read_camera, write_camera
 from pkmcal.errors import InputError
-from pkmcal.export.contract import Difference, Exporter
+from pkmcal.export.contract import Difference, Exporter, commented, exact
 from pkmcal.export.source import Source
-from pkmcal.export.text import commented, exact
 from pkmcal.files import listed
 from pkmcal.outcome import Finding, Level
 
