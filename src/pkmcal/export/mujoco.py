@@ -13,7 +13,7 @@ from pkmcal.export.mujoco_read import ReadModel, read
 from pkmcal.export.source import Source, samples
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.outcome import Finding, Level
 
 POSES = 8

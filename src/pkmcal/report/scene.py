@@ -15,7 +15,7 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.report.charts import WIDTH
 from pkmcal.report.wording import brief, number
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 ELLIPSE = 2.0
 """Standard deviations that ellipses and ellipsoids reach."""

@@ -21,7 +21,6 @@ from pkmcal.mechanisms.carriers.contract import (
     turned_blocks,
     vectors,
 )
-from pkmcal.mechanisms.joints import Direction, Interval
 
 UP = np.array([0.0, 0.0, 1.0])
 ZERO = tuple(ParameterKind(f"zero.{axis}", "1", "", np.nan) for axis in "xyz")

@@ -20,7 +20,6 @@ from pkmcal.mechanisms.carriers.contract import (
     turned_blocks,
     vectors,
 )
-from pkmcal.mechanisms.joints import Direction, Interval
 
 
 class SliderDocument(Schema):
