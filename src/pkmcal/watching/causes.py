@@ -11,7 +11,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.gauge import centre_index
 from pkmcal.mechanisms import Machine
-from pkmcal.report.wording import split_name
+from pkmcal.wording import split_name
 from pkmcal.watching.evidence import SIZE
 
 Part = Literal["zero", "rod", "arm", "base", "platform", "hinge", "all", "pair", "scale", "camera"]

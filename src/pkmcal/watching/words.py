@@ -11,7 +11,7 @@ from pkmcal.arrays import Booleans
 from pkmcal.files import listed
 from pkmcal.identify.words_names import named
 from pkmcal.outcome import Verdict
-from pkmcal.report.wording import SCALES, brief, count, decimals, number
+from pkmcal.wording import SCALES, brief, count, decimals, number
 from pkmcal.session import Session
 from pkmcal.watching.chances import POWER
 from pkmcal.watching.judged import Finding, Judgement, LegTest, Suspect
