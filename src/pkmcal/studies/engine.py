@@ -75,10 +75,10 @@ class Setting(Protocol):
     """
 
     @property
-    def quantities(self) -> Mapping[str, Quantity]: ...  # noqa: D102
+    def quantities(self) -> Mapping[str, Quantity]: ...
 
     @property
-    def doing(self) -> str: ...  # noqa: D102
+    def doing(self) -> str: ...
 
     def populations(self, runs: int) -> Sequence[Population]:
         """What ``runs`` runs of the study are made of."""

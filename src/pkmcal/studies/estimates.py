@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.hand_eye import Pair, PairProblem
 from pkmcal.identify.residuals import BatchState, Problem

@@ -8,7 +8,7 @@ the Cramér-Rao bound, with models that are the truth's, richer or poorer.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -103,7 +103,7 @@ class H4ByBoard:
     turn: float = float(np.radians(0.03))
     shift: float = 2e-4
     joint_noise: float = 1e-5
-    deviations: Deviations = Deviations()
+    deviations: Deviations = field(default_factory=Deviations)
     control: int = 10
 
     doing = "Board poses"

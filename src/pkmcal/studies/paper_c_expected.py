@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from pkmcal.outcome import Check
-from pkmcal.wording import number
-from pkmcal.reproduce.paper_c_simulation import Kind
-from pkmcal.reproduce.paper_c_study import (
+from pkmcal.studies.engine import Key, Study
+from pkmcal.studies.expected import Compared, at_most, compared, prototype_check
+from pkmcal.studies.paper_c import (
+    AXIS,
     BOUND,
     DRAWING,
     EQ3,
     EQ5,
     JOINT,
+    KINDS,
     WHITENED,
-    Key,
-    Study,
+    H4ByBoard,
+    largest_side,
+    ranks,
 )
-from pkmcal.reproduce.paper_c_validation import Before
+from pkmcal.studies.paper_c_machine import Kind
+from pkmcal.studies.paper_c_validation import Before
+from pkmcal.studies.statistics import ratio
+from pkmcal.wording import number
 
 BEFORE = Before(26e-3, 0.022)
 """[C] IV.C: the nacelle's mean error with the a priori parameters, m and rad."""
@@ -38,20 +42,24 @@ SPREAD = float(np.radians(0.12))
 JOINT_MEANS = (9.4e-2, 3.6e-2, 7.6e-2, 8.5e-2)
 """What Table 2's two columns ask for as "before" in Table 3, rad (errata)."""
 
-PROTOTYPE: dict[Key, tuple[float, float | None]] = {
-    ("design", "design", DRAWING): (4.5, 9.6),
-    ("design", "design", EQ3): (0.070, 0.24),
-    ("design", "design", JOINT): (0.052, 0.12),
-    ("design", "calibration", EQ5): (0.101, 0.37),
-    ("design", "calibration", WHITENED): (0.084, 0.182),
-    ("design", "calibration", JOINT): (0.084, 0.185),
-    ("calibration", "design", EQ3): (0.254, 2.8),
-    ("calibration", "calibration", EQ5): (0.100, 0.37),
-    ("calibration", "calibration", JOINT): (0.083, 0.183),
-    ("calibration", "calibration", BOUND): (0.083, 0.183),
-    ("rods", "design", JOINT): (0.40, None),
-    ("rods", "calibration", JOINT): (0.13, None),
-    ("rods", "rods", JOINT): (0.079, None),
+_PROTOTYPE: dict[Key, tuple[str, ...]] = {
+    ("design", "design", DRAWING): ("4.5", "9.6"),
+    ("design", "design", EQ3): ("0.070", "0.24"),
+    ("design", "design", JOINT): ("0.052", "0.12"),
+    ("design", "calibration", EQ5): ("0.101", "0.37"),
+    ("design", "calibration", WHITENED): ("0.084", "0.182"),
+    ("design", "calibration", JOINT): ("0.084", "0.185"),
+    ("calibration", "design", EQ3): ("0.254", "2.8"),
+    ("calibration", "calibration", EQ5): ("0.100", "0.37"),
+    ("calibration", "calibration", JOINT): ("0.083", "0.183"),
+    ("calibration", "calibration", BOUND): ("0.083", "0.183"),
+    ("rods", "design", JOINT): ("0.40",),
+    ("rods", "calibration", JOINT): ("0.13",),
+    ("rods", "rods", JOINT): ("0.079",),
+}
+PROTOTYPE = {
+    key: dict(zip(("larger_shift", "larger_turn"), figures, strict=False))
+    for key, figures in _PROTOTYPE.items()
 }
 """RMSE over the workspace after registration, mm and mrad, by an independent prototype that shares
 no code with this program. Its workspace and its drawn machines are not known."""
@@ -77,39 +85,17 @@ TOO_POOR = 1.5
 """chi2 per degree of freedom above which a model is too poor for its data."""
 
 
-class Compared(NamedTuple):
-    """One figure (mm or mrad), its Monte-Carlo standard error, and the prototype's."""
-
-    key: Key
-    quantity: str
-    found: float
-    error: float
-    expected: float
-
-    @property
-    def held(self) -> bool:
-        """Whether the setting leaves it comparable."""
-        return self.key[:2] not in FOLLOWS_MACHINE
-
-    @property
-    def tolerable(self) -> bool:
-        """Whether the difference is one of the workspace, not of the method."""
-        return abs(self.found - self.expected) <= TOLERANCE * self.expected + 2 * self.error
+def figures_compared(study: Study[H4ByBoard]) -> list[Compared]:
+    """Every figure that the prototype gives; held where the setting leaves it comparable."""
+    return compared(
+        study,
+        PROTOTYPE,
+        tolerance=lambda _key, _quantity: TOLERANCE,
+        held=lambda key: key[:2] not in FOLLOWS_MACHINE,
+    )
 
 
-def compared(study: Study) -> list[Compared]:
-    """Every figure that the prototype gives."""
-    out: list[Compared] = []
-    for key, (shift, turn) in PROTOTYPE.items():
-        a = study.accuracy[key]
-        out.append(Compared(key, "shift", 1e3 * a.larger_shift, 1e3 * a.larger_shift_error, shift))
-        if turn is not None:
-            mrad, error = 1e3 * a.larger_turn, 1e3 * a.larger_turn_error
-            out.append(Compared(key, "turn", mrad, error, turn))
-    return out
-
-
-def checks(study: Study, start: Before) -> tuple[Check, ...]:
+def checks(study: Study[H4ByBoard], start: Before) -> tuple[Check, ...]:
     """What must hold, or the reproduction has failed."""
     return (
         _before_check(start),
@@ -119,9 +105,14 @@ def checks(study: Study, start: Before) -> tuple[Check, ...]:
         _axis_check(study),
         _bound_check(study),
         _chi2_check(study),
-        _rods_check(study),
-        _prototype_check(compared(study)),
-    )
+        at_most(
+            "model with rods on a machine with rods 0.3 mm apart", "mm",
+            study.of("rods", "rods", JOINT)["larger_shift"].times(1e3), MOST_RODS, 3,
+        ),
+        prototype_check(
+            figures_compared(study), f"within {TOLERANCE:.0%}, Monte-Carlo error aside"
+        ),
+    )  # fmt: skip
 
 
 def _before_check(start: Before) -> Check:
@@ -134,16 +125,15 @@ def _before_check(start: Before) -> Check:
     )
 
 
-def _table_3_check(study: Study) -> Check:
-    mean = study.validation[f"design, {DRAWING}"].control_mean.mean(axis=0)
+def _table_3_check(study: Study[H4ByBoard]) -> Check:
+    mean = study.values("control_mean", "design", "design", DRAWING).mean(axis=0)
     text = ", ".join(number(100 * float(v), 1) for v in mean)
     good = bool(np.abs(mean - JOINT_MEANS).max() < 1.5e-3)
     return Check("Table 3, means before, 10⁻² rad", text, "9.4, 3.6, 7.6, 8.5", good)
 
 
-def _square_check(study: Study) -> Check:
-    old = largest_side(study, f"design, {DRAWING}")
-    new = largest_side(study, f"design, {EQ3}")
+def _square_check(study: Study[H4ByBoard]) -> Check:
+    old, new = (largest_side(study, ("design", method)) for method in (DRAWING, EQ3))
     return Check(
         "largest error of the square's sides, before and after",
         f"{number(1e3 * old, 1)} and {number(1e3 * new, 3)} mm",
@@ -152,78 +142,47 @@ def _square_check(study: Study) -> Check:
     )
 
 
-def largest_side(study: Study, name: str) -> float:
-    """Root mean square over runs of the largest of the square's four errors, m."""
-    worst = np.abs(study.validation[name].square).max(axis=1)
-    return float(np.sqrt(np.mean(worst**2)))
-
-
-def _rank_check(study: Study) -> Check:
-    found = {key: study.ranks[key] for key in RANKS}
-    text = ", ".join(f"{rank} ({count})" for rank, count in found.values())
-    wanted = ", ".join(f"{rank} ({count})" for rank, count in RANKS.values())
+def _rank_check(study: Study[H4ByBoard]) -> Check:
+    every = ranks(study)
+    found = {key: every[key] for key in RANKS}
+    text, wanted = (
+        ", ".join(f"{rank} ({count})" for rank, count in values.values())
+        for values in (found, RANKS)
+    )
     return Check("ranks, Models 12 and 31 (unknowns estimated)", text, wanted, found == RANKS)
 
 
-def _axis_check(study: Study) -> Check:
-    ratio = study.axis.chi2 / study.axis.dof
-    allowed = 0.01 + 3 * float(np.sqrt(2 / study.axis.dof / len(ratio)))
+def _axis_check(study: Study[H4ByBoard]) -> Check:
+    found, dof = study.of("design", AXIS)["chi2"].value, study.values("dof", "design", AXIS)
+    allowed = 0.01 + 3 * float(np.sqrt(2 / dof[0] / len(dof)))
     return Check(
         "χ² per degree of freedom of one axis of rotation, mean",
-        number(float(ratio.mean()), 3),
+        number(found, 3),
         f"1 ± {number(allowed, 2)}",
-        abs(float(ratio.mean()) - 1) <= allowed,
+        abs(found - 1) <= allowed,
     )
 
 
-def _bound_check(study: Study) -> Check:
-    ratios, allowed = [], []
-    kinds: tuple[Kind, ...] = ("design", "calibration")
-    for kind in kinds:
-        ml, least = (study.accuracy[kind, kind, m] for m in (JOINT, BOUND))
-        ratios.append(ml.larger_shift / least.larger_shift)
-        noise = np.hypot(
-            ml.larger_shift_error / ml.larger_shift, least.larger_shift_error / least.larger_shift
-        )
-        allowed.append(OVER_BOUND + 2 * float(noise))
+def _bound_check(study: Study[H4ByBoard]) -> Check:
+    ratios = [
+        ratio(*(study.of(kind, kind, method)["larger_shift"] for method in (JOINT, BOUND)))
+        for kind in KINDS[:2]
+    ]
     return Check(
         "joint estimate over the Cramér-Rao bound, Models 12 and 31",
-        ", ".join(number(r, 3) for r in ratios),
+        ", ".join(number(r.value, 3) for r in ratios),
         f"≤ {OVER_BOUND}, Monte-Carlo error aside",
-        all(r <= a for r, a in zip(ratios, allowed, strict=True)),
+        all(r.value <= OVER_BOUND + 2 * r.error / r.value for r in ratios),
     )
 
 
-def _chi2_check(study: Study) -> Check:
-    kinds: tuple[Kind, ...] = ("design", "calibration", "rods")
-    right = [study.accuracy[kind, kind, JOINT].chi2 for kind in kinds]
-    poor = [study.accuracy[*pair, JOINT].chi2 for pair in FOLLOWS_MACHINE]
+def _chi2_check(study: Study[H4ByBoard]) -> Check:
+    right = [study.of(kind, kind, JOINT)["chi2"].value for kind in KINDS]
+    poor = [study.of(*pair, JOINT)["chi2"].value for pair in FOLLOWS_MACHINE]
     return Check(
         "χ² per degree of freedom: right models, and models too poor",
         f"{number(min(right), 2)} to {number(max(right), 2)}, and"
         f" {number(min(poor), 1)} to {number(max(poor), 1)}",
         f"1 ± 0.1, and above {TOO_POOR}",
         max(abs(c - 1) for c in right) < 0.1 and min(poor) > TOO_POOR,
-    )
-
-
-def _rods_check(study: Study) -> Check:
-    a = study.accuracy["rods", "rods", JOINT]
-    return Check(
-        "model with rods on a machine with rods 0.3 mm apart",
-        f"{number(1e3 * a.larger_shift, 3)} ± {number(1e3 * a.larger_shift_error, 3)} mm",
-        f"≤ {MOST_RODS} mm, its Monte-Carlo error aside",
-        1e3 * (a.larger_shift - 2 * a.larger_shift_error) <= MOST_RODS,
-    )
-
-
-def _prototype_check(figures: list[Compared]) -> Check:
-    held = [f for f in figures if f.held]
-    bad = [f for f in held if not f.tolerable]
-    text = "; ".join(f"{', '.join(f.key)}: {f.found:.3g} against {f.expected:g}" for f in bad)
-    return Check(
-        "figures of the independent prototype",
-        text or f"{len(held)} of {len(held)}",
-        f"within {TOLERANCE:.0%}, Monte-Carlo error aside",
-        not bad,
     )

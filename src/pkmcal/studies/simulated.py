@@ -112,9 +112,7 @@ def simulate(
         joints = readings + spread_evenly(rng, readings.shape, noise.reading)
     else:
         joints = readings + noise.reading * rng.normal(size=readings.shape)
-    return SimulatedRuns(
-        machine, theta, view, noise, T_base_platform, joints, axis, board, control
-    )
+    return SimulatedRuns(machine, theta, view, noise, T_base_platform, joints, axis, board, control)
 
 
 def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
