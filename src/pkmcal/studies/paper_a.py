@@ -330,7 +330,7 @@ def joint_estimate(data: SimulatedRuns, start: Start) -> Fitted:
         told={
             "chi2": found.solution.cost / dof,
             "dof": np.full(len(theta), dof),
-            "steps": found.steps,
+            "steps": found.steps.astype(float),
         },
         sigma={"parameters": np.sqrt(variance)},
     )

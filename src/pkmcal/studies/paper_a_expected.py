@@ -69,8 +69,9 @@ def tolerance(key: Key, quantity: str) -> float:
 
 
 def figures_compared(study: Study[HexapodByAxes]) -> list[Compared]:
-    """Every figure that the prototype gives."""
-    return compared(study, PROTOTYPE, tolerance)
+    """Every figure that the prototype gives, the end-effector's last."""
+    figures = compared(study, PROTOTYPE, tolerance)
+    return sorted(figures, key=lambda figure: figure.quantity not in GROUPS)
 
 
 def checks(study: Study[HexapodByAxes]) -> tuple[Check, ...]:

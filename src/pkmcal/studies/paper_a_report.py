@@ -328,7 +328,7 @@ def figure_part(s: Found) -> Part:
             f" {number(100 * inside.value, 1)} ± {number(100 * inside.error, 1)} % of its errors"
             " lie in the intervals of 95 % that these give.",
         ),
-        (
+        plots=(
             Plot(
                 "errors",
                 "True values and mean errors of the thirty parameters",

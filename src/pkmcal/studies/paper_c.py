@@ -180,7 +180,7 @@ class H4ByBoard:
 
 def kind_of(name: str) -> Kind:
     """A kind of truth or model by its name."""
-    return KINDS[KINDS.index(name)]  # type: ignore[arg-type]
+    return next(kind for kind in KINDS if kind == name)
 
 
 def _fits(

@@ -57,7 +57,7 @@ _PROTOTYPE: dict[Key, tuple[str, ...]] = {
     ("rods", "calibration", JOINT): ("0.13",),
     ("rods", "rods", JOINT): ("0.079",),
 }
-PROTOTYPE = {
+PROTOTYPE: dict[Key, dict[str, str]] = {
     key: dict(zip(("larger_shift", "larger_turn"), figures, strict=False))
     for key, figures in _PROTOTYPE.items()
 }
