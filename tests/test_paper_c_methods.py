@@ -19,11 +19,10 @@ from pkmcal.identify.inverse_kinematic import (
     unknown_names,
 )
 from pkmcal.identify.measured_platform import seen_platform, taken
-from pkmcal.identify.problem import Mount
 from pkmcal.identify.rotation_axis import facing, rotation_axis
+from pkmcal.measurements import Mount, PoseSet
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import MOTIONS
-from pkmcal.observe.poses import PoseSet
+from pkmcal.mechanisms.document import MOTIONS
 from pkmcal.studies.paper_c import H4ByBoard
 from pkmcal.studies.paper_c_machine import Deviations, model
 from pkmcal.studies.simulated import measurements

@@ -10,11 +10,12 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.problem import Estimate
-from pkmcal.observe.edges import Observation
+from pkmcal.measurements import Observation
 from pkmcal.report import (
     figure,
     headline,
     identifiability,
+    page,
     parameters,
     pictures,
     poses,
@@ -22,11 +23,10 @@ from pkmcal.report import (
     rejections,
     residuals,
     scene,
-    page,
     toolpoint,
     validation_page,
 )
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 if TYPE_CHECKING:
     from pkmcal.identify.words import Findings

@@ -14,10 +14,10 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.hand_eye import Pair, PairProblem
 from pkmcal.identify.residuals import BatchState, Problem
-from pkmcal.identify.solver import FIRST_DAMPING, eliminate, minimise
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
-from pkmcal.mechanisms.limbs import LimbLayout
+from pkmcal.solver import FIRST_DAMPING, eliminate, minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
 LOOSE = 1e-9

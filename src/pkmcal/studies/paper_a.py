@@ -22,9 +22,9 @@ from pkmcal.identify.covariance import information
 from pkmcal.identify.four_step import Axes, Form, FourSteps, centres_from_axes, solve
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
 from pkmcal.identify.residuals import BatchState, Problem
-from pkmcal.identify.solver import RESTART_DAMPING
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.kinematics import forward
+from pkmcal.solver import RESTART_DAMPING
 from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, Study
 from pkmcal.studies.estimates import Fitted, drawing, freedom, joint
 from pkmcal.studies.simulated import (

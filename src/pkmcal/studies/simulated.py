@@ -16,12 +16,10 @@ from pkmcal.geometry.rigid import apply, perturb
 from pkmcal.identify.assembly import assemble
 from pkmcal.identify.axis_measurements import as_edges, to_coordinates
 from pkmcal.identify.gauge import Gauge
-from pkmcal.identify.problem import Measurements, Mount
 from pkmcal.identify.residuals import Problem
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.observe.edges import EdgeSet
-from pkmcal.observe.poses import PoseSet
+from pkmcal.mechanisms.closure import limb_ends
 
 
 @dataclass(frozen=True)
