@@ -20,6 +20,7 @@ from pkmcal.observe.images import decode
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report.residuals import KEPT, SIDES, radius_positions, rms
 from pkmcal.session.load import Session
+from pkmcal.session.photographs import Photograph
 from pkmcal.wording import count, number
 
 MOST = 12
