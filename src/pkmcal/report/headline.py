@@ -11,8 +11,8 @@ from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure
 from pkmcal.report.residuals import KEPT
 from pkmcal.report.toolpoint import ToolPoint
-from pkmcal.report.wording import brief, count, number
 from pkmcal.session.load import Session
+from pkmcal.wording import brief, count, number
 
 NO_TURN = 1e-9
 """rad; what rounding leaves."""

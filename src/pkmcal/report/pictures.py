@@ -19,9 +19,9 @@ from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report.residuals import KEPT, SIDES, radius_positions, rms
-from pkmcal.report.wording import count, number
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import Photograph
+from pkmcal.wording import count, number
 
 MOST = 12
 LARGEST_WIDTH = 640

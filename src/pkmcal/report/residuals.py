@@ -24,8 +24,8 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
-from pkmcal.report.wording import count, joined, number
 from pkmcal.session.load import Session
+from pkmcal.wording import count, joined, number
 
 KEPT = 0.5
 """Robust weight below which an edge counts as put aside; pictures draw it dashed."""

@@ -14,6 +14,8 @@ from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
     Chain,
+    Direction,
+    Interval,
     ParameterKind,
     Site,
     direction_by_frame,
