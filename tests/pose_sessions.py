@@ -10,12 +10,10 @@ from pkmcal.geometry.rigid import inverse, look_at, perturb, pose, pose_differen
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import information
-from pkmcal.identify.estimate import Measurements, Mount
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import start_state
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import kinematics
-from pkmcal.observe.edges import EdgeSet
-from pkmcal.observe.poses import PoseSet
 
 POSE_SIGMA = np.repeat([np.deg2rad(0.03), 2e-4], 3)
 """Of a board's pose from a photograph, rad and m ([C] IV.A)."""

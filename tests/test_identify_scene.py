@@ -13,13 +13,13 @@ import numpy as np
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.identify.assembly import Assembled, assemble
-from pkmcal.identify.estimate import Measurements, State
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.rows import Data
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine, load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.observe.edges import EdgeSet
+from pkmcal.mechanisms.closure import limb_ends
 
 FOCAL = 889.0
 JOINT_NOISE = 3e-6

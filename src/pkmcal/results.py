@@ -28,7 +28,7 @@ from pkmcal.outcome import Verdict
 from pkmcal.result_document import FORMAT, document_of
 
 if TYPE_CHECKING:
-    from pkmcal.calibration import Calibration
+    from pkmcal.calibration.calibrate import Calibration
 
 MECHANISM, EVERYTHING, REPORT = "mechanism.yaml", "calibration.json", "report.html"
 FILES = (REPORT, MECHANISM, EVERYTHING)
@@ -69,7 +69,7 @@ def check_output(folder: Path | str) -> None:
 
 def save(calibration: Calibration, folder: Path | str) -> None:
     """Write a calibration's three files into `folder`, whole or not at all."""
-    from pkmcal.report import report_html
+    from pkmcal.report.calibration import report_html
 
     check_output(folder)
     report = report_html(

@@ -13,7 +13,7 @@ from pkmcal.report.headline import headlines
 from pkmcal.report.toolpoint import ToolPoint, tool_point
 
 if TYPE_CHECKING:
-    from pkmcal.calibration import Calibration
+    from pkmcal.calibration.calibrate import Calibration
 
 
 @dataclass(frozen=True)

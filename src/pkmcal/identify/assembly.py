@@ -9,11 +9,12 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
-from pkmcal.identify.estimate import Measurements, State
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import Blocks, Data, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 SHADING_SIGMA = 0.03

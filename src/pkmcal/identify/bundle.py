@@ -24,11 +24,12 @@ from pkmcal.identify.covariance import (
     information,
     machine_covariance,
 )
-from pkmcal.identify.estimate import Estimate, Measurements, State, Statistics
+from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge, told_unknowns
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import Both
 from pkmcal.identify.unknowns import BatchState, own_blocks
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import (
     FIRST_DAMPING,

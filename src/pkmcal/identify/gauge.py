@@ -31,7 +31,7 @@ from pkmcal.geometry.rigid import cross, inverse, perturb, skew
 from pkmcal.identify.estimate import State
 from pkmcal.identify.unknowns import Unknowns
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import LimbLayout
+from pkmcal.mechanisms.closure import LimbLayout
 
 
 class Gauge(Protocol):

@@ -38,7 +38,7 @@ from pkmcal.identify.rows import (
     pose_rows,
 )
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, on_tangents
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, on_tangents
 from pkmcal.solver import Linear, Values, of_runs
 
 CLOSINGS = 2

@@ -28,7 +28,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import EdgeNormals, edge_normal_jacobians
 from pkmcal.geometry.rigid import dot, pose_difference, skew
-from pkmcal.mechanisms.limbs import LimbEnds, LimbLayout
+from pkmcal.mechanisms.closure import LimbEnds, LimbLayout
 
 PERFECT = 1e-6
 """Standard deviation (m) of closures without a reading: joints and rods without play. A third of

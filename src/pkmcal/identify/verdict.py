@@ -13,9 +13,9 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.words import Findings, Sentence, explain, only_heights, seen_legs
 from pkmcal.identify.words_effect import platform_by_parameters
+from pkmcal.measurements import Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
-from pkmcal.observe.edges import Observation
 from pkmcal.outcome import Verdict
 from pkmcal.solver import Stop
 

@@ -1,15 +1,15 @@
-"""Which column of the readings moves which leg, and over which range."""
+"""Which column of the readings moves which leg, over which range; what legs of one motor share."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.mechanisms.carriers.contract import base_carriers
-from pkmcal.mechanisms.rods import ActuatedLength
-from pkmcal.mechanisms.schema import Leg, MechanismDocument
+from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.document import ActuatedLength, Leg, MechanismDocument
 
 
 def motor_columns(document: MechanismDocument) -> Integers:
@@ -55,14 +55,27 @@ def motor_ranges(document: MechanismDocument) -> Array:
 
 
 def motor_units(document: MechanismDocument) -> tuple[str, ...]:
-    """``m`` or ``rad`` of each reading: a driven carrier with an angle among its numbers turns."""
+    """``m`` or ``rad`` of each reading: of a rod m, of a driven carrier its own."""
     columns = motor_columns(document)
     out = ["m"] * (int(columns.max(initial=-1)) + 1)
     for leg, column in zip(document.legs, columns.tolist(), strict=True):
         carrier = base_carriers()[leg.base.joint]
-        if column >= 0 and carrier.driven and any(p.unit == "rad" for p in carrier.parameters):
-            out[column] = "rad"
+        if column >= 0 and carrier.driven:
+            out[column] = carrier.unit
     return tuple(out)
+
+
+def bodies(document: MechanismDocument) -> Integers:
+    """On which body of an articulated platform each leg ends, (L,), counted in the order of their
+    numbers in the file; -1 where on the platform itself.
+    """
+    fields = [platform_carriers()[leg.platform.joint].body for leg in document.legs]
+    own = [
+        (field, getattr(leg.platform, field)) if field else None
+        for field, leg in zip(fields, document.legs, strict=True)
+    ]
+    known = sorted({body for body in own if body is not None})
+    return np.array([-1 if body is None else known.index(body) for body in own], dtype=int)
 
 
 def middles(document: MechanismDocument) -> Array:
@@ -70,3 +83,62 @@ def middles(document: MechanismDocument) -> Array:
     columns = motor_columns(document)
     middle = np.nan_to_num(motor_ranges(document).mean(axis=1))
     return np.where(columns >= 0, np.append(middle, 0.0)[columns], 0.0)
+
+
+Group = tuple[str, ...]
+
+
+def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
+    """Entries that change together.
+
+    Legs on one motor turn about one axis, legs on one body of the platform hang on one hinge. A
+    leg of a planar machine stays in its plane, so both of its ends have one height.
+    """
+    return (*_heights(document), *_shared(document))
+
+
+def built_in_fixed(document: MechanismDocument) -> tuple[str, ...]:
+    """Entries that are no unknowns: what leaves a planar machine's plane."""
+    if document.motion != "planar":
+        return ()
+    return tuple(
+        f"legs[{j}].{side}.{field}"
+        for j, leg in enumerate(document.legs, start=1)
+        for side, carriers in (("base", base_carriers()), ("platform", platform_carriers()))
+        for field in carriers[getattr(leg, side).joint].held_in_plane
+    )
+
+
+def sharing(document: MechanismDocument) -> Iterator[tuple[str, tuple[int, ...], tuple[str, ...]]]:
+    """Sides with the legs (from 0) that stand on one motor, or on one body of the platform, and
+    what they share.
+    """
+    columns = motor_columns(document)
+    for column in range(columns.max(initial=-1) + 1):
+        legs = tuple(j for j in range(len(columns)) if columns[j] == column)
+        kinds = {base_carriers()[document.legs[j].base.joint] for j in legs}
+        if len(legs) > 1 and len(kinds) == 1:
+            yield "base", legs, kinds.pop().shared
+    on = bodies(document)
+    for body in dict.fromkeys(on.tolist()):
+        legs = tuple(np.flatnonzero(on == body).tolist())
+        if body >= 0 and len(legs) > 1:
+            yield (
+                "platform",
+                legs,
+                platform_carriers()[document.legs[legs[0]].platform.joint].shared,
+            )
+
+
+def _shared(document: MechanismDocument) -> Iterator[Group]:
+    for side, legs, fields in sharing(document):
+        for field in fields:
+            if all(getattr(getattr(document.legs[j], side), field) is not None for j in legs):
+                yield tuple(f"legs[{j + 1}].{side}.{field}" for j in legs)
+
+
+def _heights(document: MechanismDocument) -> Iterator[Group]:
+    if document.motion != "planar":
+        return
+    for j in range(1, len(document.legs) + 1):
+        yield f"legs[{j}].base.center.z", f"legs[{j}].platform.center.z"

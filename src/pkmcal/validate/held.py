@@ -24,14 +24,15 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.assembly import assemble, batch_of, state_of
 from pkmcal.identify.bundle import BatchResult, solve_batch
-from pkmcal.identify.estimate import Measurements, State
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import PERFECT
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.mechanisms.limbs import closure
 from pkmcal.solver import Linear, Reduced, Stop, eliminate, inverse_root, stacked, transposed
 
 SOFT = 0.01

@@ -22,10 +22,11 @@ from pkmcal.arrays import Array
 from pkmcal.errors import ResultError
 from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import reduced_rows
-from pkmcal.identify.estimate import Estimate, Measurements, State
+from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import RANK_TOLERANCE, RESTART_DAMPING, Stop, minimise
 

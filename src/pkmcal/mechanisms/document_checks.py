@@ -1,0 +1,161 @@
+"""What a mechanism file's schema cannot say: whether its legs can be those of its motion.
+
+What only one kind of part can have wrong stands in its carrier's ``check``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from statistics import median
+from typing import TypeAlias
+
+import numpy as np
+
+from pkmcal.errors import InputError
+from pkmcal.files import listed
+from pkmcal.files.documents import field_path
+from pkmcal.mechanisms.carriers.contract import IN_PLANE, Site, base_carriers, platform_carriers
+from pkmcal.mechanisms.document import (
+    MOTIONS,
+    ConstantLength,
+    Leg,
+    MechanismDocument,
+    PassiveLength,
+)
+from pkmcal.mechanisms.joints import equations
+from pkmcal.mechanisms.motors import bodies, motor_columns, sharing
+
+SAME = 1e-9
+"""Metres, or parts of a direction, by which equal numbers of a file differ when written."""
+
+Where: TypeAlias = Callable[..., str]
+
+
+def check_drawing(document: MechanismDocument, where: Where | None = None) -> None:
+    """Raise InputError for a drawing whose joints and rods cannot make its motion.
+
+    where : names a field's place in the file by its keys.
+    """
+    place = where or (lambda *keys: field_path(keys))
+    for j, leg in enumerate(document.legs):
+        base, platform = base_carriers()[leg.base.joint], platform_carriers()[leg.platform.joint]
+        for side, carrier in (("base", base), ("platform", platform)):
+            site = Site(j + 1, side, document.motion, partial(place, "legs", j, side))
+            carrier.check(getattr(leg, side), site)
+        if document.motion == "planar":
+            _check_plane(document, j, leg, place)
+        if document.motion == "translation":
+            _check_parallel(j, leg, place)
+        if base.driven and not isinstance(leg.length, ConstantLength):
+            raise InputError(
+                f"leg {j + 1} is moved by its {leg.base.joint}, so its rod has one length",
+                where=place("legs", j, "length"),
+                expected="length: {actuated: false, constant: the rod's length in metres}",
+            )
+    _check_motors(document, place)
+    for side, legs, fields in sharing(document):
+        for field in fields:
+            _check_equal(document, side, legs, field, place)
+    _check_equations(document, place)
+
+
+def _check_plane(document: MechanismDocument, j: int, leg: Leg, place: Where) -> None:
+    """A planar machine's legs lie in planes z = const."""
+    if document.home and np.hypot(*document.home.rotation_vector[:2]) > IN_PLANE:
+        raise InputError(
+            "the home pose of a planar machine is turned out of its plane",
+            where=place("home", "rotation_vector"),
+            expected="[0, 0, angle]",
+        )
+    # height of the platform frame above the base frame; by most legs where no home is given
+    rise = median(leg.base.center[2] - leg.platform.center[2] for leg in document.legs)
+    if document.home is not None:
+        rise = document.home.position[2]
+    gap = leg.platform.center[2] + rise - leg.base.center[2]
+    if abs(gap) > IN_PLANE:
+        raise InputError(
+            f"leg {j + 1} of a planar machine leaves its plane",
+            where=place("legs", j, "platform", "center"),
+            found=f"its platform joint {gap * 1e3:+.4g} mm above its base joint",
+            expected="the same height (z) for both ends of a leg, at the home pose",
+            next_step="Draw the leg in its plane, or write motion: spatial",
+        )
+
+
+def _check_parallel(j: int, leg: Leg, place: Where) -> None:
+    """A platform that only translates keeps axes parallel; unequal ones would turn it."""
+    roles = (
+        base_carriers()[leg.base.joint].axis_role(leg.base),
+        platform_carriers()[leg.platform.joint].axis_role(leg.platform),
+    )
+    if roles != ("twist", "twist"):
+        return
+    if np.linalg.norm(np.cross(leg.base.axis, leg.platform.axis)) > IN_PLANE:
+        raise InputError(
+            f"the {leg.base.joint} joints of leg {j + 1} have axes that are not parallel, so they "
+            "would turn the platform",
+            where=place("legs", j, "platform", "axis"),
+            expected="the axis of its base joint",
+            next_step="Write motion: spatial, and the turn will be computed",
+        )
+
+
+def _check_motors(document: MechanismDocument, place: Where) -> None:
+    used = {int(c) + 1 for c in motor_columns(document) if c >= 0}
+    missing = sorted(set(range(1, max(used, default=0) + 1)) - used)
+    if missing:
+        raise InputError(
+            f"motor{'s' if len(missing) > 1 else ''} {listed([str(m) for m in missing])} "
+            "of the readings moves no leg",
+            where=place("legs"),
+            expected="motors numbered from 1 in the order of the readings' columns",
+        )
+
+
+def _check_equal(
+    document: MechanismDocument, side: str, legs: tuple[int, ...], field: str, place: Where
+) -> None:
+    """Legs on one motor, or on one body of the platform, are drawn with the same axis or hinge."""
+    nodes = [getattr(document.legs[j], side) for j in legs]
+    values = [getattr(node, field) for node in nodes]
+    for j, value in zip(legs[1:], values[1:], strict=True):
+        if (value is None) != (values[0] is None) or (
+            value is not None and np.abs(np.subtract(value, values[0])).max() > SAME
+        ):
+            body = platform_carriers()[document.legs[j].platform.joint].body
+            raise InputError(
+                f"legs {legs[0] + 1} and {j + 1} are on one "
+                f"{'motor' if side == 'base' else body}, but differ in {field}",
+                where=place("legs", j, side, field),
+                found=str(value),
+                expected=str(values[0]),
+            )
+
+
+def _check_equations(document: MechanismDocument, place: Where) -> None:
+    """Lengths and axes hold all freedoms of the platform, and of what turns on it."""
+    passive = [
+        j + 1 for j, leg in enumerate(document.legs) if isinstance(leg.length, PassiveLength)
+    ]
+    count = len(document.legs) - len(passive) + len(equations(document))
+    joints = [leg.platform.joint for leg in document.legs]
+    turning = [j for j, joint in enumerate(joints) if platform_carriers()[joint].turns]
+    hinges = len(set(bodies(document)[turning].tolist()))
+    freedoms = MOTIONS[document.motion].shape[1] + hinges
+    if count >= freedoms:
+        return
+    why = ""
+    if passive:
+        one = len(passive) == 1
+        why = f"; {'leg' if one else 'legs'} {listed([str(j) for j in passive])}, passive, "
+        why += "holds nothing" if one else "hold nothing"
+    kinds = dict.fromkeys(f"{joints[j].replace('-', ' ')}s" for j in turning)
+    raise InputError(
+        f"the legs do not hold the platform: {count} equations for {freedoms} freedoms{why}",
+        where=place("legs"),
+        expected="one equation a leg with a length, one a revolute joint, one a pair of universal "
+        f"joints with axes; {freedoms} for motion: {document.motion}"
+        f"{f' and its {listed(list(kinds))}' if kinds else ''}",
+        next_step="Add legs or axes, or correct motion",
+    )

@@ -1,0 +1,171 @@
+"""Where motors, guides and side bars of a machine are, and how far its legs' ends go."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import cross, dot
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import leg_readings, limb_ends, skeletons
+from pkmcal.mechanisms.motors import bodies
+
+INSET = 0.1
+"""Share of its range that a motor stays from its stops where reaches are compared."""
+NO_RANGE = 0.25
+"""Length of a guide on either side, in the leg's length, where the file gives no range."""
+PIECES = 16
+"""Straight pieces that a bent guide is drawn with."""
+STRAIGHT = 1e-9
+"""A guide's way off the line between its ends, m, below which it is one piece."""
+
+
+@dataclass(frozen=True)
+class Drives:
+    """What moves the legs' ends on the base; base frame, m, one row a leg.
+
+    arms, guides : (L,) whether an arm carries the leg's end, or it runs along a guide; neither is
+        a joint that stands still.
+    foot : (L, 3) the joint, where the motor holds the arm, or the middle of a guide.
+    axis : (L, 3) unit axis of an arm's motor, or direction of a guide; zero where there is none.
+    arm : (L,) how far the leg's end is from the foot of its arm, zero elsewhere.
+    ways : L arrays (n, 3), the leg's end along its guide from one stop to the other, two points of
+        a straight one; elsewhere the foot twice.
+    away : (L, 3) unit, square to a guide and away from the platform; zero elsewhere.
+    """
+
+    arms: Booleans
+    guides: Booleans
+    foot: Array
+    axis: Array
+    arm: Array
+    ways: tuple[Array, ...]
+    away: Array
+
+    @property
+    def any(self) -> bool:
+        """Whether there is a motor on the base at all."""
+        return bool((self.arms | self.guides).any())
+
+    @property
+    def upright(self) -> Booleans:
+        """(L,) guides that stand rather than lie."""
+        return self.guides & (np.abs(self.axis[:, 2]) > np.sqrt(0.5))
+
+    @cached_property
+    def ends(self) -> Array:
+        """(L, 2, 3) the leg's end at both ends of a guide; elsewhere the foot twice."""
+        return np.stack([way[[0, -1]] for way in self.ways])
+
+
+def drives_of(machine: Machine) -> Drives:
+    """The machine's motors, from its carriers: none is known by its name here."""
+    layout, zero = machine.layout, np.zeros(machine.n_legs)
+    chains = skeletons(layout, machine.values, zero)
+    driven = np.zeros(machine.n_legs, dtype=bool)
+    for g in layout.base:
+        driven[g.legs] = g.carrier.driven
+    several = np.array([len(chain) > 1 for chain in chains])
+    arms, guides = driven & several, driven & ~several
+    a, by_reading = _placed(machine, zero)
+    foot = np.array([chain[0] for chain in chains])
+    arm = np.where(arms, np.sqrt(dot(a - foot, a - foot)), 0.0)
+    turned = cross(by_reading, _placed(machine, zero + np.pi / 2)[1])
+    axis = np.where(arms[:, None], _unit(turned, a - foot), 0.0)
+    ways = [np.stack([p, p]) for p in foot]
+    low, high = _guide_ranges(machine, by_reading).T
+    for j in np.flatnonzero(guides):
+        readings = np.where(np.arange(machine.n_legs) == j, _steps(low[j], high[j]), 0.0)
+        way, along = (x[:, j] for x in _placed(machine, readings))
+        ways[j] = way if _is_bent(way) else way[[0, -1]]
+        foot[j] = way[PIECES // 2] if _is_bent(way) else ways[j].mean(axis=0)
+        axis[j] = _unit(along[PIECES // 2], by_reading[j])
+    away = _away(machine, foot, axis, guides)
+    return Drives(arms, guides, foot, axis, arm, tuple(ways), away)
+
+
+def _placed(machine: Machine, leg_reading: Array) -> tuple[Array, Array]:
+    """Legs' ends on the base and their derivatives, (..., L, 3) each, at readings (..., L)."""
+    shape = (*leg_reading.shape, 3)
+    a, by_reading = np.empty(shape), np.empty(shape)
+    for g in machine.layout.base:
+        own = g.of(machine.values), leg_reading[..., g.legs]
+        a[..., g.legs, :], by_reading[..., g.legs, :] = g.carrier.place(*own)
+    return a, by_reading
+
+
+def _steps(low: float, high: float) -> Array:
+    """Readings (PIECES + 1, 1) from one stop of a guide to the other."""
+    return np.linspace(low, high, PIECES + 1)[:, None]
+
+
+def _is_bent(way: Array) -> bool:
+    """Whether a way (n, 3) leaves the line between its ends."""
+    u = (way[-1] - way[0]) / max(float(np.linalg.norm(way[-1] - way[0])), 1e-300)
+    return float(np.linalg.norm(np.cross(way - way[0], u), axis=1).max()) > STRAIGHT
+
+
+def _unit(v: Array, otherwise: Array) -> Array:
+    """Vectors (..., 3) of length one; where they are none, some direction square to another."""
+    aside = np.cross(otherwise, np.eye(3)[np.abs(otherwise).argmin(axis=-1)])
+    v = np.where(dot(v, v)[..., None] > 1e-12 * dot(otherwise, otherwise)[..., None], v, aside)
+    size = np.linalg.norm(v, axis=-1, keepdims=True)
+    # what is a unit vector stays what it is, to the last digit
+    return v / np.where(np.abs(size - 1) < 1e-12, 1.0, np.maximum(size, 1e-300))
+
+
+def _guide_ranges(machine: Machine, by_reading: Array) -> Array:
+    """Least and largest reading of each leg, (L, 2); about home's where the file is silent."""
+    layout, home = machine.layout, machine.home()
+    readings = machine.inverse(home[None])[0]
+    ends = limb_ends(layout, machine.values, readings, home)
+    speed = np.linalg.norm(by_reading, axis=1)
+    spare = NO_RANGE * np.linalg.norm(ends.b - ends.a, axis=1) / np.where(speed > 0, speed, 1.0)
+    middle = leg_readings(layout, readings)
+    ranges = machine.joint_ranges
+    told = np.stack([leg_readings(layout, ranges[:, k]) for k in (0, 1)], axis=-1)
+    guess = np.stack([middle - spare, middle + spare], axis=-1)
+    return np.where(np.isfinite(told).all(axis=1, keepdims=True), told, guess)
+
+
+def _away(machine: Machine, foot: Array, axis: Array, guides: Booleans) -> Array:
+    """Where guides stand back from their legs' ends: the platform's joints lie on the other side,
+    all of them, so that two carriages on one guide agree about it.
+    """
+    home = machine.home()
+    b = limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), home).b
+    back = foot - np.array(b).mean(axis=0)
+    back = back - dot(back, axis)[:, None] * axis
+    # a guide through the platform's middle may stand back to any side
+    aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
+    back = np.where((dot(back, back) > 1e-6)[:, None], back, aside)
+    size = np.linalg.norm(back, axis=1, keepdims=True)
+    return np.where(guides[:, None], back / np.maximum(size, 1e-300), 0.0)
+
+
+def reaches(machine: Machine) -> tuple[Array, Array]:
+    """Legs' ends A and B (n, L, 3), base frame, m: with the platform at home, and, where motors
+    stand on the base, with all of them near either stop.
+
+    A carriage or an arm takes its leg's end along, so that home alone says little of the space
+    that the machine needs.
+    """
+    poses, readings = [machine.home()], [machine.inverse(machine.home()[None])[0]]
+    ranges = machine.joint_ranges
+    if any(g.carrier.driven for g in machine.layout.base) and np.isfinite(ranges).all():
+        share = np.array([[INSET], [1 - INSET]])
+        wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
+        found = machine.forward_result(wanted)
+        poses += list(found.T_base_platform[found.converged])
+        readings += list(wanted[found.converged])
+    ends = limb_ends(machine.layout, machine.values, np.stack(readings), np.stack(poses))
+    return np.array(ends.a), np.array(ends.b)
+
+
+def side_bars(machine: Machine) -> tuple[Integers, ...]:
+    """Legs of each body of an articulated platform, in the order of their numbers."""
+    on = bodies(machine.document)
+    return tuple(np.flatnonzero(on == body) for body in range(on.max(initial=-1) + 1))
