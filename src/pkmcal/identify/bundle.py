@@ -154,24 +154,20 @@ def _noise_scale(fit: _Fit) -> Both:
     problem = fit.problem
     linear = problem.linearize(fit.state)
     reduced = eliminate(linear, np.zeros(len(fit.steps)))
-    count = Both(edge_count(problem, fit.weight.edges), pose_count(problem, fit.weight.poses))
     rows = problem.edge_rows, problem.pose_rows
     out = []
-    for part, number, scale in zip(rows, count, fit.scale, strict=True):
+    for part, number, scale in zip(rows, counts(problem, fit.weight), fit.scale, strict=True):
         chi2, freedom = group_fit(linear, reduced, part, number)
         new = scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
         out.append(np.where(freedom > 5, np.maximum(new, LEAST_SCALE), scale))
     return Both(*out)
 
 
-def pose_count(problem: Problem, weight: Array) -> Array:
-    """Residuals of poses in use, each counted by its robust weight, (B,)."""
-    return np.sum(weight * robust_weights.measured_rows(problem), axis=(1, 2))
-
-
-def edge_count(problem: Problem, weight: Array) -> Array:
-    """Residuals of edges in use, each counted by its robust weight, (B,)."""
-    return np.sum(weight, axis=(1, 2)) * problem.data.whiten.shape[-1]
+def counts(problem: Problem, weight: Both) -> Both:
+    """Residuals of edges and of poses in use, each counted by its robust weight, (B,) each."""
+    poses = weight.poses * robust_weights.measured_rows(problem)
+    edges = np.sum(weight.edges, axis=(1, 2)) * problem.data.whiten.shape[-1]
+    return Both(edges, np.sum(poses, axis=(1, 2)))
 
 
 def bundle(
@@ -197,20 +193,15 @@ def bundle(
     gauge = gauge or default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing)
     batch = batch_of(machine, assembled, start)
-    problem = _mounts_near(assembled, batch)
+    problem = assembled.problem
+    # mounts are known to be near their start, as far as nothing else tells
+    mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
+    problem = replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
     result = solve_batch(problem, batch, robust=robust, scale_noise=scale_noise)
     stop = result.solution.stop[0]
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(what=f"the joint estimate failed: {stop.value}")
     return _estimate(machine, measurements, start, assembled, result, gauge)
-
-
-def _mounts_near(assembled: Assembled, start: BatchState) -> Problem:
-    """The problem whose mounts are known to be near their start, as far as nothing else tells."""
-    problem = assembled.problem
-    mounts = np.array(assembled.priors) == "mount"
-    there = problem.prior_values(start)[0]
-    return replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
 
 
 def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiability:
@@ -251,6 +242,9 @@ def _estimate(
     factor = measurements.intrinsics_factor
     edges = problem.block_residuals(found)[0] / result.noise_scale[0]
     poses = problem.pose_residuals(found)[0] / result.pose_scale[0]
+    closures = result.info.linear.value[..., problem.closure_rows]
+    joints = np.zeros(measurements.joints.shape)  # where no pose was fitted
+    joints[assembled.seen] = problem.joint_rows(closures, found)[0]
     return Estimate(
         machine=identified,
         state=_with_unseen_poses(identified, measurements, assembled, state),
@@ -259,7 +253,7 @@ def _estimate(
         edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
         edge_residuals=assembled.edges.taken(edges),
         edge_weights=assembled.edges.taken(result.weight[0]),
-        joint_residuals=_joint_residuals(result, assembled, measurements),
+        joint_residuals=joints,
         data_share=data_share(machine, state.theta, covariance, gauge),
         configurations=assembled.seen,
         statistics=_statistics(result, assembled),
@@ -284,16 +278,6 @@ def _with_unseen_poses(
     return replace(state, T_base_platform=poses, internal=internal)
 
 
-def _joint_residuals(
-    result: BatchResult, assembled: Assembled, measurements: Measurements
-) -> Array:
-    """Closures in standard deviations of a reading, (K, m); zero where no pose was fitted."""
-    rows = result.info.linear.value[0, :, result.problem.closure_rows]
-    out = np.zeros(measurements.joints.shape)
-    out[assembled.seen] = result.problem.joint_rows(rows[None], result.solution.state)[0]
-    return out
-
-
 def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     problem, linear = result.problem, result.info.linear
     kinds = np.array(assembled.priors)
@@ -301,8 +285,8 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     chi2 = [float(np.sum(linear.value[0, :, part] ** 2)) for part in rows]
     drawn = ~np.isin(kinds, ("gauge", "mount"))
     chi2_drawing = float(np.sum(linear.shared_value[0, drawn] ** 2))
-    n_edges = float(edge_count(problem, result.weight)[0])
-    n_poses = float(pose_count(problem, result.pose_weight)[0])
+    used = counts(problem, Both(result.weight, result.pose_weight))
+    n_edges, n_poses = float(used.edges[0]), float(used.poses[0])
     n_joints = linear.value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))

@@ -376,8 +376,8 @@ def carried_errors(layout: LimbLayout, before: State, e: Array, f: Array) -> Arr
     n = P + 6 S + 6 M.
 
     Centres turn with their frame. A station's left perturbation (omega, tau) becomes
-    (omega, tau + [R R_E^T t_E]x omega), as ``(T E^-1)`` keeps the camera's own axes. A mount is
-    turned with its body, and moved by the turn about its new origin.
+    (omega, tau + [R R_E^T t_E]x omega), as ``(T E^-1)`` keeps the camera's own axes. A mount's
+    are turned with its body.
     """
     told = told_unknowns(before)
     out = np.eye(told.count)
@@ -395,7 +395,6 @@ def carried_errors(layout: LimbLayout, before: State, e: Array, f: Array) -> Arr
     for m, moving in enumerate(before.on_platform):
         at, frame = told.mounts.start + 6 * m, f if moving else e
         out[at : at + 3, at : at + 3] = out[at + 3 : at + 6, at + 3 : at + 6] = frame[:3, :3]
-        out[at + 3 : at + 6, at : at + 3] = skew(frame[:3, 3]) @ frame[:3, :3]
     return out
 
 

@@ -82,7 +82,8 @@ class Unknowns:
         for name in ("machine", "stations", "optics", "shading", "mounts"):
             part: slice = getattr(self, name)
             where[name] = np.arange(part.start, part.stop)
-        return np.unique(np.concatenate([where[name] for name in names]))
+        none = np.zeros(0, dtype=int)
+        return np.unique(np.concatenate([none, *(where[name] for name in names)]))
 
 
 def own_blocks(matrix: Array, part: slice, width: int) -> Array:
