@@ -17,8 +17,7 @@ from pkmcal import __version__
 from pkmcal.arrays import Array
 from pkmcal.files import plain
 from pkmcal.geometry.rigid import inverse, skew
-from pkmcal.validate.figures import holdout_document
-from pkmcal.validate.independence import digests
+from pkmcal.session import digests
 
 if TYPE_CHECKING:
     from pkmcal.calibration import Calibration
