@@ -298,7 +298,10 @@ def evidence(held: Held, covariance: Array) -> Evidence:
     left = held.projected(held.linear.value[0, ..., None], held.linear.shared_value[0, :, None])
     u, s, vt = np.linalg.svd(by, full_matrices=False)
     seen = s > RANK_TOLERANCE * s.max(initial=0.0)
-    by, told = s[seen, None] * vt[seen] / size, -u[:, seen].T @ left[:, 0]
+    # noise is drawn in this basis: its signs must not be rounding's choice
+    sign = np.sign(vt[np.arange(len(vt)), np.abs(vt).argmax(axis=1)])[seen]
+    by = (sign * s[seen])[:, None] * vt[seen] / size
+    told = -sign * (u[:, seen].T @ left[:, 0])
     known = by[:, : len(covariance)]
     spread = np.eye(len(told)) + known @ covariance @ known.T
     lower = np.linalg.cholesky(0.5 * (spread + spread.T))
