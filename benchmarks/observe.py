@@ -35,7 +35,7 @@ def main() -> None:
     """Print the ratio, the parts of a calibration, and the memory used."""
     begin = time.perf_counter()
     from pkmcal.calibration import calibrate
-    from pkmcal.report import report_html
+    from pkmcal.report.calibration import report_html
     from pkmcal.session import load_session
 
     start_up = time.perf_counter() - begin

@@ -10,7 +10,7 @@ import pytest
 from kit_sessions import Kit, board_kit, flatness, places, probe_kit, tool
 from pkmcal.geometry.rigid import apply, register
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.report.page import report_views
+from pkmcal.report.calibration import report_views
 
 KITS = ("delta", "linear-delta")
 

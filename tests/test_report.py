@@ -11,7 +11,7 @@ from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report import parameters, pictures, rejections, residuals, wording
 from pkmcal.report.charts import ticks_between
-from pkmcal.report.page import report_views
+from pkmcal.report.calibration import report_views
 from pkmcal.report.provenance import camera_position_covariance
 from pkmcal.report.scene import enlargement
 from pkmcal.report.toolpoint import pose_covariance, tool_point

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pkmcal.observe.edges import Rejection
-from pkmcal.report.page import report_html
+from pkmcal.report.calibration import report_html
 from test_report_case import Case, Verdict, make_case
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"

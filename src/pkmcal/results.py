@@ -69,7 +69,7 @@ def check_output(folder: Path | str) -> None:
 
 def save(calibration: Calibration, folder: Path | str) -> None:
     """Write a calibration's three files into `folder`, whole or not at all."""
-    from pkmcal.report import report_html
+    from pkmcal.report.calibration import report_html
 
     check_output(folder)
     report = report_html(

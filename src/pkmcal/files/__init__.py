@@ -2,7 +2,7 @@
 
 from pkmcal.files.json_files import json_text, plain, read_json
 from pkmcal.files.tables import Table, csv_text, read_csv
-from pkmcal.files.text import closest, listed, read_text, shown, wanted_file
+from pkmcal.files.text import closest, read_text, shown, wanted_file
 from pkmcal.files.validation import Schema, field_path, validate
 from pkmcal.files.writing import (
     check_own_folder,
@@ -13,6 +13,7 @@ from pkmcal.files.writing import (
     write_text,
 )
 from pkmcal.files.yaml_files import Document, Keys, parse_yaml, read_yaml, yaml_text
+from pkmcal.wording import listed
 
 __all__ = [
     "Document",

@@ -11,8 +11,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from pkmcal.errors import InputError
-from pkmcal.files.text import closest, listed, shown
+from pkmcal.files.text import closest, shown
 from pkmcal.files.yaml_files import Document, Keys, field_path
+from pkmcal.wording import listed
 
 __all__ = ["Schema", "field_path", "validate"]
 

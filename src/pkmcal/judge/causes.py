@@ -20,7 +20,7 @@ from pkmcal.identify.problem import Measurements
 from pkmcal.judge.held import MAGNIFIED
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.edges import Observation
-from pkmcal.report.wording import split_name
+from pkmcal.wording import split_name
 
 LegPart = Literal[
     "zero", "rod", "arm", "base", "platform", "hinge", "all", "pair", "scale", "camera"

@@ -15,7 +15,7 @@ import numpy as np
 from pkmcal.arrays import Booleans
 from pkmcal.calibration import Calibration, Progress, calibrate
 from pkmcal.errors import InputError
-from pkmcal.files import listed
+from pkmcal.wording import listed
 from pkmcal.results import SavedCalibration, load
 from pkmcal.session import Session, digests, load_session
 

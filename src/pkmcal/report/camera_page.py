@@ -17,8 +17,8 @@ from pkmcal.cameras.calibration_checks import CELLS, coverage, tilts
 from pkmcal.errors import InputError
 from pkmcal.observe.images import decode
 from pkmcal.outcome import Figure
-from pkmcal.report import charts, templating
-from pkmcal.report.wording import brief, count, decimals, number
+from pkmcal.report import charts, page
+from pkmcal.wording import brief, count, decimals, number
 
 LARGEST_WIDTH = 640
 QUALITY = 70
@@ -88,7 +88,7 @@ def camera_report_html(calibration: CameraCalibration, paths: Sequence[Path | st
     """One HTML page that needs nothing else. paths : the photographs, to show them; by name."""
     used = calibration.residuals[calibration.kept]
     factor = _factor(used, calibration.camera.image_size[0])
-    return templating.render(
+    return page.render(
         "camera.html.j2",
         c=calibration,
         headline=headline(calibration),

@@ -7,7 +7,6 @@ dark theme. Lengths are millimetres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -47,18 +46,6 @@ def figure_of(
         "layout": _layout(),
         "config": {"scrollZoom": True},
     }
-
-
-@cache
-def plotly_script() -> str:
-    """Plotly's script, compressed (gzip, base64): a fifth of the page's size without it."""
-    import base64
-    import gzip
-    from importlib import resources
-
-    source = resources.files("plotly") / "package_data" / "plotly.min.js"
-    packed = gzip.compress(source.read_bytes(), 6, mtime=0)
-    return base64.b64encode(packed).decode("ascii")
 
 
 def _pairs(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> list[tuple[Joint, Joint]]:

@@ -11,7 +11,7 @@ from pkmcal.observe.edges import Observation
 from pkmcal.outcome import Figure
 from pkmcal.report.residuals import KEPT
 from pkmcal.report.toolpoint import ToolPoint
-from pkmcal.report.wording import brief, count, number
+from pkmcal.wording import brief, count, number
 from pkmcal.session import Session
 
 NO_TURN = 1e-9

@@ -12,7 +12,7 @@ from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words import Findings
 from pkmcal.identify.words_names import named
 from pkmcal.mechanisms import Machine, ParameterTable
-from pkmcal.report.wording import (
+from pkmcal.wording import (
     SCALES,
     decimals,
     joined,

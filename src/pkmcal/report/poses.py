@@ -21,7 +21,7 @@ from pkmcal.report.charts import (
     row_chart,
 )
 from pkmcal.report.residuals import KEPT, SIGMAS, expected_rms
-from pkmcal.report.wording import brief, count, decimals, number
+from pkmcal.wording import brief, count, decimals, number
 from pkmcal.session import Session
 from pkmcal.turning import turning
 

@@ -12,7 +12,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, pose_difference, skew
 from pkmcal.identify.problem import Estimate
-from pkmcal.report.wording import brief, count, decimals, number
+from pkmcal.wording import brief, count, decimals, number
 from pkmcal.session import Session
 
 OPEN = 1e3

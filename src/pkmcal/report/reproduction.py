@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pkmcal.outcome import Check, Figure, Part
-from pkmcal.report import figure, templating
+from pkmcal.report import page
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class Reproduction:
 
 def reproduction_html(found: Reproduction) -> str:
     """One HTML page that needs nothing else: no network, no other file."""
-    return templating.render(
+    return page.render(
         "reproduction.html.j2",
         r=found,
         plots=[plot for part in found.parts for plot in part.plots],
-        plotly=figure.plotly_script(),
+        plotly=page.plotly_script(),
     )

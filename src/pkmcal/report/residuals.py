@@ -24,7 +24,7 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
-from pkmcal.report.wording import count, joined, number
+from pkmcal.wording import count, joined, number
 from pkmcal.session import Session
 
 KEPT = 0.5

@@ -14,7 +14,7 @@ from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.report.charts import WIDTH
-from pkmcal.report.wording import brief, number
+from pkmcal.wording import brief, number
 from pkmcal.session import Session
 
 ELLIPSE = 2.0

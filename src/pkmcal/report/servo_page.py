@@ -12,8 +12,8 @@ from pkmcal.control.source import Controlled
 from pkmcal.control.study import Outcome, Plan, Study, study
 from pkmcal.control.words import Judgement, judgement, named
 from pkmcal.outcome import Figure, Plot, Row, Table
-from pkmcal.report import figure, servo_figures, templating
-from pkmcal.report.wording import brief, number
+from pkmcal.report import figure, servo_figures, page
+from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2
 """Choices of legs told of each number of them."""
@@ -97,7 +97,7 @@ def servo_of(
 def servo_html(found: Servo) -> str:
     """One HTML page that needs nothing else: no network, no other file."""
     plots = plots_of(found)
-    return templating.render(
+    return page.render(
         "servo.html.j2",
         s=found,
         j=found.judgement,
@@ -108,7 +108,7 @@ def servo_html(found: Servo) -> str:
         settings=settings_table(found),
         plots=plots,
         frames=servo_figures.frames(found.study, shown_run(found.study)),
-        plotly=figure.plotly_script(),
+        plotly=page.plotly_script(),
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Check
-from pkmcal.report.wording import number
+from pkmcal.wording import number
 from pkmcal.reproduce.paper_a_study import (
     BOUND,
     CORRECTED,

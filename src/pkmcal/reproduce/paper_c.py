@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.outcome import Figure
 from pkmcal.report.reproduction import Reproduction
-from pkmcal.report.wording import number
+from pkmcal.wording import number
 from pkmcal.reproduce import Options
 from pkmcal.reproduce.paper_c_expected import (
     PROTOTYPE,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.outcome import Check
-from pkmcal.report.wording import number
+from pkmcal.wording import number
 from pkmcal.reproduce.paper_c_simulation import Kind
 from pkmcal.reproduce.paper_c_study import (
     BOUND,

@@ -6,7 +6,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.outcome import Part, Row, Table
-from pkmcal.report.wording import number
+from pkmcal.wording import number
 from pkmcal.reproduce.paper_c_expected import (
     BEFORE,
     PROTOTYPE,

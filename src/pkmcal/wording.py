@@ -1,10 +1,10 @@
-"""Numbers and parameter names as people read them."""
+"""Words and numbers for people: lists, counts, magnitudes, parameters' names."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 MINUS = "\N{MINUS SIGN}"
 SCALES = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
@@ -78,9 +78,18 @@ def legs_named(numbers: Iterable[int], all_legs: int) -> str:
     return ("leg " if len(found) == 1 else "legs ") + joined([str(n) for n in found])
 
 
-def joined(words: list[str]) -> str:
+def joined(words: Sequence[str]) -> str:
     """``a, b and c``."""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    return listed(words, len(words))
+
+
+def listed(names: Sequence[str], longest: int = 6) -> str:
+    """Join names for a sentence: "a, b and c", or "a, b, c and 12 more"."""
+    if len(names) <= 1:
+        return "".join(names)
+    if len(names) <= longest:
+        return f"{', '.join(names[:-1])} and {names[-1]}"
+    return f"{', '.join(names[: longest - 1])} and {len(names) - longest + 1} more"
 
 
 def percent(share: float) -> str:
