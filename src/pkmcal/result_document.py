@@ -42,8 +42,13 @@ OPEN = 1.0
 """m or rad; a target's place that is known no better is not told by the data."""
 
 
-def document_of(calibration: Calibration) -> dict[str, Any]:
-    """The content of calibration.json, plain data without NaN."""
+def document_of(
+    calibration: Calibration, holdout: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """The content of calibration.json, plain data without NaN.
+
+    holdout : what it predicts of configurations that it did not see, where that was asked for.
+    """
     session, estimate = calibration.session, calibration.estimate
     document = {
         "pkmcal_calibration": FORMAT,
@@ -62,7 +67,7 @@ def document_of(calibration: Calibration) -> dict[str, Any]:
         "cameras": _cameras(calibration),
         "configurations": _configurations(calibration),
         "statistics": asdict(estimate.statistics),
-        "holdout": _holdout(calibration),
+        "holdout": holdout,
         "residuals": _residuals(calibration),
         "rejected": _rejected(calibration),
         "mechanism": estimate.machine.to_document(),
@@ -83,13 +88,6 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return found
-
-
-def _holdout(calibration: Calibration) -> dict[str, Any] | None:
-    """Residuals on configurations that were held out, beside those in use."""
-    if calibration.holdout is None:
-        return None
-    return holdout_document(calibration.holdout, calibration.session.configurations)
 
 
 def _parameters(calibration: Calibration) -> list[dict[str, Any]]:

@@ -71,7 +71,10 @@ def save(calibration: Calibration, folder: Path | str) -> None:
     """Write a calibration's three files into `folder`, whole or not at all."""
     from pkmcal.report.calibration import report_html
 
+    from pkmcal.judge.holdouts import holdout_of
+
     check_output(folder)
+    holdout = holdout_of(calibration)
     report = report_html(
         calibration.session,
         calibration.observation,
@@ -79,11 +82,13 @@ def save(calibration: Calibration, folder: Path | str) -> None:
         calibration.verdict,
         findings=calibration.findings,
         timings=calibration.timings,
-        holdout=calibration.holdout,
+        holdout=holdout,
     )
     texts = {
         MECHANISM: calibrated_mechanism_text(calibration),
-        EVERYTHING: json_text(document_of(calibration)),
+        EVERYTHING: json_text(
+            document_of(calibration, holdout and holdout.document(calibration.session.configurations))
+        ),
         REPORT: report,
     }
     texts |= _refined_cameras(calibration)

@@ -104,7 +104,9 @@ def summary(calibration: Calibration, folder: Path) -> dict[str, Any]:
     from dataclasses import asdict
 
     from pkmcal.commands.figures import figures_of
-    from pkmcal.validate.figures import holdout_document
+    from pkmcal.judge.holdouts import holdout_of
+
+    holdout = holdout_of(calibration)
 
     return {
         "exit_code": exit_code(calibration),
@@ -112,9 +114,7 @@ def summary(calibration: Calibration, folder: Path) -> dict[str, Any]:
         "figures": figures_of(calibration).as_dict(),
         "session_warnings": calibration.session.warnings,
         "files": {name: str(folder / name) for name in WHAT},
-        "holdout": holdout_document(calibration.holdout, calibration.session.configurations)
-        if calibration.holdout
-        else None,
+        "holdout": holdout and holdout.document(calibration.session.configurations),
         "timings": calibration.timings,
     }
 
@@ -134,11 +134,13 @@ def tell(out: Console, calibration: Calibration, folder: Path) -> None:
         values = ", ".join(_joined(*value) for value in card.values)
         out.print(f"  {card.question:{widest}}  [bold]{values}[/]", soft_wrap=True)
     if calibration.holdout:
-        from pkmcal.report.validation_page import holdout_sentence, joints_of
+        from pkmcal.judge.holdouts import holdout_of
+        from pkmcal.report.validation import held_out
 
         out.print()
-        said = holdout_sentence(calibration.holdout, joints_of(calibration.session))
-        console.print_points(out, [("", said)])
+        holdout = holdout_of(calibration)
+        said = held_out(holdout, calibration.session).said if holdout else ()
+        console.print_points(out, [("", text) for text in said])
     notes = [*calibration.session.warnings, *verdict.warnings]
     points = [(console.MARKS["doubtful"], note) for note in notes]
     points += [("[cyan]→[/]", advice) for advice in verdict.advice]

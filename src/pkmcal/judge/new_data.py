@@ -15,9 +15,9 @@ import numpy as np
 from pkmcal.arrays import Booleans
 from pkmcal.calibration import Calibration, Progress, calibrate
 from pkmcal.errors import InputError
-from pkmcal.wording import listed
 from pkmcal.results import SavedCalibration, load
 from pkmcal.session import Session, digests, load_session
+from pkmcal.wording import listed
 
 FAR = 10.0
 """Tolerances by which two drawings of one machine may differ: a corrected number, not another

@@ -24,14 +24,14 @@ from pkmcal.report import (
     scene,
     page,
     toolpoint,
-    validation_page,
+    validation,
 )
 from pkmcal.session import Session
 
 if TYPE_CHECKING:
     from pkmcal.identify.words import Findings
     from pkmcal.outcome import Verdict
-    from pkmcal.validate.holdouts import HoldOut
+    from pkmcal.judge.holdouts import HoldOut
 
 
 def report_html(
@@ -56,7 +56,7 @@ def report_html(
         **views,
         verdict=verdict,
         timings=provenance.durations(timings),
-        holdout=validation_page.holdout_views(holdout, session),
+        holdout=holdout and validation.held_out(holdout, session),
         plotly=page.plotly_script(),
     )
 
