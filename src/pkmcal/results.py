@@ -69,12 +69,12 @@ def check_output(folder: Path | str) -> None:
 
 def save(calibration: Calibration, folder: Path | str) -> None:
     """Write a calibration's three files into `folder`, whole or not at all."""
-    from pkmcal.report.calibration import report_html
-
     from pkmcal.judge.holdouts import holdout_of
+    from pkmcal.report.calibration import report_html
 
     check_output(folder)
     holdout = holdout_of(calibration)
+    told = holdout and holdout.document(calibration.session.configurations)
     report = report_html(
         calibration.session,
         calibration.observation,
@@ -86,9 +86,7 @@ def save(calibration: Calibration, folder: Path | str) -> None:
     )
     texts = {
         MECHANISM: calibrated_mechanism_text(calibration),
-        EVERYTHING: json_text(
-            document_of(calibration, holdout and holdout.document(calibration.session.configurations))
-        ),
+        EVERYTHING: json_text(document_of(calibration, told)),
         REPORT: report,
     }
     texts |= _refined_cameras(calibration)

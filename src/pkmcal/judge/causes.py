@@ -46,8 +46,8 @@ class Cause:
     """A change that is looked for.
 
     columns : (P + C, k), the change of the machine's parameters (m, rad), then of the cameras'
-    magnification, by k numbers, each in ``sizes`` (k,): a drawing's tolerance, or MAGNIFIED. legs : from
-    0. unit : of the k numbers: m, rad, or nothing for a ratio.
+    magnification, by k numbers, each in ``sizes`` (k,): a drawing's tolerance, or MAGNIFIED.
+    legs : from 0. unit : of the k numbers: m, rad, or nothing for a ratio.
     """
 
     part: LegPart

@@ -24,8 +24,8 @@ HOW = (
     " see.",
     "A camera's place costs six freedoms, also where it was left in place: what moves all of the"
     " machine against its camera is not seen, and is no change of the machine. Directions in which"
-    " a change by the drawing's whole tolerance would make less than one standard deviation are left"
-    " out.",
+    " a change by the drawing's whole tolerance would make less than one standard deviation are"
+    " left out.",
 )
 
 
