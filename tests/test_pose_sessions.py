@@ -20,7 +20,8 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.hand_eye import solve_pairs
 from pkmcal.mechanisms import load_mechanism, mechanism_text
-from pkmcal.results import load, save
+from pkmcal.report.calibration import save
+from pkmcal.results import load
 from pkmcal.session import load_session
 from pkmcal.simulate.configurations import draw_configurations
 from pkmcal.simulate.truth import true_machine

@@ -15,7 +15,7 @@ from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.edges import Observation
 from pkmcal.report.parameters import parameter_groups, unidentified
-from pkmcal.result_document import identifiability_of
+from pkmcal.results import identifiability_of
 from test_words import heaved, make, moved
 
 

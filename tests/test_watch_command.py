@@ -19,7 +19,8 @@ from pkmcal.identify.bundle import start_state
 from pkmcal.identify.problem import Measurements
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.observe.edges import Observation
-from pkmcal.results import load, save
+from pkmcal.report.calibration import save
+from pkmcal.results import load
 from pkmcal.session import load_session
 from pkmcal.simulate import Settings, load_truth, simulate_session
 from pkmcal.simulate.demo import demo_camera

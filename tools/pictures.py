@@ -31,7 +31,7 @@ from pkmcal.identify.problem import Measurements
 from pkmcal.observe import legs
 from pkmcal.recognition import platform_poses, read_photographs, recognise
 from pkmcal.report import page, templating
-from pkmcal.results import save
+from pkmcal.report.calibration import save
 from pkmcal.session import Session, load_session
 from pkmcal.simulate import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
 from pkmcal.simulate.demo import MECHANISM, SEED, SETTINGS, demo_camera

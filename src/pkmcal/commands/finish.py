@@ -34,16 +34,33 @@ def finish(
 
     quiet : say nothing of a result that may be used, and one sentence of another.
     """
-    from pkmcal.files import write_folder
-
     with console.progress(as_json or quiet) as told:
         told("Writing the report", 0.97)
-        write_folder(folder, contents(outcome, files))
+        write(outcome, folder, files)
+    return tell(outcome, folder, files, as_json=as_json, quiet=quiet)
+
+
+def write(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> None:
+    """Write the files, whole or not at all."""
+    from pkmcal.files import write_folder
+
+    write_folder(folder, contents(outcome, files))
+
+
+def tell(
+    outcome: Outcome,
+    folder: Path,
+    files: Mapping[str, str],
+    *,
+    as_json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Tell what was found and where it stands, and return the exit code."""
     if as_json:
         console.print_json(printed(outcome, folder, files))
     elif not quiet:
         out = console.out()
-        tell(out, outcome)
+        tell_people(out, outcome)
         out.print()
         console.print_files(out, [(str(folder / name), what) for name, what in files.items()])
     elif not outcome.verdict.usable:
@@ -74,7 +91,7 @@ def printed(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> dict[st
     }
 
 
-def tell(out: Console, outcome: Outcome) -> None:
+def tell_people(out: Console, outcome: Outcome) -> None:
     """What a command found, for people: the verdict, numbers, and what to look at."""
     verdict, findings = outcome.verdict, outcome.findings
     if outcome.subject:
