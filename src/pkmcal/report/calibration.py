@@ -172,7 +172,7 @@ def _geometry(
                 "The machine in three dimensions: joint centres by the drawing and as calibrated."
                 " The two plane views show the same.",
                 scene.figure_of(drawn, seen, session.configurations),
-                height=520,
+                height=420,
             ),
         ),
         html=page.render("views.html.j2", views=scene.views(drawn)),
