@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from pkmcal import results
+from pkmcal.calibration.results import base_camera_covariance, check_output, document_of, load
 from pkmcal.errors import InputError
 from pkmcal.files import json_text
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.calibration import save
-from pkmcal.results import base_camera_covariance, check_output, document_of, load
 
 
 @pytest.fixture

@@ -62,10 +62,10 @@ def calibrate(
     ] = False,
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""
-    from pkmcal.calibration import calibrate as run
+    from pkmcal.calibration.calibrate import calibrate as run
+    from pkmcal.calibration.results import check_output
     from pkmcal.report.calibration import outcome_of
-    from pkmcal.results import check_output
-    from pkmcal.session import load_session
+    from pkmcal.session.load import load_session
 
     loaded = load_session(session, model)
     folder = out or loaded.folder / "calibration"

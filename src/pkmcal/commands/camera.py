@@ -64,9 +64,9 @@ def camera(
     """Calibrate a camera from photographs of a board."""
     from dataclasses import replace
 
-    from pkmcal.cameras.calibrate import calibrate_photographs
+    from pkmcal.boards.board import load_board
+    from pkmcal.boards.camera import calibrate_photographs
     from pkmcal.files import check_writable
-    from pkmcal.observe.boards import load_board
     from pkmcal.report.camera import outcome_of
 
     if len(images) == 1 and (images[0] / "session.yaml").is_file():

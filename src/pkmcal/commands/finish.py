@@ -61,8 +61,9 @@ def tell(
     elif not quiet:
         out = console.out()
         tell_people(out, outcome)
-        out.print()
-        console.print_files(out, [(str(folder / name), what) for name, what in files.items()])
+        if files:
+            out.print()
+            console.print_files(out, [(str(folder / name), what) for name, what in files.items()])
     elif not outcome.verdict.usable:
         verdict = outcome.verdict
         console.print_error(" ".join([verdict.headline, *verdict.reasons]))
@@ -86,7 +87,7 @@ def printed(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> dict[st
     """The one JSON object of a command."""
     return {
         "exit_code": outcome.exit_code,
-        "files": {name: str(folder / name) for name in files},
+        **({"files": {name: str(folder / name) for name in files}} if files else {}),
         **(outcome.document if outcome.summary is None else outcome.summary),
     }
 

@@ -11,10 +11,11 @@ import numpy as np
 from markupsafe import Markup
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.results import REPORT, check_output, texts_of, versions
 from pkmcal.files import write_folder
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.problem import Estimate
-from pkmcal.observe.edges import EdgeSet, Observation
+from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.outcome import Finding, Level, Outcome, Part, Plot, Verdict
 from pkmcal.report import (
     charts,
@@ -30,12 +31,11 @@ from pkmcal.report import (
     validation_page,
 )
 from pkmcal.report.toolpoint import ToolPoint, tool_point
-from pkmcal.results import REPORT, check_output, texts_of, versions
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 from pkmcal.validate.figures import holdout_document
 
 if TYPE_CHECKING:
-    from pkmcal.calibration import Calibration
+    from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.words import Findings
     from pkmcal.validate.holdouts import HoldOut
 

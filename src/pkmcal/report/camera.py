@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.cameras.calibrate import CameraCalibration
-from pkmcal.cameras.calibration_checks import CELLS, coverage, tilts
-from pkmcal.cameras.files import camera_text
-from pkmcal.cameras.foreign import foreign_text
+from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
+from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.report import charts, page
 from pkmcal.report.pictures import THREADS, jpeg
