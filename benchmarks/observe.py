@@ -34,9 +34,10 @@ def decode_and_canny(paths: list[Path]) -> float:
 def main() -> None:
     """Print the ratio, the parts of a calibration, and the memory used."""
     begin = time.perf_counter()
-    from pkmcal.calibration import calibrate
-    from pkmcal.report.calibration import report_html
-    from pkmcal.session import load_session
+    from pkmcal.calibration.calibrate import calibrate
+    from pkmcal.report.calibration import report_of
+    from pkmcal.report.page import page_html
+    from pkmcal.session.load import load_session
 
     start_up = time.perf_counter() - begin
     with tempfile.TemporaryDirectory() as folder:
@@ -46,7 +47,7 @@ def main() -> None:
         runs = [calibrate(session).timings for _ in range(3)]
         parts = {name: min(run[name] for run in runs) for name in runs[0]}
         begin = time.perf_counter()
-        report_html(session, first.observation, first.estimate, first.verdict)
+        page_html(report_of(session, first.observation, first.estimate, first.verdict))
         parts["report"] = time.perf_counter() - begin
         paths = [p.path for s in session.stations for p in s.photographs]
         plain = best_of(lambda: decode_and_canny(paths))
@@ -63,8 +64,8 @@ def main() -> None:
 def simulated(folder: Path) -> Path:
     """A session of 45 photographs, 1024x768."""
     from pkmcal.mechanisms import load_mechanism
-    from pkmcal.simulate.demo import demo_camera
-    from pkmcal.simulate.session import Settings, simulate_session
+    from pkmcal.simulation.demo import demo_camera
+    from pkmcal.simulation.session import Settings, simulate_session
 
     simulate_session(folder, load_mechanism("gough-stewart"), demo_camera(), Settings(), seed=1)
     return folder

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pkmcal.cli import main
+from pkmcal.commands.cli import main
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def demo(tmp_path_factory) -> Demo:
 @pytest.fixture(scope="session")
 def calibrated(demo):
     """The demonstration's session, calibrated from Python."""
-    from pkmcal.calibration import calibrate
+    from pkmcal.calibration.calibrate import calibrate
 
     return calibrate(demo.session)
 

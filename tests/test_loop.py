@@ -12,7 +12,7 @@ from pkmcal.control.seen import seen_machine, true_edges
 from pkmcal.errors import GeometryError, InputError, PkmcalError
 from pkmcal.geometry.rigid import look_at, perturb, pose_difference
 from pkmcal.mechanisms import catalogue, load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from servo_lab import BESIDE, MIRROR, PERSPECTIVE, WITHIN, Lab
 
 MACHINE = load_mechanism("gough-stewart")
@@ -320,7 +320,7 @@ def test_a_photograph_is_a_goal_and_a_wrong_start_is_said():
 
 
 def test_a_calibration_gives_machine_camera_and_place(demo):
-    from pkmcal.results import load
+    from pkmcal.calibration.results import load
 
     saved = load(demo.calibration)
     goal = saved.T_base_platform[0]

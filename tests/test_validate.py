@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.aside import chosen, clusters, places, regions, select, spread
+from pkmcal.calibration.aside import chosen, clusters, places, regions, select, spread
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.problem import Measurements
 from pkmcal.judge.comparison import compare, promise, ratio, rms, weighed
 from pkmcal.judge.held import held_machine
 from pkmcal.judge.holdouts import by_regions, hold_out
 from pkmcal.judge.paths import straightness
 from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulate import Settings
-from pkmcal.simulate.demo import demo_camera
-from pkmcal.simulate.edges import EdgeNoise, simulate_edges
-from pkmcal.simulate.truth import draw_truth, true_machine
+from pkmcal.simulation import Settings
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.truth import draw_truth, true_machine
 from pose_sessions import JOINT_NOISE, T_CAMERA_BASE, measured, papers_case, papers_poses
 
 STATIONS = 3
@@ -359,8 +359,8 @@ def test_validate_in_words(kept, session):
 
 def test_the_drawing_is_the_drawing_again(kept, demo):
     """Held-out regions must not know, through the drawing, what they told the calibration."""
+    from pkmcal.calibration.results import load
     from pkmcal.judge.validate import drawing_of
-    from pkmcal.results import load
 
     drawn = load_mechanism(demo.session / "mechanism.yaml")
     found = drawing_of(load(kept.folder / "c"))

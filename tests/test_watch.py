@@ -12,8 +12,6 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.identify.problem import Measurements
-from pkmcal.identify.solver import Solution, Stop
 from pkmcal.judge.causes import (
     Cause,
     arms,
@@ -38,11 +36,13 @@ from pkmcal.judge.changes import (
 )
 from pkmcal.judge.held import Evidence, Trust, evidence, hold
 from pkmcal.judge.words import LookedAt, watch_verdict
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulate import Settings
-from pkmcal.simulate.demo import demo_camera
-from pkmcal.simulate.edges import EdgeNoise, simulate_edges
-from pkmcal.simulate.truth import draw_truth, true_machine
+from pkmcal.simulation import Settings
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.truth import draw_truth, true_machine
+from pkmcal.solver import Solution, Stop
 from pose_sessions import T_CAMERA_BASE, measured, papers_case, papers_poses
 
 ALPHA = 0.01

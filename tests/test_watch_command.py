@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration import calibrate
+from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.results import load
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.bundle import start_state
-from pkmcal.identify.problem import Measurements
 from pkmcal.judge.causes import magnification, magnified
 from pkmcal.judge.changes import change
 from pkmcal.judge.held import Trust, evidence, hold
 from pkmcal.judge.watch import watch
+from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
-from pkmcal.observe.edges import Observation
-from pkmcal.results import load, save
-from pkmcal.session import digests, load_session
-from pkmcal.simulate import Settings, load_truth, simulate_session
-from pkmcal.simulate.demo import demo_camera
-from pkmcal.simulate.edges import EdgeNoise, simulate_edges
-from pkmcal.simulate.truth import draw_truth
+from pkmcal.report.calibration import save
+from pkmcal.session.load import digests, load_session
+from pkmcal.simulation import Settings, load_truth, simulate_session
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.truth import draw_truth
 
 
 def photographed(folder, drawing, machine, camera, seed, **settings):

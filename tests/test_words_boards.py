@@ -12,17 +12,17 @@ from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.solver import Stop
 from pkmcal.identify.verdict import judge
 from pkmcal.identify.words import explain
 from pkmcal.identify.words_driven import conventions_held, size_columns
 from pkmcal.identify.words_effect import platform_by_parameters, pose_by_parameters
 from pkmcal.identify.words_families import circumstances
+from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.observe.edges import EdgeSet, Observation
 from pkmcal.report.identifiability import section
 from pkmcal.report.parameters import bound_together, grouped, in_words, tight_pairs
+from pkmcal.solver import Stop
 from pose_sessions import estimated, measured, papers_poses, upright
 
 

@@ -36,7 +36,7 @@ def validate(
     from pkmcal.files import check_own_folder
     from pkmcal.judge.validate import validate as run
     from pkmcal.report.validation import outcome_of
-    from pkmcal.session import load_session
+    from pkmcal.session.load import load_session
 
     loaded = load_session(session)
     folder = out or loaded.folder / "validation"

@@ -37,7 +37,7 @@ def watch(
     from pkmcal.judge.watch import check_alpha
     from pkmcal.judge.watch import watch as run
     from pkmcal.report.watch import outcome_of
-    from pkmcal.session import load_session
+    from pkmcal.session.load import load_session
 
     check_alpha(alpha)
     loaded = load_session(session)

@@ -11,12 +11,12 @@ import numpy as np
 
 from pkmcal import __version__
 from pkmcal.arrays import Array
+from pkmcal.calibration.results import EVERYTHING, MECHANISM, SavedCalibration, load
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import load_camera
 from pkmcal.errors import InputError
 from pkmcal.files import listed
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
-from pkmcal.results import EVERYTHING, MECHANISM, SavedCalibration, load
 
 SESSION_FILE = "session.yaml"
 

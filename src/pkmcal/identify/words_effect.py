@@ -8,8 +8,8 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.gauge import pose_generators, respecting_motion
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.mechanisms.kinematics import on_manifold
-from pkmcal.mechanisms.limbs import closure, dense
 
 SAMPLES = 40
 """Poses around the session's: what a session's few poses hide, others show."""

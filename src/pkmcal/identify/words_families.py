@@ -19,7 +19,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.words_driven import driven_families, remaining
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 
 AXES = "xyz"
 MOST_GROUPS = 120

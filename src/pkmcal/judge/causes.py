@@ -16,10 +16,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.identify.gauge import centre_index
-from pkmcal.identify.problem import Measurements
 from pkmcal.judge.held import MAGNIFIED
+from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.edges import Observation
 from pkmcal.wording import split_name
 
 LegPart = Literal[

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.identify.problem import Measurements
 from pkmcal.judge.prediction import Prediction, ReadingErrors, errors_on
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 REPEATS = 4000

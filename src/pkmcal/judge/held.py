@@ -27,9 +27,11 @@ from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import RANK_TOLERANCE
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Estimate, Measurements, State
+from pkmcal.identify.problem import Estimate, State
 from pkmcal.identify.residuals import Problem
-from pkmcal.identify.solver import (
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.solver import (
     RESTART_DAMPING,
     Linear,
     Reduced,
@@ -38,7 +40,6 @@ from pkmcal.identify.solver import (
     minimise,
     transposed,
 )
-from pkmcal.mechanisms import Machine
 
 MAGNIFIED = 1e-3
 """Of a camera's magnification, relative: the size against which it counts as seen."""

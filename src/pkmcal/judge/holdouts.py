@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.aside import Region, by_region, select
-from pkmcal.calibration import Calibration
+from pkmcal.calibration.aside import Region, by_region, select
+from pkmcal.calibration.calibrate import Calibration
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.problem import Estimate, Measurements
+from pkmcal.identify.problem import Estimate
 from pkmcal.judge.comparison import Comparison, compare
 from pkmcal.judge.prediction import predict
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 

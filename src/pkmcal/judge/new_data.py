@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans
-from pkmcal.calibration import Calibration, Progress, calibrate
+from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
+from pkmcal.calibration.results import SavedCalibration, load
 from pkmcal.errors import InputError
-from pkmcal.results import SavedCalibration, load
-from pkmcal.session import Session, digests, load_session
+from pkmcal.session.load import Session, digests, load_session
 from pkmcal.wording import listed
 
 FAR = 10.0

@@ -11,7 +11,7 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.judge.prediction import Prediction
 from pkmcal.mechanisms import Machine
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 SHORTEST = 3
 """Points without which nothing is straight or bent."""

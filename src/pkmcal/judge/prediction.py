@@ -23,12 +23,13 @@ from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.closure_noise import PERFECT
 from pkmcal.identify.gauge import pose_generators
-from pkmcal.identify.problem import Measurements, State
-from pkmcal.identify.solver import transposed
+from pkmcal.identify.problem import State
 from pkmcal.judge.held import Held, hold, too_little
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward, inverse_result
-from pkmcal.mechanisms.limbs import closure
+from pkmcal.solver import transposed
 
 SOFT = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a

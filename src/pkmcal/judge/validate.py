@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans
-from pkmcal.calibration import Progress
+from pkmcal.calibration.calibrate import Progress
+from pkmcal.calibration.results import SavedCalibration
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import plain
 from pkmcal.judge.comparison import Comparison, compare
@@ -25,8 +26,7 @@ from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
-from pkmcal.results import SavedCalibration
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 FORMAT = 1
 

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.aside import select
-from pkmcal.calibration import Calibration, Progress
+from pkmcal.calibration.aside import select
+from pkmcal.calibration.calibrate import Calibration, Progress
+from pkmcal.calibration.results import SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import plain
 from pkmcal.identify.assembly import seen_configurations
@@ -26,8 +27,7 @@ from pkmcal.judge.held import Held, Trust, evidence, hold
 from pkmcal.judge.new_data import known_rows, look, read
 from pkmcal.judge.words import LookedAt, watch_verdict
 from pkmcal.outcome import Verdict
-from pkmcal.results import SavedCalibration
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 FORMAT = 1
 ALPHA = 0.01

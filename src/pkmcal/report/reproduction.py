@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from pkmcal.outcome import Check, Figure, Part
-from pkmcal.report import page
+from pkmcal.outcome import Check, Figure, Finding, Level, Outcome, Part, Verdict
+from pkmcal.report.page import page_html
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,23 @@ class Reproduction:
         }
 
 
+def outcome_of(found: Reproduction) -> Outcome:
+    """As every command's: verdict, cards, parts and expectations."""
+    reasons = tuple(check.sentence for check in found.checks if not check.passed)
+    return Outcome(
+        command="reproduce",
+        title=found.title,
+        verdict=Verdict(found.passed, found.headline, reasons),
+        kicker=f"reproduction of paper {found.letter.upper()}",
+        subject=found.cited,
+        stamp="Reproduced" if found.passed else "Not reproduced",
+        figures=found.cards,
+        parts=(*found.parts, Part("checks", "Expectations", checks=found.checks)),
+        findings=tuple(Finding(Level.NOTE, text) for text in found.remarks),
+        document=found.document(),
+    )
+
+
 def reproduction_html(found: Reproduction) -> str:
     """One HTML page that needs nothing else: no network, no other file."""
-    return page.render(
-        "reproduction.html.j2",
-        r=found,
-        plots=[plot for part in found.parts for plot in part.plots],
-        plotly=page.plotly_script(),
-    )
+    return page_html(outcome_of(found))

@@ -11,8 +11,8 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words_names import named
+from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report.charts import (
     NORMAL_90,
@@ -24,8 +24,8 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
+from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, number
-from pkmcal.session import Session
 
 KEPT = 0.5
 """Robust weight below which an edge counts as put aside; pictures draw it dashed."""
@@ -187,7 +187,8 @@ def _outward(edges: EdgeSet, shifts: Array) -> RowChart | None:
         boxes.append(box(name, values, "px", 3, leg + 1))
     alt = "Boxes of the outward shift in pixels by leg, tube and side"
     title = "Edges too far out (+) or in (−), by leg, tube and side"
-    return row_chart(title, "pixels", [b for b in boxes if b], None, alt)
+    note = "looking along the leg from base to platform"
+    return row_chart(title, "pixels", [b for b in boxes if b], None, alt, note)
 
 
 def _edge_kinds(edges: EdgeSet) -> list[tuple[int, int, int]]:

@@ -12,7 +12,7 @@ from pkmcal.control.source import Controlled
 from pkmcal.control.study import Outcome, Plan, Study, study
 from pkmcal.control.words import Judgement, judgement, named
 from pkmcal.outcome import Figure, Plot, Row, Table
-from pkmcal.report import figure, servo_figures, page
+from pkmcal.report import page, servo_figures
 from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2

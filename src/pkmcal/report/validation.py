@@ -9,7 +9,7 @@ from pkmcal.judge.validate import Validation
 from pkmcal.judge.words import amount, better, factor
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
 from pkmcal.report import charts
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 from pkmcal.wording import SCALES, brief, count, decimals, number
 
 HOW = (
