@@ -1,27 +1,22 @@
-"""The page of a camera's calibration: verdict, intrinsics, corners over the photographs, field."""
+"""What a camera's calibration found, as an outcome: intrinsics, corners over photographs, field."""
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
-from pkmcal.errors import InputError
-from pkmcal.observe.images import decode
-from pkmcal.outcome import Figure
+from pkmcal.cameras.files import camera_text, foreign_text
+from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.report import charts, page
+from pkmcal.report.pictures import THREADS, jpeg
 from pkmcal.wording import brief, count, decimals, number
 
-LARGEST_WIDTH = 640
-QUALITY = 70
-THREADS = 4
 ARROW = 0.05
 """Length of a large residual's arrow as a share of the picture's width."""
 FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000)
@@ -35,27 +30,18 @@ WORDS = {
     "center.x": "centre x",
     "center.y": "centre y",
 }
-
-
-@dataclass(frozen=True)
-class Row:
-    """One intrinsic in text; sigma is empty where it was not estimated."""
-
-    name: str
-    value: str
-    sigma: str
-    unit: str
-
-
-@dataclass(frozen=True)
-class Compared:
-    """One model with its terms, and its errors in text."""
-
-    model: str
-    terms: str
-    rms: str
-    left_out: str
-    chosen: bool
+COMPARED = (
+    "Every model with more and more distortion terms. What counts is the error on views left out of"
+    " the fit; a term is taken only where they gain from it, and the model with the fewest"
+    " parameters among equals."
+)
+SIGMA = (
+    "The standard deviations say how much the intrinsics would scatter if other photographs of this"
+    " kind were taken. They hold the noise of the corners and the views' disagreement beyond it."
+    " They know nothing of what all photographs share: a board whose squares are not as long as its"
+    " file says leaves the intrinsics alone and scales every distance; a focus that moves"
+    " afterwards makes it another camera."
+)
 
 
 @dataclass(frozen=True)
@@ -83,23 +69,51 @@ class Field:
     factor: int
 
 
-def camera_report_html(calibration: CameraCalibration, paths: Sequence[Path | str] = ()) -> str:
-    """One HTML page that needs nothing else. paths : the photographs, to show them; by name."""
-    used = calibration.residuals[calibration.kept]
-    factor = _factor(used, calibration.camera.image_size[0])
-    return page.render(
-        "camera.html.j2",
-        c=calibration,
-        headline=headline(calibration),
-        cards=_cards(calibration),
-        rows=parameter_rows(calibration),
-        compared=_compared(calibration),
-        shots=_shots(calibration, [Path(path) for path in paths], factor),
-        factor=factor,
-        field=_field(calibration),
-        views=_views_chart(calibration),
-        angles=_angles_chart(calibration),
-        missed=[d for d in calibration.detections if not d.found],
+def outcome_of(
+    calibration: CameraCalibration,
+    paths: Sequence[Path | str] = (),
+    others: Sequence[tuple[str, str]] = (),
+) -> Outcome:
+    """Everything that `pkmcal camera` tells and writes.
+
+    paths : the photographs, to show them; by name. others : other programs' camera files, names
+    and forms.
+    """
+    c = calibration
+    factor = _factor(c.residuals[c.kept], c.camera.image_size[0])
+    # with its covariance, so that `calibrate --refine-camera` knows how far to move it
+    measured = replace(c.camera, covariance=c.covariance)
+    return Outcome(
+        command="camera",
+        title=f"Calibration of a {c.camera.model} camera",
+        verdict=Verdict(True, headline(c), warnings=c.warnings),
+        figures=_cards(c),
+        parts=(
+            Part("intrinsics", "Intrinsics", tables=(_intrinsics(c),), notes=_correlations(c)),
+            Part("models", "Models compared", (COMPARED,), tables=(_compared(c),), menu="Models"),
+            Part(
+                "field",
+                "Field",
+                html=page.render("field.html.j2", field=_field(c))
+                + charts.panels(_angles_chart(c), _views_chart(c)),
+            ),
+            Part(
+                "photographs",
+                "Photographs",
+                html=page.render(
+                    "corners.html.j2",
+                    shots=_shots(c, [Path(path) for path in paths], factor),
+                    factor=factor,
+                    missed=[d for d in c.detections if not d.found],
+                ),
+            ),
+            Part("how", "What σ means", (SIGMA,)),
+        ),
+        document=c.document(),
+        texts={
+            "camera.yaml": camera_text(measured),
+            **{name: foreign_text(c.camera, name, form) for name, form in others},
+        },
     )
 
 
@@ -113,20 +127,47 @@ def headline(c: CameraCalibration) -> str:
     )
 
 
-def parameter_rows(c: CameraCalibration) -> tuple[Row, ...]:
+def _intrinsics(c: CameraCalibration) -> Table:
     """The intrinsics with two digits of their sigma."""
-    out: list[Row] = []
+    rows: list[Row] = []
     values = zip(
         c.camera.parameter_names, c.camera.parameters.tolist(), c.sigma.tolist(), strict=True
     )
     for name, value, sigma in values:
-        places = decimals(sigma)
         unit = UNITS.get(name.partition(".")[0], "")
-        shown = number(value, places) if sigma > 0 else f"{value:g}"
-        out.append(
-            Row(WORDS.get(name, name), shown, number(sigma, places) if sigma > 0 else "", unit)
+        places = decimals(sigma)
+        shown = (
+            (number(value, places), number(sigma, places))
+            if sigma > 0
+            else (f"{value:g}", "not estimated")
         )
-    return tuple(out)
+        rows.append(Row(WORDS.get(name, name), (*shown, unit)))
+    return Table("", ("Parameter", "Value", "σ", "Unit"), tuple(rows), words=(3,))
+
+
+def _correlations(c: CameraCalibration) -> tuple[str, ...]:
+    pairs = [f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations]
+    if not pairs:
+        return ()
+    return (f"Hardly told apart, and so to be used together only: {'; '.join(pairs)}.",)
+
+
+def _compared(c: CameraCalibration) -> Table:
+    rows = [
+        Row(
+            one.model,
+            (
+                " ".join(one.terms) or "none",
+                number(one.rms, decimals(one.rms) + 1),
+                number(one.left_out, decimals(one.left_out) + 1),
+            ),
+            mark="good" if (one.model, one.terms) == (c.camera.model, c.terms) else None,
+        )
+        for one in c.compared
+    ]
+    columns = ("Model", "Distortion", "Fitted, px", "Left out, px")
+    note = "✓: chosen."
+    return Table("", columns, tuple(rows), note, brief=False, words=(1,))
 
 
 def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
@@ -182,19 +223,6 @@ def _data_cards(c: CameraCalibration) -> tuple[Figure, ...]:
     )
 
 
-def _compared(c: CameraCalibration) -> tuple[Compared, ...]:
-    return tuple(
-        Compared(
-            model=one.model,
-            terms=" ".join(one.terms) or "none",
-            rms=number(one.rms, decimals(one.rms) + 1),
-            left_out=number(one.left_out, decimals(one.left_out) + 1),
-            chosen=(one.model, one.terms) == (c.camera.model, c.terms),
-        )
-        for one in c.compared
-    )
-
-
 def _factor(residuals: Array, width: int) -> int:
     """Enlargement by which a large residual's arrow becomes visible and no longer than that."""
     large = float(np.quantile(np.linalg.norm(residuals, axis=-1), 0.95)) if len(residuals) else 1.0
@@ -206,7 +234,7 @@ def _shots(c: CameraCalibration, paths: list[Path], factor: int) -> tuple[Shot, 
     by_name = {path.name: path for path in paths}
     size = c.camera.image_size
     with ThreadPoolExecutor(THREADS) as pool:
-        jpegs = pool.map(lambda name: _jpeg(by_name.get(name), size), c.views)
+        jpegs = pool.map(lambda name: jpeg(by_name.get(name), size), c.views)
         return tuple(_shot(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
 
 
@@ -227,23 +255,6 @@ def _shot(c: CameraCalibration, v: int, jpeg: str, factor: int) -> Shot:
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
     width, height = c.camera.image_size
     return Shot(c.views[v], width, height, jpeg, tuple(corners), caption)
-
-
-def _jpeg(path: Path | None, size: tuple[int, int]) -> str:
-    """The photograph in grey, small, as base64; empty where it is not there."""
-    import cv2
-
-    if path is None:
-        return ""
-    try:
-        image: Any = decode(path, size, path.name)
-    except InputError:
-        return ""
-    if size[0] > LARGEST_WIDTH:
-        height = max(1, round(size[1] * LARGEST_WIDTH / size[0]))
-        image = cv2.resize(image, (LARGEST_WIDTH, height), interpolation=cv2.INTER_AREA)
-    packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-    return base64.b64encode(packed.tobytes()).decode("ascii")
 
 
 def _field(c: CameraCalibration) -> Field:

@@ -7,6 +7,7 @@ noise of a measurement: of the direction and position of each leg's axis, and of
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
 from pkmcal.calibration.recognise import read_photographs
-from pkmcal.check import Finding, Level
 from pkmcal.errors import InputError
 from pkmcal.files import plain
 from pkmcal.measurements import EdgeSet
@@ -37,6 +37,7 @@ from pkmcal.observe.repeats import (
     pixel_units,
     same_edges,
 )
+from pkmcal.outcome import Finding, Level, Part, Row, Table
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 
@@ -52,6 +53,13 @@ SHUFFLES = 16
 """Exchanges of the repeats that tell what chance explains, to a few hundredths."""
 PAPER = AxisNoise(images=1)
 """[A] Table 1, upper bounds, in degrees where the paper prints rad (errata)."""
+LEGEND = (
+    "Standard deviations of one photograph, pooled over the configurations.",
+    "ψ: of the leg's direction in the image. θ: towards the camera. x, z: of its",
+    "point with y = 0, camera frame; – for a leg level in the image, without one.",
+    "θ and z come from the leg's width in the image, so they scatter most.",
+    "Shift, tilt: of its edges, as a whole and at their ends.",
+)
 
 
 @dataclass(frozen=True)
@@ -122,11 +130,6 @@ class RepeatStudy:
     middle: LegScatter
     bound: LegScatter
     findings: tuple[Finding, ...]
-
-    @property
-    def exit_code(self) -> int:
-        """1 where a finding costs accuracy, else 0."""
-        return 1 if any(f.level is Level.DOUBTFUL for f in self.findings) else 0
 
     def as_dict(self) -> dict[str, Any]:
         """Everything under its name, for ``--json``."""
@@ -355,6 +358,32 @@ def _over_legs(rows: tuple[LegScatter, ...], share: float) -> LegScatter:
         photographs=sum(row.photographs for row in rows),
         freedom=sum(row.freedom for row in rows),
     )
+
+
+def part_of(study: RepeatStudy) -> Part:
+    """The scatter as a table, beside the paper's."""
+    rows = [Row(leg.station, (str(leg.leg), *_cells(leg))) for leg in study.legs]
+    rows.append(Row("median", ("", *_cells(study.middle))))
+    rows.append(Row("upper bound", ("", *_cells(study.bound))))
+    paper = (_degrees(PAPER.psi), _degrees(PAPER.theta), _mm(PAPER.x), _mm(PAPER.z))
+    rows.append(Row("[A] Table 1", ("", "", *paper, "", ""), "paper"))
+    columns = ("Station", "Leg", "Photos", "ψ", "θ", "x", "z", "Shift", "Tilt")
+    table = Table("Scatter of repeated photographs", columns, tuple(rows), legend=LEGEND)
+    return Part("repeats", "Repeats", tables=(table,))
+
+
+def _cells(row: LegScatter) -> tuple[str, ...]:
+    axis = (_degrees(row.psi), _degrees(row.theta), _mm(row.x), _mm(row.z))
+    edges = (f"{v:.3f} px" if math.isfinite(v) else "–" for v in (row.shift, row.tilt))
+    return str(row.photographs), *axis, *edges
+
+
+def _degrees(value: float) -> str:
+    return f"{math.degrees(value):.2g}°" if math.isfinite(value) else "–"
+
+
+def _mm(value: float) -> str:
+    return f"{value * 1e3:.2g} mm" if math.isfinite(value) else "–"
 
 
 _CAUSES = {
