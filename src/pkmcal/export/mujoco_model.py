@@ -21,9 +21,9 @@ from pkmcal.export.limbs import FIXED, SLIDE, TELESCOPE, TURN, Limbs, limbs_of
 from pkmcal.export.source import Source
 from pkmcal.geometry.rigid import cross, dot, inverse, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.joints import Equation, equations
 from pkmcal.mechanisms.kinematics import forward, inverse_result, on_manifold
-from pkmcal.mechanisms.limbs import limb_ends
 
 STEP = "0.001"
 """s; the loops' time constant is twice that, the shortest that MuJoCo allows."""

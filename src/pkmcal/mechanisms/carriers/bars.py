@@ -17,6 +17,7 @@ from pkmcal.geometry.batches import turned
 from pkmcal.geometry.rigid import cross, dot, rotation, skew
 from pkmcal.mechanisms.carriers.contract import (
     Chain,
+    Direction,
     PlatformCarrier,
     direction_by_frame,
     moved_direction,

@@ -13,6 +13,8 @@ from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
     Chain,
+    Direction,
+    Interval,
     ParameterKind,
     direction_by_frame,
     moved_direction,

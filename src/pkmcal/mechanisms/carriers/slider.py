@@ -13,6 +13,8 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
     Chain,
+    Direction,
+    Interval,
     direction_by_frame,
     moved_direction,
     moved_point,
