@@ -12,13 +12,14 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.results import load
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.bundle import start_state
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
-from pkmcal.results import load, save
+from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import demo_camera

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.identify.conditions import Condition
 from pkmcal.identify.words import Findings, Sentence
 from pkmcal.mechanisms import ParameterTable
+from pkmcal.papers.conditions import Condition
 from pkmcal.report.charts import Bar, BarChart
 from pkmcal.report.parameters import grouped
-from pkmcal.report.wording import brief, count, joined
+from pkmcal.wording import brief, count, joined
 
 FLOOR = 1e-3
 """Information below which a bar is a stub only: the drawing knows a thousand times more."""

@@ -24,8 +24,8 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
-from pkmcal.report.wording import count, joined, number
 from pkmcal.session.load import Session
+from pkmcal.wording import count, joined, number
 
 KEPT = 0.5
 """Robust weight below which an edge counts as put aside; pictures draw it dashed."""
@@ -187,7 +187,8 @@ def _outward(edges: EdgeSet, shifts: Array) -> RowChart | None:
         boxes.append(box(name, values, "px", 3, leg + 1))
     alt = "Boxes of the outward shift in pixels by leg, tube and side"
     title = "Edges too far out (+) or in (−), by leg, tube and side"
-    return row_chart(title, "pixels", [b for b in boxes if b], None, alt)
+    note = "looking along the leg from base to platform"
+    return row_chart(title, "pixels", [b for b in boxes if b], None, alt, note)
 
 
 def _edge_kinds(edges: EdgeSet) -> list[tuple[int, int, int]]:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.outcome import Figure, Row, Table
-from pkmcal.report import charts, templating
-from pkmcal.report.wording import SCALES, brief, count, decimals, number
+from pkmcal.report import charts, page
 from pkmcal.session.load import Session
 from pkmcal.validate.figures import Figures, figures, promised, reading_units
 from pkmcal.validate.holdouts import HoldOut, Judged
 from pkmcal.validate.judged import Ratio, rms
 from pkmcal.validate.paths import Straightness
+from pkmcal.wording import SCALES, brief, count, decimals, number
 
 if TYPE_CHECKING:
     from pkmcal.validation import LinePath, Validation
@@ -43,7 +43,7 @@ def joints_of(session: Session) -> Joints:
 
 def validation_html(v: Validation) -> str:
     """One HTML page that needs nothing else: no network, no other file."""
-    return templating.render(
+    return page.render(
         "validation.html.j2",
         v=v,
         verdict=v.verdict,

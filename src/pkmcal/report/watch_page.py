@@ -8,11 +8,11 @@ import numpy as np
 
 from pkmcal.identify.words_names import named
 from pkmcal.outcome import Figure, Row, Table
-from pkmcal.report import charts, templating
-from pkmcal.report.wording import SCALES, brief, count, number
+from pkmcal.report import charts, page
 from pkmcal.watching.chances import POWER, ChiSquare
 from pkmcal.watching.judged import LegTest, Suspect
 from pkmcal.watching.words import cameras_of, said, signed
+from pkmcal.wording import SCALES, brief, count, number
 
 if TYPE_CHECKING:
     from pkmcal.watch import Watch
@@ -24,7 +24,7 @@ LARGE = 2.0
 
 def watch_html(w: Watch) -> str:
     """One HTML page that needs nothing else: no network, no other file."""
-    return templating.render(
+    return page.render(
         "watch.html.j2",
         w=w,
         verdict=w.verdict,

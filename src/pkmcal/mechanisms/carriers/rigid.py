@@ -11,12 +11,13 @@ from pkmcal.geometry.batches import turned
 from pkmcal.mechanisms.carriers.contract import (
     Chain,
     PlatformCarrier,
+    Site,
     moved_point,
     point_by_frame,
     turned_blocks,
 )
 from pkmcal.mechanisms.carriers.fixed import CENTER
-from pkmcal.mechanisms.carriers.joint import JointDocument
+from pkmcal.mechanisms.carriers.joint import JointDocument, check_joint, joint_axis_role
 
 
 @final
@@ -26,6 +27,13 @@ class RigidPlatform(PlatformCarrier):
     joints: ClassVar = ("spherical", "universal", "revolute")
     schema: ClassVar = JointDocument
     parameters: ClassVar = CENTER
+    axis_role = staticmethod(joint_axis_role)
+
+    @classmethod
+    def check(cls, node: JointDocument, site: Site) -> None:
+        """An axis where the joint has one, and none where not."""
+        check_joint(node, site)
+        super().check(node, site)
 
     @staticmethod
     def place(

@@ -1,0 +1,97 @@
+"""Words and numbers for people: lists, counts, magnitudes, parameters' names."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+
+MINUS = "\N{MINUS SIGN}"
+SCALES = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
+"""Factor and name of the unit that the report shows, by the unit inside."""
+
+LARGEST_DECIMALS = 6
+LABELS = {
+    "base.arm": "arm length",
+    "base.angle": "crank angle",
+    "base.along": "place along the crank axis",
+    "base.radial": "crank axis distance",
+    "platform.hinge.x": "hinge x",
+    "platform.hinge.y": "hinge y",
+    "platform.hinge.z": "hinge z",
+    "length.constant": "rod length",
+}
+"""Names of parameters whose paths say too little."""
+LEG = re.compile(r"legs\[(\d+)\]\.(.+)")
+
+
+def decimals(sigma: float) -> int:
+    """Decimals that show ``sigma`` with two significant digits; 3 where it has none."""
+    if not math.isfinite(sigma) or sigma <= 0:
+        return 3
+    exponent = int(f"{sigma:.1e}".partition("e")[2])  # after rounding: 0.0996 is 0.10
+    return min(max(0, 1 - exponent), LARGEST_DECIMALS)
+
+
+def number(value: float, places: int, signed: bool = False) -> str:
+    """A number with a true minus sign; never a negative zero; a dash where there is none."""
+    if not math.isfinite(value):
+        return "–"
+    text = f"{value:.{places}f}"
+    if float(text) == 0:
+        return text.lstrip("-")
+    if value < 0:
+        return MINUS + text[1:]
+    return f"+{text}" if signed else text
+
+
+def brief(value: float) -> str:
+    """A positive magnitude with two significant digits, for headlines."""
+    return number(value, decimals(value))
+
+
+def count(n: float, thing: str) -> str:
+    """``1 edge``, ``12 345 edges``; thousands apart by a narrow space."""
+    text = f"{round(n):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+    return f"{text} {thing}" if round(n) == 1 else f"{text} {thing}s"
+
+
+def split_name(name: str) -> tuple[int | None, str]:
+    """Leg number from 1 (None where the parameter has none) and what is left of the path."""
+    match = LEG.fullmatch(name)
+    return (int(match[1]), match[2]) if match else (None, name)
+
+
+def label(path: str) -> str:
+    """A parameter's path without its leg, in words: ``base centre z``, ``tube 1 radius``."""
+    if path in LABELS:
+        return LABELS[path]
+    words = re.sub(r"tubes\[(\d+)\]", r"tube \1", path).replace("center", "centre")
+    return words.replace(".", " ").replace("_", " ")
+
+
+def legs_named(numbers: Iterable[int], all_legs: int) -> str:
+    """``all legs``, ``leg 3``, ``legs 1, 2 and 5``."""
+    found = sorted(set(numbers))
+    if len(found) == all_legs and all_legs > 1:
+        return "all legs"
+    return ("leg " if len(found) == 1 else "legs ") + joined([str(n) for n in found])
+
+
+def joined(words: Sequence[str]) -> str:
+    """``a, b and c``."""
+    return listed(words, len(words))
+
+
+def listed(names: Sequence[str], longest: int = 6) -> str:
+    """Join names for a sentence: "a, b and c", or "a, b, c and 12 more"."""
+    if len(names) <= 1:
+        return "".join(names)
+    if len(names) <= longest:
+        return f"{', '.join(names[:-1])} and {names[-1]}"
+    return f"{', '.join(names[: longest - 1])} and {len(names) - longest + 1} more"
+
+
+def percent(share: float) -> str:
+    """A share as whole percent, never rounded up to a certainty it has not."""
+    return f"{math.floor(100 * min(max(share, 0.0), 1.0))} %"
