@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.identify.conditions import conditions
 from pkmcal.identify.words import explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.calibration import report_html

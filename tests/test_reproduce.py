@@ -11,7 +11,7 @@ import pytest
 
 from conftest import run
 from pkmcal.commands.reproduce import Paper
-from pkmcal.identify.axis_measurements import AxisNoise
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.report.page import page_html
 from pkmcal.studies import engine
 from pkmcal.studies import paper_a_expected as expected

@@ -12,7 +12,7 @@ from pkmcal.errors import InputError
 from pkmcal.export.mujoco_home import SAME, HomeState, part_values, unit
 from pkmcal.export.mujoco_xml import LIGHT, PLATFORM, body, comment, cylinder, joint, numbers, site
 from pkmcal.geometry.rigid import inverse, rotation, rotation_vector
-from pkmcal.identify.hand_eye import quaternion
+from pkmcal.papers.hand_eye import quaternion
 
 UP = np.array([0.0, 0.0, 1.0])
 WHY_RESTRICTED = {

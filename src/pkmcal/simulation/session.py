@@ -15,7 +15,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.files import csv_text, staged_folder, yaml_text
+from pkmcal.files import csv_text, listed, staged_folder, yaml_text
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.simulation.board import board_part, holder_part
@@ -150,11 +150,15 @@ def _check(folder: Path, drawing: Machine) -> None:
             what=f"mechanism {drawing.name!r} has no tubes, so its photographs would show no legs",
             expected="tubes: [{radius: ..., from: ..., to: ...}] on its legs",
         )
-    if drawing.layout.n_internal:
+    hinged = {
+        drawing.document.legs[j].platform.joint
+        for j in np.flatnonzero(drawing.layout.internal >= 0)
+    }
+    if hinged:
         raise InputError(
             what=f"mechanism {drawing.name!r} has side bars that turn on hinges, and how far they"
             " turn is not known where it is drawn",
-            expected="platform joints other than hinged-bar",
+            expected=f"platform joints other than {listed(sorted(hinged))}",
             next_step="simulate the machine with one rod a forearm, such as h4",
         )
     try:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.bundle import BatchResult, solve_batch
-from pkmcal.identify.hand_eye import Pair, PairProblem
+from pkmcal.papers.hand_eye import Pair, PairProblem
 from pkmcal.identify.residuals import BatchState, Problem
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout

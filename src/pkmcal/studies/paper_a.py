@@ -17,9 +17,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb, register, rotation_vector
-from pkmcal.identify.axis_measurements import AxisNoise, from_coordinates
+from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
 from pkmcal.identify.covariance import information
-from pkmcal.identify.four_step import Axes, Form, FourSteps, centres_from_axes, solve
+from pkmcal.papers.four_step import Axes, Form, FourSteps, centres_from_axes, solve
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
 from pkmcal.identify.residuals import BatchState, Problem
 from pkmcal.mechanisms import Machine, load_mechanism

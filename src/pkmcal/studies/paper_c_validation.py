@@ -12,7 +12,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import inverse as inverted
 from pkmcal.geometry.rigid import rotation_vector
-from pkmcal.identify.measured_platform import taken
+from pkmcal.papers.measured_platform import taken
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse
 from pkmcal.studies.estimates import Fitted

@@ -14,7 +14,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, perturb
 from pkmcal.identify.assembly import assemble
-from pkmcal.identify.axis_measurements import as_edges, to_coordinates
+from pkmcal.papers.axis_measurements import as_edges, to_coordinates
 from pkmcal.identify.gauge import Gauge
 from pkmcal.identify.residuals import Problem
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet

@@ -10,12 +10,13 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.batches import turned
 from pkmcal.mechanisms.carriers.contract import (
     PlatformCarrier,
+    Site,
     moved_point,
     point_by_frame,
     turned_blocks,
 )
 from pkmcal.mechanisms.carriers.fixed import CENTER
-from pkmcal.mechanisms.carriers.joint import JointDocument
+from pkmcal.mechanisms.carriers.joint import JointDocument, check_joint, joint_axis_role
 
 
 @final
@@ -25,6 +26,13 @@ class RigidPlatform(PlatformCarrier):
     joints: ClassVar = ("spherical", "universal", "revolute")
     schema: ClassVar = JointDocument
     parameters: ClassVar = CENTER
+    axis_role = staticmethod(joint_axis_role)
+
+    @classmethod
+    def check(cls, node: JointDocument, site: Site) -> None:
+        """An axis where the joint has one, and none where not."""
+        check_joint(node, site)
+        super().check(node, site)
 
     @staticmethod
     def place(
