@@ -23,9 +23,6 @@ from pkmcal.papers.inverse_kinematic import (
 )
 from pkmcal.papers.measured_platform import seen_platform, taken
 from pkmcal.papers.rotation_axis import facing, rotation_axis
-from pkmcal.measurements import Mount, PoseSet
-from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.document import MOTIONS
 from pkmcal.studies.paper_c import H4ByBoard
 from pkmcal.studies.paper_c_machine import Deviations, model
 from pkmcal.studies.simulated import measurements

@@ -10,6 +10,7 @@ import pytest
 
 from pkmcal.identify.words import explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.papers.conditions import conditions
 from pkmcal.report.calibration import report_html
 from pkmcal.report.identifiability import STUB, section
 from test_report_case import Verdict, make_case

@@ -12,11 +12,11 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.bundle import BatchResult, solve_batch
-from pkmcal.papers.hand_eye import Pair, PairProblem
 from pkmcal.identify.residuals import BatchState, Problem
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
+from pkmcal.papers.hand_eye import Pair, PairProblem
 from pkmcal.solver import FIRST_DAMPING, eliminate, minimise
 from pkmcal.studies.simulated import SimulatedRuns
 

@@ -17,13 +17,13 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb, register, rotation_vector
-from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
 from pkmcal.identify.covariance import information
-from pkmcal.papers.four_step import Axes, Form, FourSteps, centres_from_axes, solve
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
 from pkmcal.identify.residuals import BatchState, Problem
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.kinematics import forward
+from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
+from pkmcal.papers.four_step import Axes, Form, FourSteps, centres_from_axes, solve
 from pkmcal.solver import RESTART_DAMPING
 from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, Study
 from pkmcal.studies.estimates import Fitted, drawing, freedom, joint

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.outcome import Check
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import Key, Study
 from pkmcal.studies.expected import ASIDE, Compared, at_most, compared, prototype_check
 from pkmcal.studies.paper_a import (

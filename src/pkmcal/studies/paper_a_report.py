@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import Study, run
 from pkmcal.studies.expected import Compared
 from pkmcal.studies.paper_a import (

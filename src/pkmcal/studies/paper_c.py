@@ -14,14 +14,13 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.papers.hand_eye import size_of, solve_pairs
-from pkmcal.papers.inverse_kinematic import Form
-from pkmcal.papers.inverse_kinematic import PoseFit, fit_poses, pose_problem
 from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import BatchState
-from pkmcal.papers.rotation_axis import rotation_axis
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
+from pkmcal.papers.hand_eye import size_of, solve_pairs
+from pkmcal.papers.inverse_kinematic import Form, PoseFit, fit_poses, pose_problem
+from pkmcal.papers.rotation_axis import rotation_axis
 from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, Study
 from pkmcal.studies.estimates import (
     Fitted,
