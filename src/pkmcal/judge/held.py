@@ -41,8 +41,8 @@ from pkmcal.solver import (
     transposed,
 )
 
-MAGNIFIED = 1e-3
-"""Of a camera's magnification, relative: the size against which it counts as seen."""
+RATIO = 1e-3
+"""Of a magnification, or another ratio: the size against which it counts as seen."""
 
 
 @dataclass(frozen=True)
@@ -286,13 +286,17 @@ class Evidence:
     w: Array
     by: Array
 
+    def along(self, columns: Array) -> Array:
+        """X D of changes (P, k) of the parameters, or (P + C, k) with cameras' magnifications."""
+        return self.by[:, : len(columns)] @ columns
+
 
 def evidence(held: Held, covariance: Array) -> Evidence:
     """What the data tell of a change from the held values, whose covariance (P, P) is the
     calibration's: whitened by V = 1 + A C A^T.
     """
     machine, n = held.machine, len(held.machine.parameters)
-    size = np.append(machine.parameters.tolerance, np.full(held.by.shape[-1] - n, MAGNIFIED))
+    size = np.append(machine.parameters.tolerance, np.full(held.by.shape[-1] - n, RATIO))
     by = held.by * size
     by[..., :n] = held.by[..., :n] @ _across_axes(machine) * size[:n]
     by = held.projected(by)
