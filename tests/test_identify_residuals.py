@@ -10,9 +10,10 @@ import pytest
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import perturb, pose
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.residuals import BatchState
+from pkmcal.identify.start import start_state
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.studies.engine import Batch
 from pkmcal.studies.paper_a import HexapodByAxes
@@ -37,7 +38,7 @@ def check(problem, state, rng, directions=4):
     assert np.isfinite(problem.residuals(state).value).all()
     for _ in range(directions):
         # one hundredth: radii are centimetres, so a unit step would leave the model's domain
-        shared = 0.01 * rng.normal(size=(state.z.shape[0], problem.n_shared))
+        shared = 0.01 * rng.normal(size=(state.z.shape[0], problem.unknowns.count))
         own = 0.01 * rng.normal(size=linear.by_own.shape[:2] + linear.by_own.shape[-1:])
         exact = np.concatenate(
             [
@@ -88,7 +89,7 @@ def test_jacobian_near_a_singular_pose_and_beside_a_leg():
     linear = problem.linearize(near)
     assert np.isfinite(problem.residuals(near).value).all()
     # curvature grows with 1 / gap, so the differences' step has to shrink
-    shared = 1e-5 * rng.normal(size=(1, problem.n_shared))
+    shared = 1e-5 * rng.normal(size=(1, problem.unknowns.count))
     exact = (linear.by_shared @ shared[:, None, :, None]).ravel()
     numeric = derivatives(problem, near, shared, np.zeros((1, 3, 6)), h=1e-2)[: exact.size]
     np.testing.assert_allclose(exact, numeric, atol=1e-6 * np.abs(exact).max())
@@ -133,7 +134,7 @@ def test_whitening_makes_the_noise_standard():
     """Residuals at the truth are the noise itself: unit covariance, [0] by [1] uncorrelated."""
     rng = np.random.default_rng(6)
     assembled, truth = make_scene(rng, runs=40).batch(rng)
-    rows = assembled.problem.block_residuals(truth)[:, assembled.row, assembled.place]
+    rows = assembled.problem.block_residuals(truth)[:, assembled.edges.row, assembled.edges.place]
     rows = rows.reshape(-1, 2)
     bound = 5 / np.sqrt(len(rows))
     np.testing.assert_allclose(rows.T @ rows / len(rows), np.eye(2), atol=2 * bound)

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words_advice import advice_on
 from pkmcal.identify.words_driven import conventions_held
 from pkmcal.identify.words_effect import platform_by_parameters

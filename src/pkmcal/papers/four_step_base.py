@@ -17,7 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference
-from pkmcal.identify.problem import State
+from pkmcal.identify.estimate import State
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.leg_axes import Axes

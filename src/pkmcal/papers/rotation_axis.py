@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector, skew
-from pkmcal.identify.pose_rows import turn_jacobian
+from pkmcal.identify.rows import turn_jacobian
 from pkmcal.measurements import PoseSet
 from pkmcal.mechanisms.document import MOTIONS
 from pkmcal.papers.measured_platform import taken

@@ -14,7 +14,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.results import REPORT, check_output, texts_of, versions
 from pkmcal.files import write_folder
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.outcome import Finding, Level, Outcome, Part, Plot, Verdict

@@ -9,7 +9,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.decided import EXACT, Decider, decided_by
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.words import Findings
 from pkmcal.identify.words_names import named
 from pkmcal.mechanisms import Machine, ParameterTable
