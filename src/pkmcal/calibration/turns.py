@@ -20,7 +20,6 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.recognise import WORKERS
 from pkmcal.errors import InputError, PkmcalError, ResultError
-from pkmcal.files import listed
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.start import misfit, start_state
@@ -30,6 +29,7 @@ from pkmcal.observe import legs
 from pkmcal.observe.repeats import combined
 from pkmcal.papers.four_step import four_step
 from pkmcal.session.load import Session
+from pkmcal.wording import listed
 
 ROUNDS = 3
 """Most looks at the edges, each from the estimate before."""

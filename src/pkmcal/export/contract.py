@@ -22,8 +22,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError, ResultError
 from pkmcal.export.source import Source
-from pkmcal.files import check_own_folder, closest, listed, write_folder
+from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.outcome import Finding
+from pkmcal.wording import listed
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from pkmcal.cameras.files import read_camera, write_camera
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, exact, quaternion, rotation_of
 from pkmcal.export.source import Source
-from pkmcal.files import listed
 from pkmcal.outcome import Finding, Level
+from pkmcal.wording import listed
 
 LAUNCH = "static_transforms.launch.yaml"
 BASE = "base"

@@ -13,14 +13,14 @@ import numpy as np
 
 from pkmcal import __version__
 from pkmcal.arrays import Array
+from pkmcal.calibration.results import EVERYTHING, MECHANISM, SavedCalibration, load
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import load_camera
 from pkmcal.errors import InputError, ResultError
-from pkmcal.files import listed
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.mechanisms.kinematics import on_manifold
-from pkmcal.results import EVERYTHING, MECHANISM, SavedCalibration, load
+from pkmcal.wording import listed
 
 SESSION_FILE = "session.yaml"
 COUNT = 64
