@@ -17,7 +17,7 @@ from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, yaml_text
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose, register, rotation
 from pkmcal.identify.gauge import pose_generators, respecting_motion
-from pkmcal.identify.words_effect import pose_by_parameters
+from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.observe.boards import Detection
 from pkmcal.simulate.board import board_from_fields

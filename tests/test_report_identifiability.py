@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pkmcal.identify.conditions import conditions
-from pkmcal.identify.words import explain, seen_legs
+from pkmcal.identify.unidentified import explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.identifiability import STUB, section
 from pkmcal.report.page import report_html

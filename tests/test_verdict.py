@@ -10,8 +10,9 @@ import pytest
 from pkmcal.files import json_text
 from pkmcal.identify.bundle import bundle, what_data_tell
 from pkmcal.identify.conditions import conditions
+from pkmcal.identify.sentences import Sentence
+from pkmcal.identify.unidentified import Findings, explain, seen_legs
 from pkmcal.identify.verdict import LEFT_OPEN, judge
-from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.edges import Observation
 from pkmcal.report.parameters import parameter_groups, unidentified

@@ -11,9 +11,10 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, generators
-from pkmcal.identify.words import MOST, describe, joined_by_boards, seen_legs, vectors
-from pkmcal.identify.words_effect import platform_by_parameters, pose_by_parameters
-from pkmcal.identify.words_families import circumstances, families, groups, hanging_together
+from pkmcal.identify.motions import Situation, candidates, groups, hanging_together
+from pkmcal.identify.sentences import MOST
+from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
+from pkmcal.identify.unidentified import describe, joined_by_boards, seen_legs, vectors
 from pkmcal.mechanisms import kinematics, load_mechanism
 from pkmcal.mechanisms.limbs import limb_ends
 from test_identify_scene import Scene, _edges, _index, stations
@@ -76,7 +77,7 @@ def told_of(scene: Scene, *views):
     edges = measurements.edges
     seen = seen_legs(edges, np.ones(len(edges)), measurements.n_stations, machine.n_legs)
     null = vectors(told.unidentified, machine)
-    return told, seen, describe(machine, seen, null, scene.poses[0])
+    return told, seen, describe(Situation(machine, seen, scene.poses[0]), null)
 
 
 # ------------------------------------------------------------------ whole sessions and poor ones
@@ -220,7 +221,7 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
         row = machine.parameters.index(f"legs[{leg + 1}].base.center.x")
         change[row : row + 3] = np.cross(axis, centres[leg] - centres[0])
     seen = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
-    (sentence,) = describe(machine, seen, change[None], poses)
+    (sentence,) = describe(Situation(machine, seen, poses), change[None])
     assert sentence.text.startswith(
         "Of the others, only legs 1 and 4 are ever seen together with legs 2 and 5: the base joints"
         " of legs 2 and 5 can turn about the axis through joints 1 and 4 against the others."
@@ -252,7 +253,7 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
 def test_single_changes_have_their_names(change, text):
     machine, poses = hexapod()
     seen = np.ones((2, 6), bool)
-    (sentence,) = describe(machine, seen, unit(machine, change)[None], poses)
+    (sentence,) = describe(Situation(machine, seen, poses), unit(machine, change)[None])
     assert sentence.text.startswith(text)
 
 
@@ -274,17 +275,17 @@ def test_legs_with_different_numbers_share_a_sentence(name, text):
         numbers = np.random.default_rng(2).normal(size=6)
         changes = [{n.format(j): v for n, v in zip(centres, numbers, strict=True)} for j in (1, 7)]
     null = np.array([unit(machine, change) for change in changes])
-    sentences = describe(machine, np.ones((2, machine.n_legs), bool), null, poses)
+    sentences = describe(Situation(machine, np.ones((2, machine.n_legs), bool), poses), null)
     assert [s.text.startswith(text) for s in sentences] == [True]
 
 
 def test_a_leg_growing_into_its_base_is_found():
     machine, poses = hexapod()
-    around = circumstances(machine, np.ones((1, 6), bool), poses[:1])
+    around = Situation(machine, np.ones((1, 6), bool), poses[:1])
     row = machine.parameters.index("legs[3].base.center.x")
     change = unit(machine, {"legs[3].length.offset": 1.0})
-    change[row : row + 3] = -around.along_base[2]
-    (sentence,) = describe(machine, np.ones((1, 6), bool), change[None], poses[:1])
+    change[row : row + 3] = -around.along[0][2]
+    (sentence,) = describe(around, change[None])
     assert "it can grow while its base joint moves back along it" in sentence.text
 
 
@@ -294,7 +295,7 @@ def test_any_basis_of_the_space_gives_the_same_words():
     machine = scene.machine.with_values(scene.theta[0])
     null = vectors(told.unidentified, machine)
     mix = np.random.default_rng(5).normal(size=(len(null), len(null)))
-    again = describe(machine, seen, mix @ null, scene.poses[0])
+    again = describe(Situation(machine, seen, scene.poses[0]), mix @ null)
     assert [s.text for s in again] == [s.text for s in expected]
 
 
@@ -303,16 +304,16 @@ def test_frames_are_no_finding():
     frames = (generators(machine.layout, machine.values) @ freedoms(machine)).T
     change = unit(machine, {"legs[3].length.offset": 1e-3})
     mixed = change + 0.02 * frames[4] - 0.01 * frames[7]
-    (sentence,) = describe(machine, np.ones((1, 6), bool), mixed[None], poses)
+    (sentence,) = describe(Situation(machine, np.ones((1, 6), bool), poses), mixed[None])
     assert sentence.text.startswith("The offset of leg 3 is free.")
-    assert describe(machine, np.ones((1, 6), bool), frames[:0], poses) == ()
+    assert describe(Situation(machine, np.ones((1, 6), bool), poses), frames[:0]) == ()
 
 
 def test_many_open_directions_stay_readable():
     machine, poses = hexapod()
     rng = np.random.default_rng(1)
     null = rng.normal(size=(25, len(machine.parameters))) * machine.parameters.tolerance
-    sentences = describe(machine, np.ones((1, 6), bool), null, poses)
+    sentences = describe(Situation(machine, np.ones((1, 6), bool), poses), null)
     assert 0 < len(sentences) <= MOST
     assert sum(s.dimensions for s in sentences) == 25
 
@@ -321,8 +322,8 @@ def test_what_the_drawing_knows_better_is_not_called_free():
     machine, poses = hexapod()
     null = unit(machine, {"legs[3].length.offset": 1.0})[None]
     seen = np.ones((1, 6), bool)
-    (weak,) = describe(machine, seen, null, poses, information=np.array([0.5]))
-    (open_,) = describe(machine, seen, null, poses)
+    (weak,) = describe(Situation(machine, seen, poses), null, np.array([0.5]))
+    (open_,) = describe(Situation(machine, seen, poses), null)
     assert weak.text.startswith("The offset of leg 3 is known from the drawing only.")
     assert "smaller tolerances" in weak.advice
     assert weak.moves_platform == pytest.approx(open_.moves_platform / np.sqrt(1.25))
@@ -404,6 +405,6 @@ def test_families_are_changes_of_this_machine():
         machine = load_mechanism(name)
         seen = np.ones((2, machine.n_legs), bool)
         seen[1, 0] = False
-        for family in families(circumstances(machine, seen, machine.home()[None])):
-            assert family.columns.shape[0] == len(machine.parameters)
-            assert np.isfinite(family.columns).all()
+        for motion in candidates(Situation(machine, seen, machine.home()[None])):
+            assert motion.columns.shape[0] == len(machine.parameters)
+            assert np.isfinite(motion.columns).all()

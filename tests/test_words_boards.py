@@ -12,17 +12,16 @@ from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.motions import Situation, sizes
 from pkmcal.identify.solver import Stop
+from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
+from pkmcal.identify.unidentified import conventions_held, explain
 from pkmcal.identify.verdict import judge
-from pkmcal.identify.words import explain
-from pkmcal.identify.words_driven import conventions_held, size_columns
-from pkmcal.identify.words_effect import platform_by_parameters, pose_by_parameters
-from pkmcal.identify.words_families import circumstances
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.observe.edges import EdgeSet, Observation
 from pkmcal.report.identifiability import section
-from pkmcal.report.parameters import bound_together, grouped, in_words, tight_pairs
+from pkmcal.report.parameters import bound_together, grouped, tight_pairs
 from pose_sessions import estimated, measured, papers_poses, upright
 
 
@@ -177,10 +176,12 @@ def test_no_sentence_speaks_of_tubes_or_photographs_of_legs(case):
 
 def test_sizes_are_columns_of_the_machine():
     machine = load_mechanism("linear-delta")
-    around = circumstances(machine, np.ones((1, 3), bool), machine.home()[None])
-    sizes = size_columns(around)
-    assert set(sizes) == {"radius", "height", "rod"}
-    centres = machine.values + 1e-3 * sizes["radius"].sum(axis=1)
+    found = {
+        size.label: size.columns
+        for size in sizes(Situation(machine, np.ones((1, 3), bool), machine.home()[None]))
+    }
+    assert list(found) == ["radius of the base joints", "height of the base joints", "rod length"]
+    centres = machine.values + 1e-3 * found["radius of the base joints"].sum(axis=1)
     moved = np.linalg.norm(machine.with_values(centres).base_centers()[:, :2], axis=1)
     np.testing.assert_allclose(
         moved - np.linalg.norm(machine.base_centers()[:, :2], axis=1), 1e-3, atol=1e-6
@@ -255,10 +256,10 @@ def test_a_held_arm_is_no_convention():
 def test_names_for_people():
     table: ParameterTable = load_mechanism("h4").parameters
     names = tuple(n for n in table.names if n.endswith(("angle", "hinge.y")))
-    assert grouped(names) == ["crank angle of legs 1 to 4", "hinge y of legs 1 to 4"]
-    assert in_words("legs[2].base.arm") == "leg 2 arm length"
-    assert in_words("legs[2].length.constant") == "leg 2 rod length"
-    assert grouped(("legs[1].base.arm", "legs[2].base.arm")) == [
+    assert grouped(table, names) == ["crank angle of legs 1 to 4", "hinge y of legs 1 to 4"]
+    assert table.in_words("legs[2].base.arm") == "leg 2 arm length"
+    assert table.in_words("legs[2].length.constant") == "leg 2 rod length"
+    assert grouped(table, ("legs[1].base.arm", "legs[2].base.arm")) == [
         "leg 1 arm length",
         "leg 2 arm length",
     ]

@@ -17,8 +17,8 @@ from pkmcal.identify.conditions import conditions
 from pkmcal.identify.paper_methods import Method as PaperMethod
 from pkmcal.identify.paper_methods import by_paper
 from pkmcal.identify.problem import Estimate, Measurements
+from pkmcal.identify.unidentified import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.identify.verdict import judge
-from pkmcal.identify.words import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.edges import Observation
 from pkmcal.outcome import Verdict

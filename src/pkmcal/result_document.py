@@ -22,7 +22,7 @@ from pkmcal.validate.independence import digests
 
 if TYPE_CHECKING:
     from pkmcal.calibration import Calibration
-    from pkmcal.identify.words import Findings
+    from pkmcal.identify.unidentified import Findings
     from pkmcal.report.parameters import Group
 
 FORMAT = 1

@@ -12,8 +12,8 @@ from pkmcal.arrays import Array
 from pkmcal.identify.centres import joint_centres
 from pkmcal.identify.gauge import apply, default_gauge
 from pkmcal.identify.problem import State
+from pkmcal.identify.tool import tool_point
 from pkmcal.mechanisms import Machine
-from pkmcal.report.toolpoint import tool_point
 from pkmcal.simulate import Truth, load_truth
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
+from pkmcal.identify.centres import Centres
+from pkmcal.identify.tool import ToolPoint, centres_and_tool
 from pkmcal.outcome import Figure
 from pkmcal.report.headline import headlines
-from pkmcal.report.toolpoint import ToolPoint, tool_point
 
 if TYPE_CHECKING:
     from pkmcal.calibration import Calibration
@@ -54,18 +54,7 @@ class Figures:
 def figures_of(calibration: Calibration) -> Figures:
     """The figures of a calibration."""
     session, estimate = calibration.session, calibration.estimate
-    covariance = free_of_gauge(estimate)
-    centres = joint_centres(session.machine, estimate.machine, covariance)
-    tool = tool_point(
-        session.machine,
-        estimate.machine,
-        covariance,
-        session.joints,
-        estimate.state.T_base_platform,
-        np.flatnonzero(estimate.configurations),
-        centres,
-        legs_seen=estimate.edge_weights.size > 0,
-    )
+    centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     return Figures(calibration, centres, tool)
 
 

@@ -58,7 +58,7 @@ def _why(found: Study, good: Outcome) -> str:
 
 def named(choice: Subset, found: Study) -> str:
     """``all legs``, ``legs 1, 3 and 5``."""
-    from pkmcal.report.wording import legs_named
+    from pkmcal.wording import legs_named
 
     return legs_named([j + 1 for j in choice.legs], found.scene.machine.n_legs)
 

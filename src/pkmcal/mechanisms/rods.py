@@ -59,4 +59,4 @@ Rod = Annotated[
 ]
 
 OFFSET = ParameterKind("offset", "m", "offset")
-CONSTANT = ParameterKind("constant", "m", "offset")
+CONSTANT = ParameterKind("constant", "m", "offset", label="rod length")

@@ -18,7 +18,7 @@ from pkmcal.errors import InputError
 from pkmcal.observe.images import decode
 from pkmcal.outcome import Figure
 from pkmcal.report import charts, templating
-from pkmcal.report.wording import brief, count, decimals, number
+from pkmcal.wording import brief, count, decimals, number
 
 LARGEST_WIDTH = 640
 QUALITY = 70

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.report.wording import count, number
+from pkmcal.wording import count, number
 
 WIDTH = 360.0
 ROW = 18.0

@@ -7,12 +7,12 @@ import numpy as np
 from pkmcal.arrays import Integers
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
+from pkmcal.identify.tool import ToolPoint
 from pkmcal.observe.edges import Observation
 from pkmcal.outcome import Figure
 from pkmcal.report.residuals import KEPT
-from pkmcal.report.toolpoint import ToolPoint
-from pkmcal.report.wording import brief, count, number
 from pkmcal.session import Session
+from pkmcal.wording import brief, count, number
 
 NO_TURN = 1e-9
 """rad; what rounding leaves."""

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from pkmcal.arrays import Array
-from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.problem import Estimate
+from pkmcal.identify.tool import centres_and_tool
 from pkmcal.observe.edges import Observation
 from pkmcal.report import (
     figure,
@@ -23,13 +20,12 @@ from pkmcal.report import (
     residuals,
     scene,
     templating,
-    toolpoint,
     validation_page,
 )
 from pkmcal.session import Session
 
 if TYPE_CHECKING:
-    from pkmcal.identify.words import Findings
+    from pkmcal.identify.unidentified import Findings
     from pkmcal.outcome import Verdict
     from pkmcal.validate.holdouts import HoldOut
 
@@ -70,9 +66,7 @@ def report_views(
     """Everything that the templates show besides the verdict, by its name there."""
     edges, machine = observation.edges, estimate.machine
     camera = residuals.camera_numbers(session)
-    covariance = free_of_gauge(estimate)
-    centres = joint_centres(session.machine, machine, covariance)
-    tool = _tool_point(session, estimate, covariance, centres)
+    centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     groups = parameters.parameter_groups(session.machine, estimate)
     drawn = scene.scene_of(session, estimate, centres)
@@ -102,18 +96,3 @@ def report_views(
         "settings": provenance.settings(session, estimate),
         "versions": provenance.versions(),
     }
-
-
-def _tool_point(
-    session: Session, estimate: Estimate, covariance: Array, centres: tuple[Centres, ...]
-) -> toolpoint.ToolPoint:
-    return toolpoint.tool_point(
-        session.machine,
-        estimate.machine,
-        covariance,
-        session.joints,
-        estimate.state.T_base_platform,
-        np.flatnonzero(estimate.configurations),
-        centres,
-        legs_seen=estimate.edge_weights.size > 0,
-    )

@@ -20,8 +20,8 @@ from pkmcal.observe.images import decode
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.photographs import Photograph
 from pkmcal.report.residuals import KEPT, SIDES, radius_positions, rms
-from pkmcal.report.wording import count, number
 from pkmcal.session import Session
+from pkmcal.wording import count, number
 
 MOST = 12
 LARGEST_WIDTH = 640

@@ -21,9 +21,9 @@ from pkmcal.report.charts import (
     row_chart,
 )
 from pkmcal.report.residuals import KEPT, SIGMAS, expected_rms
-from pkmcal.report.wording import brief, count, decimals, number
 from pkmcal.session import Session
 from pkmcal.turning import turning
+from pkmcal.wording import brief, count, decimals, number
 
 OPEN = 0.3
 """m or rad; a place that is known no better is not told by the data."""

@@ -12,8 +12,8 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, pose_difference, skew
 from pkmcal.identify.problem import Estimate
-from pkmcal.report.wording import brief, count, decimals, number
 from pkmcal.session import Session
+from pkmcal.wording import brief, count, decimals, number
 
 OPEN = 1e3
 """mm; a place that is known no better is not told by the data."""

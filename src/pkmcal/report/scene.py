@@ -14,8 +14,8 @@ from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.report.charts import WIDTH
-from pkmcal.report.wording import brief, number
 from pkmcal.session import Session
+from pkmcal.wording import brief, number
 
 ELLIPSE = 2.0
 """Standard deviations that ellipses and ellipsoids reach."""

@@ -13,7 +13,7 @@ from pkmcal.control.study import Outcome, Plan, Study, study
 from pkmcal.control.words import Judgement, judgement, named
 from pkmcal.outcome import Figure, Plot, Row, Table
 from pkmcal.report import figure, servo_figures, templating
-from pkmcal.report.wording import brief, number
+from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2
 """Choices of legs told of each number of them."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from pkmcal.report import charts, wording
+from pkmcal import wording
+from pkmcal.report import charts
 
 if TYPE_CHECKING:
     import jinja2

@@ -9,12 +9,12 @@ import numpy as np
 
 from pkmcal.outcome import Figure, Row, Table
 from pkmcal.report import charts, templating
-from pkmcal.report.wording import SCALES, brief, count, decimals, number
 from pkmcal.session import Session
 from pkmcal.validate.figures import Figures, figures, promised, reading_units
 from pkmcal.validate.holdouts import HoldOut, Judged
 from pkmcal.validate.judged import Ratio, rms
 from pkmcal.validate.paths import Straightness
+from pkmcal.wording import SCALES, brief, count, decimals, number
 
 if TYPE_CHECKING:
     from pkmcal.validation import LinePath, Validation

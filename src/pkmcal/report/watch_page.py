@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pkmcal.identify.words_names import named
 from pkmcal.outcome import Figure, Row, Table
 from pkmcal.report import charts, templating
-from pkmcal.report.wording import SCALES, brief, count, number
 from pkmcal.watching.chances import POWER, ChiSquare
 from pkmcal.watching.judged import LegTest, Suspect
 from pkmcal.watching.words import cameras_of, said, signed
+from pkmcal.wording import SCALES, brief, count, named, number
 
 if TYPE_CHECKING:
     from pkmcal.watch import Watch

@@ -10,7 +10,6 @@ import numpy as np
 from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Figure
 from pkmcal.report.reproduction import Reproduction
-from pkmcal.report.wording import brief, joined, number
 from pkmcal.reproduce import Options
 from pkmcal.reproduce.paper_a_charts import LABELS
 from pkmcal.reproduce.paper_a_expected import (
@@ -49,6 +48,7 @@ from pkmcal.reproduce.paper_a_tables import (
     noise_part,
     poses_part,
 )
+from pkmcal.wording import brief, joined, number
 
 if TYPE_CHECKING:
     from pkmcal.reproduce.paper_a_photographs import MeasuredNoise

@@ -8,7 +8,6 @@ import numpy as np
 
 from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Check
-from pkmcal.report.wording import number
 from pkmcal.reproduce.paper_a_study import (
     BOUND,
     CORRECTED,
@@ -16,6 +15,7 @@ from pkmcal.reproduce.paper_a_study import (
     PRINTED,
     Study,
 )
+from pkmcal.wording import number
 
 TABLE_1 = AxisNoise(images=1)
 """[A] Table 1, a single image. Printed in rad; degrees are meant (errata): in rad the end-effector

@@ -9,7 +9,6 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Part, Plot, Row, Table
-from pkmcal.report.wording import brief, number
 from pkmcal.reproduce.paper_a_charts import LABELS, by_poses, figure_4
 from pkmcal.reproduce.paper_a_expected import (
     AFTER,
@@ -24,6 +23,7 @@ from pkmcal.reproduce.paper_a_expected import (
 from pkmcal.reproduce.paper_a_methods import Thirty, thirty
 from pkmcal.reproduce.paper_a_simulation import study_machine
 from pkmcal.reproduce.paper_a_study import BOUND, DRAWING, JOINT, METHODS, PRINTED, Study
+from pkmcal.wording import brief, number
 
 if TYPE_CHECKING:
     from pkmcal.reproduce.paper_a_photographs import MeasuredNoise

@@ -8,7 +8,6 @@ import numpy as np
 
 from pkmcal.outcome import Figure
 from pkmcal.report.reproduction import Reproduction
-from pkmcal.report.wording import number
 from pkmcal.reproduce import Options
 from pkmcal.reproduce.paper_c_expected import (
     PROTOTYPE,
@@ -43,6 +42,7 @@ from pkmcal.reproduce.paper_c_tables import (
     table_4_part,
 )
 from pkmcal.reproduce.paper_c_validation import Before, before
+from pkmcal.wording import number
 
 MODELS_31: tuple[Kind, Kind] = ("design", "calibration")
 CITED = (

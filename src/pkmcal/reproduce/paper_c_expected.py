@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.outcome import Check
-from pkmcal.report.wording import number
 from pkmcal.reproduce.paper_c_simulation import Kind
 from pkmcal.reproduce.paper_c_study import (
     BOUND,
@@ -20,6 +19,7 @@ from pkmcal.reproduce.paper_c_study import (
     Study,
 )
 from pkmcal.reproduce.paper_c_validation import Before
+from pkmcal.wording import number
 
 BEFORE = Before(26e-3, 0.022)
 """[C] IV.C: the nacelle's mean error with the a priori parameters, m and rad."""

@@ -6,7 +6,6 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.outcome import Part, Row, Table
-from pkmcal.report.wording import number
 from pkmcal.reproduce.paper_c_expected import (
     BEFORE,
     PROTOTYPE,
@@ -28,6 +27,7 @@ from pkmcal.reproduce.paper_c_study import (
     Study,
 )
 from pkmcal.reproduce.paper_c_validation import Before
+from pkmcal.wording import number
 
 LABELS = {
     DRAWING: "a priori",

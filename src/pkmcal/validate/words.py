@@ -9,10 +9,10 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
-from pkmcal.report.wording import SCALES, brief, count
 from pkmcal.validate.figures import figures, promised, reading_units
 from pkmcal.validate.holdouts import HoldOut, Judged
 from pkmcal.validate.judged import Ratio, ratio, rms
+from pkmcal.wording import SCALES, brief, count
 
 MOSTLY_NOISE = 2**0.5
 """Factor on the photographs' noise within which that is more than half of the mean square."""

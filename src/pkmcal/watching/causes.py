@@ -11,8 +11,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.gauge import centre_index
 from pkmcal.mechanisms import Machine
-from pkmcal.report.wording import split_name
 from pkmcal.watching.evidence import SIZE
+from pkmcal.wording import split_name
 
 Part = Literal["zero", "rod", "arm", "base", "platform", "hinge", "all", "pair", "scale", "camera"]
 

@@ -9,12 +9,11 @@ import numpy as np
 
 from pkmcal.arrays import Booleans
 from pkmcal.files import listed
-from pkmcal.identify.words_names import named
 from pkmcal.outcome import Verdict
-from pkmcal.report.wording import SCALES, brief, count, decimals, number
 from pkmcal.session import Session
 from pkmcal.watching.chances import POWER
 from pkmcal.watching.judged import Finding, Judgement, LegTest, Suspect
+from pkmcal.wording import SCALES, brief, count, decimals, named, number
 
 NOISIER = 1.5
 """Times the calibration's noise from which on the photographs are no longer the same kind."""

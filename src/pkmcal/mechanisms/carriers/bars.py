@@ -61,7 +61,11 @@ class Bar(PlatformCarrier):
     joints: ClassVar = ("bar",)
     schema: ClassVar = BarDocument
     shared: ClassVar = ("hinge",)
-    parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("hinge", "m", "center"))
+    called: ClassVar = "side bars' joints (half a bar's width)"
+    parameters: ClassVar = (
+        *vectors("center", "m", "center"),
+        *vectors("hinge", "m", "center", label="hinge"),
+    )
 
     @staticmethod
     def place(
@@ -116,9 +120,10 @@ class HingedBar(PlatformCarrier):
     joints: ClassVar = ("hinged-bar",)
     schema: ClassVar = HingedBarDocument
     shared: ClassVar = ("hinge", "axis")
+    called: ClassVar = "side bars' joints"
     parameters: ClassVar = (
         *vectors("center", "m", "center"),
-        *vectors("hinge", "m", "center"),
+        *vectors("hinge", "m", "center", label="hinge"),
         *vectors("axis", "1", "axis"),
     )
 

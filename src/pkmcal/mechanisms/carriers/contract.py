@@ -28,12 +28,28 @@ class ParameterKind(NamedTuple):
 
     Where the file may leave the field out, ``otherwise`` is its value, and it is no parameter of
     a machine whose file does. Without a tolerance's name it is a constant of the drawing.
+    label : what people call it, where its side and path say too little.
     """
 
     path: str
     unit: str
     tolerance: str
     otherwise: float = 0.0
+    label: str = ""
+
+
+class NamedMotion(NamedTuple):
+    """Changes of one leg's carrier that people can picture, should data leave them open.
+
+    columns : (n, m) changes of the carrier's n parameters. one, several : what is open, of one leg
+    and of several; together : of all legs, where only some combinations are open. Sentences without
+    a full stop, with the places that :class:`pkmcal.identify.motions.Motion` lists.
+    """
+
+    columns: Array
+    one: str
+    several: str
+    together: str = ""
 
 
 class CarriedPoint(NamedTuple):
@@ -54,6 +70,7 @@ class Carrier(ABC):
     """What both sides share: words in files, schema, parameters, and changes of the frames.
 
     shared : fields that legs on one motor, or on one bar, have in common.
+    called : the limb's ends on this side, where sentences speak of all of them.
 
     Frames change by E on base coordinates and F on platform coordinates, (..., 4, 4), see
     :mod:`pkmcal.identify.gauge`.
@@ -63,6 +80,16 @@ class Carrier(ABC):
     schema: ClassVar[type[Schema]]
     parameters: ClassVar[tuple[ParameterKind, ...]]
     shared: ClassVar[tuple[str, ...]] = ()
+    called: ClassVar[str] = ""
+
+    @staticmethod
+    def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
+        """What of a leg's numbers (n,) data may leave open together, and has a name of its own.
+
+        readings : (K,) of the leg's motor at the poses of a session, NaN on the platform side.
+        """
+        del parameters, readings
+        return ()
 
     @staticmethod
     @abstractmethod
@@ -87,6 +114,7 @@ class BaseCarrier(Carrier):
     """
 
     driven: ClassVar[bool] = False
+    called: ClassVar[str] = "base joints"
 
     @staticmethod
     @abstractmethod
@@ -127,6 +155,7 @@ class PlatformCarrier(Carrier):
 
     turns: ClassVar[bool] = False
     floats: ClassVar[bool] = False
+    called: ClassVar[str] = "platform joints"
 
     @staticmethod
     @abstractmethod
@@ -181,9 +210,12 @@ def by_pose(arm: Array) -> Array:
     return out
 
 
-def vectors(name: str, unit: str, tolerance: str) -> tuple[ParameterKind, ...]:
+def vectors(name: str, unit: str, tolerance: str, label: str = "") -> tuple[ParameterKind, ...]:
     """The three components of a field."""
-    return tuple(ParameterKind(f"{name}.{axis}", unit, tolerance) for axis in "xyz")
+    return tuple(
+        ParameterKind(f"{name}.{axis}", unit, tolerance, label=label and f"{label} {axis}")
+        for axis in "xyz"
+    )
 
 
 def of_part(node: Any, kind: ParameterKind) -> float | None:

@@ -12,6 +12,7 @@ from pkmcal.files import Schema
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
+    NamedMotion,
     direction_by_frame,
     moved_direction,
     moved_point,
@@ -44,6 +45,24 @@ class Slider(BaseCarrier):
     schema: ClassVar = SliderDocument
     shared: ClassVar = ("axis",)
     parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("axis", "1", "axis"))
+
+    @staticmethod
+    def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
+        """The guide leans about the middle of where its carriage was."""
+        del parameters
+        lean = np.zeros((6, 3))
+        lean[3:] = np.eye(3)
+        lean[:3] = -np.nanmean(readings) * np.eye(3)
+        return (
+            NamedMotion(
+                lean,
+                one="how the guide of {legs} leans cannot be told from where it stands{better}",
+                several="how the guides of {legs} lean cannot be told from where they stand"
+                "{better}",
+                together="how the guides of {legs} lean to each other cannot be told from where"
+                " they stand{better} {ways}{mostly}",
+            ),
+        )
 
     @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:

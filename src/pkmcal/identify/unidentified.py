@@ -1,10 +1,12 @@
 """What the data leave open, said so that people know what to do.
 
+    data -> directions that they do not see -> nearest motions with a name -> sentences
+
 The null space of the data's information has no axes of its own: any rotation of it is as good.
-So changes that people can picture (:mod:`pkmcal.identify.words_families`) are held against the
-whole space, one after the other: what lies in it is taken out and said, the rest stays for the
-next. All comparisons are made in units of the drawing's tolerances, with the frames' freedoms
-taken out.
+So changes that people can picture (:mod:`pkmcal.identify.motions`) are held against the whole
+space, one after the other: what lies in it is taken out and said
+(:mod:`pkmcal.identify.sentences`), the rest stays for the next. All comparisons are made in units
+of the drawing's tolerances, with the frames' freedoms taken out.
 """
 
 from __future__ import annotations
@@ -16,13 +18,10 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.gauge import freedoms, generators
+from pkmcal.identify.motions import Motion, Situation, all_radii, candidates
 from pkmcal.identify.problem import Estimate
-from pkmcal.identify.words_advice import advice_on
-from pkmcal.identify.words_driven import conventions_held
-from pkmcal.identify.words_effect import platform_by_parameters
-from pkmcal.identify.words_families import Circumstances, Family, all_radii, circumstances, families
-from pkmcal.identify.words_parts import Part, merged
-from pkmcal.identify.words_text import said_of
+from pkmcal.identify.sentences import Found, Sentence, few, sentence
+from pkmcal.identify.tool import platform_by_parameters
 from pkmcal.mechanisms import Machine
 
 if TYPE_CHECKING:
@@ -41,31 +40,9 @@ of its variance. Poses that only shift seem to turn by their noise, so direction
 come out with a trace of information."""
 NEW = 0.1
 """Sine of the angle to what is said already below which a change says nothing new."""
-MOVES = 0.01
-"""Share of a joint centre's tolerance below which a platform counts as not moved: a hundredth
-of what the drawing leaves open disappears beside any calibration's own deviations."""
-MOST = 8
-"""Sentences that people read."""
-
-
-@dataclass(frozen=True)
-class Sentence:
-    """One thing that the data do not tell.
-
-    text, advice : what, and what to do. parameters : the names that it is about, most first.
-    dimensions : independent changes that it stands for. moves_platform : how far (m, root mean
-    square over its joints and poses) the platform moves when these changes are as large as the
-    drawing's tolerance lets expect. matters : whether that is more than nothing. weak : the data
-    know it, yet less than the drawing does.
-    """
-
-    text: str
-    advice: str
-    parameters: tuple[str, ...]
-    dimensions: int
-    moves_platform: float
-    matters: bool
-    weak: bool = False
+HELD = 1e-6
+"""Metres a metre (or a radian) of a held value that free values leave undone, at most, for it to be
+a convention: both are derivatives at one machine, alike but for rounding."""
 
 
 @dataclass(frozen=True)
@@ -88,17 +65,6 @@ class Findings:
     also_conventional: int = 0
 
 
-class _Open(NamedTuple):
-    """What is left open, in units of the drawing's deviations: rows (n, P) orthonormal, their
-    covariance (n, n) as the estimate leaves it, frames (P, g) orthonormal, unit (P,).
-    """
-
-    rows: Array
-    covariance: Array
-    frames: Array
-    unit: Array
-
-
 def explain(
     told: Identifiability,
     estimate: Estimate,
@@ -111,38 +77,35 @@ def explain(
     """
     machine, table = estimate.machine, estimate.machine.parameters
     poses = estimate.state.T_base_platform[estimate.configurations]
+    photographed = estimate.edge_weights.size > 0
+    around = Situation(machine, seen, poses, photographed, only_heights(estimate))
     effect = platform_by_parameters(machine, poses)
-    photographed, heights = estimate.edge_weights.size > 0, only_heights(estimate)
-    drawing = effect @ (table.free_matrix() * table.tolerances_free())
-    lost = (*told.unidentified, *(d for d in told.weak if d.information < HARDLY))
-    weak = tuple(d for d in told.weak if d.information >= HARDLY)
+    unseen = {id(d) for d in told.unidentified}
 
     def said(directions: tuple[Direction, ...]) -> tuple[Sentence, ...]:
-        null = vectors(directions, machine)
-        known = _information(directions, told)
-        return describe(
-            machine, seen, null, poses, known, photographed=photographed, heights=heights
-        )
+        known = [0.0 if id(d) in unseen else d.information for d in directions]
+        return describe(around, vectors(directions, machine), np.array(known), effect)
 
+    lost = (*told.unidentified, *(d for d in told.weak if d.information < HARDLY))
+    weak = tuple(d for d in told.weak if d.information >= HARDLY)
     # Poses and heights blend what they hardly see with what they do not: together it has names.
     sentences = (*said(lost), *said(weak)) if photographed else said((*lost, *weak))
-    free = tuple(s for s in sentences if not s.weak)
-    rest = tuple(s for s in sentences if s.weak)
-    by_drawing = float(np.linalg.norm(drawing))
-    held = conventions_held(machine, effect)
-    return Findings(told, free, rest, by_drawing, conditions, *held)
+    conventional, others = conventions_held(machine, effect)
+    return Findings(
+        told,
+        tuple(s for s in sentences if not s.weak),
+        tuple(s for s in sentences if s.weak),
+        float(np.linalg.norm(effect @ (table.free_matrix() * table.tolerances_free()))),
+        conditions,
+        conventional,
+        others,
+    )
 
 
 def only_heights(estimate: Estimate) -> bool:
     """Whether nothing but heights was measured: what is not measured leaves no residual."""
     poses = estimate.pose_residuals
     return not estimate.edge_weights.size and len(poses) > 0 and not poses[:, :5].any()
-
-
-def _information(directions: tuple[Direction, ...], told: Identifiability) -> Array:
-    """What the data know of each direction, 0 where it is rounding only."""
-    gone = {id(d) for d in told.unidentified}
-    return np.array([0.0 if id(d) in gone else d.information for d in directions])
 
 
 def vectors(directions: tuple[Direction, ...], machine: Machine) -> Array:
@@ -168,41 +131,73 @@ def joined_by_boards(seen: Booleans, measurements: Measurements) -> Booleans:
     return out
 
 
+def conventions_held(machine: Machine, effect: Array) -> tuple[tuple[str, ...], int]:
+    """Held parameters that say nothing of the machine, by name, and how many combinations of the
+    other held ones do so: the free ones, or the frames, do all that they could do.
+
+    effect : (r, P) the platform's displacements by the parameters, frames taken out.
+    """
+    table = machine.parameters
+    if not table.fixed:
+        return (), 0
+    every = replace(table, fixed=()).free_matrix()
+    held = effect @ every @ every[[table.index(name) for name in table.fixed]].T
+    free = effect @ table.free_matrix()
+    q, s, _ = np.linalg.svd(free, full_matrices=False)
+    q = q[:, s > 1e-9 * s.max(initial=0.0)]
+    left = held - q @ (q.T @ held)
+    # a metre moves joints by about a metre: without effect is without effect in metres
+    alone = np.linalg.norm(left, axis=0) < HELD
+    names = tuple(name for name, said in zip(table.fixed, alone, strict=True) if said)
+    others = left[:, ~alone]
+    kinds = np.unique(np.round(others / HELD), axis=1)  # what is tied counts once
+    rank = int(np.sum(np.linalg.svd(others, compute_uv=False) > HELD))
+    return names, kinds.shape[1] - rank
+
+
+# ------------------------------------------------------------------ directions to motions
+
+
+class _Open(NamedTuple):
+    """What is left open, in units of the drawing's deviations: rows (n, P) orthonormal, their
+    covariance (n, n) as the estimate leaves it, frames (P, g) orthonormal, unit (P,).
+    """
+
+    rows: Array
+    covariance: Array
+    frames: Array
+    unit: Array
+
+
 def describe(
-    machine: Machine,
-    seen: Booleans,
-    null: Array,
-    T_base_platform: Array,
-    information: Array | None = None,
-    *,
-    photographed: bool = True,
-    heights: bool = False,
+    around: Situation, null: Array, information: Array | None = None, effect: Array | None = None
 ) -> tuple[Sentence, ...]:
     """Sentences for a space of changes that the data do not see.
 
-    machine : at the estimate. seen : (S, L) legs that each station sees. null : (n, P) changes of
-    all parameters in their units, any basis. T_base_platform : (K, 4, 4) the session's poses.
+    null : (n, P) changes of all parameters in their units, any basis.
     information : (n,) singular values of what the data know of each after all, in units of the
     tolerance, 0 where absent: from ``HARDLY`` on it is said that the drawing knows it better, not
-    that it is free. photographed : whether legs were, and not boards or poses only. heights :
-    whether it was heights only.
+    that it is free. effect : (r, P) as :func:`platform_by_parameters` gives it.
     """
+    machine = around.machine
     space = _open(machine, null, information)
-    if len(space.rows) == 0:
+    if not len(space.rows):
         return ()
-    around = circumstances(machine, seen, T_base_platform, photographed, heights)
-    if not photographed:  # nobody asks a board how thick legs are
-        radii = _within(all_radii(around), space, INSIDE[0])
-        space = _without(space, radii)
-    effect = platform_by_parameters(machine, T_base_platform) * space.unit
-    parts = merged(_explained(around, space))
-    sentences = [_sentence(around, space, part, effect) for part in parts]
-    return _few(sentences)
+    if effect is None:
+        effect = platform_by_parameters(machine, around.T_base_platform)
+    if not around.photographed:  # nobody asks a board how thick legs are
+        space = _without(space, _within(all_radii(around).columns, space, INSIDE[0]))
+    found = _alike(around, _explained(around, space))
+    said = [sentence(around, part, space.unit, *_moves(part, space, effect)) for part in found]
+    return few(said)
 
 
 def _open(machine: Machine, null: Array, information: Array | None) -> _Open:
     """The open space without frames, in units of the drawing's deviations."""
-    unit = _unit(machine)
+    squares = machine.parameters.free_matrix() ** 2
+    # tied parameters share one deviation
+    shared = np.where(squares.sum(axis=1) > 0, squares @ squares.sum(axis=0), 1.0)
+    unit = machine.parameters.tolerance * np.sqrt(np.maximum(shared, 1.0))
     moved = generators(machine.layout, machine.values) @ freedoms(machine)
     frames = _orthonormal((moved / unit[:, None]).T).T
     rows = null / unit
@@ -217,13 +212,6 @@ def _open(machine: Machine, null: Array, information: Array | None) -> _Open:
     return _Open(basis, mixed / (1 + s**2) @ mixed.T, frames, unit)
 
 
-def _unit(machine: Machine) -> Array:
-    """The drawing's deviations (P,), larger for tied ones, which share one deviation."""
-    squares = machine.parameters.free_matrix() ** 2
-    shared = np.where(squares.sum(axis=1) > 0, squares @ squares.sum(axis=0), 1.0)
-    return machine.parameters.tolerance * np.sqrt(np.maximum(shared, 1.0))
-
-
 def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
     """An orthonormal basis (k, P) of the rows' space."""
     if rows.size == 0:
@@ -232,25 +220,25 @@ def _orthonormal(rows: Array, least: float = 1e-6) -> Array:
     return vt[s > least * max(float(s[0]), 1e-300)]
 
 
-def _explained(around: Circumstances, space: _Open) -> list[Part]:
-    """Families that lie in the open space, each with what it says anew."""
-    parts: list[Part] = []
+def _explained(around: Situation, space: _Open) -> list[Found]:
+    """Motions that lie in the open space, each with what it says anew."""
+    parts: list[Found] = []
     done = np.zeros((0, space.rows.shape[1]))
-    known, whole = list(families(around)), space
-    for family, inside in [*((f, share) for share in INSIDE for f in known[:-1]), (known[-1], 0.0)]:
+    known, whole = list(candidates(around)), space
+    for motion, inside in [*((m, share) for share in INSIDE for m in known[:-1]), (known[-1], 0.0)]:
         if len(done) == len(whole.rows):
             break
-        found = _within(family, space, inside)
+        found = _within(motion.columns, space, inside)
         new = _directions(found - (found @ done.T) @ done)
         if len(new) == 0:
             continue
-        if family.kind == "rest":
+        if motion is known[-1]:
             found = new
         done = _orthonormal(np.concatenate([done, new]))
-        numbers = _coefficients(family, space, found)
-        own = numbers @ family.columns.T / space.unit
-        parts.append(Part((family,), found, numbers, own, len(new)))
-        if family.kind in EQUIVALENT:
+        numbers = _coefficients(motion, space, found)
+        own = numbers @ motion.columns.T / space.unit
+        parts.append(Found(motion, motion.legs, found, numbers, own, len(new)))
+        if motion.convention:
             space = _without(space, new)
     return parts
 
@@ -270,9 +258,9 @@ def _directions(rows: Array) -> Array:
     return vt[s > NEW]
 
 
-def _within(family: Family, space: _Open, inside: float) -> Array:
-    """Directions (k, P) of the open space that the family can make, orthonormal."""
-    columns = (family.columns / space.unit[:, None]).T
+def _within(changes: Array, space: _Open, inside: float) -> Array:
+    """Directions (k, P) of the open space that changes (P, m) can make, orthonormal."""
+    columns = (changes / space.unit[:, None]).T
     size = np.linalg.norm(columns, axis=1)
     columns = columns[size > 0] / size[size > 0, None]
     # what only moves the frames changes nothing, whatever rounding leaves of it
@@ -282,9 +270,9 @@ def _within(family: Family, space: _Open, inside: float) -> Array:
     return u[:, s**2 > inside].T @ space.rows
 
 
-def _coefficients(family: Family, space: _Open, found: Array) -> Array:
-    """The family's own numbers (k, m) for each direction, frames aside."""
-    columns = family.columns / space.unit[:, None]
+def _coefficients(motion: Motion, space: _Open, found: Array) -> Array:
+    """The motion's own numbers (k, m) for each direction, frames aside."""
+    columns = motion.columns / space.unit[:, None]
     scale = np.linalg.norm(columns, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     both = np.concatenate([columns / scale, space.frames], axis=1)
@@ -292,58 +280,23 @@ def _coefficients(family: Family, space: _Open, found: Array) -> Array:
     return (solved[: columns.shape[1]] / scale[:, None]).T
 
 
-EQUIVALENT = ("against", "turn")
-"""Kinds that are taken out of what is said afterwards: changes of the description, not of a leg."""
+def _alike(around: Situation, parts: list[Found]) -> list[Found]:
+    """Parts with one sentence as one: the same of several legs, or the same legs' again."""
+    out: dict[tuple[object, ...], Found] = {}
+    for part in parts:
+        single = len(part.legs) == 1
+        key = (part.motion.one, *((part.how(around), len(part.space)) if single else part.legs))
+        out[key] = out[key].and_of(part) if key in out else part
+    return list(out.values())
 
 
-def _sentence(around: Circumstances, space: _Open, part: Part, effect: Array) -> Sentence:
+def _moves(part: Found, space: _Open, effect: Array) -> tuple[float, bool]:
+    """How far (m) it moves the platform, and whether the data know something of it after all."""
     found = _directions(part.space)
     mixed = found @ space.rows.T
-    weak = _known(space, mixed) >= HARDLY
-    moved = effect @ found.T
-    moved = float(np.sqrt(np.trace(moved @ (mixed @ space.covariance @ mixed.T) @ moved.T)))
-    table = around.machine.parameters
-    matters = moved > MOVES * float(table.tolerance[around.at.base].mean())
-    size = np.linalg.norm(part.own, axis=0)
-    order = np.argsort(-np.round(size, 6), kind="stable")
-    names = tuple(table.names[k] for k in order[: int(np.sum(size > 0.15 * size.max()))])
-    text = said_of(around, part.families, part.coefficients, names, weak)
-    how_far = "This does not move the platform."
-    if matters:
-        how_far = (
-            f"Within the drawing's tolerances this moves the platform by {moved * 1e3:.2g} mm."
-        )
-    return Sentence(
-        f"{text}. {how_far}",
-        advice_on(around, part.families, names, matters, weak),
-        names,
-        part.new,
-        moved,
-        matters,
-        weak,
-    )
-
-
-def _known(space: _Open, mixed: Array) -> float:
-    """What the data know at most of changes, rows (k, n) of coordinates in the open space."""
+    moved = effect @ (space.unit[:, None] * found.T)
+    covariance = mixed @ space.covariance @ mixed.T
     # the estimate's information is the drawing's, one, and the data's
     data = mixed @ (np.linalg.inv(space.covariance) - np.eye(len(space.rows))) @ mixed.T
-    return float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
-
-
-def _few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
-    """At most ``MOST`` sentences, the rest counted in the last."""
-    if len(sentences) <= MOST:
-        return tuple(sentences)
-    ranked = sorted(sentences, key=lambda s: -s.moves_platform)
-    kept = [s for s in sentences if s in ranked[: MOST - 1]]
-    rest = ranked[MOST - 1 :]
-    moved = float(np.sqrt(sum(s.moves_platform**2 for s in rest)))
-    last = replace(
-        rest[0],
-        text=f"And {len(rest)} more of this kind. {rest[0].text}",
-        parameters=tuple(dict.fromkeys(name for s in rest for name in s.parameters)),
-        dimensions=sum(s.dimensions for s in rest),
-        moves_platform=moved,
-    )
-    return (*kept, last)
+    known = float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
+    return float(np.sqrt(np.trace(moved @ covariance @ moved.T))), known >= HARDLY
