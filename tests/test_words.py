@@ -175,9 +175,7 @@ def test_common_turns_of_parallel_axes_move_nothing():
     poses = moved(machine, np.random.default_rng(1), 15, turn=0.0)
     _, _, sentences = told_of(make("3-upu", poses=poses, errors=0.0))
     turn = sentences[0]
-    assert turn.text.startswith(
-        "The common direction of both universal axes of each of legs 1 to 3 is free"
-    )
+    assert turn.text.startswith("The common direction of both axes of each of legs 1 to 3 is free")
     assert turn.dimensions == 6
     assert not turn.matters
     assert turn.moves_platform < 1e-9
@@ -231,22 +229,23 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"legs[3].length.offset": 1.0}, "The offset of leg 3 is free."),
+        ({"legs[3].length.offset": 1.0}, "The length offset of leg 3 is free."),
         ({"legs[2].base.center.z": 1.0}, "The base joint of leg 2 is free along z."),
         ({"legs[5].tubes[1].radius": 1.0}, "The tubes' radii of leg 5 are free."),
         (
             {f"legs[{j}].length.offset": 1.0 for j in range(1, 7)},
-            "The common part of the offsets of legs 1 to 6 is free.",
+            "The length offset, of all legs alike, is free.",
         ),
         (
             {"legs[1].base.center.z": 1.0, "legs[2].base.center.z": -1.0,
              "legs[3].base.center.z": 0.6, "legs[5].base.center.z": 1.1},
-            "The heights (z) of the base joints are free against each other in one way.",
+            "The values of base centre z of legs 1 to 6 are free against each other in one way:",
         ),
         (
             {"legs[1].base.center.x": 1.0, "legs[4].length.offset": 0.7,
              "legs[6].platform.center.y": -0.8},
-            "A combination of x of leg 1's base joint, leg 4's offset, y of leg 6's",
+            "Of the machine's numbers, one combination is free: +1 mm of leg 1 base centre x goes "
+            "with −0.80 mm of leg 6 platform centre y and +0.70 mm of leg 4 length offset.",
         ),
     ],
 )  # fmt: skip
@@ -260,7 +259,10 @@ def test_single_changes_have_their_names(change, text):
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("6-spu-passive", "Of the values of legs 1 and 7, one combination each is free, mostly of"),
+        (
+            "6-spu-passive",
+            "Of the values of legs 1 and 7, one combination each is free, mostly of leg",
+        ),
         ("constant-legs", "The tubes' radii of legs 1 and 3 are free."),
     ],
 )
@@ -305,7 +307,7 @@ def test_frames_are_no_finding():
     change = unit(machine, {"legs[3].length.offset": 1e-3})
     mixed = change + 0.02 * frames[4] - 0.01 * frames[7]
     (sentence,) = describe(Situation(machine, np.ones((1, 6), bool), poses), mixed[None])
-    assert sentence.text.startswith("The offset of leg 3 is free.")
+    assert sentence.text.startswith("The length offset of leg 3 is free.")
     assert describe(Situation(machine, np.ones((1, 6), bool), poses), frames[:0]) == ()
 
 
@@ -324,7 +326,7 @@ def test_what_the_drawing_knows_better_is_not_called_free():
     seen = np.ones((1, 6), bool)
     (weak,) = describe(Situation(machine, seen, poses), null, np.array([0.5]))
     (open_,) = describe(Situation(machine, seen, poses), null)
-    assert weak.text.startswith("The offset of leg 3 is known from the drawing only.")
+    assert weak.text.startswith("The length offset of leg 3 is known from the drawing only.")
     assert "smaller tolerances" in weak.advice
     assert weak.moves_platform == pytest.approx(open_.moves_platform / np.sqrt(1.25))
 

@@ -123,7 +123,7 @@ class Motion:
 
     - ``{legs}``: leg 3; legs 1 to 4. ``{each}``: "each of ", before several legs.
     - ``{is}``, ``{are}``, ``{open}``: is free, are free, free; or that only the drawing knows it.
-      ``{better}``, ``{unsure}``: the same as an end of the sentence, empty where it is free.
+      ``{better}``, ``{limited}``: the same as an end of the sentence, empty where it is free.
     - ``{n}``: how many independent changes of a leg. ``{combinations}``: that so many are open.
       ``{ways}``: in how many ways.
     - ``{mostly}``: the numbers of a single change, or the parameters that change most.
@@ -152,13 +152,13 @@ def candidates(s: Situation) -> Iterator[Motion]:
     """Every motion, the most particular first; the last is anything at all."""
     yield from (_unseen(s, j) for j in s.legs if not s.seen[:, j].any())
     yield from _conventions(s)
-    for j in s.legs:
-        yield from _directions_and_tubes(s, j)
-    for j in s.legs:
-        yield from _lengths_and_points(s, j)
-    yield from _sizes(s)
     carried = [m for j in s.legs for m in _carriers(s, j)]
-    yield from (motion for motion, _ in carried)
+    own = [
+        m for of in (_directions_and_tubes, _lengths_and_points) for j in s.legs for m in of(s, j)
+    ]
+    shared = [*(motion for motion, _ in carried), *_sizes(s)]
+    # photographs tell legs one by one; poses leave open what is the same of all
+    yield from (*own, *shared) if s.photographed else (*shared, *own)
     for group in groups(s.seen):
         yield from _group(s, group)
     yield from _same_of_all(s)
@@ -200,8 +200,10 @@ def _conventions(s: Situation) -> Iterator[Motion]:
         for axis in range(3):
             shifts[centres[:, axis], axis, list(s.legs)] = 1.0
     shifts = shifts.reshape(len(shifts), -1)
-    if s.photographed:  # legs in photographs tell where their ends are
-        shifts = shifts[:, :0]
+    layout = s.machine.layout
+    bars = any(g.carrier.floats or g.carrier.turns for g in layout.platform)
+    if s.photographed or (layout.motion[:3].any() and not bars):
+        shifts = shifts[:, :0]  # photographs, or the platform's turns, tell the ends of legs
     else:
         one = "of {how}: both can shift alike {ways}"
         yield Motion(s.legs, shifts, one, how=_difference, convention=True)
@@ -259,8 +261,8 @@ def _directions_and_tubes(s: Situation, leg: int) -> Iterator[Motion]:
 
 def _lengths_and_points(s: Situation, leg: int) -> Iterator[Motion]:
     """The leg growing along itself, then its numbers and its points one by one."""
-    start = "{legs} keeps nearly one direction in the data: it{unsure} {how}"
-    starts = "{legs} keep nearly one direction each in the data: each of them{unsure} {how}"
+    start = "{legs} keeps nearly one direction in the data: it {how}{limited}"
+    starts = "{legs} keep nearly one direction each in the data: each of them {how}{limited}"
     how = _sliding if s.rows(leg, "length").size else _sliding_passive
     yield Motion((leg,), _slide(s, leg), start, starts, how)
     for field, rows in s.fields[leg].items():
@@ -403,7 +405,7 @@ def _sizes(s: Situation) -> Iterator[Motion]:
         columns = np.stack([g.columns.sum(axis=1) for g in group], axis=1)
         whose = "all legs" if len(legs) == len(s.legs) else named(legs)
         text = f"{joined([f'the {g.label}' for g in group])}, of {whose} alike, "
-        labels = tuple((g.label, g.unit) for g in group)
+        labels = tuple((f"the {g.label}", g.unit) for g in group)
         if len(group) == 1:
             yield Motion(legs, columns, text + "{is}")
         elif s.heights:
@@ -412,7 +414,7 @@ def _sizes(s: Situation) -> Iterator[Motion]:
             yield Motion(legs, columns, text + apart + "{mostly}", labels=labels)
     for group in (g for g in chosen if len(g) > 1):
         text = f"{joined([f'the {g.of_one}' for g in group])} of {{each}}{{legs}} {apart}{{mostly}}"
-        labels = tuple((g.of_one, g.unit) for g in group)
+        labels = tuple((f"the {g.of_one}", g.unit) for g in group)
         for j in s.legs:
             columns = np.stack([g.columns[:, j] for g in group], axis=1)
             if columns.any(axis=0).all():
@@ -458,8 +460,8 @@ def changes(
     said: list[str] = []
     for k in order:
         places = decimals(abs(shown[k])) if k != first else int(one < 1)
-        unit = SCALES.get(labels[k][1], SCALES["rad"])[1]
-        said.append(f"{number(shown[k], places, signed=True)} {unit} of {labels[k][0]}")
+        unit = " mm" if labels[k][1] == "m" else "°"
+        said.append(f"{number(shown[k], places, signed=True)}{unit} of {labels[k][0]}")
     if len(said) > most:
         said = [*said[: most - 1], f"{len(said) - most + 1} smaller changes"]
     return said, factor
@@ -499,13 +501,15 @@ def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[Motion]:
     frames = generators(s.machine.layout, s.machine.values)
     ends: list[Array] = []
     for body, side in enumerate(("base", "platform")):
-        moved = np.zeros((len(frames), 6))
         rows = np.concatenate([s.rows(j, side) for j in legs])
+        moved = np.zeros((len(frames), 6))
         moved[rows] = frames[rows, 6 * body : 6 * body + 6]
+        middle = s.machine.values[centre_index(s.machine.layout)[body][list(legs)]].mean(axis=0)
+        moved[:, :3] += moved[:, 3:] @ skew(middle)  # turns about the middle of these legs' joints
         ends.append(moved)
     who, relation = named(legs), _relation(s, legs)
     joints = f"joint{'s' if len(legs) > 1 else ''} of {who}"
-    text = f"{relation}: {{}} can{{{{unsure}}}} {{{{how}}}} against the others"
+    text = f"{relation}: {{}} can {{{{how}}}} against the others{{{{limited}}}}"
     for what, columns, body in (
         (f"the base {joints}", ends[0], 0),
         (f"the platform {joints}", ends[1], 1),
@@ -544,11 +548,11 @@ def _rigid(legs: tuple[int, ...], body: int) -> How:
 
 def rigid_words(twists: Array, points: Array, legs: tuple[int, ...]) -> str:
     """``shift along x and turn about the axis through joints 1 and 4``: twists (k, 6) about the
-    origin, (omega, tau), of some legs' joints among the points (L, 3).
+    middle of some legs' joints among the points (L, 3), (omega, tau) each.
     """
     middle = points[list(legs)].mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=-1))))
-    omega, tau = twists[:, :3] * spread, twists[:, 3:] + cross(twists[:, :3], middle)
+    omega, tau = twists[:, :3] * spread, twists[:, 3:]
     least = 1e-2 * max(float(np.linalg.norm(np.c_[omega, tau], axis=1).max()), 1e-300)
     u, s, vt = np.linalg.svd(omega, full_matrices=True)
     turns = int(np.sum(s > least))

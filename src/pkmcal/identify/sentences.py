@@ -99,10 +99,10 @@ def sentence(around: Situation, found: Found, unit: Array, moved: float, weak: b
         "are": f"are {known}",
         "open": "to the drawing" if weak else "free",
         "better": " better than the drawing does" if weak else "",
-        "unsure": ", as far as the data know," if weak else "",
+        "limited": ", which only the drawing limits" if weak else "",
         "n": in_full(n),
         "combinations": f"{in_full(n)} combination{'' if n == 1 else 's'}"
-        f"{' each' if several else ''} {open_}",
+        f"{' each' if several and len(found.motion.legs) == 1 else ''} {open_}",
         "ways": ways(len(found.space)),
         "mostly": _mostly(around, found, rows, unit),
         "how": found.how(around),
@@ -129,7 +129,7 @@ def _mostly(around: Situation, found: Found, rows: Array, unit: Array) -> str:
     table, single = around.machine.parameters, len(found.space) == 1
     if found.motion.labels:
         if not single:
-            return f" {ways(len(found.numbers))}"
+            return f" {ways(len(found.numbers))}" if len(found.numbers) > 1 else ""
         said, _ = changes(found.numbers[0], found.motion.labels)
     else:
         if len({table.labels[k] for k in rows}) == 1 and len(rows) > 1:

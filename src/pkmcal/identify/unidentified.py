@@ -40,6 +40,8 @@ of its variance. Poses that only shift seem to turn by their noise, so direction
 come out with a trace of information."""
 NEW = 0.1
 """Sine of the angle to what is said already below which a change says nothing new."""
+FEWEST, CHEAP = 20, 10.0
+"""Steps to the fewest numbers, and how much less a frame's costs: they are not said."""
 HELD = 1e-6
 """Metres a metre (or a radian) of a held value that free values leave undone, at most, for it to be
 a convention: both are derivatives at one machine, alike but for rounding."""
@@ -271,13 +273,22 @@ def _within(changes: Array, space: _Open, inside: float) -> Array:
 
 
 def _coefficients(motion: Motion, space: _Open, found: Array) -> Array:
-    """The motion's own numbers (k, m) for each direction, frames aside."""
+    """The motion's own numbers (k, m) for each direction, frames aside.
+
+    Frames leave a choice: of a single change the numbers whose magnitudes have the smallest sum,
+    by reweighted least squares, since people want to read as few as possible.
+    """
     columns = motion.columns / space.unit[:, None]
     scale = np.linalg.norm(columns, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    both = np.concatenate([columns / scale, space.frames], axis=1)
-    solved = np.linalg.lstsq(both, found.T, rcond=1e-6)[0]
-    return (solved[: columns.shape[1]] / scale[:, None]).T
+    m, both = len(scale), np.concatenate([columns / scale, space.frames], axis=1)
+    weight = np.ones(both.shape[1])
+    few = len(found) == 1 and m > 1 and not (motion.how or motion.convention)
+    for _ in range(FEWEST if few else 1):
+        solved = np.linalg.lstsq(both * weight, found.T, rcond=1e-6)[0] * weight[:, None]
+        weight[:m] = np.sqrt(np.abs(solved[:m, 0]) / max(np.abs(solved[:m, 0]).max(), 1e-300))
+        weight[m:] = CHEAP
+    return (solved[:m] / scale[:, None]).T
 
 
 def _alike(around: Situation, parts: list[Found]) -> list[Found]:
