@@ -25,9 +25,9 @@ from pkmcal.control.loop import VisualServo
 from pkmcal.control.seen import true_edges
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulate.demo import camera_of_size
-from pkmcal.simulate.session import Studio
-from pkmcal.simulate.truth import Settings, Truth, draw_truth
+from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.session import Studio
+from pkmcal.simulation.truth import Settings, Truth, draw_truth
 
 CALLS = 1000
 

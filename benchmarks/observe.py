@@ -34,9 +34,9 @@ def decode_and_canny(paths: list[Path]) -> float:
 def main() -> None:
     """Print the ratio, the parts of a calibration, and the memory used."""
     begin = time.perf_counter()
-    from pkmcal.calibration import calibrate
+    from pkmcal.calibration.calibrate import calibrate
     from pkmcal.report import report_html
-    from pkmcal.session import load_session
+    from pkmcal.session.load import load_session
 
     start_up = time.perf_counter() - begin
     with tempfile.TemporaryDirectory() as folder:
@@ -63,8 +63,8 @@ def main() -> None:
 def simulated(folder: Path) -> Path:
     """A session of 45 photographs, 1024x768."""
     from pkmcal.mechanisms import load_mechanism
-    from pkmcal.simulate.demo import demo_camera
-    from pkmcal.simulate.session import Settings, simulate_session
+    from pkmcal.simulation.demo import demo_camera
+    from pkmcal.simulation.session import Settings, simulate_session
 
     simulate_session(folder, load_mechanism("gough-stewart"), demo_camera(), Settings(), seed=1)
     return folder

@@ -23,7 +23,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import start_state
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.residuals import BatchState, Problem
-from pkmcal.identify.solver import minimise
+from pkmcal.solver import minimise
 from test_identify_scene import guess, make_scene
 
 

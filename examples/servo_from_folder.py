@@ -16,7 +16,7 @@ from pkmcal.control.loop import VisualServo
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.observe.images import decode
 from pkmcal.results import load
-from pkmcal.session import load_session
+from pkmcal.session.load import load_session
 
 
 def arguments() -> argparse.Namespace:

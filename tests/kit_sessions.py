@@ -12,15 +12,15 @@ import cv2
 import numpy as np
 import yaml
 
-from pkmcal.calibration import calibrate
+from pkmcal.boards.board import Detection
+from pkmcal.calibration.calibrate import calibrate
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, yaml_text
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose, register, rotation
 from pkmcal.identify.gauge import pose_generators, respecting_motion
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import load_mechanism, mechanism_text
-from pkmcal.observe.boards import Detection
-from pkmcal.simulate.board import board_from_fields
+from pkmcal.simulation.board import board_from_fields
 
 LENGTH, ANGLE = 5e-4, np.deg2rad(0.3)
 """Standard deviations of what a kit's parts differ from the drawing by."""

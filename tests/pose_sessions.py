@@ -11,10 +11,8 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.covariance import information
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Measurements, Mount
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import kinematics
-from pkmcal.observe.edges import EdgeSet
-from pkmcal.observe.poses import PoseSet
 
 POSE_SIGMA = np.repeat([np.deg2rad(0.03), 2e-4], 3)
 """Of a board's pose from a photograph, rad and m ([C] IV.A)."""

@@ -7,13 +7,13 @@ import numpy as np
 from pkmcal.cameras import Camera, camera_models
 from pkmcal.geometry.rigid import apply, look_at
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.simulate.casting import Part
-from pkmcal.simulate.demo import camera_of_size
-from pkmcal.simulate.render import Sensor, View, photograph, render
-from pkmcal.simulate.scene import Finish, Room, discs_of, machine_parts
-from pkmcal.simulate.shapes import Wall
-from pkmcal.simulate.surfaces import Clouds, Lamp, Lighting, Material, SmoothNoise
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.simulation.casting import Part
+from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.render import Sensor, View, photograph, render
+from pkmcal.simulation.scene import Finish, Room, discs_of, machine_parts
+from pkmcal.simulation.shapes import Wall
+from pkmcal.simulation.surfaces import Clouds, Lamp, Lighting, Material, SmoothNoise
 
 PERSPECTIVE = camera_of_size((640, 480))
 MIRROR = camera_models()["unified"](

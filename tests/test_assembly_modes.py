@@ -7,7 +7,7 @@ import pytest
 
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import assembly_modes, catalogue, load_mechanism
-from pkmcal.mechanisms.rows import pose_rows
+from pkmcal.mechanisms.closure import pose_rows
 from test_kinematics import CONVERGED, hexapod, machine_of, tripod, workspace, yawed
 
 APART = 1e-6

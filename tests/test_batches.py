@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pkmcal.geometry.batches import batch_last, damped_step, is_batch_last, stepped
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, kinematics, load_mechanism
-from pkmcal.mechanisms.batches import batch_last, damped_step, is_batch_last, stepped
-from pkmcal.mechanisms.closing import CHUNK, base_batch_last
-from pkmcal.mechanisms.limbs import closure
-from pkmcal.mechanisms.rows import base_ends, platform_ends, pose_rows, rows_between
+from pkmcal.mechanisms.closure import base_ends, closure, platform_ends, pose_rows, rows_between
+from pkmcal.mechanisms.kinematics import CHUNK, base_batch_last
 from test_kinematics import SMALL, hexapod, workspace
 
 

@@ -11,16 +11,21 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.boards import Boards, StationBoard, find_boards
+from pkmcal.boards.views import Boards, StationBoard, find_boards
+from pkmcal.calibration.recognise import (
+    boards_of,
+    check_observable,
+    found_stations,
+    read_photographs,
+)
 from pkmcal.check import Level, check_session
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.recognition import boards_of, check_observable, found_stations, read_photographs
-from pkmcal.session import load_session
-from pkmcal.simulate import board_for, load_truth
-from pkmcal.simulate.board import SIZE, Print, board_from_fields
-from pkmcal.simulate.scene import discs_of
+from pkmcal.session.load import load_session
+from pkmcal.simulation import board_for, load_truth
+from pkmcal.simulation.board import SIZE, Print, board_from_fields
+from pkmcal.simulation.scene import discs_of
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +113,7 @@ def test_poses_from_rendered_photographs(rendered, found):
 )  # fmt: skip
 def test_prints_are_what_the_detectors_look_for(fields):
     """The print drawn straight on, half a millimetre a pixel, is found whole and in its place."""
-    from pkmcal.observe.boards import detect_board
+    from pkmcal.boards.find import detect_board
 
     board = board_from_fields(fields)
     printed = Print.of(board)
@@ -213,7 +218,7 @@ def test_check_of_a_session_without_a_board_says_nothing_of_one(demo):
 
 
 def test_calibrating_with_the_board(folder):
-    from pkmcal.calibration import calibrate
+    from pkmcal.calibration.calibrate import calibrate
 
     result = calibrate(folder)
     assert len(result.measurements.poses) == 2

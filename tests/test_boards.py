@@ -6,10 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from pkmcal.boards.board import chessboard, load_board
+from pkmcal.boards.detect import detect_boards
+from pkmcal.boards.find import detect_board
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, pose, rotation
-from pkmcal.observe.boards import chessboard, detect_board, detect_boards, load_board
 
 SIZE = (480, 360)
 GREY = 110

@@ -14,9 +14,9 @@ from pkmcal.identify.bundle import bundle, solve_batch, start_state, what_data_t
 from pkmcal.identify.covariance import identifiability, machine_covariance
 from pkmcal.identify.gauge import BestFit, ThreeCentres, centre_index
 from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.problem import Measurements
-from pkmcal.identify.solver import Stop
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.solver import Stop
 from test_identify_scene import JOINT_NOISE, guess, make_scene
 
 

@@ -10,13 +10,13 @@ import pytest
 import yaml
 
 from conftest import run
-from pkmcal.calibration import calibrate
+from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.recognise import boards_of, read_photographs
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.hand_eye import solve_pairs
-from pkmcal.recognition import boards_of, read_photographs
-from pkmcal.session import load_session
-from pkmcal.simulate import load_truth
+from pkmcal.session.load import load_session
+from pkmcal.simulation import load_truth
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.gauge import ThreeCentres, apply
 from pkmcal.identify.problem import State
-from pkmcal.session import load_session
-from pkmcal.simulate import Settings, load_truth, simulate_session
+from pkmcal.session.load import load_session
+from pkmcal.simulation import Settings, load_truth, simulate_session
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,20 @@ import cv2
 import numpy as np
 import pytest
 
+from pkmcal.boards.board import Detection, chessboard
+from pkmcal.boards.camera import calibrate_camera, calibrate_photographs, views_of
+from pkmcal.boards.fit import (
+    board_poses,
+    covariance_of,
+    fit_camera,
+    line_offsets,
+    linear_poses,
+    settled_poses,
+)
+from pkmcal.boards.selection import positions
 from pkmcal.cameras import camera_models
-from pkmcal.cameras.calibrate import calibrate_camera, calibrate_photographs, views_of
-from pkmcal.cameras.fit import covariance_of, fit_camera
-from pkmcal.cameras.resection import board_poses, line_offsets, linear_poses, settled_poses
-from pkmcal.cameras.starts import positions
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
-from pkmcal.observe.boards import Detection, chessboard
 from pkmcal.report.camera_page import camera_report_html
 from test_boards import CAMERAS, render, view
 

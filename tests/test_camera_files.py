@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pkmcal.cameras import camera_models, load_camera
-from pkmcal.cameras.foreign import read_camera, write_camera
+from pkmcal.cameras.files import read_camera, write_camera
 from pkmcal.errors import InputError
 
 VALUES = {

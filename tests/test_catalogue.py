@@ -18,7 +18,8 @@ from pkmcal.files import parse_yaml, validate
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import (
     MechanismDocument,
     catalogue,
@@ -27,8 +28,8 @@ from pkmcal.mechanisms import (
     machine_from_document,
     mechanism_text,
 )
-from pkmcal.mechanisms.limbs import closure, dense
-from pkmcal.simulate import (
+from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.simulation import (
     EdgeNoise,
     Settings,
     draw_truth,
@@ -37,7 +38,7 @@ from pkmcal.simulate import (
     simulate_session,
     true_machine,
 )
-from pkmcal.simulate.configurations import draw_configurations
+from pkmcal.simulation.configurations import draw_configurations
 
 NAMES = sorted(n for n in catalogue() if any(r.size for r in load_mechanism(n).radii()))
 """Machines whose legs a camera can see; cranks and sliders are in test_h4 and test_delta."""

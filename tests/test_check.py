@@ -17,7 +17,7 @@ from pkmcal.check import (
     check_session,
 )
 from pkmcal.check_joints import JointCheck, joint_findings
-from pkmcal.session import load_session
+from pkmcal.session.load import load_session
 
 GOOD = StationCheck("front", 15, True, 0.2, 0.04, 0.08, 5.5, 0.05, 0.01, 0.8)
 

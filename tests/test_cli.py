@@ -21,7 +21,7 @@ from pkmcal.cli import main
 from pkmcal.files import read_csv
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.results import load
-from pkmcal.starter import TO_FILL, template_files
+from pkmcal.session.starter import TO_FILL, template_files
 
 COMMANDS = (
     *("demo", "new", "check", "camera", "calibrate", "validate", "servo", "export", "watch"),
@@ -383,7 +383,7 @@ def test_no_traceback_whatever_happens(error, code, said, tmp_path, monkeypatch)
     def fail(_folder):
         raise error
 
-    monkeypatch.setattr("pkmcal.starter.write_session", fail)
+    monkeypatch.setattr("pkmcal.session.starter.write_session", fail)
     monkeypatch.delenv("PKMCAL_DEBUG", raising=False)
     done = run("new", tmp_path)
     assert (done.code, done.out) == (code, "")

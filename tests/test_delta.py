@@ -9,7 +9,7 @@ from pkmcal.geometry.rigid import perturb, pose
 from pkmcal.identify.gauge import alignment, changed_frames, default_gauge, freedoms
 from pkmcal.identify.problem import State
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import closure
+from pkmcal.mechanisms.closure import closure
 from pose_sessions import estimated, measured
 
 DRIVEN = ("delta", "linear-delta", "6-rus", "hexaglide")

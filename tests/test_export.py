@@ -10,7 +10,7 @@ import yaml
 
 from conftest import run
 from export_sources import CAMERA, built, calibration, source_of
-from pkmcal.cameras.foreign import read_camera
+from pkmcal.cameras.files import read_camera
 from pkmcal.cameras.unified import Unified
 from pkmcal.errors import InputError, ResultError
 from pkmcal.export import ros

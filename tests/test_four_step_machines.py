@@ -19,17 +19,16 @@ from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import centre_index, default_gauge
-from pkmcal.identify.problem import Measurements, Mount, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.start import better_start, misfit
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import (
     Machine,
     catalogue,
     load_mechanism,
     mechanism_text,
 )
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.observe.edges import EdgeSet
-from pkmcal.observe.poses import PoseSet
+from pkmcal.mechanisms.closure import limb_ends
 
 MACHINES = ("gough-stewart", "3-rpr", "3-rps", "3-upu", "6-spu-passive", "constant-legs")
 NOISE = 1e-4

@@ -14,7 +14,7 @@ from pkmcal.identify.conditions import Condition, conditions
 from pkmcal.identify.four_step import four_step
 from pkmcal.identify.four_step_model import legs_of
 from pkmcal.mechanisms import load_mechanism, machine_from_document
-from pkmcal.mechanisms.schema import MechanismDocument
+from pkmcal.mechanisms.document import MechanismDocument
 from test_four_step_machines import (
     THREE_BY_THREE,
     THREE_BY_TWO,

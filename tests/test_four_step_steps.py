@@ -33,7 +33,7 @@ from pkmcal.identify.four_step_platform import (
 )
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.registration import fixes_pose, laid, loose
-from pkmcal.observe.poses import PoseSet
+from pkmcal.measurements import PoseSet
 from test_four_step_machines import make_scene
 
 SPATIAL, PLANAR, TRANSLATION = np.eye(6), np.eye(6)[:, [2, 3, 4]], np.eye(6)[:, 3:]
@@ -304,7 +304,7 @@ def constant_legs(rng):
     """Three legs of constant length 1 about fixed centres: a body that they carry."""
     scene = make_scene("constant-legs", rng, 30)
     machine = scene.machine
-    from pkmcal.mechanisms.limbs import leg_readings, limb_ends
+    from pkmcal.mechanisms.closure import leg_readings, limb_ends
 
     ends = limb_ends(
         machine.layout, machine.values, scene.measurements.joints, scene.truth.T_base_platform

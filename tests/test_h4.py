@@ -10,7 +10,7 @@ from pkmcal.identify.assembly import assemble
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.gauge import default_gauge, freedoms, pose_generators
 from pkmcal.mechanisms import kinematics, load_mechanism
-from pkmcal.mechanisms.limbs import closure, dense
+from pkmcal.mechanisms.closure import closure, dense
 from pose_sessions import (
     T_CAMERA_BASE,
     T_PLATFORM_BOARD,

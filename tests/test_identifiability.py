@@ -18,13 +18,13 @@ from pkmcal.identify.bundle import bundle, start_state, what_data_tell
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import apply, default_gauge, freedoms, generators
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.verdict import judge
+from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.observe.edges import Observation
-from pkmcal.simulate import EdgeNoise, Settings, simulate_edges, true_machine
-from pkmcal.simulate.stations import default_stations
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.simulation import EdgeNoise, Settings, simulate_edges, true_machine
+from pkmcal.simulation.stations import default_stations
 from test_joint_machines import JOINT_NOISE, Session, camera
 
 LARGEST = 1.9

@@ -24,7 +24,7 @@ from pkmcal.identify.gauge import (
     station_generators,
     transformation,
 )
-from pkmcal.mechanisms.limbs import closure
+from pkmcal.mechanisms.closure import closure
 from test_identify_scene import make_scene
 
 GAUGES = [ThreeCentres(), ThreeCentres((1, 3, 5)), BestFit()]

@@ -14,11 +14,11 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.identify.assembly import Assembled, assemble
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import BatchState, Data
+from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine, load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.observe.edges import EdgeSet
+from pkmcal.mechanisms.closure import limb_ends
 
 FOCAL = 889.0
 JOINT_NOISE = 3e-6

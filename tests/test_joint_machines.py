@@ -12,10 +12,10 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.identify.problem import Measurements, Mount, State
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements, Mount, PoseSet
 from pkmcal.mechanisms import catalogue, load_mechanism
-from pkmcal.observe.poses import PoseSet
-from pkmcal.simulate import EdgeNoise, Settings, draw_truth, simulate_edges
+from pkmcal.simulation import EdgeNoise, Settings, draw_truth, simulate_edges
 from test_identify_residuals import check
 
 NAMES = sorted(n for n in catalogue() if any(r.size for r in load_mechanism(n).radii()))

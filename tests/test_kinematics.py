@@ -21,8 +21,8 @@ from pkmcal.mechanisms import (
     machine_from_document,
 )
 from pkmcal.mechanisms.carriers.contract import base_carriers
+from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.mechanisms.kinematics import CONVERGED, NEAR_SINGULAR
-from pkmcal.mechanisms.limbs import closure, dense
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=8, deadline=None)

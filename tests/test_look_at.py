@@ -6,7 +6,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from pkmcal.errors import InputError
-from pkmcal.session import look_at_pose
+from pkmcal.session.load import look_at_pose
 
 coordinate = st.floats(-10, 10)
 point = st.tuples(coordinate, coordinate, coordinate)

@@ -12,7 +12,7 @@ from pkmcal.control.seen import seen_machine, true_edges
 from pkmcal.errors import GeometryError, InputError, PkmcalError
 from pkmcal.geometry.rigid import look_at, perturb, pose_difference
 from pkmcal.mechanisms import catalogue, load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from servo_lab import BESIDE, MIRROR, PERSPECTIVE, WITHIN, Lab
 
 MACHINE = load_mechanism("gough-stewart")

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from pkmcal.boards.detect import detect_boards, marker_share
+from pkmcal.boards.find import detect_board
 from pkmcal.errors import InputError
-from pkmcal.observe.board_diagnosis import marker_share
-from pkmcal.observe.boards import detect_board, detect_boards
 from test_boards import CAMERAS, FILES, board_of, render
 from test_targets import poses_around
 

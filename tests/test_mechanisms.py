@@ -19,8 +19,7 @@ from pkmcal.mechanisms import (
     mechanism_text,
 )
 from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
-from pkmcal.mechanisms.limbs import MOTIONS
-from pkmcal.mechanisms.rods import ActuatedLength, ConstantLength
+from pkmcal.mechanisms.document import MOTIONS, ActuatedLength, ConstantLength
 
 
 @pytest.fixture(params=sorted(catalogue()), scope="module")

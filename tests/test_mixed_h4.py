@@ -10,11 +10,9 @@ import pytest
 
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.problem import Measurements, Mount
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe.edges import EdgeSet
-from pkmcal.observe.poses import PoseSet
-from pkmcal.simulate import EdgeNoise, simulate_edges, true_machine, with_forearms
+from pkmcal.simulation import EdgeNoise, simulate_edges, true_machine, with_forearms
 from test_joint_machines import camera
 
 READING = 1e-5

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from pkmcal.observe.legs import Photographs, measure, photographs_of
-from pkmcal.observe.lines import FLOOR, HALVES, edge_set, fit_edges
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
-from pkmcal.observe.profiles import FAINT
+from pkmcal.observe.profiles import FAINT, FLOOR, HALVES, edge_set, fit_edges
 from test_observe_drawing import (
     FRONT,
     camera_of,

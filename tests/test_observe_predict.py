@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from pkmcal.geometry.rigid import look_at
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.predict import (
     JOINT_MARGIN,
     edge_points,

@@ -7,11 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
-from pkmcal.observe.distance import DIRECTIONS, direction_of, distance_tables
-from pkmcal.observe.legs import photographs_of, search
+from pkmcal.observe.legs import REACH, photographs_of, search, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
-from pkmcal.observe.search import REACH, search_legs
-from pkmcal.observe.stations import View, find_station
+from pkmcal.observe.stations import DIRECTIONS, View, direction_of, distance_tables, find_station
 from test_observe_drawing import (
     FRONT,
     camera_of,

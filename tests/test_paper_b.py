@@ -14,8 +14,8 @@ from pkmcal.geometry import great_circles
 from pkmcal.geometry.cylinders import edge_normals, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
 from pkmcal.identify import linear
-from pkmcal.simulate import Settings, simulate_session
-from pkmcal.simulate.stations import StationPose
+from pkmcal.simulation import Settings, simulate_session
+from pkmcal.simulation.stations import StationPose
 
 RADIUS = 0.014
 CONFIGURATIONS, LEGS = 60, 6

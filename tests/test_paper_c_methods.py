@@ -19,11 +19,10 @@ from pkmcal.identify.inverse_kinematic import (
     unknown_names,
 )
 from pkmcal.identify.measured_platform import seen_platform, taken
-from pkmcal.identify.problem import Mount
 from pkmcal.identify.rotation_axis import facing, rotation_axis
+from pkmcal.measurements import Mount, PoseSet
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import MOTIONS
-from pkmcal.observe.poses import PoseSet
+from pkmcal.mechanisms.document import MOTIONS
 from pkmcal.reproduce.paper_c_simulation import Settings, measurements, model, simulate
 from test_hand_eye import anywhere, measured, platform_poses, seen_from, true_machine
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pkmcal.errors import InputError
-from pkmcal.photographs import photograph_header
+from pkmcal.session.photographs import photograph_header
 
 
 def image(path, width, height):

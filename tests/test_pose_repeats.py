@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pkmcal.boards.board import Detection
+from pkmcal.boards.poses import mean_poses, one_a_configuration
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
-from pkmcal.observe.boards import Detection
-from pkmcal.observe.pose_repeats import mean_poses, one_a_configuration
 from test_targets import CAMERA, board, poses_around, seen  # noqa: F401 - board is a fixture
 
 CONFIGURATIONS, REPEATS = 300, 5

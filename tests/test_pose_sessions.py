@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from pkmcal.calibration import calibrate
+from pkmcal.calibration.calibrate import calibrate
 from pkmcal.check import Level, check_session
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, yaml_text
@@ -21,9 +21,9 @@ from pkmcal.geometry.rigid import (
 from pkmcal.identify.hand_eye import solve_pairs
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.results import load, save
-from pkmcal.session import load_session
-from pkmcal.simulate.configurations import draw_configurations
-from pkmcal.simulate.truth import true_machine
+from pkmcal.session.load import load_session
+from pkmcal.simulation.configurations import draw_configurations
+from pkmcal.simulation.truth import true_machine
 
 T_TRACKER_BASE = pose(rotation(np.array([0.4, -0.2, 2.0])), np.array([1.5, 0.3, -0.4]))
 T_PLATFORM_TARGET = pose(rotation(np.array([0.3, 1.2, 0.4])), np.array([0.03, 0.02, -0.04]))

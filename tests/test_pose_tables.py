@@ -7,7 +7,7 @@ import pytest
 
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import pose, pose_difference, rotation
-from pkmcal.pose_tables import check_lengths, read_poses
+from pkmcal.session.poses import check_lengths, read_poses
 
 NAMES = tuple(f"{k:03d}" for k in range(8))
 FULL = "configuration,x,y,z,qw,qx,qy,qz"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.observe.poses import PoseSet, concatenate_poses
+from pkmcal.measurements import PoseSet, concatenate_poses
 
 
 def some(n, station=0):

@@ -9,19 +9,22 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration import calibrate
+from pkmcal.calibration.calibrate import calibrate
 from pkmcal.check import Level
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
 from pkmcal.identify.axis_measurements import to_coordinates
+from pkmcal.measurements import concatenate
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe.edges import concatenate
 from pkmcal.observe.legs import StationEdges
-from pkmcal.observe.motions import Cylinders, axis_coordinates, by_ends, fit_motions
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.observe.repeats import (
+    Cylinders,
+    axis_coordinates,
+    by_ends,
     combined,
+    fit_motions,
     groups_of,
     mean_covariance,
     mean_edges,
@@ -30,10 +33,10 @@ from pkmcal.observe.repeats import (
     same_edges,
 )
 from pkmcal.repeatability import _findings, _Look, _station_row
-from pkmcal.session import load_session
-from pkmcal.simulate import EdgeNoise, Settings, load_truth, simulate_edges, simulate_session
-from pkmcal.simulate.configurations import draw_configurations
-from pkmcal.simulate.demo import camera_of_size
+from pkmcal.session.load import load_session
+from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges, simulate_session
+from pkmcal.simulation.configurations import draw_configurations
+from pkmcal.simulation.demo import camera_of_size
 
 CAMERA = camera_of_size((640, 480))
 STATION = look_at(np.array([0.1, -0.9, 0.25]), np.array([0.0, 0.0, 0.2]), np.array([0, 0, 1.0]))

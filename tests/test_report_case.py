@@ -10,11 +10,11 @@ from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.geometry.cylinders import contour_point, edge_normals, tangent_basis
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.problem import Estimate, State, Statistics
+from pkmcal.measurements import EdgeSet, Observation, Rejection
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe.edges import EdgeSet, Observation, Rejection
 from pkmcal.observe.predict import legs_in_camera
-from pkmcal.photographs import Photograph
-from pkmcal.session import Session, Station
+from pkmcal.session.load import Session, Station
+from pkmcal.session.photographs import Photograph
 
 OUTWARD = 0.25
 """Pixels that the case's edges lie outward, besides the camera's own shift."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pkmcal.observe.edges import Rejection
+from pkmcal.measurements import Rejection
 from pkmcal.report.page import report_html
 from test_report_case import Case, Verdict, make_case
 

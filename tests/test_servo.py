@@ -9,29 +9,29 @@ import pytest
 
 from pkmcal.cameras import camera_models
 from pkmcal.control.analysis import equilibria, matrix_at, of_legs, subsets, visibility
-from pkmcal.control.ends import End
-from pkmcal.control.estimates import Uncertainty, estimates
 from pkmcal.control.image import Eye, responses
 from pkmcal.control.laws import limited, task_of
 from pkmcal.control.seen import legs_at, seen_machine, true_edges
 from pkmcal.control.simulation import (
+    End,
     Loop,
     assembly_sign,
+    loop_factor,
+    one_image,
     outside,
     platform_joints,
     simulate,
 )
-from pkmcal.control.steady import loop_factor, one_image
-from pkmcal.control.study import Plan, Scene, check_loop, check_pose, study
+from pkmcal.control.study import Plan, Scene, Uncertainty, check_loop, check_pose, estimates, study
 from pkmcal.control.words import judgement
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
-from pkmcal.simulate.configurations import draw_configurations
-from pkmcal.simulate.demo import demo_camera
-from pkmcal.simulate.edges import EdgeNoise, simulate_edges
-from pkmcal.simulate.stations import default_stations
+from pkmcal.simulation.configurations import draw_configurations
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.stations import default_stations
 
 QUIET = EdgeNoise(0.0, 0.0)
 CLEAN = Loop(noise=QUIET, joint_noise=0.0, rate=10.0, delay=0, duration=8.0)

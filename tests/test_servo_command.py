@@ -11,7 +11,7 @@ import pytest
 
 from conftest import run
 from pkmcal.cameras.files import camera_text
-from pkmcal.simulate.demo import demo_camera
+from pkmcal.simulation.demo import demo_camera
 
 QUICK = ("--runs", 3, "--rate", 6, "--noise", 0, "--joint-noise", 0, "--duration", 8, "--delay", 0)
 CHROMIUM = next(

@@ -10,8 +10,8 @@ import pytest
 
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
-from pkmcal.readings import check_readings
-from pkmcal.session import load_session
+from pkmcal.session.load import load_session
+from pkmcal.session.readings import check_readings
 
 SESSION = """\
 pkmcal: 1

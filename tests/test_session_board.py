@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from pkmcal.session import load_session
+from pkmcal.session.load import load_session
 from test_session import change, fault, folder, image
 
 __all__ = ["folder"]

@@ -14,9 +14,9 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import contour_point, edge_normals
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose_difference
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import closure
-from pkmcal.session import load_session, look_at_pose
-from pkmcal.simulate import (
+from pkmcal.mechanisms.closure import closure
+from pkmcal.session.load import load_session, look_at_pose
+from pkmcal.simulation import (
     EdgeNoise,
     Sensor,
     Settings,
@@ -26,13 +26,13 @@ from pkmcal.simulate import (
     simulate_session,
     true_machine,
 )
-from pkmcal.simulate.casting import Part, Scene
-from pkmcal.simulate.configurations import draw_configurations, usable
-from pkmcal.simulate.demo import MECHANISM, SETTINGS, demo_camera
-from pkmcal.simulate.render import View, photograph, render
-from pkmcal.simulate.scene import Finish, discs_of, machine_parts
-from pkmcal.simulate.shapes import Ball, Box, Cylinder, Wall
-from pkmcal.simulate.surfaces import Lamp, Lighting, Material, SmoothNoise
+from pkmcal.simulation.casting import Part, Scene
+from pkmcal.simulation.configurations import draw_configurations, usable
+from pkmcal.simulation.demo import MECHANISM, SETTINGS, demo_camera
+from pkmcal.simulation.render import View, photograph, render
+from pkmcal.simulation.scene import Finish, discs_of, machine_parts
+from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
+from pkmcal.simulation.surfaces import Lamp, Lighting, Material, SmoothNoise
 
 Z = np.array([0.0, 0.0, 1.0])
 DARK = Lighting((), 0.0, 0.0)
@@ -221,7 +221,7 @@ def test_edges_have_the_stated_noise(setting):
 
 def _check_exact(machine, T_camera_base, poses, edges, e):
     """One edge's normal is the geometry's."""
-    from pkmcal.mechanisms.limbs import limb_ends
+    from pkmcal.mechanisms.closure import limb_ends
 
     ends = limb_ends(machine.layout, machine.values, np.zeros(6), poses[edges.configuration[e]])
     T, leg = T_camera_base[edges.station[e]], edges.leg[e]
@@ -429,7 +429,7 @@ def test_the_demonstration_can_be_drawn():
 
 def test_importing_is_quick():
     code = (
-        "import sys, pkmcal.simulate; "
+        "import sys, pkmcal.simulation; "
         "sys.exit(any(name in sys.modules for name in ('cv2', 'scipy')))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -14,9 +14,9 @@ from pkmcal.commands.comparison import compare
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.profiles import Profiles, estimate_blur, profile_offsets
-from pkmcal.simulate import (
+from pkmcal.simulation import (
     Settings,
     board_for,
     draw_truth,
@@ -24,13 +24,13 @@ from pkmcal.simulate import (
     simulate_session,
     with_forearms,
 )
-from pkmcal.simulate.board import board_from_fields
-from pkmcal.simulate.configurations import FARTHEST_TURN, unfolded
-from pkmcal.simulate.demo import camera_of_size
-from pkmcal.simulate.drives import drives_of, reaches, side_bars
-from pkmcal.simulate.scene import Finish, discs_of, machine_parts
-from pkmcal.simulate.shapes import Cylinder
-from pkmcal.simulate.surfaces import SmoothNoise
+from pkmcal.simulation.board import board_from_fields
+from pkmcal.simulation.configurations import FARTHEST_TURN, unfolded
+from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.drives import drives_of, reaches, side_bars
+from pkmcal.simulation.scene import Finish, discs_of, machine_parts
+from pkmcal.simulation.shapes import Cylinder
+from pkmcal.simulation.surfaces import SmoothNoise
 from test_catalogue import whitened
 
 NAMES = ("h4", "delta", "6-rus", "linear-delta", "hexaglide")

@@ -9,13 +9,14 @@ import pytest
 
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.registration import Dense, minimise_dense
-from pkmcal.identify.solver import (
+from pkmcal.solver import (
     Linear,
     Stop,
     damped_step,
     eliminate,
     minimise,
     reduced_normal,
+    take,
 )
 from test_identify_scene import guess, make_scene
 
@@ -105,7 +106,7 @@ def test_runs_of_a_batch_do_not_touch_each_other():
         only = np.array([run])
         alone = solve_batch(
             assembled.problem.select(only),
-            assembled.problem.take(start, only),
+            take(start, only),
             robust=False,
             scale_noise=False,
         )

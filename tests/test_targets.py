@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.boards.board import Detection, chessboard
+from pkmcal.boards.poses import board_views, detect_again, detect_in, moving_poses, standing
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose, pose_difference, rotation
-from pkmcal.observe.boards import Detection, chessboard
-from pkmcal.observe.standing import standing
-from pkmcal.observe.targets import board_views, detect_again, detect_in, moving_poses
 from test_boards import CAMERAS, FILES, board_of, render
 
 CAMERA = CAMERAS["pinhole"]
@@ -194,7 +193,7 @@ def test_slow_ways_are_tried_on_some_chessboards_only(tmp_path, monkeypatch):
         none = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
         return Detection(name, (8, 6), *none, reason="none")
 
-    monkeypatch.setattr("pkmcal.observe.targets.detect_board", detect)
+    monkeypatch.setattr("pkmcal.boards.poses.detect_board", detect)
     images = [np.zeros((6, 8), dtype=np.uint8)] * 9
     kinds = {kind: board_of(tmp_path, FILES[kind]) for kind in ("chessboard", "charuco")}
     for kind, most, count in (("chessboard", 3, 3), ("chessboard", 0, 0), ("charuco", 9, 0)):

@@ -9,14 +9,21 @@ import pytest
 
 from pkmcal.control.laws import task_of
 from pkmcal.control.seen import legs_at, seen_machine, true_edges
-from pkmcal.control.track import Sight, start_state, track
-from pkmcal.control.track_fit import corrected_pose, edge_rows, leg_lines, weighted
+from pkmcal.control.track import (
+    Sight,
+    corrected_pose,
+    edge_rows,
+    leg_lines,
+    start_state,
+    track,
+    weighted,
+)
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
+from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.observe.edges import EdgeSet
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.predict import tubes_of
 from servo_lab import BESIDE, MIRROR, PERSPECTIVE, WITHIN, Lab
 

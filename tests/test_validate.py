@@ -13,12 +13,12 @@ from conftest import run
 from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.problem import Measurements
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulate import Settings
-from pkmcal.simulate.demo import demo_camera
-from pkmcal.simulate.edges import EdgeNoise, simulate_edges
-from pkmcal.simulate.truth import draw_truth, true_machine
+from pkmcal.simulation import Settings
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.truth import draw_truth, true_machine
 from pkmcal.validate.held import held, predict
 from pkmcal.validate.holdouts import by_regions, chosen, hold_out, judge, select
 from pkmcal.validate.judged import promise, ratio, rms, weighed

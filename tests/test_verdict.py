@@ -13,8 +13,8 @@ from pkmcal.identify.conditions import conditions
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.unidentified import Findings, explain, seen_legs
 from pkmcal.identify.verdict import LEFT_OPEN, judge
+from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe.edges import Observation
 from pkmcal.report.parameters import parameter_groups, unidentified
 from pkmcal.result_document import identifiability_of
 from test_words import heaved, make, moved

@@ -12,13 +12,13 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.identify.problem import Measurements
-from pkmcal.identify.solver import Solution, Stop
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulate import Settings
-from pkmcal.simulate.demo import demo_camera
-from pkmcal.simulate.edges import EdgeNoise, simulate_edges
-from pkmcal.simulate.truth import draw_truth, true_machine
+from pkmcal.simulation import Settings
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.truth import draw_truth, true_machine
+from pkmcal.solver import Solution, Stop
 from pkmcal.watching.causes import (
     Cause,
     arms,

@@ -11,20 +11,19 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration import calibrate
+from pkmcal.calibration.calibrate import calibrate
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.bundle import start_state
-from pkmcal.identify.problem import Measurements
+from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
-from pkmcal.observe.edges import Observation
 from pkmcal.results import load, save
-from pkmcal.session import load_session
-from pkmcal.simulate import Settings, load_truth, simulate_session
-from pkmcal.simulate.demo import demo_camera
-from pkmcal.simulate.edges import EdgeNoise, simulate_edges
-from pkmcal.simulate.truth import draw_truth
+from pkmcal.session.load import load_session
+from pkmcal.simulation import Settings, load_truth, simulate_session
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.truth import draw_truth
 from pkmcal.validate.independence import digests
 from pkmcal.watch import watch
 from pkmcal.watching.causes import magnification

@@ -16,7 +16,7 @@ from pkmcal.identify.sentences import MOST
 from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
 from pkmcal.identify.unidentified import describe, joined_by_boards, seen_legs, vectors
 from pkmcal.mechanisms import kinematics, load_mechanism
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from test_identify_scene import Scene, _edges, _index, stations
 
 
@@ -386,8 +386,7 @@ def test_groups_follow_what_stations_share():
 
 
 def test_a_board_on_the_base_joins_stations():
-    from pkmcal.identify.problem import Measurements, Mount
-    from pkmcal.observe.poses import PoseSet
+    from pkmcal.measurements import Measurements, Mount, PoseSet
 
     edges = make("gough-stewart", n=1).measurements(np.random.default_rng(0)).edges
     poses = PoseSet(

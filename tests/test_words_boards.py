@@ -13,15 +13,15 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.motions import Situation, sizes
-from pkmcal.identify.solver import Stop
 from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
 from pkmcal.identify.unidentified import conventions_held, explain
 from pkmcal.identify.verdict import judge
+from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.observe.edges import EdgeSet, Observation
 from pkmcal.report.identifiability import section
 from pkmcal.report.parameters import bound_together, grouped, tight_pairs
+from pkmcal.solver import Stop
 from pose_sessions import estimated, measured, papers_poses, upright
 
 

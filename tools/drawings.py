@@ -16,11 +16,11 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.cylinders import edge_normals
 from pkmcal.geometry.rigid import apply, inverse, look_at
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe import legs, profiles
+from pkmcal.observe.legs import sample
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
-from pkmcal.observe.search import sample
-from pkmcal.simulate import Truth
+from pkmcal.simulation import Truth
 
 if TYPE_CHECKING:
     from pictures import Case

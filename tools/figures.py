@@ -162,7 +162,8 @@ def measure(data: Path, render: Path, work: Path, only: set[str]) -> dict[str, A
         "--regions", "2"))  # fmt: skip
     take("servo", lambda: command("servo", "gough-stewart", "-o", work / "servo"))
     take("servo calibrated", lambda: command(
-        "servo", calibration, "-o", work / "servo2", "--runs", "20"))  # fmt: skip
+        "servo", calibration, "-o", work / "servo2", "--runs", "20",
+        "--session", data / "hexapod-pinhole"))  # fmt: skip
     take("exports pinhole", lambda: exported(calibration, "pinhole"))
     for name in ("gough-stewart", "delta", "linear-delta", "h4", "h4-rods", "3-upu", "3-rps"):
         take(f"exports {name}", lambda n=name: exported(n, n))

@@ -23,18 +23,18 @@ import numpy as np
 
 import pkmcal
 from pkmcal.arrays import Array
-from pkmcal.calibration import Calibration
+from pkmcal.calibration.calibrate import Calibration
+from pkmcal.calibration.recognise import platform_poses, read_photographs, recognise
 from pkmcal.commands.comparison import compare
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
-from pkmcal.identify.problem import Measurements
+from pkmcal.measurements import Measurements
 from pkmcal.observe import legs
-from pkmcal.recognition import platform_poses, read_photographs, recognise
 from pkmcal.report import page, templating
 from pkmcal.results import save
-from pkmcal.session import Session, load_session
-from pkmcal.simulate import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
-from pkmcal.simulate.demo import MECHANISM, SEED, SETTINGS, demo_camera
+from pkmcal.session.load import Session, load_session
+from pkmcal.simulation import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
+from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera
 
 sys.path.insert(0, str(Path(__file__).parent))
 import drawings

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 from pkmcal import errors
 
 if TYPE_CHECKING:
-    from pkmcal.calibration import calibrate
+    from pkmcal.calibration.calibrate import calibrate
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import Machine, load_mechanism
-    from pkmcal.session import load_session
+    from pkmcal.session.load import load_session
 
 __version__ = "0.1.0"
 
@@ -35,10 +35,10 @@ __all__ = [
 
 _HOMES = {
     "Machine": "pkmcal.mechanisms",
-    "calibrate": "pkmcal.calibration",
+    "calibrate": "pkmcal.calibration.calibrate",
     "load_camera": "pkmcal.cameras",
     "load_mechanism": "pkmcal.mechanisms",
-    "load_session": "pkmcal.session",
+    "load_session": "pkmcal.session.load",
 }
 
 

@@ -14,21 +14,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.calibration import Progress
-from pkmcal.check_board import BoardCheck, BoardsCheck, check_boards
-from pkmcal.check_joints import JointCheck, joint_checks, joint_findings
-from pkmcal.check_poses import pose_findings
-from pkmcal.errors import InputError, PkmcalError
-from pkmcal.files import listed, plain
-from pkmcal.gathering import known_stations
-from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
-from pkmcal.observe import legs
-from pkmcal.observe.images import decode
-from pkmcal.observe.quality import Quality, quality, unrecognised_quality
-from pkmcal.outcome import Finding, Level, wrong
-from pkmcal.photographs import label_of
-from pkmcal.recognition import (
+from pkmcal.calibration.calibrate import Progress
+from pkmcal.calibration.gather import known_stations
+from pkmcal.calibration.recognise import (
     Recognition,
     board_images,
     check_observable,
@@ -37,8 +25,20 @@ from pkmcal.recognition import (
     recognise,
     why_unrecognised,
 )
-from pkmcal.session import Session, Station, load_session
-from pkmcal.starter import untouched_files
+from pkmcal.check_board import BoardCheck, BoardsCheck, check_boards
+from pkmcal.check_joints import JointCheck, joint_checks, joint_findings
+from pkmcal.check_poses import pose_findings
+from pkmcal.errors import InputError, PkmcalError
+from pkmcal.files import listed, plain
+from pkmcal.geometry.rigid import inverse, pose_difference
+from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
+from pkmcal.observe import legs
+from pkmcal.observe.images import decode
+from pkmcal.observe.quality import Quality, quality, unrecognised_quality
+from pkmcal.outcome import Finding, Level, wrong
+from pkmcal.session.load import Session, Station, load_session
+from pkmcal.session.photographs import label_of
+from pkmcal.session.starter import untouched_files
 
 OVEREXPOSED = 0.25
 """Share of saturated pixels on the legs beyond which edges are lost: a highlight takes a tenth."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pkmcal.arrays import Integers
-from pkmcal.boards import Boards, StationBoard, board_of, station_board
+from pkmcal.boards.views import Boards, StationBoard, board_of, station_board
 from pkmcal.errors import InputError
 from pkmcal.outcome import Finding, Level, wrong
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 POOR = 0.5
 """px rms from which the corners are worse than any sharp photograph of a flat board has them."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.files import listed
 from pkmcal.outcome import Finding, Level
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 LITTLE_USED = 0.5
 """Share of a joint's range below which its configurations are crowded."""

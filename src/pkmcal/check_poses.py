@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from pkmcal.boards import Boards
-from pkmcal.doubts import check_poses, richer_models
+from pkmcal.boards.views import Boards
+from pkmcal.calibration.doubts import check_poses, richer_models, turning
+from pkmcal.calibration.gather import known_stations, measurements_of, refinement_of, with_poses
+from pkmcal.calibration.turns import identify_poses
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.gathering import known_stations, measurements_of, with_poses
 from pkmcal.identify.verdict import POOR
 from pkmcal.outcome import Finding, Level, wrong
-from pkmcal.refinement import refinement_of
-from pkmcal.session import Session
-from pkmcal.turning import turning
-from pkmcal.turns import identify_poses
+from pkmcal.session.load import Session
 
 
 def pose_findings(session: Session, boards: Boards) -> list[Finding]:

@@ -14,33 +14,31 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.calibration import Calibration, Progress, calibrate
+from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
+from pkmcal.calibration.recognise import read_photographs
 from pkmcal.check import Finding, Level
 from pkmcal.errors import InputError
 from pkmcal.files import plain
 from pkmcal.identify.axis_measurements import AxisNoise
+from pkmcal.measurements import EdgeSet
 from pkmcal.observe import legs
-from pkmcal.observe.edges import EdgeSet
-from pkmcal.observe.motions import (
+from pkmcal.observe.predict import legs_in_camera
+from pkmcal.observe.repeats import (
     Cylinders,
+    Groups,
     axis_coordinates,
     by_camera,
     by_ends,
     by_platform,
-    fit_motions,
-    half_angles,
-)
-from pkmcal.observe.predict import legs_in_camera
-from pkmcal.observe.repeats import (
-    Groups,
     deviations,
+    fit_motions,
     groups_of,
+    half_angles,
     odd_ones,
     pixel_units,
     same_edges,
 )
-from pkmcal.recognition import read_photographs
-from pkmcal.session import Session, Station, load_session
+from pkmcal.session.load import Session, Station, load_session
 
 SHARED = 0.3
 """Share of the scatter, above what chance explains, from which its cause is told."""

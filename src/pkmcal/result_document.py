@@ -21,7 +21,7 @@ from pkmcal.validate.figures import holdout_document
 from pkmcal.validate.independence import digests
 
 if TYPE_CHECKING:
-    from pkmcal.calibration import Calibration
+    from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.unidentified import Findings
     from pkmcal.report.parameters import Group
 

@@ -28,7 +28,7 @@ from pkmcal.outcome import Verdict
 from pkmcal.result_document import FORMAT, document_of
 
 if TYPE_CHECKING:
-    from pkmcal.calibration import Calibration
+    from pkmcal.calibration.calibrate import Calibration
 
 MECHANISM, EVERYTHING, REPORT = "mechanism.yaml", "calibration.json", "report.html"
 FILES = (REPORT, MECHANISM, EVERYTHING)

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Booleans
-from pkmcal.calibration import Calibration, Progress, calibrate
+from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
 from pkmcal.errors import InputError
 from pkmcal.files import listed, plain
 from pkmcal.identify.assembly import seen_configurations
 from pkmcal.outcome import Verdict
 from pkmcal.results import SavedCalibration, load
-from pkmcal.session import Session, load_session
+from pkmcal.session.load import Session, load_session
 from pkmcal.validate.holdouts import select
 from pkmcal.validate.independence import check_machine, known_rows
 from pkmcal.watching.evidence import Evidence, Trust, evidence

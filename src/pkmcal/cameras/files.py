@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.cameras.contract import Camera, camera_models
+from pkmcal.cameras.contract import LEAST_FOCAL, Camera, camera_models
 from pkmcal.errors import InputError
-from pkmcal.files import closest, read_yaml, validate, write_text, yaml_text
+from pkmcal.files import (
+    Document,
+    closest,
+    listed,
+    parse_yaml,
+    read_text,
+    read_yaml,
+    shown,
+    validate,
+    write_text,
+    yaml_text,
+)
 
 
 def load_camera(path: Path | str, label: str | None = None) -> Camera:
@@ -62,3 +75,335 @@ def camera_text(camera: Camera) -> str:
     if camera.covariance is not None:
         document["covariance"] = camera.covariance.tolist()
     return yaml_text(document)
+
+
+FORMATS = ("opencv", "ros", "kalibr")
+SAME = 1e-12
+"""Relative difference of a number before and after; decimal text of sixteen digits keeps it."""
+_ROS = {"plumb_bob": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
+_KALIBR = {
+    ("pinhole", "radtan"): "pinhole",
+    ("pinhole", "none"): "pinhole",
+    ("pinhole", "equi"): "fisheye",
+    ("omni", "radtan"): "unified",
+    ("omni", "none"): "unified",
+}
+_OPENCV_NAMES: dict[str, tuple[str, ...]] = {
+    "matrix": ("camera_matrix", "cameraMatrix", "K", "Camera_Matrix"),
+    "distortion": ("distortion_coefficients", "distCoeffs", "D", "Distortion_Coefficients"),
+    "width": ("image_width", "image_Width", "width"),
+    "height": ("image_height", "image_Height", "height"),
+    "xi": ("xi", "Xi"),
+}
+
+
+def read_camera(path: Path | str, camera: str | None = None) -> Camera:
+    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; which one is told by its content.
+
+    camera : name of one of several in a Kalibr file, such as cam1.
+    """
+    path = Path(path)
+    text = read_text(path)
+    if "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv")):
+        return _from_opencv(text, path.name)
+    document = parse_yaml(text, path)
+    if "model" in document.data:
+        return load_camera(path)
+    if "camera_matrix" in document.data:
+        return _from_ros(document)
+    cameras = [key for key, value in document.data.items() if _is_kalibr(value)]
+    if cameras:
+        return _from_kalibr(document, cameras, camera)
+    raise InputError(
+        "this is no camera file that is known",
+        where=path.name,
+        found=f"the keys {listed(list(document.data), 4)}",
+        expected="model (pkmcal), camera_matrix (OpenCV, ROS), or camera_model under cam0 (Kalibr)",
+    )
+
+
+def write_camera(camera: Camera, path: Path | str, form: str) -> None:
+    """Write a camera for another program; it is read back and compared before it is written.
+
+    form : opencv (XML where the path ends so, else YAML), ros or kalibr.
+    """
+    path = Path(path)
+    if form not in FORMATS:
+        raise InputError(
+            "no such format of camera files",
+            found=form,
+            expected=closest(form, FORMATS) or listed(FORMATS),
+        )
+    if form == "opencv":
+        text = _opencv_text(camera, xml=path.suffix.lower() == ".xml")
+        again = _from_opencv(text, path.name)
+    elif form == "ros":
+        text = yaml_text(_ros_data(camera, path.stem))
+        again = _from_ros(parse_yaml(text, path))
+    else:
+        text = yaml_text({"cam0": _kalibr_data(camera)})
+        again = _from_kalibr(parse_yaml(text, path), ["cam0"], None)
+    same = type(again) is type(camera) and tuple(again.image_size) == tuple(camera.image_size)
+    if not same or not np.allclose(again.parameters, camera.parameters, rtol=SAME, atol=1e-300):
+        raise InputError(
+            f"the format {form} does not keep this camera", where=path.name, found=again.model
+        )
+    write_text(path, text)
+
+
+def _from_opencv(text: str, label: str) -> Camera:
+    import cv2
+
+    try:
+        storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+        found: dict[str, Any] = {
+            key: _opencv_node(storage, names) for key, names in _OPENCV_NAMES.items()
+        }
+        flag = storage.getNode("fisheye_model")
+        fisheye = (not flag.empty() and flag.real() != 0) or "fisheye" in _word(storage)
+        storage.release()
+    except cv2.error:
+        raise InputError(
+            "not valid as OpenCV writes it",
+            where=label,
+            next_step="Write it again with cv2.FileStorage",
+        ) from None
+    for key in ("matrix", "width", "height"):
+        if found[key] is None:
+            raise InputError(
+                f"the camera's {key} is missing", where=label, expected=_OPENCV_NAMES[key][0]
+            )
+    size = (round(float(found["width"][0])), round(float(found["height"][0])))
+    k = found["distortion"] if found["distortion"] is not None else np.zeros(0)
+    xi = found["xi"]
+    model = "unified" if xi is not None else "fisheye" if fisheye else "pinhole"
+    return _made(model, size, found["matrix"], k, None if xi is None else float(xi[0]), label)
+
+
+def _word(storage: Any) -> str:
+    """The distortion model's name, where the file has one."""
+    node = storage.getNode("distortion_model")
+    return node.string() if not node.empty() and node.isString() else ""
+
+
+def _opencv_node(storage: Any, names: tuple[str, ...]) -> Array | None:
+    for name in names:
+        node = storage.getNode(name)
+        if node.empty():
+            continue
+        if node.isInt() or node.isReal():
+            return np.array([node.real()])
+        matrix = node.mat()
+        if matrix is not None:
+            return np.asarray(matrix, dtype=float).reshape(-1)
+    return None
+
+
+def _opencv_text(camera: Camera, xml: bool) -> str:
+    import cv2
+
+    form = cv2.FileStorage_FORMAT_XML if xml else cv2.FileStorage_FORMAT_YAML
+    storage = cv2.FileStorage("", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY | form)
+    values = _named(camera)
+    storage.write("image_width", int(camera.image_size[0]))
+    storage.write("image_height", int(camera.image_size[1]))
+    storage.write("camera_matrix", _matrix(values))
+    storage.write("distortion_coefficients", np.array(camera.document()["distortion"])[:, None])
+    if camera.model == "fisheye":
+        storage.write("fisheye_model", 1)
+    if camera.model == "unified":
+        storage.write("xi", np.array([[values["xi"]]]))
+    return storage.releaseAndGetString()
+
+
+def _from_ros(document: Document) -> Camera:
+    word = document.data.get("distortion_model", "plumb_bob")
+    if word not in _ROS:
+        raise _not_ours(document.where("distortion_model"), word, _ROS)
+    size = _size(document, ("image_width",), ("image_height",))
+    matrix = _numbers(document, ("camera_matrix", "data"), (9,))
+    k = np.zeros(0)
+    if "distortion_coefficients" in document.data:
+        k = _numbers(document, ("distortion_coefficients", "data"), range(15))
+    return _made(_ROS[word], size, matrix, k, None, document.where("camera_matrix"))
+
+
+def _ros_data(camera: Camera, name: str) -> dict[str, Any]:
+    words = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
+    if camera.model not in words:
+        raise InputError(
+            f"ROS camera_info has no distortion model for a {camera.model} camera",
+            expected="pinhole or fisheye",
+            next_step="Write it for OpenCV or Kalibr, or calibrate with the model fisheye",
+        )
+    matrix = _matrix(_named(camera))
+    k = camera.document()["distortion"]
+    projection = np.concatenate([matrix, np.zeros((3, 1))], axis=1)
+
+    def table(values: Array) -> dict[str, Any]:
+        rows, columns = values.shape
+        return {"rows": rows, "cols": columns, "data": values.reshape(-1).tolist()}
+
+    return {
+        "image_width": int(camera.image_size[0]),
+        "image_height": int(camera.image_size[1]),
+        "camera_name": name,
+        "camera_matrix": table(matrix),
+        "distortion_model": words[camera.model],
+        "distortion_coefficients": table(np.array([k])),
+        "rectification_matrix": table(np.eye(3)),
+        "projection_matrix": table(projection),
+    }
+
+
+def _is_kalibr(value: Any) -> bool:
+    return isinstance(value, dict) and "camera_model" in value
+
+
+def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> Camera:
+    if wanted is None and len(cameras) > 1:
+        raise InputError(
+            "the file holds several cameras", where=document.label, found=listed(cameras),
+            next_step="Name one of them",
+        )  # fmt: skip
+    key = wanted or cameras[0]
+    if key not in cameras:
+        raise InputError(
+            "the file has no such camera", where=document.label, found=key, expected=listed(cameras)
+        )
+    data = document.data[key]
+    pair = (str(data["camera_model"]), str(data.get("distortion_model", "none")))
+    if pair not in _KALIBR:
+        known = ["-".join(names) for names in _KALIBR]
+        raise _not_ours(document.where(key, "camera_model"), "-".join(pair), known)
+    model = _KALIBR[pair]
+    count = 5 if model == "unified" else 4
+    values = _numbers(document, (key, "intrinsics"), (count,))
+    size = _size(document, (key, "resolution", 0), (key, "resolution", 1))
+    k = np.zeros(0)
+    if pair[1] != "none":
+        k = _numbers(document, (key, "distortion_coeffs"), (4,))
+    fu, fv, pu, pv = values[-4:].tolist()
+    matrix = np.array([fu, 0, pu, 0, fv, pv, 0, 0, 1])
+    xi = float(values[0]) if model == "unified" else None
+    return _made(model, size, matrix, k, xi, document.where(key, "intrinsics"))
+
+
+def _kalibr_data(camera: Camera) -> dict[str, Any]:
+    values, k = _named(camera), camera.document()["distortion"]
+    if any(k[4:]):
+        raise InputError(
+            "Kalibr's radtan distortion has no third radial term",
+            found=f"k3 = {k[4]:g}",
+            next_step="Calibrate without k3, or write the camera for OpenCV or ROS",
+        )
+    four = [values[name] for name in ("focal.x", "focal.y", "center.x", "center.y")]
+    mirror = camera.model == "unified"
+    return {
+        "camera_model": "omni" if mirror else "pinhole",
+        "intrinsics": [values["xi"], *four] if mirror else four,
+        "distortion_model": "equi" if camera.model == "fisheye" else "radtan",
+        "distortion_coeffs": list(k[:4]),
+        "resolution": [int(n) for n in camera.image_size],
+    }
+
+
+def _made(
+    model: str, size: tuple[int, int], matrix: Any, k: Array, xi: float | None, where: str
+) -> Camera:
+    """A camera of this program from another's numbers, with its own checks."""
+    kind = camera_models()[model]
+    most = len([name for name in kind.parameter_names if name[0] in "kp" and name[1:].isdigit()])
+    m = np.asarray(matrix, dtype=float).reshape(3, 3)
+    faults = (
+        (m[0, 1] != 0, "skew, which no model here has", f"{m[0, 1]:g}"),
+        (np.any(k[most:] != 0), f"distortion beyond the model's {most} terms", f"{len(k)} terms"),
+        (min(m[0, 0], m[1, 1]) <= 0, "a focal length that is not positive", f"{m[0, 0]:g}"),
+        (xi is not None and xi < 0, "a negative xi; it should be 0 or more", f"{xi}"),
+        (not np.all(np.isfinite([*m.ravel(), *k])), "numbers that are not finite", "nan or inf"),
+        (
+            min(m[0, 0], m[1, 1]) < LEAST_FOCAL * size[0],
+            "a focal length that looks like millimetres; it is wanted in pixels",
+            f"{m[0, 0]:g} at a width of {size[0]}",
+        ),
+    )
+    for wrong, what, found in faults:
+        if wrong:
+            raise InputError(f"the camera has {what}", where=where, found=found)
+    fields: dict[str, Any] = {
+        "model": model,
+        "image_size": size,
+        "focal": (float(m[0, 0]), float(m[1, 1])),
+        "center": (float(m[0, 2]), float(m[1, 2])),
+        "distortion": tuple(k[:most].tolist()),
+    }
+    if xi is not None:
+        fields["xi"] = xi
+    return kind.from_document(kind.schema(**fields))
+
+
+def _named(camera: Camera) -> dict[str, float]:
+    return dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
+
+
+def _matrix(values: dict[str, float]) -> Array:
+    return np.array(
+        [
+            [values["focal.x"], 0, values["center.x"]],
+            [0, values["focal.y"], values["center.y"]],
+            [0, 0, 1.0],
+        ]
+    )
+
+
+def _value(document: Document, keys: tuple[str | int, ...]) -> Any:
+    value: Any = document.data
+    for key in keys:
+        try:
+            value = value[key]
+        except (KeyError, IndexError, TypeError):
+            raise InputError("this is missing", where=document.where(*keys)) from None
+    return value
+
+
+def _numbers(document: Document, keys: tuple[str, ...], counts: Sequence[int]) -> Array:
+    values = _value(document, keys)
+    numeric = isinstance(values, list) and all(
+        isinstance(v, int | float) and not isinstance(v, bool) for v in values
+    )
+    if numeric and len(values) in counts:
+        return np.array(values, dtype=float)
+    wanted = f"{counts[0]}" if len(counts) == 1 else f"up to {max(counts)}"
+    raise InputError(
+        "this is not the list of numbers that it should be",
+        where=document.where(*keys),
+        found=shown(values),
+        expected=f"{wanted} numbers",
+    )
+
+
+def _size(
+    document: Document, width: tuple[str | int, ...], height: tuple[str | int, ...]
+) -> tuple[int, int]:
+    out: list[int] = []
+    for keys in (width, height):
+        value = _value(document, keys)
+        if not isinstance(value, int) or isinstance(value, bool) or value <= 0:
+            raise InputError(
+                "this is no size in pixels",
+                where=document.where(*keys),
+                found=shown(value),
+                expected="a whole number above 0",
+            )
+        out.append(value)
+    return out[0], out[1]
+
+
+def _not_ours(where: str, found: str, known: Any) -> InputError:
+    return InputError(
+        "this model of camera or lens is not known here",
+        where=where,
+        found=found,
+        expected=listed(list(known)),
+        next_step="Calibrate again from photographs of a board: pkmcal camera",
+    )

@@ -13,7 +13,7 @@ from pkmcal.commands import console
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.calibration import Calibration
+    from pkmcal.calibration.calibrate import Calibration
 
 
 class Method(StrEnum):
@@ -66,9 +66,9 @@ def calibrate(
     ] = False,
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""
-    from pkmcal.calibration import calibrate as run
+    from pkmcal.calibration.calibrate import calibrate as run
     from pkmcal.results import check_output, save
-    from pkmcal.session import load_session
+    from pkmcal.session.load import load_session
 
     loaded = load_session(session, model)
     folder = out or loaded.folder / "calibration"

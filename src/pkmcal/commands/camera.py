@@ -13,7 +13,7 @@ from pkmcal.commands import console
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.cameras.calibrate import CameraCalibration
+    from pkmcal.boards.camera import CameraCalibration
 
 ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"}
 WHAT = {
@@ -66,9 +66,9 @@ def camera(
     as_json: console.Json = False,
 ) -> int:
     """Calibrate a camera from photographs of a board."""
-    from pkmcal.cameras.calibrate import calibrate_photographs
+    from pkmcal.boards.board import load_board
+    from pkmcal.boards.camera import calibrate_photographs
     from pkmcal.files import check_writable
-    from pkmcal.observe.boards import load_board
 
     if len(images) == 1 and (images[0] / "session.yaml").is_file():
         paths, there = of_session(images[0])
@@ -164,8 +164,7 @@ def save(found: CameraCalibration, paths: list[Path], folder: Path, forms: list[
     """Write camera.yaml, camera.json, camera.html and other programs' files; returns the names."""
     from dataclasses import replace
 
-    from pkmcal.cameras.files import save_camera
-    from pkmcal.cameras.foreign import write_camera
+    from pkmcal.cameras.files import save_camera, write_camera
     from pkmcal.files import json_text, staged_folder
     from pkmcal.report.camera_page import camera_report_html
 

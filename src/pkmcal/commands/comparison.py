@@ -14,10 +14,10 @@ from pkmcal.identify.gauge import apply, default_gauge
 from pkmcal.identify.problem import State
 from pkmcal.identify.tool import tool_point
 from pkmcal.mechanisms import Machine
-from pkmcal.simulate import Truth, load_truth
+from pkmcal.simulation import Truth, load_truth
 
 if TYPE_CHECKING:
-    from pkmcal.calibration import Calibration
+    from pkmcal.calibration.calibrate import Calibration
 
 WITHIN = 2.0
 """Standard deviations within which 95 % of the values should lie."""

@@ -18,7 +18,7 @@ from pkmcal.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.calibration import Calibration
+    from pkmcal.calibration.calibrate import Calibration
     from pkmcal.commands.comparison import Comparison
 
 HERE = Path("pkmcal-demo")
@@ -90,8 +90,8 @@ def _simulate(session: Path, fast: bool, told: console.Progress) -> None:
     from dataclasses import replace
 
     from pkmcal.mechanisms import load_mechanism
-    from pkmcal.simulate import simulate_session
-    from pkmcal.simulate.demo import MECHANISM, SEED, SETTINGS, camera_of_size, demo_camera
+    from pkmcal.simulation import simulate_session
+    from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, camera_of_size, demo_camera
 
     settings = replace(SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else SETTINGS
     camera = camera_of_size(FAST_SIZE) if fast else demo_camera()
@@ -106,7 +106,7 @@ def _simulate(session: Path, fast: bool, told: console.Progress) -> None:
 
 
 def _calibrate(session: Path, told: console.Progress) -> Calibration:
-    from pkmcal.calibration import calibrate
+    from pkmcal.calibration.calibrate import calibrate
 
     rest = 0.97 - SIMULATING
     return calibrate(session, progress=lambda text, share: told(text, SIMULATING + rest * share))

@@ -13,7 +13,7 @@ from pkmcal.outcome import Figure
 from pkmcal.report.headline import headlines
 
 if TYPE_CHECKING:
-    from pkmcal.calibration import Calibration
+    from pkmcal.calibration.calibrate import Calibration
 
 
 @dataclass(frozen=True)

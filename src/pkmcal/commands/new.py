@@ -23,7 +23,7 @@ def new(
     as_json: console.Json = False,
 ) -> int:
     """Write a commented session to fill in."""
-    from pkmcal.starter import write_session
+    from pkmcal.session.starter import write_session
 
     names = write_session(folder)
     if as_json:

@@ -136,7 +136,7 @@ def _plan(
     from pkmcal.control.simulation import Loop
     from pkmcal.control.source import pose_of
     from pkmcal.control.study import Plan
-    from pkmcal.simulate.edges import EdgeNoise
+    from pkmcal.simulation.edges import EdgeNoise
 
     law_named(law)
     _positive("--gain", gain, 1000)

@@ -62,8 +62,8 @@ def simulate(
     """Simulate a session with photographs and known truth."""
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import load_mechanism
-    from pkmcal.simulate import Sensor, Settings, board_for, simulate_session, with_forearms
-    from pkmcal.simulate.demo import camera_of_size
+    from pkmcal.simulation import Sensor, Settings, board_for, simulate_session, with_forearms
+    from pkmcal.simulation.demo import camera_of_size
 
     if not 0 < joint_noise < 1:
         raise InputError(

@@ -42,7 +42,7 @@ def validate(
 ) -> int:
     """Errors on data that the calibration did not see."""
     from pkmcal.files import check_own_folder
-    from pkmcal.session import load_session
+    from pkmcal.session.load import load_session
     from pkmcal.validation import validate as run
 
     loaded = load_session(session)

@@ -38,7 +38,7 @@ def watch(
 ) -> int:
     """Is the machine still as calibrated? Tests each leg."""
     from pkmcal.files import check_own_folder
-    from pkmcal.session import load_session
+    from pkmcal.session.load import load_session
     from pkmcal.watch import check_alpha
     from pkmcal.watch import watch as run
 

@@ -1,7 +1,7 @@
 """What the camera of a simulated loop measures: edges with noise, and whether legs are in view.
 
 The edges are those that :mod:`pkmcal.observe.predict` expects, each with a sideways error and a
-tilt in pixels as :class:`pkmcal.simulate.edges.EdgeNoise` has them; places a few along each edge,
+tilt in pixels as :class:`pkmcal.simulation.edges.EdgeNoise` has them; places a few along each edge,
 because a loop runs a hundred thousand samples.
 """
 
@@ -24,7 +24,7 @@ from pkmcal.observe.predict import (
     tubes_of,
     unobstructed,
 )
-from pkmcal.simulate.edges import EdgeNoise
+from pkmcal.simulation.edges import EdgeNoise
 
 PLACES = 5
 """Places along an edge; more change its noise by less than a tenth."""

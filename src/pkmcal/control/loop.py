@@ -1,40 +1,24 @@
-"""The loop that a laboratory connects: one photograph or its edges in, joint velocities out.
-
-    servo = VisualServo.from_calibration("calibration", "station1", goal=T_base_platform)
-    while True:
-        step = servo.step_image(image, readings)
-        send(step.joint_velocities)
-
-One call a sample, nothing done in between. Velocities are zero, and ``step.sentence`` says why,
-whenever control must stop; nothing is latched, so a loop that shall stay stopped stops calling.
-"""
+"""What a loop needs of a calibration on disk."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.control.laws import BLIND, Task, law_named, limited, solution, task_of
-from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image, seen_machine
-from pkmcal.control.track import Sight, check_image, start_state, track
-from pkmcal.control.track_fit import LAG, LegLines, weighted
-from pkmcal.control.track_goal import (
+from pkmcal.control.goal import (
     Goal,
     GoalPhotograph,
+    Status,
+    Step,
     aspect_of,
     check_sides,
     checked_normals,
     goal_of,
-)
-from pkmcal.control.track_start import FITS, assembly_sentence, misfit
-from pkmcal.control.track_status import (
-    Status,
-    Step,
     leaving,
     leg_list,
     missing_clauses,
@@ -42,10 +26,87 @@ from pkmcal.control.track_status import (
     range_sentence,
     vague_sentence,
 )
-from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import dot
+from pkmcal.control.laws import BLIND, Task, law_named, limited, solution, task_of
+from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image, seen_machine
+from pkmcal.control.track import (
+    FITS,
+    LAG,
+    LegLines,
+    Sight,
+    assembly_sentence,
+    check_image,
+    misfit,
+    start_state,
+    track,
+    weighted,
+)
+from pkmcal.errors import InputError, ResultError
+from pkmcal.geometry.rigid import dot, inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
+
+if TYPE_CHECKING:
+    from pkmcal.export.source import Source
+
+
+@dataclass(frozen=True)
+class CalibratedStation:
+    """A machine and one camera before it. T_camera_base : (4, 4). edge_shift : px outward."""
+
+    machine: Machine
+    camera: Camera
+    T_camera_base: Array
+    edge_shift: float
+
+
+def calibrated_station(
+    folder: Path | str, station: str, session: Path | None = None
+) -> CalibratedStation:
+    """One station of a calibration's folder.
+
+    session : where the cameras' files are, if not above or beside the folder.
+    Raises InputError where there is no such station or no camera file, ResultError for a
+    calibration that was refused.
+    """
+    from pkmcal.export.source import load_source
+    from pkmcal.results import load
+
+    saved = load(folder)
+    if not saved.verdict.usable:
+        raise ResultError(
+            what="the calibration was refused: " + " ".join(saved.verdict.reasons),
+            where=str(folder),
+            next_step="control needs a machine that is known; calibrate again",
+        )
+    source = load_source(folder, session)
+    _check_station(folder, station, source)
+    files = {s.name: s.camera for s in saved.stations}
+    shifts = {c["file"]: float(c["edge_shift"]) for c in saved.document["cameras"]}
+    return CalibratedStation(
+        machine=source.machine,
+        camera=source.cameras[station],
+        T_camera_base=inverse(source.T_base_camera[station]),
+        edge_shift=shifts.get(files[station], 0.0),
+    )
+
+
+def _check_station(folder: Path | str, station: str, source: Source) -> None:
+    if station not in source.T_base_camera:
+        raise InputError(
+            what="the calibration has no such station",
+            where=str(folder),
+            found=station,
+            expected=" or ".join(source.T_base_camera),
+        )
+    if station not in source.cameras:
+        raise InputError(
+            what="the station's camera file was not found",
+            where=str(folder),
+            found=station,
+            expected="the session above or beside the calibration, with its cameras",
+            next_step="give the session's folder as session",
+        )
+
 
 __all__ = ["GoalPhotograph", "Status", "Step", "VisualServo"]
 
@@ -144,7 +205,7 @@ class VisualServo:
         the class. Raises InputError where the calibration has no such station, and ResultError
         for a calibration that was refused.
         """
-        from pkmcal.control.track_calibration import calibrated_station
+        # self-import
 
         at = calibrated_station(folder, station, session)
         options.setdefault("edge_shift", at.edge_shift)

@@ -23,16 +23,16 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import SIDE_SIGNS, line_through
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, register, skew
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.kinematics import forward, inverse_result
-from pkmcal.mechanisms.limbs import (
+from pkmcal.mechanisms.closure import (
     Closure,
     LimbEnds,
     along,
+    base_ends,
     closure,
     limb_ends,
     rod_lengths,
 )
-from pkmcal.mechanisms.rows import base_ends
+from pkmcal.mechanisms.kinematics import forward, inverse_result
 from pkmcal.mechanisms.velocities import readings_rows
 
 

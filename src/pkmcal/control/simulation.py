@@ -1,28 +1,168 @@
-"""The servoing loop in simulation: a true machine, and a controller that believes another one.
-
-All runs of a study advance together, one array operation a sample. A sample: the camera measures
-the edges, the controller answers, after its delay, with the drives' rates, the drives move, and
-the true machine's platform follows by its forward kinematics.
-"""
+"""How a servoing run can end, and what the user is told."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.control.ends import End
 from pkmcal.control.image import Eye
-from pkmcal.control.laws import Where, joint_velocities, law_named, limited
-from pkmcal.control.seen import SeenMachine
-from pkmcal.control.steady import loop_factor, one_image
+from pkmcal.control.laws import Where, joint_velocities, law_named, limited, solution, task_of
+from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, forward, inverse_result
-from pkmcal.mechanisms.limbs import closure, limb_ends
-from pkmcal.simulate.edges import EdgeNoise
+from pkmcal.simulation.edges import EdgeNoise
+
+
+class End(Enum):
+    """A run's end: a word for files, what happened, and what would help.
+
+    ``good`` is a platform at its goal; every other end is a failure.
+    """
+
+    REACHED = (
+        "reached",
+        "the platform reached the goal",
+        "",
+    )
+    SLOW = (
+        "slow",
+        "the platform was still on its way when the time was up",
+        "give it more time, a higher gain or faster drives",
+    )
+    UNSTEADY = (
+        "unsteady",
+        "noise of the edges kept the platform away from the goal",
+        "let the camera see more legs, control by edges, or lower the gain",
+    )
+    OTHER_POSE = (
+        "other_pose",
+        "the legs look as wanted, but the platform is at another pose",
+        "let the camera see more legs, start nearer to the goal, or compare the readings with"
+        " those at the goal",
+    )
+    STUCK = (
+        "stuck",
+        "the control came to rest before the goal, where the errors of the legs cancel",
+        "let the camera see more legs, or lead the platform through a pose in between",
+    )
+    DIVERGED = (
+        "diverged",
+        "the control did not converge; the legs are no nearer to the goal than at the start",
+        "calibrate the camera's place, or lower the gain or the delay",
+    )
+    LOST_LEG = (
+        "lost_leg",
+        "a leg left the camera's view, so the control was stopped",
+        "move the camera back, or lead the platform through a pose in between",
+    )
+    LEFT_WORKSPACE = (
+        "left_workspace",
+        "a drive came to the end of its range, or a leg could not follow",
+        "lead the platform through a pose in between, or improve the geometry that the control"
+        " believes",
+    )
+    SINGULAR = (
+        "singular",
+        "the platform came to a singular pose, where the drives do not hold it",
+        "choose a start in the goal's assembly, or a path that keeps away from singular poses",
+    )
+    WRONG_ASSEMBLY = (
+        "wrong_assembly",
+        "the start is in another assembly than the goal; a way between them crosses a singular"
+        " pose",
+        "assemble the machine as at the goal before the control begins",
+    )
+
+    def __init__(self, word: str, what: str, help_: str) -> None:
+        self.word = word
+        self.what = what
+        self.help = help_
+
+    @property
+    def good(self) -> bool:
+        """Whether the platform is at its goal."""
+        return self is End.REACHED
+
+    @property
+    def sentence(self) -> str:
+        """What happened and what would help."""
+        what = self.what[0].upper() + self.what[1:] + "."
+        return f"{what} {self.help[0].upper()}{self.help[1:]}." if self.help else what
+
+
+DRAWS = 24
+"""Images of each goal; the standard deviation over all goals is then good to a few percent."""
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """What one image's noise is, told as the platform's place, root mean squares of the goals.
+
+    joints : (R,) m, over the platform's joints. position : (R,) m of their middle. turn : (R,) rad.
+    """
+
+    joints: Array
+    position: Array
+    turn: Array
+
+    def held(self, step: float, delay: int) -> Stillness:
+        """The same in the closed loop."""
+        part = loop_factor(step, delay)
+        return Stillness(self.joints * part, self.position * part, self.turn * part)
+
+
+def loop_factor(step: float, delay: int) -> float:
+    """Standard deviation of the platform in the loop, as a part of one image's.
+
+    step : gain / rate, what of an error is corrected in a sample. The platform follows
+    x(k + 1) = x(k) - step (x(k - delay) + noise); without delay its variance is
+    step / (2 - step) of the noise's. inf where the loop is unstable.
+    """
+    n = delay + 1
+    follow = np.eye(n, k=-1)
+    follow[0, 0] += 1.0
+    follow[0, n - 1] -= step
+    if np.abs(np.linalg.eigvals(follow)).max() >= 1:
+        return float("inf")
+    drive = np.zeros((n, n))
+    drive[0, 0] = step**2
+    # P = F P F^T + Q, as one linear system
+    whole = np.eye(n * n) - np.kron(follow, follow)
+    return float(np.sqrt(np.linalg.solve(whole, drive.ravel())[0]))
+
+
+def one_image(
+    eye: Eye,
+    believed: SeenMachine,
+    law: str,
+    goals: Array,
+    readings: Array,
+    noise: EdgeNoise,
+    rng: np.random.Generator,
+    draws: int = DRAWS,
+) -> Stillness:
+    """The platform's apparent displacement at goals (R, 4, 4) by the noise of single images."""
+    points = eye.points(goals, readings)
+    wanted = eye.normals(points, EdgeNoise(0.0, 0.0), rng)
+    squares = np.zeros((3, len(goals)))
+    for _ in range(draws):
+        measured = eye.normals(points, noise, rng)
+        legs = legs_from_image(believed, directions_of(measured), readings)
+        task = task_of(law, believed, measured, wanted, legs)
+        twist = (task.twist @ solution(task)[..., None])[..., 0]
+        arms = legs.b - legs.pivot[..., None, :]
+        turned = np.cross(twist[..., None, :3], arms) + twist[..., None, 3:]
+        squares[0] += dot(turned, turned).mean(axis=-1)
+        squares[1] += dot(twist[..., 3:], twist[..., 3:])
+        squares[2] += dot(twist[..., :3], twist[..., :3])
+    return Stillness(*np.sqrt(squares / draws))
+
 
 SETTLED = 0.02
 """Part of the way at which a platform counts as arrived, as control engineers have it."""

@@ -9,17 +9,16 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, load_camera
-from pkmcal.control.estimates import Uncertainty
 from pkmcal.control.seen import seen_machine
-from pkmcal.control.study import Scene
+from pkmcal.control.study import Scene, Uncertainty
 from pkmcal.errors import InputError
 from pkmcal.export.source import Source, load_source
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.results import SavedCalibration, SavedStation, load
-from pkmcal.simulate.demo import demo_camera
-from pkmcal.simulate.stations import default_stations
-from pkmcal.simulate.truth import stream, true_machine
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation.stations import default_stations
+from pkmcal.simulation.truth import stream, true_machine
 
 CALIBRATED = 1 / 30
 """What a calibration leaves of a drawing's tolerances: 2 mm become 0.06 mm, as in the

@@ -24,7 +24,7 @@ from pkmcal.export.samples import samples
 from pkmcal.export.source import Source
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.outcome import Finding, Level
 
 POSES = 8

@@ -11,11 +11,10 @@ from pkmcal.arrays import Array
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import CarrierGroup, limb_ends
+from pkmcal.mechanisms.document import ActuatedLength, PassiveLength
 from pkmcal.mechanisms.joints import Equation, equations
 from pkmcal.mechanisms.kinematics import forward, inverse_result, on_manifold
-from pkmcal.mechanisms.layout import CarrierGroup
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.mechanisms.rods import ActuatedLength, PassiveLength
 
 SAME = 1e-9
 """Metres and radians by which two legs' common axis or hinge may differ: rounding."""

@@ -23,7 +23,7 @@ from pkmcal.export.mujoco_home import (
 )
 from pkmcal.export.mujoco_platform import UP, Anchor
 from pkmcal.export.mujoco_xml import LIGHT, ball, body, comment, cylinder, joint, numbers, site
-from pkmcal.mechanisms.rods import ActuatedLength
+from pkmcal.mechanisms.document import ActuatedLength
 
 STIFF = 2.0e4
 """N/m of a drive's position control: with the parts' masses it settles within some 20 ms."""

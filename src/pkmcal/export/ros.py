@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from pkmcal.arrays import Array
-from pkmcal.cameras.foreign import read_camera, write_camera
+from pkmcal.cameras.files import read_camera, write_camera
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter
 from pkmcal.export.source import Source

@@ -1,9 +1,22 @@
 """Files in and out: YAML with line numbers, schemas, CSV tables, outputs whole or not at all."""
 
-from pkmcal.files.json_files import json_text, plain, read_json
+from pkmcal.files.documents import (
+    Document,
+    Keys,
+    closest,
+    json_text,
+    listed,
+    parse_yaml,
+    plain,
+    read_json,
+    read_text,
+    read_yaml,
+    shown,
+    wanted_file,
+    yaml_text,
+)
+from pkmcal.files.schema import Schema, field_path, validate
 from pkmcal.files.tables import Table, csv_text, read_csv
-from pkmcal.files.text import closest, listed, read_text, shown, wanted_file
-from pkmcal.files.validation import Schema, field_path, validate
 from pkmcal.files.writing import (
     check_own_folder,
     check_writable,
@@ -12,7 +25,6 @@ from pkmcal.files.writing import (
     write_folder,
     write_text,
 )
-from pkmcal.files.yaml_files import Document, Keys, parse_yaml, read_yaml, yaml_text
 
 __all__ = [
     "Document",

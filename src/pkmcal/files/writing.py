@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pkmcal.errors import InputError
-from pkmcal.files.text import listed
+from pkmcal.files.documents import listed
 
 
 def check_writable(folder: Path | str) -> None:

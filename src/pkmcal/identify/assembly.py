@@ -12,8 +12,9 @@ from pkmcal.identify.blocks import BatchState, Blocks, Data
 from pkmcal.identify.gauge import Gauge, frame_rows, freedoms
 from pkmcal.identify.hinges import exact_moves
 from pkmcal.identify.pose_rows import PoseBlocks, PoseData
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import SHADING_SIGMA, SHIFT_SIGMA, Problem
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 

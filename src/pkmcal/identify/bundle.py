@@ -27,10 +27,12 @@ from pkmcal.identify.covariance import (
 )
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.mounts import start_mounts
-from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
+from pkmcal.identify.problem import Estimate, State, Statistics
 from pkmcal.identify.residuals import Problem
 from pkmcal.identify.robust import Both
-from pkmcal.identify.solver import (
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.solver import (
     FIRST_DAMPING,
     RESTART_DAMPING,
     Solution,
@@ -38,7 +40,6 @@ from pkmcal.identify.solver import (
     eliminate,
     minimise,
 )
-from pkmcal.mechanisms import Machine
 
 LEAST_SCALE = 1.0
 """The stated noise is never believed to be too large. What moves several edges alike (shading,

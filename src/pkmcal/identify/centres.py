@@ -16,7 +16,7 @@ from pkmcal.geometry.rigid import apply, register
 from pkmcal.identify.gauge import BestFit, transformation
 from pkmcal.identify.problem import Estimate
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import LimbEnds, limb_ends
+from pkmcal.mechanisms.closure import LimbEnds, limb_ends
 
 FLAT = 1e-6
 """Points nearer to one line than this part of their spread fix no rotation about it."""

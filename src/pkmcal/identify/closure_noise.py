@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.mechanisms.limbs import LimbLayout
+from pkmcal.mechanisms.closure import LimbLayout
 
 PERFECT = 1e-6
 """Standard deviation (m) of closures without a reading: joints and rods without play. A third of

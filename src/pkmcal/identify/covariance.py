@@ -28,8 +28,8 @@ from pkmcal.identify.gauge import (
 from pkmcal.identify.hinges import conventions, move_generators
 from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import Problem
-from pkmcal.identify.solver import Linear, Reduced, eliminate, reduced_normal, transposed
 from pkmcal.mechanisms import Machine, ParameterTable
+from pkmcal.solver import Linear, Reduced, eliminate, reduced_normal, transposed
 
 RANK_TOLERANCE = 1e-9
 """Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14

@@ -64,8 +64,9 @@ from pkmcal.identify.four_step_platform import (
 )
 from pkmcal.identify.gauge import BestFit, centre_index, default_gauge
 from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.registration import Body, fixes_pose, laid
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 __all__ = [

@@ -16,10 +16,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.identify import linear
-from pkmcal.identify.problem import Measurements
+from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import leg_readings
-from pkmcal.observe.edges import EdgeSet
+from pkmcal.mechanisms.closure import leg_readings
 
 ONE_DIRECTION = 1e-6
 """Ratio of eigenvalues below which a leg counts as seen in one direction only, for its centre."""

@@ -12,8 +12,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference
-from pkmcal.identify.problem import Measurements, State
-from pkmcal.observe.poses import PoseSet
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements, PoseSet
 
 
 class Views(NamedTuple):

@@ -20,7 +20,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
 from pkmcal.identify.problem import State
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import LimbLayout
+from pkmcal.mechanisms.closure import LimbLayout
 
 
 class Gauge(Protocol):

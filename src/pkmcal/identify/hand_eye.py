@@ -31,10 +31,11 @@ from pkmcal.geometry.rigid import (
 )
 from pkmcal.identify.mounts import mean_pose
 from pkmcal.identify.pose_rows import turn_jacobian
-from pkmcal.identify.problem import Measurements, State
-from pkmcal.identify.solver import Linear, Values, minimise
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.solver import Linear, Values, minimise, take
 
 TURN = 0.03
 """Standard deviation (rad) that the drawing's poses are given: two degrees."""
@@ -114,18 +115,6 @@ class PairProblem:
         parts = (self.body[runs], self.seen[runs], self.weight[runs])
         return replace(self, body=parts[0], seen=parts[1], weight=parts[2])
 
-    @staticmethod
-    def take(state: Pair, runs: Integers) -> Pair:
-        """Some runs' states."""
-        return Pair(state.T_camera_base[runs], state.T_mount[runs])
-
-    @staticmethod
-    def put(state: Pair, runs: Integers, part: Pair) -> Pair:
-        """Some runs' states replaced."""
-        camera, mount = state.T_camera_base.copy(), state.T_mount.copy()
-        camera[runs], mount[runs] = part
-        return Pair(camera, mount)
-
 
 def solve_pairs(body: Array, seen: Array, size: float) -> Pair:
     """Camera and mount of B runs from the platform's poses and the board's, (B, K, 4, 4) each.
@@ -146,7 +135,7 @@ def solve_pairs(body: Array, seen: Array, size: float) -> Pair:
     apart = np.linalg.norm(problem.differences(every), axis=-1)
     best = np.argmin(np.median(apart, axis=1).reshape(n, runs), axis=0)
     chosen = best * runs + np.arange(runs)
-    pair = PairProblem.take(every, chosen)
+    pair = take(every, chosen)
     _check_told(problem.select(chosen), pair)
     return pair
 

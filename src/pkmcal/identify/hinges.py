@@ -19,7 +19,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.gauge import centre_index, freedoms, generators, respecting_motion
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import LimbLayout
+from pkmcal.mechanisms.closure import LimbLayout
 
 
 def conventions(machine: Machine) -> Array:

@@ -18,9 +18,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import inverse, perturb
 from pkmcal.identify.measured_platform import Seen, Taken, seen_platform, taken
-from pkmcal.identify.solver import Linear, Values, transposed
 from pkmcal.mechanisms import kinematics
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure, dense
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense
+from pkmcal.solver import Linear, Values, of_runs, transposed
 
 Form = Literal["joint", "implicit"]
 PRINTED = 1e-4
@@ -192,22 +192,10 @@ class ImplicitProblem:
 
     def select(self, runs: Integers) -> ImplicitProblem:
         """Some runs only."""
-        weigh = self.weigh if len(self.weigh) == 1 else self.weigh[runs]
         poses, readings = self.T_camera_board[runs], self.readings[runs]
-        return replace(self, T_camera_board=poses, readings=readings, weigh=weigh)
-
-    @staticmethod
-    def take(state: ImplicitState, runs: Integers) -> ImplicitState:
-        """Some runs' states."""
-        return ImplicitState(*(part[runs] for part in state))
-
-    @staticmethod
-    def put(state: ImplicitState, runs: Integers, part: ImplicitState) -> ImplicitState:
-        """Some runs' states replaced."""
-        out = [array.copy() for array in state]
-        for array, new in zip(out, part, strict=True):
-            array[runs] = new
-        return ImplicitState(*out)
+        return replace(
+            self, T_camera_board=poses, readings=readings, weigh=of_runs(self.weigh, runs)
+        )
 
 
 def _placed(values: Array, index: Integers, n: int) -> Array:

@@ -20,11 +20,12 @@ from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.implicit import Form, ImplicitProblem, ImplicitState
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.rotation_axis import axis_frames
-from pkmcal.identify.solver import RESTART_DAMPING, Solution, Stop, eliminate, minimise
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import inverse_result
+from pkmcal.solver import RESTART_DAMPING, Solution, Stop, eliminate, minimise
 
 ROUNDS = 2
 """Whitening again, at the solution: it changes by a thousandth after the second."""

@@ -17,9 +17,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot
-from pkmcal.identify.problem import Measurements
+from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.edges import EdgeSet
 
 Method = Literal["plain", "huber", "tukey", "least-median", "robust", "errors-in-variables"]
 

@@ -71,7 +71,7 @@ def _columns(turn_by_turn: Array, shift_by_turn: Array, shift_by_shift: Array) -
 
 
 def taken(motion: Array, whole: Array) -> Taken:
-    """A pose as the machine can take it; motion (6, d) of :data:`pkmcal.mechanisms.limbs.MOTIONS`.
+    """A pose as the machine can take it; motion (6, d) of ``MOTIONS``.
 
     Of the turn, ``R = Exp(s) R_own``: R_own about z where the machine turns about z alone (s is
     then horizontal), none where it does not turn. Places that it cannot take are off as they are.

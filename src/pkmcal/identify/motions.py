@@ -24,7 +24,7 @@ from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.gauge import centre_index, generators
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.wording import SCALES, decimals, joined, named, number, split_name
 
 AXES = "xyz"

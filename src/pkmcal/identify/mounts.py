@@ -6,7 +6,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import inverse, pose
-from pkmcal.identify.problem import Measurements
+from pkmcal.measurements import Measurements
 
 TURNS = 15
 ALIKE = 1e-4

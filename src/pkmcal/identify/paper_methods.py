@@ -24,8 +24,9 @@ from pkmcal.identify.four_step_boards import mount_poses
 from pkmcal.identify.gauge import apply, centre_index, default_gauge
 from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.inverse_kinematic import inverse_kinematic
-from pkmcal.identify.problem import Estimate, Measurements, State, Statistics
+from pkmcal.identify.problem import Estimate, State, Statistics
 from pkmcal.identify.residuals import BatchState
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 Method = Literal["four-step", "linear", "inverse-kinematic"]

@@ -3,53 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.edges import EdgeSet
-from pkmcal.observe.poses import PoseSet
-
-
-@dataclass(frozen=True)
-class Mount:
-    """What a board or a tracker's target is fixed to; its place there is estimated."""
-
-    name: str
-    body: Literal["base", "platform"]
-
-
-@dataclass(frozen=True)
-class Measurements:
-    """Everything that was measured, nothing that was assumed.
-
-    edges : silhouette edges. joints : (K, m) readings, m or rad. joint_noise : their
-    standard deviation. n_stations : S. camera_of_station : (S,) number of the camera (file)
-    that each station uses: one edge shift is estimated for each camera. intrinsics_factor :
-    (C, n, r) square roots F of the cameras' intrinsics' covariances F F^T, where these are to be
-    refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
-    those units from the calibration's values. poses : of boards or targets, each on one of the
-    ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
-    gives edges in photographs.
-    """
-
-    edges: EdgeSet
-    joints: Array
-    joint_noise: float
-    n_stations: int
-    camera_of_station: Integers
-    intrinsics_factor: Array = field(default_factory=lambda: np.zeros((1, 0, 0)))
-    intrinsics_at: Array = field(default_factory=lambda: np.zeros((1, 0)))
-    poses: PoseSet = field(default_factory=PoseSet.empty)
-    mounts: tuple[Mount, ...] = ()
-    shaded: bool = False
-
-    @property
-    def on_platform(self) -> Booleans:
-        """(M,) which of the mounts move with the platform."""
-        return np.array([mount.body == "platform" for mount in self.mounts], dtype=bool)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot, perturb, pose, register, rotation, skew
-from pkmcal.identify.solver import Linear, Solution, Values, minimise
+from pkmcal.solver import Linear, Solution, Values, minimise
 
 SCALE = 1e-4
 """Metres that count as one standard deviation; it only sets where the search stops."""
@@ -27,7 +27,7 @@ LOOSE = 1e-4
 """Eigenvalue below which a body's items count as loose, of 1 for an item that one frame holds:
 a shape error is then seen a hundredth of its size."""
 ANY_MOTION = np.eye(6)
-"""Motion (6, d) of a body that is free; columns as in :data:`pkmcal.mechanisms.limbs.MOTIONS`."""
+"""Motion (6, d) of a free body; columns as in :data:`pkmcal.mechanisms.document.MOTIONS`."""
 
 
 class Body(NamedTuple):
@@ -94,18 +94,6 @@ class BodyProblem:
     def select(self, runs: Integers) -> BodyProblem:
         """Some runs only."""
         return replace(self, measured=self.measured[runs], weight=self.weight[runs])
-
-    @staticmethod
-    def take(state: Body, runs: Integers) -> Body:
-        """Some runs' states."""
-        return Body(state.points[runs], state.poses[runs])
-
-    @staticmethod
-    def put(state: Body, runs: Integers, part: Body) -> Body:
-        """Some runs' states replaced."""
-        points, poses = state.points.copy(), state.poses.copy()
-        points[runs], poses[runs] = part.points, part.poses
-        return Body(points, poses)
 
 
 def fit_body(
@@ -262,18 +250,6 @@ class Dense:
     def select(self, runs: Integers) -> Dense:
         """Some runs only."""
         return replace(self, runs=self.runs[runs])
-
-    @staticmethod
-    def take(state: Array, runs: Integers) -> Array:
-        """Some runs' vectors."""
-        return state[runs]
-
-    @staticmethod
-    def put(state: Array, runs: Integers, part: Array) -> Array:
-        """Some runs' vectors replaced."""
-        out = state.copy()
-        out[runs] = part
-        return out
 
 
 def minimise_dense(

@@ -28,9 +28,9 @@ from pkmcal.geometry.rigid import skew
 from pkmcal.identify.blocks import BatchState, Blocks, Data
 from pkmcal.identify.closure_noise import by_noise, joint_rows
 from pkmcal.identify.pose_rows import PoseBlocks, PoseData, PoseRows, no_poses, pose_rows
-from pkmcal.identify.solver import Linear, Values
 from pkmcal.identify.steps import moved
-from pkmcal.mechanisms.limbs import Closure, LimbLayout, closure
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure
+from pkmcal.solver import Linear, Values, of_runs
 
 SHADING_SIGMA = 0.03
 """Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
@@ -170,22 +170,9 @@ class Problem:
         """The problem of some runs only."""
         return replace(
             self,
-            data=Data(**_of_runs(self.data, runs)),
-            pose_data=PoseData(**_of_runs(self.pose_data, runs)),
+            data=of_runs(self.data, runs),
+            pose_data=of_runs(self.pose_data, runs),
         )
-
-    @staticmethod
-    def take(state: BatchState, runs: Integers) -> BatchState:
-        """The states of some runs."""
-        return BatchState(**{name: array[runs] for name, array in vars(state).items()})
-
-    @staticmethod
-    def put(state: BatchState, runs: Integers, part: BatchState) -> BatchState:
-        """The state with some runs replaced."""
-        out = {name: array.copy() for name, array in vars(state).items()}
-        for name, array in vars(part).items():
-            out[name][runs] = array
-        return BatchState(**out)
 
     def weighted(self, weight: Array, poses: Array | None = None) -> Problem:
         """The same problem with other weights of the edges' blocks, and of the boards' poses where
@@ -378,13 +365,6 @@ class Problem:
         """The parameter of each free unknown where each moves one parameter alone."""
         alone = np.all((self.free != 0).sum(axis=0) == 1) and np.all(self.free.sum(axis=0) == 1)
         return np.argmax(self.free, axis=0) if alone else None
-
-
-def _of_runs(data: Data | PoseData, runs: Integers) -> dict[str, Array]:
-    """The numbers of some runs; what all runs share stays."""
-    return {
-        name: array if array.shape[0] == 1 else array[runs] for name, array in vars(data).items()
-    }
 
 
 def _one_hot(values: Array, index: Integers, n: int) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.residuals import Problem
-from pkmcal.identify.solver import FIRST_DAMPING, RESTART_DAMPING, minimise
+from pkmcal.solver import FIRST_DAMPING, RESTART_DAMPING, minimise
 
 FULL, NONE = 4.0, 6.5
 """Weights are 1 up to FULL and 0 from NONE standard deviations: of clean edges 3 in 10^4 lose

@@ -16,8 +16,8 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import cross, dot, rotation, rotation_vector, skew
 from pkmcal.identify.measured_platform import taken
 from pkmcal.identify.pose_rows import turn_jacobian
-from pkmcal.mechanisms.limbs import MOTIONS
-from pkmcal.observe.poses import PoseSet
+from pkmcal.measurements import PoseSet
+from pkmcal.mechanisms.document import MOTIONS
 
 Turning = Literal["none", "one axis", "any"]
 TURNS: dict[str, Turning] = {

@@ -18,7 +18,7 @@ from pkmcal.identify.gauge import (
     station_generators,
 )
 from pkmcal.identify.hinges import move_generators, slid, turned_back
-from pkmcal.mechanisms.limbs import on_tangents
+from pkmcal.mechanisms.closure import on_tangents
 
 if TYPE_CHECKING:
     from pkmcal.identify.residuals import Problem

@@ -14,8 +14,8 @@ from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.gauge import freedoms, pose_generators, respecting_motion
 from pkmcal.identify.problem import Estimate
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.mechanisms.kinematics import on_manifold
-from pkmcal.mechanisms.limbs import closure, dense
 
 SAMPLES = 40
 """Poses around the session's: what a session's few poses hide, others show."""

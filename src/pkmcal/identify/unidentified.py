@@ -27,8 +27,7 @@ from pkmcal.mechanisms import Machine
 if TYPE_CHECKING:
     from pkmcal.identify.conditions import Condition
     from pkmcal.identify.covariance import Direction, Identifiability
-    from pkmcal.identify.problem import Measurements
-    from pkmcal.observe.edges import EdgeSet
+    from pkmcal.measurements import EdgeSet, Measurements
 
 INSIDE = (0.999, 0.95)
 """Shares of a change (squared) that lie in the open space for it to explain part of that space:

@@ -12,13 +12,13 @@ from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.sentences import Sentence
-from pkmcal.identify.solver import Stop
 from pkmcal.identify.tool import platform_by_parameters
 from pkmcal.identify.unidentified import Findings, explain, only_heights, seen_legs
+from pkmcal.measurements import Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
-from pkmcal.observe.edges import Observation
 from pkmcal.outcome import Verdict
+from pkmcal.solver import Stop
 
 FAR = 5.0
 """Tolerances by which a value may leave the drawing before a person should look."""

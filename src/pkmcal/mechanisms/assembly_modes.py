@@ -12,11 +12,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import pose, pose_difference, rotation
-from pkmcal.mechanisms.closing import CONVERGED, Closed, close
-from pkmcal.mechanisms.kinematics import inverse_result, typical_reach
-from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.mechanisms.rows import base_ends, platform_ends
-from pkmcal.mechanisms.signs import assembly_sign
+from pkmcal.mechanisms.closure import LimbLayout, base_ends, platform_ends
+from pkmcal.mechanisms.kinematics import CONVERGED, Closed, close, inverse_result, typical_reach
+from pkmcal.mechanisms.velocities import assembly_sign
 
 BATCH = 1000
 """Starts at a time."""

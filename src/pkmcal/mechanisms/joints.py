@@ -1,65 +1,34 @@
-"""Joints at the ends of a limb: what stands in the file, and which equation their axes add.
+"""The equations that joints' axes add to the closure, with exact derivatives; metres.
 
-A spherical joint has a centre. A universal joint has its first axis, fixed to the body that it
-stands on; a revolute joint has one axis, and the limb turns about it. On a spatial machine these
-axes add equations between the limb's line and the two bodies:
+A joint at a limb's end may have an axis. On a spatial machine the axes add equations between the
+limb's line and the two bodies, by what each end's carrier says that its axis does:
 
-- revolute: the limb is square to the axis, ([A] eq. 7);
-- universal at both ends: the limb does not twist, so the two first axes and the limb's line lie
-  in one plane (errata, 3-UPU).
+- ``square``, a revolute joint: the limb is square to the axis ([A] eq. 7);
+- ``twist`` at both ends, universal joints: the limb does not twist, so the two first axes and the
+  limb's line lie in one plane (errata, 3-UPU).
+
+Each says that the limb's line d = B - A has no part along a direction w: ``d . w = 0``. A revolute
+joint on the base has w = v, its unit axis; on the platform w = R v'. A limb that cannot twist has
+``w = v x R v'``. In metres, so that they stand beside lengths in one least-squares problem.
 
 Planar and translational machines move as their file says, whatever the axes: there they add none.
 """
 
 from __future__ import annotations
 
-from math import hypot
-from typing import TYPE_CHECKING, Annotated, Literal
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
-from pydantic import AfterValidator
+import numpy as np
 
-from pkmcal.files import Schema
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import ParameterKind
+from pkmcal.mechanisms.document import Leg, MechanismDocument
 
-if TYPE_CHECKING:
-    from pkmcal.mechanisms.schema import Leg, MechanismDocument
-
-SHORTEST = 1e-6
-"""An axis shorter than this is a row of zeros, not a direction."""
 AXIS = tuple(ParameterKind(f"axis.{axis}", "1", "axis") for axis in "xyz")
 
 Equation = Literal["revolute base", "revolute platform", "torsion"]
-
-
-def _direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
-    length = hypot(*axis)
-    if length < SHORTEST:
-        raise ValueError("an axis of length zero is no direction; write one such as [0, 0, 1]")
-    if abs(length - 1) < 1e-12:  # read back what was written, to the last digit
-        return axis
-    x, y, z = (c / length for c in axis)
-    return x, y, z
-
-
-Direction = Annotated[tuple[float, float, float], AfterValidator(_direction)]
-
-
-def _rising(value: tuple[float, float]) -> tuple[float, float]:
-    if not value[0] < value[1]:
-        raise ValueError("should be two increasing readings [min, max]")
-    return value
-
-
-Interval = Annotated[tuple[float, float], AfterValidator(_rising)]
-"""Smallest and largest reading of a motor."""
-
-
-class JointDocument(Schema):
-    """``{joint: revolute, center: [x, y, z], axis: [x, y, z]}``: metres, the body's frame."""
-
-    joint: Literal["spherical", "universal", "revolute"]
-    center: tuple[float, float, float]
-    axis: Direction | None = None
 
 
 def equations(document: MechanismDocument) -> tuple[tuple[int, Equation], ...]:
@@ -89,3 +58,84 @@ def axes_in_use(document: MechanismDocument) -> set[tuple[int, str]]:
         "torsion": ("base", "platform"),
     }
     return {(j, side) for j, which in equations(document) for side in sides[which]}
+
+
+@dataclass(frozen=True)
+class AngleLayout:
+    """The E angle equations of a machine.
+
+    leg : (E,). base, platform : (E, 3) positions of the axes' parameters (0 where there is none).
+    on_base, on_platform : (E,) which of the axes each equation has; both for a torsion.
+    """
+
+    leg: Integers
+    base: Integers
+    platform: Integers
+    on_base: Booleans
+    on_platform: Booleans
+
+    def __len__(self) -> int:
+        return len(self.leg)
+
+
+class AngleRows(NamedTuple):
+    """Values (..., E) m, derivatives by the limb's line (..., E, 3), by the platform's turn
+    (..., E, 3), and by the base and platform axes' parameters (..., E, 3) each.
+    """
+
+    value: Array
+    by_line: Array
+    by_turn: Array
+    by_base_axis: Array
+    by_platform_axis: Array
+
+
+def angle_layout(document: MechanismDocument, base: Integers, platform: Integers) -> AngleLayout:
+    """The equations of a document; base, platform : (L, 3) axes' positions, -1 for none."""
+    found = equations(document)
+    leg = np.array([j for j, _ in found], dtype=int)
+    kinds = np.array([kind for _, kind in found], dtype=object)
+    on_base = np.isin(kinds, ["revolute base", "torsion"])
+    on_platform = np.isin(kinds, ["revolute platform", "torsion"])
+    return AngleLayout(
+        leg,
+        np.where(on_base[:, None], base[leg], 0),
+        np.where(on_platform[:, None], platform[leg], 0),
+        on_base,
+        on_platform,
+    )
+
+
+def angle_rows(layout: AngleLayout, theta: Array, rot: Array, line: Array) -> AngleRows:
+    """The equations of the limbs' lines.
+
+    theta : (..., P). rot : platform's rotation (..., 3, 3). line : (..., E, 3) B - A of each
+    equation's leg, m.
+    """
+    first, second = layout.on_base[:, None], layout.on_platform[:, None]
+    v, v_size = _unit(theta[..., layout.base], first)
+    own, own_size = _unit(theta[..., layout.platform], second)
+    turned = (rot[..., None, :, :] @ own[..., None])[..., 0]
+    w = np.where(first & second, cross(v, turned), np.where(first, v, turned))
+    by_v = np.where(second, cross(turned, line), line)
+    by_turned = np.where(first, cross(line, v), line)
+    by_own = (np.swapaxes(rot, -1, -2)[..., None, :, :] @ by_turned[..., None])[..., 0]
+    return AngleRows(
+        value=dot(line, w),
+        by_line=w,
+        by_turn=np.where(second, cross(turned, by_turned), 0.0),
+        by_base_axis=np.where(first, _across(by_v, v) / v_size, 0.0),
+        by_platform_axis=np.where(second, _across(by_own, own) / own_size, 0.0),
+    )
+
+
+def _unit(axis: Array, used: Booleans) -> tuple[Array, Array]:
+    """Unit axes and their sizes (..., E, 1); z where an equation has none."""
+    axis = np.where(used, axis, np.array([0.0, 0.0, 1.0]))
+    size = np.sqrt(dot(axis, axis))[..., None]
+    return axis / size, size
+
+
+def _across(gradient: Array, axis: Array) -> Array:
+    """The part of a gradient across a unit axis: its length changes nothing."""
+    return gradient - dot(gradient, axis)[..., None] * axis

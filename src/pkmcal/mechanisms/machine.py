@@ -12,30 +12,25 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import pose, rotation
-from pkmcal.mechanisms import (
-    amplification,
-    assembly_modes,
-    extents,
-    kinematics,
-    paths,
-    signs,
-    velocities,
-    workspace,
-)
+from pkmcal.mechanisms import assembly_modes, kinematics, velocities, workspace
 from pkmcal.mechanisms.carriers.contract import (
     ParameterKind,
     base_carriers,
     of_part,
     platform_carriers,
 )
-from pkmcal.mechanisms.drawing_checks import check_drawing
+from pkmcal.mechanisms.closure import LimbLayout, layout_of, limb_ends
+from pkmcal.mechanisms.document import (
+    CONSTANT,
+    OFFSET,
+    ActuatedLength,
+    MechanismDocument,
+    PassiveLength,
+)
+from pkmcal.mechanisms.document_checks import check_drawing
 from pkmcal.mechanisms.joints import AXIS, axes_in_use
-from pkmcal.mechanisms.limbs import LimbLayout, layout_of, limb_ends
-from pkmcal.mechanisms.motors import motor_ranges, motor_units
+from pkmcal.mechanisms.motors import built_in_fixed, built_in_ties, motor_ranges, motor_units
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.mechanisms.rods import CONSTANT, OFFSET, ActuatedLength, PassiveLength
-from pkmcal.mechanisms.schema import MechanismDocument
-from pkmcal.mechanisms.ties import built_in_fixed, built_in_ties
 
 
 @dataclass(frozen=True)
@@ -190,13 +185,13 @@ class Machine:
 
     def amplification(
         self, T_base_platform: Array, p_platform: Array | None = None
-    ) -> amplification.Amplification:
+    ) -> velocities.Amplification:
         """Speeds, forces and conditioning at poses (n, 4, 4), of a point (3,) of the platform, m;
-        see :mod:`pkmcal.mechanisms.amplification`.
+        see :mod:`pkmcal.mechanisms.velocities`.
         """
         poses = _checked(T_base_platform, (4, 4), "T_base_platform")
         point = None if p_platform is None else _checked(p_platform, (3,), "p_platform")
-        return amplification.amplification(self.layout, self.values, poses, point)
+        return velocities.amplification(self.layout, self.values, poses, point)
 
     def limits(self) -> workspace.Limits:
         """The machine with its ranges and home's assembly, for the functions of workspaces."""
@@ -211,41 +206,41 @@ class Machine:
 
     def extents(
         self, directions: Array, start: Array | None = None, most: float | None = None
-    ) -> extents.Extents:
+    ) -> workspace.Extents:
         """How far the platform comes along directions (k, 3) or twists (k, 6) from a pose (4, 4),
-        home when absent; see :func:`pkmcal.mechanisms.extents.extents`.
+        home when absent; see :func:`pkmcal.mechanisms.workspace.extents`.
         """
         axes = np.asarray(directions, dtype=float)
         axes = _checked(axes, (6,) if axes.shape[-1:] == (6,) else (3,), "directions")
         begin = self._home if start is None else _checked(start, (4, 4), "start")
-        return extents.extents(self.limits(), axes.reshape(-1, axes.shape[-1]), begin, most)
+        return workspace.extents(self.limits(), axes.reshape(-1, axes.shape[-1]), begin, most)
 
     def grid(
         self, directions: Array | None = None, middle: Array | None = None, count: int = 25
-    ) -> extents.Grid:
+    ) -> workspace.Grid:
         """The workspace at the orientation of a pose (4, 4), home when absent: along all of the
         motion's directions, or a section along two (2, 3); see
-        :func:`pkmcal.mechanisms.extents.grid`.
+        :func:`pkmcal.mechanisms.workspace.grid`.
         """
         own = np.eye(3)[self.layout.free[3:]]
         axes = own if directions is None else _checked(directions, (3,), "directions")
         begin = self._home if middle is None else _checked(middle, (4, 4), "middle")
-        return extents.grid(self.limits(), begin, axes, count)
+        return workspace.grid(self.limits(), begin, axes, count)
 
-    def check_path(self, T_base_platform: Array) -> paths.PathCheck:
+    def check_path(self, T_base_platform: Array) -> workspace.PathCheck:
         """Whether a path of poses (n, 4, 4) stays in the workspace and crosses no singular pose,
         and where not.
         """
         poses = _checked(T_base_platform, (4, 4), "T_base_platform")
-        return paths.check_path(self.limits(), poses)
+        return workspace.check_path(self.limits(), poses)
 
     def same_assembly(self, T_base_platform: Array, T_reference: Array | None = None) -> Booleans:
         """Whether poses (n, 4, 4) may belong to the assembly of a reference (4, 4), home when
-        absent. False is sure, True is not; see :func:`pkmcal.mechanisms.signs.same_assembly`.
+        absent. False is sure, True is not; see :func:`pkmcal.mechanisms.velocities.same_assembly`.
         """
         poses = _checked(T_base_platform, (4, 4), "T_base_platform")
         other = self._home if T_reference is None else _checked(T_reference, (4, 4), "T_reference")
-        return signs.same_assembly(self.layout, self.values, poses, other)
+        return velocities.same_assembly(self.layout, self.values, poses, other)
 
     def assembly_modes(self, joints: Array, rng: np.random.Generator) -> Array:
         """Distinct poses (k, 4, 4) that close the machine at one set of readings (m,)."""

@@ -4,31 +4,41 @@ A twist is (omega, tau), rad/s and m/s, the rate of the left perturbation of
 :mod:`pkmcal.geometry.rigid`: omega turns the platform about its own origin, tau moves that origin,
 both along the base frame's axes. [B] eq. 6-7 in general: the closure's derivatives give
 ``by_pose twist + by_internal hinges' rates + by_reading readings' rates = 0``.
+
+Amplification: with J the forward Jacobian, ``twist = J rates``. The power of the motors is that of
+the platform, so in a machine without weight and friction ``motor forces = J^T wrench``: what makes
+a platform fast makes its motors feel more.
+
+Signs: the inverse Jacobian's determinant says on which side of the singular poses a pose lies.
+Between two poses with different signs every path crosses a singular pose. Equal signs promise
+nothing: two assemblies may have the same, and only a path between them tells.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
-from pkmcal.geometry.rigid import dot
-from pkmcal.mechanisms.kinematics import inverse_result, own_scale
-from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.mechanisms.limbs import Closure
-from pkmcal.mechanisms.rows import (
+from pkmcal.arrays import Array, Booleans
+from pkmcal.geometry.rigid import dot, skew
+from pkmcal.mechanisms.closure import (
     BaseEnds,
+    Closure,
+    LimbLayout,
     Rows,
     base_ends,
     by_readings,
     platform_ends,
+    pose_rows,
     rows_between,
 )
+from pkmcal.mechanisms.kinematics import inverse_result, own_scale, platform_radius, scaled_rows
 
 LOST = 1e-9
 """Smallest singular value of a scaled Jacobian that still gives rates: a pose is right to 1e-12 m
-(:data:`pkmcal.mechanisms.closing.CONVERGED`), so below it not three digits would be right."""
+(:data:`pkmcal.mechanisms.kinematics.CONVERGED`), so below it not three digits would be right."""
 
 
 class _Moving(NamedTuple):
@@ -126,3 +136,112 @@ def _pseudo_inverse(jac: Array) -> Array:
     usable = known[..., None] & (s[..., -1:] > LOST)
     weights = np.where(usable, 1 / np.where(usable, s, 1.0), np.nan)
     return np.swapaxes(vt, -1, -2) @ (weights[..., None] * np.swapaxes(u, -1, -2))
+
+
+@dataclass(frozen=True)
+class Amplification:
+    """At poses (...); NaN where the pose is singular or out of reach.
+
+    A unit of joint speed is a vector of all readings' rates of length 1, in m/s, or in rad/s for
+    cranks; of a machine with both, 1 m/s counts as 1 rad/s.
+
+    fastest, slowest : (...) largest and smallest speed of the point, m/s per unit of joint speed,
+        over the directions of the file's motion; 0 where the motors cannot move it in some of them.
+    quickest_turn, slowest_turn : (...) the same of the platform's turning, rad/s. Zero where the
+        machine does not turn.
+    force : (..., m) the largest force of each motor, N (of a crank its torque, N m), for 1 N on the
+        point in any direction. torque : (..., m) for a moment of 1 N m about the point.
+    condition : (...) largest over smallest speed, turns scaled by the platform's radius so that
+        they count as its joints' speeds; 1 is best. Smallest is over the machine's own freedoms.
+    """
+
+    fastest: Array
+    slowest: Array
+    quickest_turn: Array
+    slowest_turn: Array
+    force: Array
+    torque: Array
+    condition: Array
+
+
+def amplification(
+    layout: LimbLayout, theta: Array, poses: Array, p_platform: Array | None = None
+) -> Amplification:
+    """The maps' values at poses T_base_platform (..., 4, 4), theta (..., P).
+
+    p_platform : (3,) the point of the platform that is meant, m, platform frame; its origin when
+    absent. Static: the machine's own weight is not in the forces.
+    """
+    jac = forward_jacobian(layout, theta, poses)
+    turning, moving = jac[..., :3, :], jac[..., 3:, :]
+    if p_platform is not None:
+        arm = (poses[..., :3, :3] @ p_platform[:, None])[..., 0]
+        moving = moving - skew(arm) @ turning
+    scale = platform_radius(layout, theta)[..., None, None]
+    scaled = _singular_values(np.concatenate([scale * turning, moving], axis=-2))
+    speeds, turns = _singular_values(moving), _singular_values(turning)
+    free = layout.free
+    n_moves, n_turns = (
+        min(int(np.count_nonzero(part)), layout.n_readings) for part in (free[3:], free[:3])
+    )
+    own = min(layout.motion.shape[1], layout.n_readings)
+    with np.errstate(divide="ignore"):  # a freedom that no motor moves
+        condition = scaled[..., 0] / scaled[..., own - 1]
+    zero = np.zeros(speeds.shape[:-1])
+    return Amplification(
+        fastest=speeds[..., 0],
+        slowest=speeds[..., n_moves - 1],
+        quickest_turn=turns[..., 0] if n_turns else zero,
+        slowest_turn=turns[..., n_turns - 1] if n_turns else zero,
+        force=np.sqrt(np.sum(moving**2, axis=-2)),
+        torque=np.sqrt(np.sum(turning**2, axis=-2)),
+        condition=condition,
+    )
+
+
+def _singular_values(jac: Array) -> Array:
+    """Singular values (..., k), falling; NaN where the matrix is not known."""
+    known = np.asarray(np.isfinite(jac).all(axis=(-1, -2)))
+    values = np.linalg.svd(np.where(known[..., None, None], jac, 0.0), compute_uv=False)
+    return np.where(known[..., None], values, np.nan)
+
+
+def determinant_of(scaled: Array) -> Array:
+    """Determinant (...) of scaled rows (..., E, d), see
+    :func:`pkmcal.mechanisms.kinematics.scaled_rows`. NaN where they are not known, and for machines
+    with more or fewer rows than freedoms, which have none.
+    """
+    if scaled.shape[-1] != scaled.shape[-2]:
+        return np.full(scaled.shape[:-2], np.nan)
+    known = np.asarray(np.isfinite(scaled).all(axis=(-1, -2)))
+    square = np.where(known[..., None, None], scaled, np.eye(scaled.shape[-1]))
+    return np.where(known, np.linalg.det(square), np.nan)
+
+
+def sign_of(scaled: Array) -> Array:
+    """Sign (...) of :func:`determinant_of`: 1 or -1; 0 where there is none."""
+    return np.nan_to_num(np.sign(determinant_of(scaled)))
+
+
+def assembly_sign(
+    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array
+) -> Array:
+    """The sign (...) of assemblies: poses (..., 4, 4) and hinges' turns (..., n) that close the
+    machine at readings (..., m).
+    """
+    rows = pose_rows(layout, theta, readings, poses, internal)
+    return sign_of(scaled_rows(layout, theta, rows))
+
+
+def same_assembly(layout: LimbLayout, theta: Array, poses: Array, reference: Array) -> Booleans:
+    """Whether poses (..., 4, 4) may belong to the reference's assembly (4, 4), (...).
+
+    False is sure: every path between the two crosses a singular pose. True is necessary only, see
+    the module's docstring; machines without a determinant are always True, as are poses that a limb
+    cannot reach.
+    """
+    signs = []
+    for some in (poses, reference):
+        readings, internal = inverse_result(layout, theta, some)
+        signs.append(assembly_sign(layout, theta, readings, some, internal))
+    return np.asarray(signs[0] * signs[1] >= 0)

@@ -16,7 +16,7 @@ from pkmcal.cameras import Camera
 from pkmcal.geometry.cylinders import SIDE_SIGNS, line_through
 from pkmcal.geometry.rigid import apply, cross, dot
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.limbs import limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 
 JOINT_MARGIN = 0.006
 """Metres left out at both ends of a tube: collars and joint housings hide or imitate edges."""

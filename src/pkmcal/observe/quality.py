@@ -8,10 +8,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.legs import CLEARANCE, SEARCH_SAMPLES, Photographs
+from pkmcal.observe.legs import CLEARANCE, SEARCH_SAMPLES, Photographs, sample, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.observe.profiles import SATURATED
-from pkmcal.observe.search import sample, search_legs
 
 BLACK = 8
 """Grey level up to which a sample is taken as black: shading and edges drown in the noise."""

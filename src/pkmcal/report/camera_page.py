@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.cameras.calibrate import CameraCalibration
-from pkmcal.cameras.calibration_checks import CELLS, coverage, tilts
+from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
 from pkmcal.errors import InputError
 from pkmcal.observe.images import decode
 from pkmcal.outcome import Figure

@@ -8,10 +8,10 @@ from pkmcal.arrays import Integers
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.tool import ToolPoint
-from pkmcal.observe.edges import Observation
+from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure
 from pkmcal.report.residuals import KEPT
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, number
 
 NO_TURN = 1e-9

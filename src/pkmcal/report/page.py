@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.tool import centres_and_tool
-from pkmcal.observe.edges import Observation
+from pkmcal.measurements import Observation
 from pkmcal.report import (
     figure,
     headline,
@@ -22,7 +22,7 @@ from pkmcal.report import (
     templating,
     validation_page,
 )
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 if TYPE_CHECKING:
     from pkmcal.identify.unidentified import Findings

@@ -14,13 +14,13 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
-from pkmcal.mechanisms.limbs import limb_ends
-from pkmcal.observe.edges import EdgeSet
+from pkmcal.measurements import EdgeSet
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
 from pkmcal.observe.predict import legs_in_camera
-from pkmcal.photographs import Photograph
 from pkmcal.report.residuals import KEPT, SIDES, radius_positions, rms
-from pkmcal.session import Session
+from pkmcal.session.load import Session
+from pkmcal.session.photographs import Photograph
 from pkmcal.wording import count, number
 
 MOST = 12

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.doubts import turning
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.problem import Estimate
-from pkmcal.observe.edges import Observation
-from pkmcal.observe.poses import PoseSet
+from pkmcal.measurements import Observation, PoseSet
 from pkmcal.report.charts import (
     NORMAL_90,
     Bar,
@@ -21,8 +21,7 @@ from pkmcal.report.charts import (
     row_chart,
 )
 from pkmcal.report.residuals import KEPT, SIGMAS, expected_rms
-from pkmcal.session import Session
-from pkmcal.turning import turning
+from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
 OPEN = 0.3

@@ -12,7 +12,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, pose_difference, skew
 from pkmcal.identify.problem import Estimate
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
 OPEN = 1e3

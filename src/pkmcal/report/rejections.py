@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from pkmcal.observe.edges import Rejection
+from pkmcal.measurements import Rejection
 from pkmcal.report.residuals import SIDES
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""

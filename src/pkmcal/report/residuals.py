@@ -10,8 +10,8 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.problem import Estimate
+from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.edges import EdgeSet
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report.charts import (
     NORMAL_90,
@@ -23,7 +23,7 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
 
 KEPT = 0.5

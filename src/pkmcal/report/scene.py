@@ -14,7 +14,7 @@ from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.report.charts import WIDTH
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
 ELLIPSE = 2.0

@@ -9,8 +9,8 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.control.study import Outcome, Study
 from pkmcal.geometry.rigid import inverse
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.mechanisms.limbs import limb_ends
 
 COLOURS = {"true": "--quiet", "identified": "--drawing", "cad": "--good", "hand": "--calibrated"}
 SHADES = {"identified": "rgba(0,104,168,.16)", "hand": "rgba(194,72,12,.16)"}

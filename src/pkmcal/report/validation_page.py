@@ -9,7 +9,7 @@ import numpy as np
 
 from pkmcal.outcome import Figure, Row, Table
 from pkmcal.report import charts, templating
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 from pkmcal.validate.figures import Figures, figures, promised, reading_units
 from pkmcal.validate.holdouts import HoldOut, Judged
 from pkmcal.validate.judged import Ratio, rms

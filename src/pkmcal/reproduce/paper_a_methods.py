@@ -13,10 +13,10 @@ from pkmcal.identify.covariance import information
 from pkmcal.identify.four_step import Form, FourSteps, centres_from_axes, solve
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
 from pkmcal.identify.residuals import BatchState, Problem
-from pkmcal.identify.solver import RESTART_DAMPING
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.reproduce.paper_a_simulation import Settings, Truth, measured_axes
+from pkmcal.solver import RESTART_DAMPING
 
 POSES = 10
 """Poses a run at which the end-effector is compared, [A] 4.3."""

@@ -10,8 +10,8 @@ from typing import NamedTuple
 from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.repeatability import LegScatter, study_repeats
-from pkmcal.simulate import Settings, simulate_session
-from pkmcal.simulate.demo import MECHANISM, camera_of_size
+from pkmcal.simulation import Settings, simulate_session
+from pkmcal.simulation.demo import MECHANISM, camera_of_size
 
 SIZE = (1024, 768)
 """[A] 4.2: pixels; the lens of 6 mm is the demonstration's too."""

@@ -21,8 +21,8 @@ from pkmcal.identify.four_step import Axes
 from pkmcal.identify.gauge import ThreeCentres, freedoms
 from pkmcal.identify.residuals import Blocks, Data, Problem
 from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.mechanisms.limbs import limb_ends
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from pkmcal.identify.implicit import Form
 from pkmcal.identify.inverse_kinematic import PoseFit, fit_poses, pose_problem
 from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import BatchState, Problem
-from pkmcal.identify.solver import eliminate, minimise
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.reproduce.paper_c_simulation import Settings, Truth, measurements, workspace
+from pkmcal.solver import eliminate, minimise
 
 POSES = 100
 """Poses at which a run's machine is held against the truth."""

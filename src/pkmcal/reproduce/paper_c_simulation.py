@@ -16,11 +16,9 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import look_at, perturb, pose, rotation
-from pkmcal.identify.problem import Measurements, Mount
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.kinematics import inverse, on_manifold
-from pkmcal.observe.edges import EdgeSet
-from pkmcal.observe.poses import PoseSet
 
 Kind = Literal["design", "calibration", "rods"]
 MIDDLE = np.array([0.0, 0.0, -0.45])

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from pkmcal.arrays import Booleans
+from pkmcal.calibration.turns import Turns
 from pkmcal.identify.bundle import bundle
+from pkmcal.measurements import Observation
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.edges import Observation
-from pkmcal.turns import Turns
 from pkmcal.validate.holdouts import select
 from pkmcal.validate.regions import Region
 

@@ -10,8 +10,8 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.gauge import pose_generators
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward, inverse_result
-from pkmcal.mechanisms.limbs import closure
 
 STEPS = 20
 SETTLED = 1e-10

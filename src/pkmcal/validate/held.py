@@ -27,12 +27,13 @@ from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.closure_noise import PERFECT
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Measurements, State
+from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import Problem
-from pkmcal.identify.solver import Linear, Reduced, Stop, eliminate, transposed
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.mechanisms.limbs import closure
+from pkmcal.solver import Linear, Reduced, Stop, eliminate, transposed
 
 SOFT = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a

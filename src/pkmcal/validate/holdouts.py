@@ -9,7 +9,8 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.problem import Estimate, Measurements
+from pkmcal.identify.problem import Estimate
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.validate.drawn import Errors, errors_on
 from pkmcal.validate.held import Prediction, predict

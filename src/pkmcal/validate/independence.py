@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Booleans
 from pkmcal.errors import InputError
 from pkmcal.files import listed
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 
 if TYPE_CHECKING:
     from pkmcal.results import SavedCalibration

@@ -24,10 +24,11 @@ from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
 from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.covariance import RANK_TOLERANCE
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Estimate, Measurements, State
+from pkmcal.identify.problem import Estimate, State
 from pkmcal.identify.residuals import Problem
-from pkmcal.identify.solver import RESTART_DAMPING, Stop, eliminate, minimise, transposed
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.solver import RESTART_DAMPING, Stop, eliminate, minimise, transposed
 
 SIZE = 1e-3
 """Of a magnification, relative: the size against which it counts as seen."""

@@ -13,8 +13,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
-from pkmcal.identify.problem import Measurements
-from pkmcal.observe.edges import Observation
+from pkmcal.measurements import Measurements, Observation
 
 FOCAL = ("focal.x", "focal.y")
 

@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Booleans
 from pkmcal.files import listed
 from pkmcal.outcome import Verdict
-from pkmcal.session import Session
+from pkmcal.session.load import Session
 from pkmcal.watching.chances import POWER
 from pkmcal.watching.judged import Finding, Judgement, LegTest, Suspect
 from pkmcal.wording import SCALES, brief, count, decimals, named, number

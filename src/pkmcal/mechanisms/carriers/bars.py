@@ -13,9 +13,10 @@ from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.files import Schema
+from pkmcal.geometry.batches import turned
 from pkmcal.geometry.rigid import cross, dot, rotation, skew
-from pkmcal.mechanisms.batches import turned
 from pkmcal.mechanisms.carriers.contract import (
+    Direction,
     PlatformCarrier,
     direction_by_frame,
     moved_direction,
@@ -24,7 +25,6 @@ from pkmcal.mechanisms.carriers.contract import (
     turned_blocks,
     vectors,
 )
-from pkmcal.mechanisms.joints import Direction
 
 BarNumber = Annotated[int, Field(ge=1, description="the number of the side bar, from 1")]
 Point = Annotated[tuple[float, float, float], Field(description="a point [x, y, z] in metres")]

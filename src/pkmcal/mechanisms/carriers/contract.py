@@ -14,13 +14,41 @@ import importlib
 import pkgutil
 from abc import ABC, abstractmethod
 from functools import cache
-from typing import Any, ClassVar, NamedTuple
+from math import hypot
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
+from pydantic import AfterValidator
 
 from pkmcal.arrays import Array
 from pkmcal.files import Schema
 from pkmcal.geometry.rigid import apply, skew
+
+SHORTEST = 1e-6
+"""An axis shorter than this is a row of zeros, not a direction."""
+
+
+def _direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
+    length = hypot(*axis)
+    if length < SHORTEST:
+        raise ValueError("an axis of length zero is no direction; write one such as [0, 0, 1]")
+    if abs(length - 1) < 1e-12:  # read back what was written, to the last digit
+        return axis
+    x, y, z = (c / length for c in axis)
+    return x, y, z
+
+
+Direction = Annotated[tuple[float, float, float], AfterValidator(_direction)]
+
+
+def _rising(value: tuple[float, float]) -> tuple[float, float]:
+    if not value[0] < value[1]:
+        raise ValueError("should be two increasing readings [min, max]")
+    return value
+
+
+Interval = Annotated[tuple[float, float], AfterValidator(_rising)]
+"""Smallest and largest reading of a motor."""
 
 
 class ParameterKind(NamedTuple):

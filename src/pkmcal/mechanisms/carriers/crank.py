@@ -12,6 +12,8 @@ from pkmcal.files import Schema
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
+    Direction,
+    Interval,
     NamedMotion,
     ParameterKind,
     direction_by_frame,
@@ -21,7 +23,6 @@ from pkmcal.mechanisms.carriers.contract import (
     turned_blocks,
     vectors,
 )
-from pkmcal.mechanisms.joints import Direction, Interval
 
 UP = np.array([0.0, 0.0, 1.0])
 ZERO = tuple(ParameterKind(f"zero.{axis}", "1", "", np.nan) for axis in "xyz")

@@ -14,7 +14,7 @@ from pkmcal.mechanisms.carriers.contract import (
     turned_blocks,
     vectors,
 )
-from pkmcal.mechanisms.joints import JointDocument
+from pkmcal.mechanisms.carriers.joint import JointDocument
 
 CENTER = vectors("center", "m", "center")
 

@@ -7,7 +7,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.mechanisms.batches import turned
+from pkmcal.geometry.batches import turned
 from pkmcal.mechanisms.carriers.contract import (
     PlatformCarrier,
     moved_point,
@@ -15,7 +15,7 @@ from pkmcal.mechanisms.carriers.contract import (
     turned_blocks,
 )
 from pkmcal.mechanisms.carriers.fixed import CENTER
-from pkmcal.mechanisms.joints import JointDocument
+from pkmcal.mechanisms.carriers.joint import JointDocument
 
 
 @final

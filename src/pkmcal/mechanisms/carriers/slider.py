@@ -12,6 +12,8 @@ from pkmcal.files import Schema
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
+    Direction,
+    Interval,
     NamedMotion,
     direction_by_frame,
     moved_direction,
@@ -20,7 +22,6 @@ from pkmcal.mechanisms.carriers.contract import (
     turned_blocks,
     vectors,
 )
-from pkmcal.mechanisms.joints import Direction, Interval
 
 
 class SliderDocument(Schema):

@@ -1,0 +1,1 @@
+"""Boards in photographs: found, measured as poses; cameras calibrated from them."""

@@ -1,0 +1,237 @@
+"""Calibration boards: their description, and their corners found in photographs.
+
+Board frame: x along the first count, y along the second, z into the board, as OpenCV has it; m.
+A corner's id is its row in :attr:`Board.points`, row by row. ChArUco: the inner corners, from the
+outer corner of the first square. Chessboard: the inner corners, from the first of them. Grid of
+markers: four corners a marker, clockwise as printed, from the outer corner of the first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationInfo, field_validator
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.errors import InputError
+from pkmcal.files import Document, Schema, closest, read_yaml, shown, validate
+
+Count = Annotated[int, Field(ge=3, le=100)]
+Counts = tuple[Count, Count]
+InnerCorners = tuple[Annotated[int, Field(ge=3, le=100)], Annotated[int, Field(ge=3, le=100)]]
+Length = Annotated[float, Field(gt=0)]
+LONGEST = 5.0
+"""m; a square or marker longer than this was written in millimetres."""
+
+
+class _Dictionary(Schema):
+    dictionary: str = Field(description="a dictionary's name in OpenCV, such as DICT_5X5_100")
+
+    @field_validator("dictionary")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if name in dictionaries():
+            return name
+        guess = closest(name, dictionaries())
+        raise ValueError(
+            f"OpenCV has no dictionary of markers {shown(name)}"
+            + (f"; {guess} comes near" if guess else "")
+        )
+
+
+def _metres(length: float) -> float:
+    if length > LONGEST:
+        raise ValueError(f"{length:g} looks like millimetres; lengths are wanted in metres")
+    return length
+
+
+class CharucoSchema(_Dictionary):
+    """``type: charuco``; ``legacy: true`` is the pattern of OpenCV before 4.6 with even rows."""
+
+    type: Literal["charuco"]
+    squares: Counts = Field(description="[columns, rows] of squares, for example [9, 7]")
+    square: Length = Field(description="the length of a square's side in metres")
+    marker: Length = Field(description="the length of a marker's side in metres")
+    legacy: bool = False
+
+    @field_validator("square", "marker")
+    @classmethod
+    def _in_metres(cls, length: float, info: ValidationInfo) -> float:
+        square = info.data.get("square")
+        if square is not None and length >= square:
+            raise ValueError(f"a marker of {length:g} m does not fit into a square of {square:g} m")
+        return _metres(length)
+
+
+class ChessboardSchema(Schema):
+    """``type: chessboard``, with ``corners`` (inner ones) or ``squares``."""
+
+    type: Literal["chessboard"]
+    corners: InnerCorners | None = None
+    squares: Counts | None = Field(default=None, validate_default=True)
+    square: Length = Field(description="the length of a square's side in metres")
+
+    @field_validator("squares")
+    @classmethod
+    def _one_of_two(cls, squares: Counts | None, info: ValidationInfo) -> Counts | None:
+        corners = info.data.get("corners")
+        if (corners is None) == (squares is None):
+            raise ValueError(
+                "a chessboard needs either corners, the inner ones, such as [7, 6], or squares,"
+                " one more each way"
+            )
+        return squares
+
+    @field_validator("square")
+    @classmethod
+    def _in_metres(cls, length: float) -> float:
+        return _metres(length)
+
+
+class GridSchema(_Dictionary):
+    """``type: aruco_grid``: ArUco or AprilTag markers in rows; the first has ``first_id``."""
+
+    type: Literal["aruco_grid"]
+    markers: tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]] = (
+        Field(description="[columns, rows] of markers, for example [6, 5]")
+    )
+    marker: Length = Field(description="the length of a marker's side in metres")
+    gap: Length = Field(description="the distance between two markers in metres")
+    first_id: Annotated[int, Field(ge=0)] = 0
+
+    @field_validator("marker", "gap")
+    @classmethod
+    def _in_metres(cls, length: float) -> float:
+        return _metres(length)
+
+
+SCHEMAS: dict[str, type[Schema]] = {
+    "charuco": CharucoSchema, "chessboard": ChessboardSchema, "aruco_grid": GridSchema,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board.
+
+    counts : columns and rows of inner corners, or of markers for a grid of markers.
+    points : (N, 3) m, board frame, by corner id.
+    lines : ids of corners on one straight line, at least three each.
+    document : board.yaml's fields.
+    """
+
+    type: str
+    counts: tuple[int, int]
+    points: Array
+    lines: tuple[tuple[int, ...], ...]
+    document: dict[str, Any]
+
+    @property
+    def described(self) -> str:
+        """In words, for messages."""
+        columns, rows = self.counts
+        if self.type == "aruco_grid":
+            return f"a grid of {columns}x{rows} markers"
+        if self.type == "charuco":
+            return f"a ChArUco board of {columns + 1}x{rows + 1} squares"
+        return f"a chessboard of {columns}x{rows} inner corners"
+
+    @property
+    def turnable(self) -> bool:
+        """True where a photograph cannot tell the board from itself turned by 180 degrees."""
+        return self.type == "chessboard" and sum(self.counts) % 2 == 0
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What one photograph shows of the board.
+
+    ids : (n,) corners found. pixels : (n, 2). sigma : (n,) px, standard deviation of a coordinate
+        by the noise and sharpness of the picture; 0 where unknown.
+    reason : why no corner is used, empty where the board was found.
+    weak : ids of corners located but not fitted: half covered, in shadow or at the border.
+    mirrored : the picture is a mirror image; only boards with markers can tell.
+    """
+
+    name: str
+    image_size: tuple[int, int]
+    ids: Integers
+    pixels: Array
+    sigma: Array
+    reason: str = ""
+    weak: tuple[int, ...] = ()
+    mirrored: bool = False
+
+    @property
+    def found(self) -> bool:
+        """True where the board's corners are there."""
+        return not self.reason
+
+
+def load_board(path: Path | str, label: str | None = None) -> Board:
+    """Read a board file; every fault is an InputError with its line."""
+    return board_from_document(read_yaml(path, label))
+
+
+def board_from_document(document: Document) -> Board:
+    """The board of a file's fields, checked."""
+    kind = document.data.get("type")
+    if not isinstance(kind, str) or kind not in SCHEMAS:
+        guess = closest(str(kind), SCHEMAS)
+        raise InputError(
+            "no such type of board" if kind is not None else "the board's type is missing",
+            where=document.where("type"),
+            found=kind,
+            expected=guess or " or ".join(SCHEMAS),
+        )
+    fields: Any = validate(document, SCHEMAS[kind])
+    data = fields.model_dump(mode="json", exclude_none=True)
+    if kind == "aruco_grid":
+        return _marker_grid(fields, data)
+    if kind == "charuco":
+        columns, rows = (n - 1 for n in fields.squares)
+        return _grid(kind, (columns, rows), fields.square, (fields.square,) * 2, data)
+    corners = fields.corners or tuple(n - 1 for n in fields.squares)
+    return _grid(kind, corners, fields.square, (0.0, 0.0), data)
+
+
+def chessboard(corners: tuple[int, int], square: float) -> Board:
+    """A chessboard of (columns, rows) inner corners, square in m."""
+    document = {"type": "chessboard", "corners": list(corners), "square": square}
+    return _grid("chessboard", corners, square, (0.0, 0.0), document)
+
+
+def _grid(
+    kind: str, counts: tuple[int, int], square: float, first: tuple[float, float], data: Any
+) -> Board:
+    columns, rows = counts
+    y, x = np.mgrid[:rows, :columns].reshape(2, -1)
+    points = np.stack([first[0] + square * x, first[1] + square * y, 0.0 * x], axis=-1)
+    ids = np.arange(rows * columns).reshape(rows, columns)
+    lines = [tuple(line) for grid in (ids, ids.T) for line in grid.tolist() if len(line) > 2]
+    return Board(kind, counts, points, tuple(lines), data)
+
+
+def _marker_grid(fields: GridSchema, data: dict[str, Any]) -> Board:
+    columns, rows = fields.markers
+    row, column = np.mgrid[:rows, :columns].reshape(2, -1)
+    side, step = fields.marker, fields.marker + fields.gap
+    around = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * side
+    xy = (np.stack([column, row], axis=-1) * step)[:, None] + around
+    points = np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=-1).reshape(-1, 3)
+    lines = [
+        tuple(np.flatnonzero(points[:, axis] == value).tolist())
+        for axis in (1, 0)
+        for value in np.unique(points[:, axis])
+    ]
+    return Board("aruco_grid", fields.markers, points, tuple(v for v in lines if len(v) > 2), data)
+
+
+def dictionaries() -> tuple[str, ...]:
+    """Names of OpenCV's dictionaries of markers."""
+    import cv2
+
+    return tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))

@@ -1,0 +1,431 @@
+"""A camera calibrated from photographs of a board, with what is wrong or weak in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.boards.fit import Fit, Views, covariance_of
+from pkmcal.boards.selection import (
+    TERMS,
+    Candidate,
+    HeldOut,
+    best_of,
+    candidates,
+    fitted_to_all,
+    held_out,
+    is_worse,
+    spread_of_views,
+    thinned,
+)
+from pkmcal.cameras.contract import Camera
+from pkmcal.errors import InputError, ResultError
+from pkmcal.files import closest, listed
+from pkmcal.geometry.rigid import dot
+
+if TYPE_CHECKING:
+    # self-import
+    from pkmcal.boards.board import Board, Detection
+
+
+LEAST_VIEWS = 3
+GOOD_VIEWS = 6
+UNFIT = 3.0
+"""A model whose left-out error is so many times another's is refused; less, and worse, warned."""
+LEAST_SURE = 0.02
+"""Share of the focal length that its standard deviation may reach; a machine of a metre would be
+2 cm off."""
+EXPLAINED = 0.004
+"""Held-out error as a share of the image's width from which no model explains the photographs."""
+STANDS_OUT = 2.5
+FACING = 15.0
+"""degrees; boards tilted by less all say the same about the focal length."""
+CELLS = (8, 6)
+COVERED = 0.5
+
+
+def check_enough(used: Sequence[Any], taken: int) -> None:
+    """Raise `InputError` where fewer than three photographs show the board."""
+    if len(used) < LEAST_VIEWS:
+        raise InputError(
+            "too few photographs show the board",
+            found=f"{len(used)} of {taken}",
+            expected=f"{LEAST_VIEWS} at least, better ten, with the board tilted differently",
+        )
+
+
+def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
+    """The chosen model cannot even be begun."""
+    other = min(pool, key=lambda c: c.left_out) if pool else None
+    return InputError(
+        f"the model {model} does not fit the photographs",
+        expected=f"{other.model}, which predicts views left out to {other.left_out:.2g} px"
+        if other
+        else "photographs of one flat board by one camera",
+    )
+
+
+def check_model(model: str, chosen: Candidate, best: Candidate) -> list[str]:
+    """Sentences of doubt about a model named by the user; `InputError` where it does not fit."""
+    if model == "auto" or best.model == chosen.model or not is_worse(chosen, best):
+        return []
+    ratio = chosen.left_out / best.left_out
+    if ratio > UNFIT:
+        raise InputError(
+            f"the model {model} does not fit the photographs",
+            found=f"an error of {chosen.left_out:.2g} px on views left out",
+            expected=f"{best.model}, with {best.left_out:.2g} px",
+        )
+    return [
+        f"The model {best.model} predicts views left out better than {model}:"
+        f" {best.left_out:.3g} px against {chosen.left_out:.3g} px."
+    ]
+
+
+def check_determined(fit: Fit, covariance: Array, views: Views) -> None:
+    """Raise `ResultError` where the views do not tell the focal length."""
+    names = fit.camera.parameter_names
+    mine = [names.index("focal.x"), names.index("focal.y")]
+    if "xi" in names:
+        # Pixels a radian in the picture's middle, f / (1 + xi): f and xi alone are never sure.
+        xi = names.index("xi")
+        by = np.zeros((2, len(names)))
+        by[[0, 1], mine] = 1.0
+        by[:, xi] = -fit.camera.parameters[mine] / (1 + fit.camera.parameters[xi])
+        sigma = np.sqrt(np.diag(by @ covariance @ by.T))
+    else:
+        sigma = np.sqrt(np.diag(covariance))[mine]
+    share = float(np.max(sigma / fit.camera.parameters[mine]))
+    if share <= LEAST_SURE and np.isfinite(share):
+        return
+    tilt = tilts(fit.T_camera_board, views.points)
+    raise ResultError(
+        "the photographs do not tell the focal length, because the board looks much the same in"
+        " all of them",
+        found=f"a standard deviation of {100 * min(share, 9.99):.0f} % of it, with the board"
+        f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
+        next_step="Take photographs with the board tilted by 20 to 45 degrees, each to another"
+        " side, and near the picture's corners",
+    )
+
+
+def check_explained(rms: float, camera: Camera) -> None:
+    """Raise `ResultError` where not even the best model explains the photographs."""
+    limit = EXPLAINED * camera.image_size[0]
+    if rms <= limit:
+        return
+    raise ResultError(
+        "no camera model explains these photographs",
+        found=f"an error of {rms:.2g} px on views left out ({camera.model} fits best)",
+        expected=f"{limit:.2g} px at most, usually a tenth of that",
+        next_step="Look for a bent board, a wrong board file, a zoom or focus that moved, or"
+        " photographs of two cameras",
+    )
+
+
+def tilts(T_camera_board: Array, points: Array) -> Array:
+    """Angle (V,) in degrees between the board's normal and the line of sight to its middle."""
+    middle = T_camera_board[:, :3, :3] @ points.mean(axis=0) + T_camera_board[:, :3, 3]
+    normal = T_camera_board[:, :3, 2]
+    across = np.linalg.norm(np.cross(normal, middle), axis=-1)
+    return np.rad2deg(np.arctan2(across, np.abs(dot(normal, middle))))
+
+
+def coverage(pixels: Array, image_size: tuple[int, int]) -> Array:
+    """Corners in each cell of the picture, CELLS columns and rows, (rows, columns)."""
+    flat = pixels[np.isfinite(pixels).all(axis=-1)]
+    edges = [
+        np.linspace(-0.5, size - 0.5, n + 1) for size, n in zip(image_size, CELLS, strict=True)
+    ]
+    return np.histogram2d(flat[:, 1], flat[:, 0], bins=(edges[1], edges[0]))[0]
+
+
+def warnings_of(calibration: CameraCalibration) -> list[str]:
+    """Sentences about what is not wrong but should be known."""
+    c = calibration
+    found = [_missed(c), _few(c), _mirrored(c), _spread(c), _facing(c), _uncovered(c), _aside(c)]
+    found += _outstanding(c) + _inseparable(c)
+    return [text for text in found if text]
+
+
+def _missed(c: CameraCalibration) -> str:
+    missed = [d for d in c.detections if not d.found]
+    if not missed:
+        return ""
+    return (
+        f"{len(missed)} of {len(c.detections)} photographs are not used:"
+        f" {listed([f'{d.name} ({d.reason})' for d in missed])}."
+    )
+
+
+def _few(c: CameraCalibration) -> str:
+    if len(c.views) >= GOOD_VIEWS:
+        return ""
+    return f"Only {len(c.views)} photographs: how far they agree says little; ten are better."
+
+
+def _mirrored(c: CameraCalibration) -> str:
+    mirrored = [d.name for d in c.detections if d.mirrored]
+    if not mirrored:
+        return ""
+    return (
+        f"{len(mirrored)} photographs are mirror images, such as {mirrored[0]}: flip all of this"
+        " camera's photographs, for the calibration and for the machine, or the machine's model"
+        " comes out as its mirror image."
+    )
+
+
+def _spread(c: CameraCalibration) -> str:
+    if c.spread <= 1:
+        return ""
+    return (
+        f"The views disagree by {c.spread:.1f} times what the corners' noise explains (a board"
+        " that is not flat, or a lens that the model does not describe wholly); the standard"
+        " deviations contain it."
+    )
+
+
+def _facing(c: CameraCalibration) -> str:
+    most = tilts(c.T_camera_board, c.board.points).max()
+    if most >= FACING:
+        return ""
+    return (
+        f"The board is tilted by {most:.0f} degrees at most; tilts of 20 to 45 degrees tell the"
+        " focal length better."
+    )
+
+
+def _uncovered(c: CameraCalibration) -> str:
+    share = float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
+    if share >= COVERED:
+        return ""
+    return f"Corners cover {100 * share:.0f} % of the picture; outside, the camera is extrapolated."
+
+
+def _aside(c: CameraCalibration) -> str:
+    seen = np.isfinite(c.residuals).all(axis=-1)
+    aside = int((seen & ~c.kept).sum())
+    if not aside:
+        return ""
+    return f"{aside} of {int(seen.sum())} corners lie too far off and have lost their weight."
+
+
+def _outstanding(c: CameraCalibration) -> list[str]:
+    middle = float(np.median(c.held_out.by_view))
+    return [
+        f"The residuals of {name} are {rms / middle:.1f} times those of the middle photograph."
+        for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True)
+        if rms > STANDS_OUT * middle
+    ]
+
+
+def _inseparable(c: CameraCalibration) -> list[str]:
+    """Xi with f, and the like: known together, not alone."""
+    if c.camera.model != "unified":
+        return []
+    pairs = [p for p in c.correlations if "xi" in p[:2]]
+    if not pairs:
+        return []
+    others = listed([f"{a if b == 'xi' else b} ({rho:+.3f})" for a, b, rho in pairs])
+    return [
+        f"xi is hardly told apart from {others}, the correlation in brackets: use them together,"
+        " never one of them with another calibration's rest."
+    ]
+
+
+STRONG = 0.95
+"""Correlation from which two intrinsics are named as hardly told apart."""
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """A calibrated camera, how sure it is, and what it was found from.
+
+    terms : distortion parameters that were estimated. covariance : (n, n) of the intrinsics,
+        zero where not estimated. spread : factor on the corners' noise by which views disagree,
+        contained in the covariance.
+    views : names of the V photographs used. T_camera_board : (V, 4, 4) m.
+    pose_covariance : (V, 6, 6), left perturbation, with the intrinsics' share.
+    pixels : (V, N, 2) corners seen, NaN where not. residuals : (V, N, 2) px, predicted minus seen.
+    weight : (V, N); corners far off count less, down to 0.
+    rms, held_out : px, root mean square of the residual's length, on the views used and on views
+        that the camera was not fitted to (their poses are). noise : px, corners' noise beyond
+        their own sigma, a coordinate.
+    compared : every model and set of terms that was tried.
+    """
+
+    camera: Camera
+    terms: tuple[str, ...]
+    covariance: Array
+    spread: float
+    views: tuple[str, ...]
+    T_camera_board: Array
+    pose_covariance: Array
+    pixels: Array
+    residuals: Array
+    weight: Array
+    noise: float
+    rms: float
+    held_out: HeldOut
+    compared: tuple[Candidate, ...]
+    board: Board
+    detections: tuple[Detection, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations of the intrinsics (n,), 0 where not estimated."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def kept(self) -> Booleans:
+        """(V, N) corners in use: seen, and with at least half their weight."""
+        return np.isfinite(self.residuals).all(axis=-1) & (self.weight >= 0.5)
+
+    @property
+    def correlations(self) -> tuple[tuple[str, str, float], ...]:
+        """Pairs of intrinsics that are hardly told apart, the strongest first."""
+        sigma = np.where(self.sigma > 0, self.sigma, 1.0)
+        rho = self.covariance / sigma / sigma[:, None]
+        names = self.camera.parameter_names
+        pairs = [
+            (names[i], names[j], float(rho[i, j]))
+            for i in range(len(names))
+            for j in range(i + 1, len(names))
+            if abs(rho[i, j]) >= STRONG
+        ]
+        return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))
+
+    def document(self) -> dict[str, Any]:
+        """Everything in plain data, for JSON; the camera as its file has it."""
+        names = self.camera.parameter_names
+        return {
+            "camera": self.camera.document(),
+            "parameters": [
+                {"name": name, "value": value, "sigma": sigma, "estimated": sigma > 0}
+                for name, value, sigma in zip(
+                    names, self.camera.parameters.tolist(), self.sigma.tolist(), strict=True
+                )
+            ],
+            "covariance": self.covariance.tolist(),
+            "views_disagree_by": self.spread,
+            "rms": self.rms,
+            "held_out_rms": self.held_out.rms,
+            "straightness": self.held_out.straightness,
+            "corner_noise": self.noise,
+            "correlations": [list(pair) for pair in self.correlations],
+            "compared": [
+                {"model": c.model, "terms": list(c.terms), "rms": c.rms, "left_out_rms": c.left_out}
+                for c in self.compared
+            ],
+            "views": [
+                {
+                    "photograph": name,
+                    "T_camera_board": self.T_camera_board[v].tolist(),
+                    "covariance": self.pose_covariance[v].tolist(),
+                    "held_out_rms": float(self.held_out.by_view[v]),
+                }
+                for v, name in enumerate(self.views)
+            ],
+            "not_used": {d.name: d.reason for d in self.detections if not d.found},
+            "board": self.board.document,
+            "warnings": list(self.warnings),
+        }
+
+
+def calibrate_photographs(
+    paths: Sequence[Path | str], board: Board, model: str = "auto"
+) -> CameraCalibration:
+    """Find the board in photographs of one size and calibrate the camera that took them."""
+    from pkmcal.boards.detect import detect_boards
+
+    _check_model(model)
+    return calibrate_camera(detect_boards(paths, board), board, model)
+
+
+def calibrate_camera(
+    detections: Sequence[Detection], board: Board, model: str = "auto"
+) -> CameraCalibration:
+    """Calibrate from corners that were found. model : pinhole, fisheye, unified, or auto.
+
+    Raises `InputError` where the views are too few or `model` does not fit, and `ResultError`
+    where the views do not determine the camera.
+    """
+    _check_model(model)
+    used = [detection for detection in detections if detection.found]
+    check_enough(used, len(detections))
+    image_size = used[0].image_size
+    views = views_of(used, board)
+    pool = candidates(thinned(views), image_size, tuple(TERMS))
+    mine = tuple(c for c in pool if model in ("auto", c.model))
+    if not mine:
+        raise no_fit(model, pool)
+    chosen, best = best_of(mine), best_of(pool)
+    doubt = check_model(model, chosen, best)
+    fit = fitted_to_all(chosen, views)
+    return _calibration(fit, chosen, pool, views, board, tuple(detections), doubt)
+
+
+def views_of(detections: Sequence[Detection], board: Board) -> Views:
+    """Detections as arrays."""
+    shape = len(detections), len(board.points)
+    pixels, sigma = np.full((*shape, 2), np.nan), np.zeros(shape)
+    for v, detection in enumerate(detections):
+        pixels[v, detection.ids] = detection.pixels
+        sigma[v, detection.ids] = detection.sigma
+    return Views(board.points, pixels, sigma)
+
+
+def _calibration(
+    fit: Fit,
+    chosen: Candidate,
+    pool: tuple[Candidate, ...],
+    views: Views,
+    board: Board,
+    detections: tuple[Detection, ...],
+    doubt: list[str],
+) -> CameraCalibration:
+    names = tuple(d.name for d in detections if d.found)
+    by_noise, poses_by_noise, _ = covariance_of(fit, views)
+    spread = spread_of_views(fit, views)
+    covariance = by_noise * spread**2
+    check_determined(fit, covariance, views)
+    tested = held_out(fit, views, board.lines)
+    check_explained(tested.rms, fit.camera)
+    kept = (fit.weight >= 0.5) & views.seen
+    lengths = np.sum(np.nan_to_num(fit.residuals) ** 2, axis=-1)
+    calibration = CameraCalibration(
+        camera=replace(fit.camera, covariance=covariance),
+        terms=chosen.terms,
+        covariance=covariance,
+        spread=spread,
+        views=names,
+        T_camera_board=fit.T_camera_board,
+        pose_covariance=poses_by_noise * spread**2,
+        pixels=views.pixels,
+        residuals=fit.residuals,
+        weight=fit.weight,
+        noise=fit.tau,
+        rms=float(np.sqrt(lengths[kept].mean())),
+        held_out=tested,
+        compared=pool,
+        board=board,
+        detections=detections,
+        warnings=(),
+    )
+    return replace(calibration, warnings=(*doubt, *warnings_of(calibration)))
+
+
+def _check_model(model: str) -> None:
+    known = ("auto", *TERMS)
+    if model not in known:
+        raise InputError(
+            "no such camera model",
+            found=model,
+            expected=closest(model, known) or listed(known),
+        )

@@ -1,0 +1,564 @@
+"""Board corners to sub-pixel: a model of the corner fitted to the grey levels around it.
+
+Around a corner two edges cross. With e1 and e2 the signed distances of a pixel from them and s
+the blur, the picture of a chessboard's corner is ``c + a g(e1 / s) g(e2 / s)`` with
+``g = erf(. / sqrt 2)``, and that of a marker's corner the same with ``(1 + g) / 2``. Place, both
+directions, blur and grey levels are fitted to all pixels of a window that follows the board's
+local scale, so that it stays short where a lens or mirror makes the board small and bends its
+lines. This is the maximum-likelihood place of the corner, and measures the same on a slanted
+board as on a straight one. All corners of a photograph are fitted at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.boards.board import Board, Detection
+
+STEPS = 12
+SETTLED = 1e-3
+"""px; a thirtieth of what the noise of a good photograph does."""
+FARTHEST = 0.25
+"""Squares by which the fit may move a corner that a detector has found."""
+LEAST_RADIUS, MOST_RADIUS = 2.5, 14
+"""px; below, the window holds too few pixels for seven unknowns, above, lines bend."""
+BLURS = (0.25, 4.0)
+"""px; outside, the window shows something other than a corner."""
+LEAST_SHARE = 0.6
+"""Share of the window's variance that a corner explains; shadows and fingers leave less."""
+
+
+class Window(NamedTuple):
+    """Which pixels around a corner count, in squares of the board from the corner.
+
+    reach : as far along the edges. margin : as far across them (a ChArUco board's markers begin
+    behind it); reach again where nothing is printed inside the squares.
+    saddle : two dark squares meet at the corner, not one.
+    """
+
+    reach: float
+    margin: float
+    saddle: bool
+
+
+class Corners(NamedTuple):
+    """Fitted corners: places (n, 2) px, where the fit holds (n,), sigma (n,) px a coordinate."""
+
+    pixels: Array
+    good: Booleans
+    sigma: Array
+
+
+def refine(
+    image: Integers, start: Array, axes: Array, window: Window, bends: Array | None = None
+) -> Corners:
+    """Fit corners near `start`.
+
+    image : (height, width) grey levels. start : (n, 2) px.
+    axes : (n, 2, 2) px; axes[:, k] is the picture of one square along the board's axis k; of a
+        marker's corner, of its side, away from the corner.
+    bends : (n, 2, 2) px; second differences of the picture along the same axes, by which a lens
+        or mirror bends the edges; none for straight ones.
+    """
+    if len(start) == 0:
+        return Corners(start, np.zeros(0, dtype=bool), np.zeros(0))
+    scale = np.sqrt(np.abs(np.linalg.det(axes)))
+    widened = np.maximum(1.0, LEAST_RADIUS / np.maximum(window.reach * scale, 1e-6))
+    offsets, grey, inside = _pixels(image, start, axes, window.reach * widened)
+    weight = _weights(offsets, axes, window, widened) * inside
+    offsets, grey, weight = _packed(offsets, grey, weight)
+    first = _first(grey, weight, axes, window.saddle)
+    shape = _Shape(offsets, _curvature(first, axes, bends), window.saddle)
+    p, residual = _fit(grey, weight, shape, first)
+    return _judged(start, p, residual, grey, weight, scale, shape)
+
+
+def _pixels(
+    image: Integers, start: Array, axes: Array, reach: Array
+) -> tuple[Array, Array, Booleans]:
+    """Pixels around every corner: offsets from it (n, m, 2), grey (n, m), inside the picture."""
+    longest = float(np.max(reach * np.abs(axes).sum(axis=1).max(axis=-1), initial=0.0))
+    radius = int(np.clip(np.ceil(longest), 3, MOST_RADIUS))
+    dy, dx = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    base = np.rint(start).astype(int)
+    x, y = base[:, :1] + dx.ravel(), base[:, 1:] + dy.ravel()
+    height, width = image.shape
+    inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
+    offsets = np.stack([x - start[:, :1], y - start[:, 1:]], axis=-1)
+    return offsets, grey, inside
+
+
+def _weights(offsets: Array, axes: Array, window: Window, widened: Array) -> Array:
+    """1 for pixels of the window, falling to 0 over the last fifth of its reach; (n, m)."""
+    board = np.abs(np.linalg.solve(np.swapaxes(axes, -1, -2), np.swapaxes(offsets, -1, -2)))
+    along, across = board.max(axis=1), board.min(axis=1)
+    reach, margin = window.reach * widened[:, None], window.margin * widened[:, None]
+    taper = np.clip((reach - along) / (0.2 * reach), 0, 1)
+    return taper * (across < margin) * (np.abs(offsets).max(axis=-1) <= MOST_RADIUS)
+
+
+def _packed(offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Only the pixels that count, each corner's to the left, as wide as the largest window."""
+    most = max(int(np.count_nonzero(weight, axis=1).max()), 1)
+    order = np.argsort(weight == 0, axis=1, kind="stable")[:, :most]
+    rows = np.arange(len(order))[:, None]
+    return offsets[rows, order], grey[rows, order], weight[rows, order]
+
+
+def _first(grey: Array, weight: Array, axes: Array, saddle: bool) -> Array:
+    """Start of the fit: x, y, two directions, log blur, level, amplitude; (n, 7).
+
+    Of a marker's corner both edges are directed so that the marker is on their positive side.
+    """
+    angle = np.arctan2(axes[..., 1], axes[..., 0])
+    if not saddle:
+        inward = np.sum(_normals(angle) * axes[:, ::-1], axis=-1)
+        angle = angle + np.where(inward < 0, np.pi, 0.0)
+    total = np.maximum(weight.sum(axis=1), 1e-9)
+    mean = np.sum(weight * grey, axis=1) / total
+    spread = np.sqrt(np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total)
+    zero = np.zeros(len(grey))
+    return np.stack([zero, zero, angle[:, 0], angle[:, 1], zero, mean, spread], axis=-1)
+
+
+def _normals(angle: Array) -> Array:
+    """Positive sides (..., 2) of edges with these directions."""
+    return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+
+
+class _Shape(NamedTuple):
+    """What a corner's picture is made of: pixels' offsets (n, m, 2), curvatures (n, 2) 1/px of its
+    two edges towards their positive sides, and whether two dark squares meet.
+    """
+
+    offsets: Array
+    curvature: Array
+    saddle: bool
+
+
+def _curvature(first: Array, axes: Array, bends: Array | None) -> Array:
+    """Curvatures of the edges, (n, 2): the part of the second difference across the edge."""
+    if bends is None:
+        return np.zeros((len(first), 2))
+    across = np.sum(_normals(first[:, 2:4]) * bends, axis=-1)
+    return across / np.maximum(np.sum(axes**2, axis=-1), 1e-9)
+
+
+def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Array]:
+    """Weighted Levenberg-Marquardt of all corners at once; parameters (n, 7), residuals (n, m)."""
+    p = _levelled(grey, weight, shape, p)
+    value, by = _model(p, shape)
+    cost = np.sum(weight * (grey - value) ** 2, axis=1)
+    damping = np.full(len(p), 1e-3)
+    for _ in range(STEPS):
+        weighted = by * weight[..., None]
+        normal = np.swapaxes(by, 1, 2) @ weighted
+        right = (np.swapaxes(weighted, 1, 2) @ (grey - value)[..., None])[..., 0]
+        diagonal = np.einsum("nii->ni", normal)
+        normal = normal + (damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
+        step = np.clip(np.linalg.solve(normal, right[..., None])[..., 0], -_MOST, _MOST)
+        trial = p + step
+        trial_value, trial_by = _model(trial, shape)
+        trial_cost = np.sum(weight * (grey - trial_value) ** 2, axis=1)
+        better = trial_cost < cost
+        p = np.where(better[:, None], trial, p)
+        value = np.where(better[:, None], trial_value, value)
+        by = np.where(better[:, None, None], trial_by, by)
+        cost = np.where(better, trial_cost, cost)
+        damping = np.where(better, damping * 0.1, damping * 10)
+        if np.abs(step[:, :2]).max() < SETTLED:
+            break
+    return p, grey - value
+
+
+_MOST = np.array([1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3])
+"""Longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur."""
+
+
+def _levelled(grey: Array, weight: Array, shape: _Shape, p: Array) -> Array:
+    """The start with level and amplitude fitted: these two are linear."""
+    bare = p.copy()
+    bare[:, 5], bare[:, 6] = 0.0, 1.0
+    form = _model(bare, shape)[0]
+    total = np.maximum(weight.sum(axis=1), 1e-9)
+    mean = np.sum(weight * form, axis=1) / total
+    off = form - mean[:, None]
+    variance = np.maximum(np.sum(weight * off * off, axis=1), 1e-9)
+    bare[:, 6] = np.sum(weight * off * grey, axis=1) / variance
+    bare[:, 5] = np.sum(weight * grey, axis=1) / total - bare[:, 6] * mean
+    return bare
+
+
+def _model(p: Array, shape: _Shape) -> tuple[Array, Array]:
+    """Grey levels (n, m) and their derivatives by the seven unknowns (n, m, 7)."""
+    from scipy.special import erf
+
+    d = shape.offsets - p[:, None, :2]
+    blur = np.exp(p[:, 4])[:, None]
+    half = 1.0 if shape.saddle else 0.5
+    forms: list[Array] = []
+    chains: list[Array] = []
+    for k in (0, 1):
+        cos, sin = np.cos(p[:, 2 + k])[:, None], np.sin(p[:, 2 + k])[:, None]
+        bend = shape.curvature[:, k, None]
+        along, across = d[..., 0] * cos + d[..., 1] * sin, d[..., 1] * cos - d[..., 0] * sin
+        z = (across - 0.5 * bend * along**2) / blur
+        forms.append(half * erf(z / np.sqrt(2)) + (1 - half))
+        slope = half * np.sqrt(2 / np.pi) * np.exp(-0.5 * z * z) / blur
+        by_angle = -along - bend * along * across
+        parts = (sin + bend * along * cos, bend * along * sin - cos, by_angle, -z * blur)
+        chains.append(slope[..., None] * np.stack(np.broadcast_arrays(*parts), axis=-1))
+    level, amplitude = p[:, 5:6], p[:, 6:7]
+    by = np.empty((*d.shape[:-1], 7))
+    first = (amplitude * forms[1])[..., None] * chains[0]
+    second = (amplitude * forms[0])[..., None] * chains[1]
+    by[..., :2] = first[..., :2] + second[..., :2]
+    by[..., 2], by[..., 3] = first[..., 2], second[..., 2]
+    by[..., 4] = first[..., 3] + second[..., 3]
+    by[..., 5], by[..., 6] = 1.0, forms[0] * forms[1]
+    return level + amplitude * by[..., 6], by
+
+
+def _judged(
+    start: Array, p: Array, residual: Array, grey: Array, weight: Array, scale: Array, shape: _Shape
+) -> Corners:
+    """Where the fit is a corner, and how sure its place is by what it leaves unexplained."""
+    total = np.maximum(weight.sum(axis=1), 1e-9)
+    mean = np.sum(weight * grey, axis=1) / total
+    variance = np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total
+    left = np.sum(weight * residual**2, axis=1) / total
+    blur, moved = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
+    good = (
+        (left < (1 - LEAST_SHARE) * variance)
+        & (blur > BLURS[0] / 2)
+        & (blur < np.maximum(BLURS[1], 0.2 * scale))
+        & (moved < np.maximum(1.5, FARTHEST * scale))
+        & (weight.sum(axis=1) > 12)
+        & np.isfinite(p).all(axis=1)
+    )
+    by = _model(p, shape)[1]
+    normal = np.swapaxes(by, 1, 2) @ (by * weight[..., None]) + 1e-9 * np.eye(7)
+    # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.
+    noise = np.maximum(left, 1 / 12)
+    covariance = np.linalg.inv(normal) * noise[:, None, None]
+    sigma = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0) / 2)
+    return Corners(start + np.where(good[:, None], p[:, :2], 0.0), good, sigma)
+
+
+REACH = 0.25
+"""Squares around a corner that its fit uses: longer edges say little more, and begin to bend."""
+BENT = 0.02
+"""px by which an edge may leave its tangent within the window before its bend is put in."""
+CLEAR = 0.9
+"""Share of the blank border between edge and marker that the window may fill."""
+LEAST_CORNERS = 6
+"""Corners below which a photograph says nothing: four fix a board's pose, two more test it."""
+WHOLE = 0.75
+"""Share of a chessboard's corners that must look like corners: what is found there is the whole
+board, or something else."""
+SMALL = 1000
+"""px; pictures wider than this are tried at half their size as well."""
+STRAIGHT_ENOUGH = 0.35
+"""Share of a square by which a corner may lie off the middle of its two neighbours' line."""
+
+Raw = tuple[Integers, Array]
+"""Corner ids (n,) and pixels (n, 2) as a detector gives them."""
+
+
+def detect_board(image: Integers, board: Board, name: str = "", quick: bool = False) -> Detection:
+    """Find the board's corners in one photograph, grey levels (height, width) uint8.
+
+    quick : only the first way of finding a chessboard.
+    """
+    if board.type == "chessboard":
+        raw, mirrored, why = _chessboard(image, board, quick)
+    else:
+        raw, mirrored, why = (_charuco if board.type == "charuco" else _marker_grid)(image, board)
+    size = (image.shape[1], image.shape[0])
+    nothing = np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0)
+    if len(raw[0]) < LEAST_CORNERS:
+        return Detection(name, size, *nothing, reason=why)
+    fitted = _fitted(image, board, raw)
+    ids, good = raw[0], fitted.good
+    weak = tuple(int(i) for i in ids[~good])
+    least = WHOLE * len(board.points) if board.type == "chessboard" else LEAST_CORNERS
+    if good.sum() < least or _on_a_line(board.points[ids[good], :2]):
+        why = f"only {good.sum()} of {len(board.points)} corners are sharp and uncovered"
+        return Detection(name, size, *nothing, reason=why, weak=weak)
+    return Detection(
+        name, size, ids[good], fitted.pixels[good], fitted.sigma[good], "", weak, mirrored
+    )
+
+
+def _fitted(image: Integers, board: Board, raw: Raw) -> Corners:
+    """The corners' fits; a grid of markers may have plain corners or touching dark squares."""
+    ids, pixels = raw
+    data = board.document
+    if board.type == "aruco_grid":
+        module = 1 / (marker_bits(data["dictionary"]) + 2)
+        reach = min(REACH, 0.8 * data["gap"] / data["marker"])
+        axes = _marker_axes(ids, pixels)
+        plain = refine(image, pixels, axes, Window(reach, CLEAR * module, False))
+        touching = refine(image, pixels, axes, Window(reach, CLEAR * module, True))
+        # Both may be found: on a marker's inner pattern too. The right ones are the surer ones.
+        right = plain.good.sum() > touching.good.sum() or (
+            np.median(plain.sigma) <= np.median(touching.sigma)
+        )
+        return plain if right else touching
+    margin = REACH
+    if board.type == "charuco":
+        margin = min(REACH, CLEAR * 0.5 * (1 - data["marker"] / data["square"]))
+    window = Window(REACH, margin, True)
+    fitted = refine(image, pixels, _axes(board, ids, pixels)[0], window)
+    # How lines bend is told by the fitted corners; the detector's are too rough for it.
+    sides, bends = _axes(board, ids, fitted.pixels)
+    if np.abs(bends).max() * REACH**2 / 2 < BENT:
+        return fitted
+    return refine(image, fitted.pixels, sides, window, bends)
+
+
+def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
+    """Pictures of the square's two sides at every corner, (n, 2, 2) px, [:, k] along axis k; and
+    second differences along them, (n, 2, 2) px.
+
+    From the neighbours found; where a corner has none along an axis, from the mean of the rest.
+    """
+    columns, rows = board.counts
+    grid = np.full((rows * columns, 2), np.nan)
+    grid[ids] = pixels
+    grid = grid.reshape(rows, columns, 2)
+    sides = np.empty((len(ids), 2, 2))
+    bends = np.zeros((len(ids), 2, 2))
+    for k, axis in enumerate((1, 0)):
+        step = np.diff(grid, axis=axis)
+        mean = np.nanmean(step.reshape(-1, 2), axis=0) if np.isfinite(step).any() else np.nan
+        side = _beside(step, axis).reshape(-1, 2)[ids]
+        sides[:, k] = np.where(np.isfinite(side), side, mean)
+        # At the board's border the bend of the nearest corner inside serves as well.
+        second = _nearest(_padded(np.diff(step, axis=axis), axis, 1, 1), axis)
+        bends[:, k] = np.nan_to_num(second.reshape(-1, 2)[ids])
+    # A single row of corners has no second side: take it square.
+    for k in (0, 1):
+        bare = ~np.isfinite(sides[:, k]).all(axis=1)
+        sides[bare, k] = (1 - 2 * k) * sides[bare, 1 - k][:, ::-1] * [1, -1]
+    return sides, bends
+
+
+def _padded(values: Array, axis: int, before: int, after: int) -> Array:
+    """With NaN before and after along an axis."""
+    pad = [(0, 0)] * values.ndim
+    pad[axis] = (before, after)
+    return np.pad(values, pad, constant_values=np.nan)
+
+
+def _beside(step: Array, axis: int) -> Array:
+    """Mean of the steps to both sides, or the one that there is."""
+    both = np.stack([_padded(step, axis, 1, 0), _padded(step, axis, 0, 1)])
+    known = np.isfinite(both)
+    total = np.where(known, both, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(known.any(axis=0), total, np.nan)
+
+
+def _nearest(values: Array, axis: int) -> Array:
+    """NaN replaced by the mean of the two neighbours' values, or the one that there is."""
+    around = [np.roll(values, shift, axis) for shift in (1, -1)]
+    known = np.isfinite(np.stack(around))
+    total = np.where(known, np.stack(around), 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(np.isfinite(values), values, total)
+
+
+def _marker_axes(ids: Integers, pixels: Array) -> Array:
+    """As :func:`_axes`, with a marker's sides, away from the corner; ids come in fours."""
+    corner = pixels.reshape(-1, 4, 2)
+    top, right = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 1]
+    bottom, left = corner[:, 2] - corner[:, 3], corner[:, 3] - corner[:, 0]
+    x = np.stack([top, -top, -bottom, bottom], axis=1)
+    y = np.stack([left, right, -right, -left], axis=1)
+    return np.stack([x, y], axis=2).reshape(len(ids), 2, 2)
+
+
+def _on_a_line(xy: Array) -> bool:
+    spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
+    return bool(spread[1] < 1e-6 * spread[0])
+
+
+def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
+    detector = charuco_detector(board.document)
+    best: Raw = (np.zeros(0, dtype=int), np.zeros((0, 2)))
+    markers = 0
+    for mirrored in (False, True):
+        picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
+        corners, ids, _, marker_ids = detector.detectBoard(picture)
+        markers = max(markers, _length(marker_ids))
+        found = _raw(corners, ids, image.shape[1], mirrored)
+        if len(found[0]) >= LEAST_CORNERS:
+            return found, mirrored, ""
+        best = max(best, found, key=lambda raw: len(raw[0]))
+    why = f"{markers} of the board's markers and {len(best[0])} corners are recognised"
+    return best, False, why if markers else "none of the board's markers is recognised"
+
+
+def _raw(corners: Any, ids: Any, width: int, mirrored: bool) -> Raw:
+    """OpenCV's corners and ids, whose shapes differ between versions."""
+    if _length(ids) == 0:
+        return np.zeros(0, dtype=int), np.zeros((0, 2))
+    pixels = np.asarray(corners, dtype=float).reshape(-1, 2)
+    if mirrored:
+        pixels = pixels * [-1, 1] + [width - 1, 0]
+    return np.asarray(ids).reshape(-1).astype(int), pixels
+
+
+def _length(found: Any) -> int:
+    """Entries of what OpenCV found; None where it found nothing."""
+    return 0 if found is None else len(found)
+
+
+def charuco_detector(data: dict[str, Any]) -> Any:
+    """OpenCV's detector of a ChArUco board's fields."""
+    import cv2
+
+    board = cv2.aruco.CharucoBoard(
+        tuple(data["squares"]), data["square"], data["marker"], dictionary(data["dictionary"])
+    )
+    board.setLegacyPattern(bool(data.get("legacy", False)))
+    return cv2.aruco.CharucoDetector(board)
+
+
+def dictionary(name: str) -> Any:
+    """OpenCV's dictionary of markers."""
+    import cv2
+
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def marker_bits(name: str) -> int:
+    """Bits of a marker's side without its border."""
+    return int(dictionary(name).markerSize)
+
+
+def detect_markers(image: Integers, name: str) -> tuple[Integers, Array]:
+    """Markers of a dictionary: ids (k,) and corners (k, 4, 2) px."""
+    import cv2
+
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary(name)).detectMarkers(image)
+    if _length(ids) == 0:
+        return np.zeros(0, dtype=int), np.zeros((0, 4, 2))
+    return np.asarray(ids).reshape(-1).astype(int), np.asarray(corners, float).reshape(-1, 4, 2)
+
+
+def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
+    data = board.document
+    count = board.counts[0] * board.counts[1]
+    for mirrored in (False, True):
+        picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
+        ids, corners = detect_markers(picture, data["dictionary"])
+        ids = ids - data.get("first_id", 0)
+        ours = (ids >= 0) & (ids < count)
+        twice = np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
+        ours &= ~twice
+        if ours.sum() >= 2:
+            found = (4 * ids[ours, None] + np.arange(4)).reshape(-1)
+            return _raw(corners[ours], found, image.shape[1], mirrored), mirrored, ""
+    return _raw([], [], 0, False), False, "fewer than two of the board's markers are recognised"
+
+
+def _chessboard(image: Integers, board: Board, quick: bool) -> tuple[Raw, bool, str]:
+    pixels = find_chessboard(image, board.counts, quick)
+    if pixels is None:
+        why = f"no chessboard of {board.counts[0]}x{board.counts[1]} inner corners is recognised"
+        return _raw([], [], 0, False), False, why
+    return (np.arange(len(pixels)), pixels), False, ""
+
+
+def find_chessboard(image: Integers, counts: tuple[int, int], quick: bool = False) -> Array | None:
+    """Corners (rows * columns, 2) px in the board's order, None where not found.
+
+    quick : the first way only, for trying many counts.
+    """
+    for pixels in _attempts(image, counts, quick):
+        grid = pixels.reshape(counts[1], counts[0], 2)
+        if _is_grid(grid):
+            return _oriented(image, grid).reshape(-1, 2)
+    return None
+
+
+def _attempts(image: Integers, counts: tuple[int, int], quick: bool) -> Iterator[Array]:
+    """What OpenCV finds by several ways, the fastest and most successful first."""
+    import cv2
+
+    thorough = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    adaptive = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    for picture, scale in _pictures(image, quick):
+        ways = [
+            lambda p=picture: cv2.findChessboardCornersSB(p, counts, flags=thorough),
+            lambda p=picture: cv2.findChessboardCorners(p, counts, flags=adaptive),
+        ]
+        # Enlarged, the second way takes seconds on a cluttered picture.
+        for way in ways[:1] if quick or scale > 1 else ways:
+            found, corners = way()
+            if found and _length(corners) == counts[0] * counts[1]:
+                pixels = np.asarray(corners, dtype=float).reshape(-1, 2)
+                yield (pixels + 0.5) / scale - 0.5
+
+
+def _pictures(image: Integers, quick: bool) -> Iterator[tuple[Any, float]]:
+    """The photograph; with its contrast evened out; smaller; larger; each with its scale."""
+    import cv2
+
+    yield image, 1.0
+    if quick:
+        return
+    yield cv2.createCLAHE(3.0, (8, 8)).apply(image), 1.0
+    if image.shape[1] > SMALL:
+        yield cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 0.5
+    yield cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), 2.0
+
+
+def _is_grid(grid: Array) -> bool:
+    """Corners in order: every one near the middle between its neighbours, no row crossing."""
+    for axis in (0, 1):
+        step = np.diff(grid, axis=axis)
+        length = np.linalg.norm(step, axis=-1)
+        bend = np.linalg.norm(np.diff(step, axis=axis), axis=-1)
+        near = np.minimum(*np.split(np.stack([
+            np.take(length, range(length.shape[axis] - 1), axis),
+            np.take(length, range(1, length.shape[axis]), axis),
+        ]), 2))[0]  # fmt: skip
+        if length.min() < 2 or np.any(bend > STRAIGHT_ENOUGH * 2 * near):
+            return False
+    right = grid[:-1, 1:] - grid[:-1, :-1]
+    down = grid[1:, :-1] - grid[:-1, :-1]
+    area = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]
+    return bool(np.all(area > 0) or np.all(area < 0))
+
+
+def _oriented(image: Integers, grid: Array) -> Array:
+    """The grid seen from the front and, where its colours tell, from its dark first square.
+
+    Turns by 180 degrees only: the counts fix the rest, or (square boards) nothing does.
+    """
+    right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if right[0] * down[1] - right[1] * down[0] < 0:
+        grid = grid[:, ::-1]
+    if sum(grid.shape[:2]) % 2 and _first_square_light(image, grid):
+        grid = grid[::-1, ::-1]
+    return np.ascontiguousarray(grid)
+
+
+def _first_square_light(image: Integers, grid: Array) -> bool:
+    """True where the square whose last corner is the grid's first is lighter than its neighbours.
+
+    Told by all inner squares, by turns of equal colour, since one may lie in a shadow.
+    """
+    centre = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    x, y = np.rint(centre).astype(int).reshape(-1, 2).T
+    grey = image[np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)]
+    row, column = np.mgrid[: centre.shape[0], : centre.shape[1]].reshape(2, -1)
+    # inner square (0, 0) has the colour of the first outer one, a diagonal step away
+    same = (row + column) % 2 == 0
+    return bool(grey[same].mean() > grey[~same].mean())

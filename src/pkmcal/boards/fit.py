@@ -1,0 +1,408 @@
+"""Maximum-likelihood fit of a camera and of the board's poses to the corners seen.
+
+Unknowns: the free intrinsics, and six numbers a view (left perturbation of ``T_camera_board``).
+A corner's residual is divided by sqrt(sigma^2 + tau^2): sigma is what its own fit in the picture
+says, tau what the model leaves out, estimated so that chi square is what it should be. Corners
+far off lose their weight. The poses are eliminated view by view (:mod:`pkmcal.solver`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras.contract import Camera
+from pkmcal.geometry.rigid import apply, dot, perturb, pose, rotation, skew
+from pkmcal.solver import Linear, Values, eliminate, minimise, own_factors, transposed
+
+FULL, NONE = 4.0, 6.5
+"""A corner counts fully up to FULL and not at all from NONE standard deviations on."""
+LEAST_NOISE = 1e-4
+"""px; keeps noise-free data finite."""
+ROUNDS = 12
+STEPS = 20
+"""Most steps of a round; a long valley, such as that of xi and f, is followed over several."""
+SETTLED = 1e-3
+"""Change of the corners' weights and relative change of tau that end the rounds."""
+
+
+class Views(NamedTuple):
+    """Corners of V views of one board.
+
+    points : (N, 3) m, board frame. pixels : (V, N, 2), NaN where a corner is not seen.
+    sigma : (V, N) px, a corner's own standard deviation, 0 where unknown.
+    """
+
+    points: Array
+    pixels: Array
+    sigma: Array
+
+    @property
+    def seen(self) -> Booleans:
+        """(V, N) True where a corner is seen."""
+        return np.asarray(np.isfinite(self.pixels).all(axis=-1))
+
+    def take(self, views: Integers | Sequence[int]) -> Views:
+        """Some of the views."""
+        return Views(self.points, self.pixels[views], self.sigma[views])
+
+
+class State(NamedTuple):
+    """Free intrinsics (B, k), of one run where there are any, and poses ``T_camera_board``
+    (B, K, 4, 4).
+    """
+
+    intrinsics: Array
+    T_camera_board: Array
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Corners as the solver wants them: B runs of K views with one camera.
+
+    camera : model and image size; its parameters where not free.
+    free : positions of the free intrinsics; none where only poses are wanted.
+    pixels : (B, K, N, 2). scale : (B, K, N) root of weight over sigma; 0 for corners not seen.
+    """
+
+    camera: Camera
+    free: Integers
+    points: Array
+    pixels: Array
+    scale: Array
+
+    def residuals(self, state: State) -> Values:
+        """Whitened residuals, NaN where the camera does not see a corner that was seen."""
+        camera = with_free(self.camera, self.free, state)
+        there = apply(state.T_camera_board[..., None, :, :], self.points)
+        off = (camera.project(there) - self.pixels) * self.scale[..., None]
+        off = np.where(self.scale[..., None] > 0, off, 0.0)
+        return Values(off.reshape(*off.shape[:2], -1), np.zeros((len(off), 0)))
+
+    def linearize(self, state: State) -> Linear:
+        """Whitened residuals and their exact derivatives."""
+        camera = with_free(self.camera, self.free, state)
+        rotated = apply(state.T_camera_board[..., None, :, :], self.points)
+        turned = rotated - state.T_camera_board[..., None, :3, 3]
+        by_point, by_parameters = camera.project_jacobians(rotated)
+        by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
+        value = self.residuals(state).value
+        usable = np.isfinite(value)
+        shape = value.shape
+        scale = self.scale[..., None, None]
+
+        def rows(jacobian: Array) -> Array:
+            flat = np.where(scale > 0, jacobian * scale, 0.0)
+            flat = flat.reshape(*shape, jacobian.shape[-1])
+            return np.where(usable[..., None], flat, 0.0)
+
+        shared = rows(by_parameters[..., self.free])
+        if not len(self.free):
+            # The solver wants one shared unknown at least; this one moves nothing.
+            shared = np.zeros((*shape, 1))
+        return Linear(
+            np.where(usable, value, 0.0),
+            shared,
+            rows(by_pose),
+            usable,
+            np.zeros((shape[0], 0)),
+            np.zeros((0, shared.shape[-1])),
+        )
+
+    def moved(self, state: State, shared: Array, own: Array) -> State:
+        """The state after a step; xi stays at 0 or above."""
+        intrinsics = state.intrinsics
+        if len(self.free):
+            intrinsics = intrinsics + shared
+            if "xi" in self.camera.parameter_names:
+                xi = self.free == self.camera.parameter_names.index("xi")
+                intrinsics[:, xi] = np.maximum(intrinsics[:, xi], 0.0)
+        return State(intrinsics, perturb(state.T_camera_board, own))
+
+    def select(self, runs: Integers) -> Problem:
+        """The problem of some runs."""
+        return replace(self, pixels=self.pixels[runs], scale=self.scale[runs])
+
+
+def with_free(camera: Camera, free: Integers, state: State) -> Camera:
+    """The camera with its free intrinsics as the state has them."""
+    if not len(free):
+        return camera
+    parameters = camera.parameters.copy()
+    parameters[free] = state.intrinsics[0]
+    return replace(camera, parameters=parameters)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A camera fitted to views.
+
+    free : positions of the estimated intrinsics. T_camera_board : (V, 4, 4).
+    residuals : (V, N, 2) px, predicted minus seen, NaN where not seen. weight : (V, N), 0 to 1.
+    tau : px, noise beyond the corners' own. converged : False where the search gave up.
+    """
+
+    camera: Camera
+    free: Integers
+    T_camera_board: Array
+    residuals: Array
+    weight: Array
+    tau: float
+    converged: bool
+
+    def problem(self, views: Views) -> Problem:
+        """The whitened problem at the fit's weights, as one run."""
+        return _problem(self.camera, self.free, views, self.weight, self.tau)
+
+    @property
+    def state(self) -> State:
+        """The fit as the solver's state."""
+        return State(self.camera.parameters[None, self.free], self.T_camera_board[None])
+
+
+def fit_camera(
+    camera: Camera, free: Integers, views: Views, T_camera_board: Array, rounds: int = ROUNDS
+) -> Fit:
+    """Fit intrinsics and poses from a start; weights and noise alternate with the search."""
+    seen = views.seen
+    weight = seen.astype(float)
+    state = State(camera.parameters[None, free], T_camera_board[None])
+    tau, cut, converged, off = 1.0, 4.0, True, views.pixels
+    for _ in range(rounds):
+        problem = _problem(camera, free, views, weight, tau)
+        found = minimise(problem, state, max_steps=STEPS)
+        state, converged = found.state, "converged" in found.stop[0].value
+        off = _off(with_free(camera, free, state), state, views)
+        dof = max(2 * weight.sum() - 6 * len(seen) - len(free), 1.0)
+        new_tau = noise_beyond(off, views.sigma, weight, dof)
+        robust = _robust_scale(off, views.sigma, seen)
+        new_weight = _weights(off, views.sigma, robust * cut, seen)
+        change = np.abs(new_weight - weight).max(initial=0.0)
+        done = cut == 1.0 and change < SETTLED and abs(new_tau - tau) <= SETTLED * max(tau, new_tau)
+        weight, tau, cut = new_weight, new_tau, max(cut / 2, 1.0)
+        if done:
+            break
+    return Fit(
+        with_free(camera, free, state), free, state.T_camera_board[0], off, weight, tau, converged
+    )
+
+
+def refit(fit: Fit, views: Views, kept: Integers) -> Fit:
+    """The camera from some of the views, from the fit to all, with its weights and noise."""
+    part = views.take(kept)
+    problem = _problem(fit.camera, fit.free, part, fit.weight[kept], fit.tau)
+    state = State(fit.camera.parameters[None, fit.free], fit.T_camera_board[kept][None])
+    found = minimise(problem, state, max_steps=15)
+    camera = with_free(fit.camera, fit.free, found.state)
+    off = _off(camera, found.state, part)
+    return replace(
+        fit, camera=camera, T_camera_board=found.state.T_camera_board[0], residuals=off,
+        weight=fit.weight[kept],
+    )  # fmt: skip
+
+
+def fit_poses(
+    camera: Camera, views: Views, T_camera_board: Array, scale: Array
+) -> tuple[Array, Array]:
+    """Poses (V, 4, 4) alone, each view on its own, and their costs (V,). scale : (V, N)."""
+    problem = Problem(
+        camera, np.zeros(0, dtype=int), views.points, views.pixels[:, None], scale[:, None]
+    )
+    found = minimise(
+        problem, State(np.zeros((len(scale), 0)), T_camera_board[:, None]), max_steps=STEPS
+    )
+    return found.state.T_camera_board[:, 0], found.cost
+
+
+def covariance_of(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
+    """Covariances at a fit: intrinsics (n, n), zero where not free; poses (V, 6, 6); and the
+    poses' derivative by the intrinsics (V, 6, n).
+    """
+    linear = fit.problem(views).linearize(fit.state)
+    n = len(fit.camera.parameters)
+    whole = np.zeros((n, n))
+    if len(fit.free):
+        part = inverted(reduced_normals(linear).sum(axis=0))
+        whole[np.ix_(fit.free, fit.free)] = part
+    q, r = own_factors(linear.by_own, np.zeros(1))
+    rows = linear.by_own.shape[-2]
+    inner = np.linalg.inv(r[0] + 1e-150 * np.eye(6))
+    by = np.zeros((len(fit.T_camera_board), 6, n))
+    if len(fit.free):
+        by[..., fit.free] = -inner @ (transposed(q[0, :, :rows]) @ linear.by_shared[0])
+    poses = inner @ transposed(inner) + by @ whole @ transposed(by)
+    return whole, poses, by
+
+
+def reduced_normals(linear: Linear) -> Array:
+    """Each view's share of the intrinsics' normal matrix, poses eliminated, (V, k, k)."""
+    rows = eliminate(linear, np.zeros(1)).rows[0]
+    return transposed(rows) @ rows
+
+
+def inverted(normal: Array) -> Array:
+    """Inverse of a normal matrix; what is not determined becomes very uncertain, not an error."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    values, vectors = np.linalg.eigh(normal / scale / scale[:, None])
+    values = np.maximum(values, 1e-14)
+    return (vectors / values) @ vectors.T / scale / scale[:, None]
+
+
+def noise_beyond(off: Array, sigma: Array, weight: Array, dof: float) -> float:
+    """The tau with sum of w |off|^2 / (sigma^2 + tau^2) = dof, LEAST_NOISE at least; px."""
+    squares = weight * np.nan_to_num(np.sum(off**2, axis=-1))
+
+    def excess(tau: float) -> float:
+        return float(np.sum(squares / (sigma**2 + tau**2))) - dof
+
+    low, high = LEAST_NOISE, float(np.sqrt(squares.sum() / dof)) + 2 * LEAST_NOISE
+    if excess(low) <= 0:
+        return low
+    for _ in range(40):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+    return float(high)
+
+
+def _problem(camera: Camera, free: Integers, views: Views, weight: Array, tau: float) -> Problem:
+    scale = np.where(views.seen, np.sqrt(weight / (views.sigma**2 + tau**2)), 0.0)
+    return Problem(camera, free, views.points, views.pixels[None], scale[None])
+
+
+def _off(camera: Camera, state: State, views: Views) -> Array:
+    """Predicted minus seen, (V, N, 2) px; far away where the camera cannot see the corner."""
+    off = camera.project(apply(state.T_camera_board[0][:, None], views.points)) - views.pixels
+    lost = views.seen[..., None] & ~np.isfinite(off)
+    return np.where(lost, 1e3, off)
+
+
+def _robust_scale(off: Array, sigma: Array, seen: Booleans) -> float:
+    """Tau from the median of the residuals' lengths, px: half of a 2-D normal's lie within
+    sqrt(2 ln 2) standard deviations.
+    """
+    middle = float(np.median(np.sum(off[seen] ** 2, axis=-1))) / (2 * np.log(2))
+    return float(np.sqrt(max(middle - float(np.median(sigma[seen] ** 2)), LEAST_NOISE**2)))
+
+
+def _weights(off: Array, sigma: Array, tau: float, seen: Booleans) -> Array:
+    """1 up to FULL standard deviations, a cosine's way down to 0 at NONE, (V, N)."""
+    distance = np.sqrt(np.sum(np.nan_to_num(off) ** 2, axis=-1) / (sigma**2 + tau**2))
+    x = np.clip((distance - FULL) / (NONE - FULL), 0, 1)
+    return np.where(seen, 0.5 * (1 + np.cos(np.pi * x)), 0.0)
+
+
+class BoardPoses(NamedTuple):
+    """Where a board was in each of V views.
+
+    T_camera_board : (V, 4, 4). covariance : (V, 6, 6) of (omega, tau), left perturbation, by the
+    corners' noise alone. by_intrinsics : (V, 6, n) derivative by the camera's parameters; with
+    their covariance C a pose's whole covariance is covariance + by_intrinsics C by_intrinsics^T.
+    residuals : (V, N, 2) px. weight : (V, N). noise : px beyond the corners' own.
+    """
+
+    T_camera_board: Array
+    covariance: Array
+    by_intrinsics: Array
+    residuals: Array
+    weight: Array
+    noise: float
+
+
+def board_poses(camera: Camera, views: Views) -> BoardPoses:
+    """The board's pose in every view, by maximum likelihood with a known camera."""
+    start = settled_poses(camera, views)
+    fit = fit_camera(camera, np.zeros(0, dtype=int), views, start)
+    # The derivative by all intrinsics, though none of them is estimated here.
+    as_if_free = replace(fit, free=np.arange(len(camera.parameters)))
+    return BoardPoses(
+        fit.T_camera_board,
+        covariance_of(fit, views)[1],
+        covariance_of(as_if_free, views)[2],
+        fit.residuals,
+        fit.weight,
+        fit.tau,
+    )
+
+
+def settled_poses(camera: Camera, views: Views, start: Array | None = None) -> Array:
+    """Poses (V, 4, 4) by least squares, the better of each view's two tilts."""
+    start = linear_poses(camera.ray(views.pixels), views.points) if start is None else start
+    scale = views.seen.astype(float)
+    first, cost = fit_poses(camera, views, start, scale)
+    second, other = fit_poses(camera, views, tilted_back(first, views.points), scale)
+    return np.where((other < cost)[:, None, None], second, first)
+
+
+def tilted_back(T_camera_board: Array, points: Array) -> Array:
+    """The pose that looks almost the same from far away: the board tilted the other way.
+
+    Half a turn about the line of sight through the board's middle undoes, in the picture, half a
+    turn of the board about its own normal.
+    """
+    middle = points.mean(axis=0)
+    rot = T_camera_board[..., :3, :3]
+    centre = rot @ middle + T_camera_board[..., :3, 3]
+    sight = centre / np.linalg.norm(centre, axis=-1, keepdims=True)
+    turned = rotation(np.pi * sight) @ rot @ np.diag([-1.0, -1.0, 1.0])
+    return pose(turned, centre - turned @ middle)
+
+
+def linear_poses(rays: Array, points: Array) -> Array:
+    """Poses (..., 4, 4) with rays (..., N, 3) parallel to T points (N, 3), points on a plane z = 0.
+
+    ray x (r1 X + r2 Y + t) = 0 is linear in r1, r2 and t, for rays to all sides; r1 and r2 are
+    made orthonormal afterwards. NaN rays are left out.
+    """
+    known = np.asarray(np.isfinite(rays).all(axis=-1))
+    s = np.where(known[..., None], rays, 0.0)
+    middle, spread = points[:, :2].mean(axis=0), points[:, :2].std() + 1e-12
+    plane = np.concatenate([(points[:, :2] - middle) / spread, np.ones((len(points), 1))], axis=-1)
+    # sum over corners of kron(X X^T, I - s s^T), the normal matrix of the cross products
+    across = known[..., None, None] * np.eye(3) - s[..., :, None] * s[..., None, :]
+    normal = np.einsum("na,nb,...nij->...aibj", plane, plane, across, optimize=True)
+    normal = normal.reshape(*rays.shape[:-2], 9, 9)
+    vector = np.linalg.eigh(normal)[1][..., 0].reshape(*rays.shape[:-2], 3, 3)
+    m1, m2, m0 = vector[..., 0, :] / spread, vector[..., 1, :] / spread, vector[..., 2, :]
+    m0 = m0 - m1 * middle[0] - m2 * middle[1]
+    size = np.sqrt(np.linalg.norm(m1, axis=-1) * np.linalg.norm(m2, axis=-1))
+    size = np.maximum(size, 1e-300)[..., None]
+    ahead = np.einsum("...ni,...ni->...", s, _planar(m1, m2, m0, points))
+    size = size * np.where(ahead < 0, -1.0, 1.0)[..., None]
+    m1, m2, t = m1 / size, m2 / size, m0 / size
+    u, _, vt = np.linalg.svd(np.stack([m1, m2], axis=-1), full_matrices=False)
+    r12 = u @ vt
+    rot = np.concatenate([r12, np.cross(r12[..., 0], r12[..., 1])[..., None]], axis=-1)
+    return pose(rot, t)
+
+
+def _planar(m1: Array, m2: Array, m0: Array, points: Array) -> Array:
+    x, y = points[:, :1], points[:, 1:2]
+    return m1[..., None, :] * x + m2[..., None, :] * y + m0[..., None, :]
+
+
+def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ...]) -> Array:
+    """Distances (n,) px of corners from the great circle through their line's rays.
+
+    pixels : (N, 2) of one view, NaN where not seen. lines : ids of corners on a straight line.
+    A line's plane is fitted to its rays, weighted so that pixels count, not angles.
+    """
+    rays = camera.ray(pixels)
+    by_pixel = camera.ray_jacobians(pixels)[0]
+    good = np.asarray(np.isfinite(rays).all(axis=-1))
+    out: list[Array] = []
+    for line in lines:
+        ids = np.array(line)[good[list(line)]]
+        if len(ids) < 3:
+            continue
+        s, turn = rays[ids], by_pixel[ids]
+        weight, normal = np.ones(len(ids)), np.zeros(3)
+        for _ in range(3):
+            normal = np.linalg.eigh((s * weight[:, None]).T @ s)[1][:, 0]
+            slope = np.linalg.norm(np.einsum("nik,i->nk", turn, normal), axis=-1)
+            weight = 1 / np.maximum(slope, 1e-12) ** 2
+        out.append(dot(s, normal) * np.sqrt(weight))
+    return np.concatenate(out) if out else np.zeros(0)

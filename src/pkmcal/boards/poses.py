@@ -1,0 +1,482 @@
+"""A calibration board in a station's photographs: from its corners to measured poses.
+
+Every photograph that shows the board gives a pose by maximum likelihood from all its corners with
+their noise; corners far off lose their weight, and a board that is partly hidden counts by what
+is seen of it. A board on the platform is somewhere else in every photograph, and each photograph
+(each repeat too) is one measurement. A board on the base is always in the same place: its
+photographs are one measurement, by the means of their corners (:mod:`pkmcal.boards.poses`).
+
+A pose's uncertainty here is that of its corners: their noise in the picture, and what camera
+model and board leave unexplained. What the camera's calibration may be wrong by is not in it.
+That error is common to all photographs of a camera; as noise of each pose on its own it would
+average out over the photographs, which it does not do. ``BoardPoses.by_intrinsics`` says how it
+moves them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.boards.board import Board, Detection
+from pkmcal.boards.detect import THREADS
+from pkmcal.boards.find import detect_board
+from pkmcal.boards.fit import BoardPoses, Views, board_poses, fit_poses, tilted_back
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.files import listed
+from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
+from pkmcal.measurements import PoseSet, Rejection
+from pkmcal.observe.repeats import Groups, groups_of
+
+UNEXPLAINED = 0.004
+"""Share of the image's width that corners lie off their prediction, rms, from which the board file
+or the camera file is wrong; good ones leave a hundredth of it."""
+LEAST_CORNERS = 6
+"""Corners with weight below which a pose is not tested by any corner."""
+TWO_TILTS = 25.0
+"""Chi square by which a board must speak against its other tilt, which looks alike from afar."""
+UNSURE = "the board: too few corners agree on one pose, or its tilt is not sure"
+
+
+@dataclass(frozen=True)
+class BoardViews:
+    """One station's K photographs of a board, of which F show it.
+
+    configuration : (K,) rows of the session's readings. detections : K. shown : (F,) the
+    photographs that show it. views, poses : of these. rms : (F,) px. usable : (F,) True where the
+    pose is sure.
+    """
+
+    station: int
+    camera: Camera
+    board: Board
+    configuration: Integers
+    detections: tuple[Detection, ...]
+    shown: Integers
+    views: Views
+    poses: BoardPoses
+    rms: Array
+    usable: Booleans
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the photographs that show the board."""
+        return [self.detections[k].name for k in self.shown]
+
+    @property
+    def rejected(self) -> tuple[Rejection, ...]:
+        """Photographs without a pose, with the reason."""
+        missed = [(k, f"the board: {d.reason}") for k, d in enumerate(self.detections) if d.reason]
+        unsure = [(int(k), UNSURE) for k in self.shown[~self.usable]]
+        return tuple(self.rejection(k, why) for k, why in sorted(missed + unsure))
+
+    def rejection(self, photograph: int, reason: str) -> Rejection:
+        """One photograph's board left out; photograph : its number among the K."""
+        return Rejection(self.station, int(self.configuration[photograph]), -1, -1, -1, reason)
+
+
+def detect_in(
+    images: Sequence[Integers], board: Board, names: Sequence[str]
+) -> tuple[Detection, ...]:
+    """The board's corners in photographs, by the first way of finding it."""
+
+    def detect(k: int) -> Detection:
+        # Taken in the thread, so that photographs may be decoded there.
+        return detect_board(images[k], board, names[k], quick=True)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        return tuple(pool.map(detect, range(len(names))))
+
+
+def detect_again(
+    images: Sequence[Integers], board: Board, found: Sequence[Detection], most: int
+) -> tuple[Detection, ...]:
+    """Where the board was not found, every way is tried, on `most` photographs spread over these.
+
+    Only a chessboard has more than one way, and it takes seconds.
+    """
+    missed = [k for k, detection in enumerate(found) if not detection.found]
+    if board.type != "chessboard" or not missed or most < 1:
+        return tuple(found)
+    places = np.unique(np.linspace(0, len(missed) - 1, min(most, len(missed))).astype(int))
+    chosen = [missed[k] for k in places]
+    out = list(found)
+    with ThreadPoolExecutor(THREADS) as pool:
+        again = pool.map(lambda k: detect_board(images[k], board, found[k].name), chosen)
+        for k, detection in zip(chosen, again, strict=True):
+            out[k] = detection
+    return tuple(out)
+
+
+def board_views(
+    station: int,
+    camera: Camera,
+    configuration: Integers,
+    board: Board,
+    detections: Sequence[Detection],
+) -> BoardViews:
+    """Poses of the board in one station's photographs.
+
+    detections : one a photograph. Raises `InputError` where the corners cannot be this board's,
+    or this camera's.
+    """
+    _check_sides(board, detections)
+    shown = np.flatnonzero([detection.found for detection in detections])
+    views = _views(board, [detection for detection in detections if detection.found])
+    poses = board_poses(camera, views) if len(shown) else _no_poses(camera, views)
+    squares = poses.weight * np.nan_to_num(np.sum(poses.residuals**2, axis=-1))
+    used = poses.weight.sum(axis=1)
+    rms = np.sqrt(squares.sum(axis=1) / (2 * np.maximum(used, 1e-9)))
+    usable = (used >= LEAST_CORNERS) & _one_tilt(camera, views, poses)
+    seen = BoardViews(
+        station, camera, board, configuration, tuple(detections), shown, views, poses, rms, usable
+    )
+    _check_explained(seen)
+    return seen
+
+
+def moving_poses(seen: BoardViews, mount: int) -> PoseSet:
+    """A board on the platform: one measurement a photograph, in the order of the photographs."""
+    kept = seen.usable
+    return pose_set(
+        seen.station,
+        seen.configuration[seen.shown[kept]],
+        mount,
+        seen.poses.T_camera_board[kept],
+        seen.poses.covariance[kept],
+    )
+
+
+def pose_set(
+    station: int, configuration: Integers, mount: int, T_camera_board: Array, covariance: Array
+) -> PoseSet:
+    """Poses (N, 4, 4) of one station with their covariances (N, 6, 6) as measurements."""
+    n = len(configuration)
+    return PoseSet(
+        station=np.full(n, station),
+        configuration=configuration,
+        mount=np.full(n, mount),
+        T_station_target=T_camera_board,
+        whiten=np.linalg.inv(np.linalg.cholesky(covariance)),
+    )
+
+
+def _views(board: Board, detections: Sequence[Detection]) -> Views:
+    """Corners as the fit wants them, NaN where not seen."""
+    shape = (len(detections), len(board.points))
+    pixels, sigma = np.full((*shape, 2), np.nan), np.zeros(shape)
+    for k, detection in enumerate(detections):
+        pixels[k, detection.ids], sigma[k, detection.ids] = detection.pixels, detection.sigma
+    return Views(board.points, pixels, sigma)
+
+
+def _no_poses(camera: Camera, views: Views) -> BoardPoses:
+    n = len(camera.parameters)
+    none = np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros((0, 6, n))
+    return BoardPoses(*none, views.pixels, views.sigma, 0.0)
+
+
+def _one_tilt(camera: Camera, views: Views, poses: BoardPoses) -> Booleans:
+    """(V,) True where the corners tell the pose from the board tilted the other way."""
+    if not len(poses.T_camera_board):
+        return np.zeros(0, dtype=bool)
+    scale = np.sqrt(poses.weight / (views.sigma**2 + poses.noise**2))
+    first, cost = fit_poses(camera, views, poses.T_camera_board, scale)
+    second, other = fit_poses(camera, views, tilted_back(first, views.points), scale)
+    # Where both searches end in one place there is no other tilt.
+    same = np.linalg.norm((second - first)[:, :3, :3], axis=(1, 2)) < 1e-3
+    return same | (other > cost + TWO_TILTS)
+
+
+def _check_sides(board: Board, detections: Sequence[Detection]) -> None:
+    """Raise `InputError` for a board, or photographs, that leave the board's axes open."""
+    if board.turnable:
+        raise InputError(
+            "the board cannot be told from itself turned by half a turn, so its pose is not known",
+            where="board.yaml",
+            found=board.described,
+            expected="an odd and an even number of corners, or a board with markers (charuco)",
+        )
+    mirrored = [detection.name for detection in detections if detection.mirrored]
+    if mirrored:
+        raise InputError(
+            "the photographs are mirror images",
+            where=listed(mirrored, 3),
+            expected="photographs in which the board's markers are not reversed",
+            next_step="Flip all photographs of this camera, and calibrate the camera from flipped"
+            " ones",
+        )
+
+
+def _check_explained(seen: BoardViews) -> None:
+    """Raise `InputError` where the corners do not lie as board and camera files say."""
+    limit = UNEXPLAINED * seen.camera.image_size[0]
+    if not len(seen.rms) or np.median(seen.rms) <= limit:
+        return
+    worst = int(np.argmax(seen.rms))
+    raise InputError(
+        "the board's corners do not lie as the board file and the camera file say",
+        where=seen.names[worst],
+        found=f"{np.median(seen.rms):.2g} px rms off their places ({seen.board.described})",
+        expected=f"{limit:.2g} px at most, usually a hundredth of that",
+        next_step="Look for a wrong board file, a bent board, or another camera's file",
+    )
+
+
+STILL = 0.2
+"""px, rms over the board, that two photographs may differ by beyond their noise. A camera on a
+tripod keeps a tenth; less than this hardly shows in the edges of legs, which are as uncertain."""
+SURE = 4.0
+"""Standard deviations of a photograph's own noise beyond that."""
+MOST_ODD = 1 / 3
+"""Share of the photographs that may disagree one by one; with more, the board was never still."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a board stood, from the photographs that agree.
+
+    T_camera_board : (4, 4). covariance : (6, 6), left perturbation, by the corners alone.
+    agreed : (F,) photographs used, of those that show the board. scatter : px, rms over the board
+    and these photographs of their distance from the mean; nan where there is only one.
+    noise : px rms beyond the corners' noise that the mean leaves unexplained.
+    rejected : photographs that disagree.
+    """
+
+    T_camera_board: Array
+    covariance: Array
+    agreed: Booleans
+    scatter: float
+    noise: float
+    rejected: tuple[Rejection, ...]
+
+    def poses(self, seen: BoardViews, mount: int) -> PoseSet:
+        """One measurement; the configuration of its row says nothing, for nothing moves."""
+        row = seen.configuration[seen.shown[self.agreed]][:1]
+        return pose_set(seen.station, row, mount, self.T_camera_board[None], self.covariance[None])
+
+
+def standing(seen: BoardViews) -> Standing | None:
+    """The board's one pose in a station's photographs; None where none shows it surely.
+
+    Raises `InputError` where the board or the camera was moved between photographs.
+    """
+    if not seen.usable.any():
+        return None
+    there, noise = _places(seen)
+    agreed = _agreed(there, noise, seen.usable)
+    odd = seen.usable & ~agreed
+    _check_still(seen, there, agreed)
+    T_camera_board, covariance, rest = _mean_pose(seen, agreed)
+    off = there[agreed] - there[agreed].mean(axis=0)
+    scatter = float(np.sqrt(np.mean(off**2))) if agreed.sum() > 1 else float("nan")
+    distance = _distance(there, there[agreed].mean(axis=0))
+    return Standing(
+        T_camera_board,
+        covariance,
+        agreed,
+        scatter,
+        rest,
+        tuple(
+            seen.rejection(
+                int(seen.shown[k]),
+                f"the board stands {distance[k]:.1f} px from where the other photographs show it",
+            )
+            for k in np.flatnonzero(odd)
+        ),
+    )
+
+
+def _places(seen: BoardViews) -> tuple[Array, Array]:
+    """Where each photograph's pose puts the board's corners, (F, N, 2) px, and the standard
+    deviation of that, rms over the board, (F,) px.
+    """
+    T = seen.poses.T_camera_board[:, None]
+    there = apply(T, seen.board.points)
+    by_point = seen.camera.project_jacobians(there)[0]
+    by_pose = np.concatenate([-by_point @ skew(there - T[..., :3, 3]), by_point], axis=-1)
+    variance = np.einsum("fnip,fpq,fniq->fni", by_pose, seen.poses.covariance, by_pose)
+    return seen.camera.project(there), np.sqrt(np.nanmean(variance, axis=(1, 2)))
+
+
+def _agreed(there: Array, noise: Array, usable: Booleans) -> Booleans:
+    """(F,) the photographs that agree with the one that agrees with the most others."""
+    limit = np.sqrt(STILL**2 + SURE**2 * (noise[:, None] ** 2 + noise**2))
+    agree = (_distance(there[:, None], there) <= limit) & usable & usable[:, None]
+    return agree[int(np.argmax(agree.sum(axis=1)))]
+
+
+def _distance(there: Array, other: Array) -> Array:
+    """Root mean square over the board of the distance of its corners; (..., N, 2) px."""
+    return np.sqrt(np.nanmean(np.sum((there - other) ** 2, axis=-1), axis=-1))
+
+
+def _check_still(seen: BoardViews, there: Array, agreed: Booleans) -> None:
+    """Raise `InputError` where photographs disagree that follow one another, or too many do."""
+    used = np.flatnonzero(seen.usable)
+    runs = [
+        (bool(same), [int(k) for k in run]) for same, run in groupby(used, key=lambda k: agreed[k])
+    ]
+    long = next((n for n, (same, run) in enumerate(runs) if not same and len(run) > 1), None)
+    if long is not None:
+        # A run at the beginning ends with the movement, any other begins with it.
+        before, after = (runs[long][1], runs[long + 1][1]) if long == 0 else (
+            runs[long - 1][1], runs[long][1]
+        )  # fmt: skip
+        raise _moved(seen, there, before, after)
+    odd = int((seen.usable & ~agreed).sum())
+    if odd > MOST_ODD * len(used) and odd > 1:
+        raise InputError(
+            "the board, or the camera, did not stand still",
+            where=_folder(seen),
+            found=f"{odd} of {len(used)} photographs show it in other places than the rest",
+            expected=_EXPECTED,
+        )
+
+
+_EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
+    "station show the board in one place"  # fmt: skip
+
+
+def _moved(seen: BoardViews, there: Array, before: list[int], after: list[int]) -> InputError:
+    """The error that names the photographs between which the board moved."""
+    names, poses = seen.names, seen.poses.T_camera_board
+    pixels = float(_distance(there[before[-1]], there[after[0]]))
+    middle = seen.board.points.mean(axis=0)
+    metres = float(np.linalg.norm(np.diff(apply(poses[[before[-1], after[0]]], middle), axis=0)))
+    turn = float(np.linalg.norm(pose_difference(poses[after[0]], poses[before[-1]])[:3]))
+    return InputError(
+        f"the board, or the camera, moved after {names[before[-1]]}",
+        where=names[after[0]],
+        found=f"the board {pixels:.1f} px away ({metres * 1e3:.1f} mm, {np.rad2deg(turn):.2f}"
+        " degrees)",
+        expected=_EXPECTED,
+        next_step=f"Make the photographs from {names[after[0]]} on a station of their own, if only"
+        " the camera was moved; take them again, if the board was",
+    )
+
+
+def _folder(seen: BoardViews) -> str:
+    return seen.names[0].rpartition("/")[0] or seen.names[0]
+
+
+def _mean_pose(seen: BoardViews, agreed: Booleans) -> tuple[Array, Array, float]:
+    """The pose by the means of the corners over photographs, its covariance (6, 6), and the
+    noise px that the means leave unexplained.
+
+    What the photographs do not share (pixel noise) averages out, and its size is told by their
+    scatter; what they share (the camera model, the board's print) remains, and does not.
+    """
+    views, poses = seen.views, seen.poses
+    used = agreed[:, None] & (poses.weight > 0.5)
+    count = used.sum(axis=0)
+    pixels = np.where(used[..., None], views.pixels, 0.0).sum(axis=0)
+    pixels = np.where(count[:, None] > 0, pixels / np.maximum(count, 1)[:, None], np.nan)
+    off = np.where(used[..., None], views.pixels - pixels, 0.0)
+    freedom = 2 * int(np.sum(np.maximum(count - 1, 0)))
+    single = np.sqrt(np.where(used, views.sigma**2, 0.0).sum(axis=0) / np.maximum(count, 1))
+    noise = np.sqrt(np.sum(off**2) / freedom) if freedom > 0 else single
+    sigma = noise / np.sqrt(np.maximum(count, 1))
+    mean = board_poses(seen.camera, Views(views.points, pixels[None], sigma[None]))
+    covariance = mean.covariance[0] + _wandering(seen, agreed, mean.T_camera_board[0], noise)
+    return mean.T_camera_board[0], covariance, mean.noise
+
+
+def _wandering(seen: BoardViews, agreed: Booleans, T_camera_board: Array, noise: Array) -> Array:
+    """Covariance (6, 6) of the mean by what moves the whole board from photograph to photograph
+    (a floor that shakes), beyond what the corners' noise does; zero where there is no more.
+    """
+    count = int(agreed.sum())
+    if count < 2:
+        return np.zeros((6, 6))
+    sigma2 = np.mean(seen.views.sigma[seen.views.seen] ** 2) + seen.poses.noise**2
+    # each pose's covariance, had its corners only the noise that differs between photographs
+    each = seen.poses.covariance[agreed] * (np.mean(np.square(noise)) / sigma2)
+    off = pose_difference(seen.poses.T_camera_board[agreed], T_camera_board)
+    chi2 = np.einsum("fi,fij,fj->", off, np.linalg.inv(each), off)
+    spread = chi2 / (6 * (count - 1))
+    return max(spread - 1.0, 0.0) * each.mean(axis=0) / count
+
+
+MOST_COMMON = 0.99
+ODD = "the board lies {:.1f} standard deviations from where the repeats show it"
+FAR = 5.0
+"""Standard deviations (of six numbers: root mean square) of a repeat from the middle one beyond
+which it is not one of them."""
+
+
+class MeanPoses(NamedTuple):
+    """One pose a configuration, (G,); which repeats took part (N,), and how far each lies off (N,),
+    in standard deviations.
+    """
+
+    first: Integers
+    pose: Array
+    covariance: Array
+    used: Booleans
+    off: Array
+
+
+def mean_poses(configuration: Integers, T: Array, covariance: Array, common: float) -> MeanPoses:
+    """The mean pose of each configuration's repeats.
+
+    configuration : (N,). T : (N, 4, 4). covariance : (N, 6, 6), left perturbation. common : share
+    of it that the repeats have in common.
+    """
+    groups = groups_of(configuration)
+    delta = pose_difference(T, T[groups.first[groups.member]])
+    off = _deviation(delta - groups.median(delta)[groups.member], covariance)
+    # Of two that differ nobody knows which is wrong, so both stay and their scatter tells.
+    used = (off < FAR * max(1.0, _usual(off, groups))) | (groups.count[groups.member] < 3)
+    kept = groups_of(configuration[used])
+    delta, covariance_used = delta[used], covariance[used]
+    mean, stated = kept.mean(delta), kept.mean(covariance_used)
+    alone = (1 - common) * stated
+    rest = delta - mean[kept.member]
+    freedom = float(np.sum(kept.count - 1))
+    spread = 1.0
+    if freedom:
+        size = np.sum(_deviation(rest, alone[kept.member]) ** 2)
+        spread = max(float(size) / freedom, 1.0)
+    total = common * stated + spread * alone / kept.count[:, None, None]
+    first = np.flatnonzero(used)[kept.first]
+    reference = T[groups.first[groups.member]][used][kept.first]
+    return MeanPoses(first, perturb(reference, mean), total, used, off)
+
+
+def _deviation(delta: Array, covariance: Array) -> Array:
+    """Root mean square (N,) of six numbers (N, 6) in standard deviations."""
+    white = np.linalg.solve(np.linalg.cholesky(covariance), delta[..., None])[..., 0]
+    return np.sqrt(np.mean(white**2, axis=-1))
+
+
+def _usual(off: Array, groups: Groups) -> float:
+    """The middle distance of repeats from their median, where there are several."""
+    several = groups.count[groups.member] > 2
+    return float(np.median(off[several])) if several.any() else 1.0
+
+
+def one_a_configuration(seen: BoardViews, mount: int) -> tuple[PoseSet, tuple[Rejection, ...]]:
+    """A board on the platform: one measurement a configuration, and the repeats that are odd."""
+    kept = np.flatnonzero(seen.usable)
+    rows = seen.configuration[seen.shown[kept]]
+    if not len(kept):
+        return moving_poses(seen, mount), ()
+    sigma2 = float(np.median(seen.views.sigma[seen.views.seen]) ** 2)
+    noise2 = seen.poses.noise**2
+    common = min(noise2 / (noise2 + sigma2), MOST_COMMON)
+    found = mean_poses(rows, seen.poses.T_camera_board[kept], seen.poses.covariance[kept], common)
+    odd = tuple(
+        seen.rejection(int(seen.shown[kept[k]]), ODD.format(found.off[k]))
+        for k in np.flatnonzero(~found.used)
+    )
+    poses = pose_set(seen.station, rows[found.first], mount, found.pose, found.covariance)
+    by = groups_of(rows[found.used]).mean(seen.poses.by_intrinsics[kept[found.used]])
+    return replace(poses, by_intrinsics=by), odd

@@ -1,0 +1,302 @@
+"""Which camera model: first fits, errors on photographs left out, and the choice among models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.boards.fit import (
+    Fit,
+    Views,
+    fit_camera,
+    fit_poses,
+    inverted,
+    line_offsets,
+    linear_poses,
+    refit,
+    settled_poses,
+)
+from pkmcal.cameras.contract import Camera, camera_models
+from pkmcal.geometry.rigid import apply
+from pkmcal.solver import eliminate, transposed
+
+FOCALS = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
+"""Range of pixels a radian in the picture's middle, as a share of its width."""
+TRIES = 16
+XIS = (0.0, 0.5, 1.0, 1.5, 2.2)
+KEPT = 3
+"""Best tries that are refined, over so many rounds of weights: it is a start only."""
+ROUNDS = 3
+
+
+def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers:
+    """Positions of the free intrinsics: focal length, centre, xi where there is one, and terms."""
+    base = ("focal.x", "focal.y", "center.x", "center.y", "xi")
+    names = camera.parameter_names
+    return np.array([k for k, name in enumerate(names) if name in base or name in terms])
+
+
+def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> Fit | None:
+    """The best fit without distortion, None where no try gives finite pixels."""
+    scored: list[tuple[float, Camera, Array]] = []
+    for camera in _tries(model, image_size):
+        poses = linear_poses(camera.ray(views.pixels), views.points)
+        score = _score(camera, poses, views)
+        if np.isfinite(score):
+            scored.append((score, camera, poses))
+    scored.sort(key=lambda item: item[0])
+    best: Fit | None = None
+    for _, camera, poses in scored[:KEPT]:
+        settled = settled_poses(camera, views, poses)
+        fit = fit_camera(camera, positions(camera, ()), views, settled, ROUNDS)
+        if best is None or _median(fit) < _median(best):
+            best = fit
+    return best
+
+
+def extended(fit: Fit, views: Views, terms: tuple[str, ...]) -> Fit:
+    """The fit continued with more free terms."""
+    return fit_camera(fit.camera, positions(fit.camera, terms), views, fit.T_camera_board)
+
+
+def _tries(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
+    width, height = image_size
+    kind = camera_models()[model]
+    names = kind.parameter_names
+    for scale in np.geomspace(*FOCALS[model], TRIES):
+        for xi in XIS if "xi" in names else (0.0,):
+            values = dict.fromkeys(names, 0.0)
+            values["focal.x"] = values["focal.y"] = float(scale) * width * (1 + xi)
+            values["center.x"], values["center.y"] = (width - 1) / 2, (height - 1) / 2
+            if "xi" in names:
+                values["xi"] = xi
+            yield kind(image_size, np.array([values[name] for name in names]))
+
+
+def _score(camera: Camera, poses: Array, views: Views) -> float:
+    """Median distance, px, of predicted corners from seen ones; lost corners count as far."""
+    off = camera.project(apply(poses[:, None], views.points)) - views.pixels
+    distance = np.linalg.norm(off, axis=-1)[views.seen]
+    return float(np.median(np.where(np.isfinite(distance), distance, np.inf)))
+
+
+def _median(fit: Fit) -> float:
+    distance = np.linalg.norm(fit.residuals, axis=-1)
+    return float(np.nanmedian(distance))
+
+
+FOLDS = 10
+"""Parts that the views are dealt into; each is predicted by a camera fitted to the others."""
+CHANCE = 1.5
+"""Disagreement of views (square) that chance alone explains, with ten views or so."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors on held-out views.
+
+    residuals : (V, N, 2) px; each view's pose is fitted, the camera is that of other views.
+    rms : px, of the residuals' lengths. by_view : (V,) the same by view.
+    straightness : px, root mean square distance of corners from the great circle of their board
+        line, in rays of the camera of other views; no pose takes part in it.
+    """
+
+    residuals: Array
+    rms: float
+    by_view: Array
+    straightness: float
+
+
+def held_out(fit: Fit, views: Views, lines: tuple[tuple[int, ...], ...]) -> HeldOut:
+    """Refit without each part of the views, and predict that part."""
+    count = len(fit.T_camera_board)
+    kept = (fit.weight >= 0.5) & views.seen
+    residuals = np.full(views.pixels.shape, np.nan)
+    bends: list[Array] = []
+    part_of = np.arange(count) % min(FOLDS, count)
+    for part in range(part_of.max() + 1):
+        out = np.flatnonzero(part_of == part)
+        camera = refit(fit, views, np.flatnonzero(part_of != part)).camera
+        mine = views.take(out)
+        scale = np.where(kept[out], 1 / np.sqrt(mine.sigma**2 + fit.tau**2), 0.0)
+        poses, _ = fit_poses(camera, mine, fit.T_camera_board[out], scale)
+        predicted = camera.project(apply(poses[:, None], views.points))
+        residuals[out] = np.where(kept[out][..., None], predicted - mine.pixels, np.nan)
+        for v in out:
+            pixels = np.where(kept[v][:, None], views.pixels[v], np.nan)
+            bends.append(line_offsets(camera, pixels, lines))
+    squares = np.sum(residuals**2, axis=-1)
+    bend = np.concatenate(bends)
+    return HeldOut(
+        residuals,
+        float(np.sqrt(np.nanmean(squares))),
+        np.sqrt(np.nanmean(squares, axis=1)),
+        float(np.sqrt(np.mean(bend**2))) if bend.size else float("nan"),
+    )
+
+
+def left_out_residuals(fit: Fit, views: Views) -> Array:
+    """Residuals (V, N, 2) px of each view under the camera of the others, to first order."""
+    moved, rows, _ = _without_each(fit, views)
+    change = (rows @ moved[..., None])[..., 0].reshape(*views.seen.shape, 2)
+    scale = fit.problem(views).scale[0][..., None]
+    return fit.residuals + np.where(scale > 0, change / np.where(scale > 0, scale, 1.0), 0.0)
+
+
+def spread_of_views(fit: Fit, views: Views) -> float:
+    """Factor by which the intrinsics scatter over the views more than the corners' noise says.
+
+    The jackknife over views, whose covariance is (V - 1) / V of the sum of squares of what each
+    view's absence changes, against that of the noise; 1 where chance explains the difference.
+    """
+    moved, _, normal = _without_each(fit, views)
+    off = moved - moved.mean(axis=0)
+    count = len(moved)
+    jackknife = (count - 1) / count * off.T @ off
+    ratio = float(np.trace(normal @ jackknife)) / max(len(fit.free), 1)
+    return float(np.sqrt(ratio)) if ratio > CHANCE else 1.0
+
+
+def _without_each(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
+    """How leaving out each view moves the free intrinsics (V, k), to first order; the rows with
+    poses eliminated (V, r, k); the normal matrix of all (k, k).
+
+    With rows A_v and residuals r_v of view v, that is (N - N_v)^-1 A_v^T r_v, since all views
+    together are in balance.
+    """
+    linear = fit.problem(views).linearize(fit.state)
+    rows = eliminate(linear, np.zeros(1)).rows[0]
+    normals = transposed(rows) @ rows
+    whole = normals.sum(axis=0)
+    right = transposed(rows) @ linear.value[0][..., None]
+    moved = np.stack([inverted(whole - part) for part in normals]) @ right
+    return moved[..., 0], rows, whole
+
+
+TERMS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "pinhole": (
+        (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
+    ),
+    "fisheye": ((), ("k1",), ("k1", "k2"), ("k1", "k2", "k3"), ("k1", "k2", "k3", "k4")),
+    "unified": ((), ("p1", "p2"), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2")),
+}  # fmt: skip
+"""Candidates, from few terms to many; the model with the fewest first among equals."""
+LEAST_GAIN = 0.01
+"""Share by which the error on left-out views must fall for a term to be worth having."""
+MOST_CORNERS = 1500
+"""Corners in all that the choice looks at; the final fit takes every one."""
+LEAST_OF_VIEW = 12
+"""Corners that every view keeps, where it has them."""
+HOPELESS = 5.0
+"""A model that fits so many times worse than another, with two radial terms, gets no more."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One model with one set of terms.
+
+    parameters : number of free intrinsics. rms : px, length of the residual, root mean square.
+    left_out : the same on views left out of the fit, to first order. by_view : (V,) px^2.
+    """
+
+    model: str
+    terms: tuple[str, ...]
+    parameters: int
+    rms: float
+    left_out: float
+    by_view: Array
+    fit: Fit
+
+
+def candidates(
+    views: Views, image_size: tuple[int, int], models: tuple[str, ...]
+) -> tuple[Candidate, ...]:
+    """Every model with each of its sets of terms, fitted; models without a start are missing."""
+    fits: list[tuple[str, tuple[str, ...], Fit]] = []
+    # The unified camera fits almost anything: it tells which of the others are hopeless.
+    for model in sorted(models, key=list(TERMS).index, reverse=True):
+        start = first_fit(model, views, image_size)
+        if start is None:
+            continue
+        for terms in TERMS[model]:
+            fit = extended(start, views, terms)
+            fits.append((model, terms, fit))
+            if "k2" in terms and _level(fit) > HOPELESS * min(_level(f) for _, _, f in fits):
+                break
+            # A set that holds this one begins where it ended.
+            start = fit if "k1" in terms else start
+    if not fits:
+        return ()
+    judged = _judged_corners([fit for _, _, fit in fits], views)
+    pool = [_candidate(model, terms, fit, views, judged) for model, terms, fit in fits]
+    return tuple(sorted(pool, key=lambda c: list(TERMS).index(c.model)))
+
+
+def best_of(pool: tuple[Candidate, ...]) -> Candidate:
+    """The fewest parameters among candidates that cannot be told from the best."""
+    best = min(pool, key=lambda c: c.left_out)
+    return min((c for c in pool if not is_worse(c, best)), key=lambda c: c.parameters)
+
+
+def is_worse(candidate: Candidate, best: Candidate) -> bool:
+    """True where left-out views tell the two apart: by a hundredth of the error, and by more
+    than the standard error of the difference over the views.
+    """
+    if candidate.left_out <= best.left_out * (1 + LEAST_GAIN):
+        return False
+    gain = candidate.by_view - best.by_view
+    error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    return bool(gain.mean() > error)
+
+
+def fitted_to_all(chosen: Candidate, views: Views) -> Fit:
+    """A candidate's fit continued with every corner."""
+    fit = chosen.fit
+    return fit_camera(fit.camera, fit.free, views, fit.T_camera_board)
+
+
+def thinned(views: Views) -> Views:
+    """The views with fewer corners each, where there are many: evenly over the board."""
+    total = int(views.seen.sum())
+    if total <= MOST_CORNERS:
+        return views
+    # One set of corners for all views, so that arrays stay small; no pattern of rows in it.
+    order = np.random.default_rng(0).permutation(len(views.points))
+    used = order[: max(len(order) * MOST_CORNERS // total, LEAST_OF_VIEW)]
+    for seen in views.seen:
+        mine = order[seen[order]]
+        used = np.union1d(used, mine[:LEAST_OF_VIEW])
+    return Views(views.points[used], views.pixels[:, used], views.sigma[:, used])
+
+
+def _judged_corners(fits: list[Fit], views: Views) -> Booleans:
+    """Corners by which all candidates are judged: those in use by the one that fits best."""
+    return (min(fits, key=_level).weight > 0.5) & views.seen
+
+
+def _level(fit: Fit) -> float:
+    """Median length of a residual, px."""
+    return float(np.nanmedian(np.linalg.norm(fit.residuals, axis=-1)))
+
+
+def _candidate(
+    model: str, terms: tuple[str, ...], fit: Fit, views: Views, judged: Booleans
+) -> Candidate:
+    def squares(off: Array) -> Array:
+        return np.where(judged, np.sum(np.nan_to_num(off) ** 2, axis=-1), 0.0)
+
+    left_out = squares(left_out_residuals(fit, views))
+    counts = np.maximum(judged.sum(axis=1), 1)
+    total = max(int(judged.sum()), 1)
+    return Candidate(
+        model=model,
+        terms=terms,
+        parameters=len(fit.free),
+        rms=float(np.sqrt(squares(fit.residuals).sum() / total)),
+        left_out=float(np.sqrt(left_out.sum() / total)),
+        by_view=left_out.sum(axis=1) / counts,
+        fit=fit,
+    )

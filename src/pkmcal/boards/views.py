@@ -1,0 +1,178 @@
+"""The calibration board of a session: found in its stations' photographs, as measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.boards.board import Board, Detection, load_board
+from pkmcal.boards.detect import check_boards
+from pkmcal.boards.poses import (
+    BoardViews,
+    Standing,
+    board_views,
+    detect_again,
+    detect_in,
+    one_a_configuration,
+    standing,
+)
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import inverse
+from pkmcal.measurements import PoseSet, Rejection, concatenate_poses
+from pkmcal.session.load import Session
+from pkmcal.session.photographs import label_of
+from pkmcal.session.schema import Body
+
+MOUNT = 0
+"""A session has one board, so one mount."""
+ENOUGH = 4
+"""Photographs in which a chessboard that stands still is looked for by slow ways."""
+EXAMINED = 2
+"""Photographs that are examined for another board."""
+
+
+@dataclass(frozen=True)
+class StationBoard:
+    """The board in one station's photographs; stood : where, of a board on the base."""
+
+    seen: BoardViews
+    stood: Standing | None
+
+    @property
+    def poses(self) -> PoseSet:
+        """The measurements that it gives."""
+        return self._moving[0] if self.stood is None else self.stood.poses(self.seen, MOUNT)
+
+    @property
+    def rejected(self) -> tuple[Rejection, ...]:
+        """Photographs whose board is not used."""
+        return self.seen.rejected + (self._moving[1] if self.stood is None else self.stood.rejected)
+
+    @cached_property
+    def _moving(self) -> tuple[PoseSet, tuple[Rejection, ...]]:
+        return one_a_configuration(self.seen, MOUNT)
+
+
+@dataclass(frozen=True)
+class Boards:
+    """The board in all stations that observe it.
+
+    stations : by their number in the session. body : what the board is fixed to.
+    """
+
+    stations: Mapping[int, StationBoard] = field(default_factory=dict[int, StationBoard])
+    body: Body = "platform"
+
+    @property
+    def poses(self) -> PoseSet:
+        """All measurements."""
+        return concatenate_poses([station.poses for station in self.stations.values()])
+
+    @property
+    def rejected(self) -> tuple[Rejection, ...]:
+        """All that is not used."""
+        return tuple(r for station in self.stations.values() for r in station.rejected)
+
+    def joined(self, T_camera_base: Sequence[Array | None]) -> list[Array | None]:
+        """Poses of the stations with those that are not known put in through a board on the base.
+
+        T_camera_base : (4, 4) each, None where not known.
+        T_camera_base = T_camera_board T_board_other T_other_base, [A] 3.3.
+        """
+        stood = {k: s.stood.T_camera_board for k, s in self.stations.items() if s.stood}
+        known = ((k, T) for k, T in enumerate(T_camera_base) if T is not None and k in stood)
+        T_board_base = next((inverse(stood[k]) @ T for k, T in known), None)
+        if T_board_base is None:
+            return list(T_camera_base)
+        return [
+            stood[k] @ T_board_base if T is None and k in stood else T
+            for k, T in enumerate(T_camera_base)
+        ]
+
+
+def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> Boards:
+    """The session's board in every station that observes it.
+
+    images : decoded photographs by the station's number. Raises `InputError` where a station's
+    photographs do not show the board, or show that it moved though it is fixed to the base.
+    """
+    board = board_of(session)
+    if board is None:
+        return Boards()
+    return Boards(
+        {
+            number: station_board(session, board, number, images[number])
+            for number, station in enumerate(session.stations)
+            if "board" in station.observe
+        },
+        session.board_body,
+    )
+
+
+def board_of(session: Session) -> Board | None:
+    """The board that stations of a session observe, from its file; None where none does."""
+    if session.board is None or not any("board" in s.observe for s in session.stations):
+        return None
+    return load_board(session.board, label=label_of(session.folder, session.board))
+
+
+def station_board(
+    session: Session, board: Board, number: int, images: Sequence[Integers]
+) -> StationBoard:
+    """The board in one station's photographs, all of them decoded."""
+    station = session.stations[number]
+    labels = [label_of(session.folder, photo.path) for photo in station.photographs]
+    moves = session.board_body == "platform"
+    detections = detect_in(images, board, labels)
+    nowhere = not any(detection.found for detection in detections)
+    _check_another(session, board, number, detections)
+    # A board that moves says something new in every photograph; a still one is seen enough.
+    most = len(images) if moves else ENOUGH if nowhere else 0
+    detections = detect_again(images, board, detections, most)
+    if not any(detection.found for detection in detections):
+        raise _nowhere(session, board, number, detections)
+    rows = np.array([photo.configuration for photo in station.photographs])
+    seen = board_views(number, station.camera, rows, board, detections)
+    stood = None if moves else standing(seen)
+    if not moves and stood is None:
+        raise InputError(
+            "no photograph shows the board well enough for its pose",
+            where=f"session.yaml, stations.{station.name}",
+            found=seen.rejected[0].reason,
+            expected="one at least in which the board is large, sharp and little hidden",
+        )
+    return StationBoard(seen, stood)
+
+
+def _check_another(
+    session: Session, board: Board, number: int, detections: Sequence[Detection]
+) -> None:
+    """Raise `InputError` where photographs show another board, or more of it than is described."""
+    station = session.stations[number]
+    shown = np.flatnonzero([detection.found for detection in detections])
+    rows = shown if shown.size else np.arange(len(detections))
+    few = rows[np.unique(np.linspace(0, len(rows) - 1, EXAMINED).astype(int))]
+    paths = [station.photographs[k].path for k in few]
+    try:
+        check_boards(paths, [detections[k] for k in few], board)
+    except InputError as error:
+        raise error.located(f"session.yaml, stations.{station.name}") from None
+
+
+def _nowhere(
+    session: Session, board: Board, number: int, detections: Sequence[Detection]
+) -> InputError:
+    """The error about a board that none of a station's photographs shows."""
+    station = session.stations[number]
+    return InputError(
+        f"the board is in none of the photographs of station {station.name}",
+        where=detections[0].name,
+        found=detections[0].reason,
+        expected=f"{board.described}, sharp, and not hidden by the machine",
+        next_step="Check the board file, the light and the focus, or write observe: legs for this"
+        " station",
+    )

@@ -1,0 +1,428 @@
+"""Mistakes in a session that its measured poses betray, as errors that name file and place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import chain, combinations
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import InputError, PkmcalError
+from pkmcal.geometry.rigid import inverse, pose, pose_difference, rotation_vector
+from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.hand_eye import start_from_poses
+from pkmcal.identify.mounts import mean_pose
+from pkmcal.identify.problem import Estimate, State
+from pkmcal.identify.rotation_axis import RotationAxis, rotation_axis
+from pkmcal.identify.verdict import POOR, RicherModel
+from pkmcal.measurements import Measurements, PoseSet
+from pkmcal.mechanisms import Machine
+from pkmcal.session.load import Session
+
+BAD = 2.0
+"""Factor on the poses' noise, from which mistakes are looked for."""
+LOST = 0.1
+"""Share of poses given up from which they are."""
+CURED = 0.5
+"""A mistake is believed where, put right, the poses' misfit is at most this part of what it was."""
+FEWEST = 3
+"""Poses on either side of a movement: fewer are outliers."""
+OTHER_SIZE = 2e-3
+"""Relative difference of a board's size below which the print is as good as printers are."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A mistake that explains the poses.
+
+    motor : column of the readings with the wrong sign, or exchanged with the other. configuration :
+    the first after a movement; before : the last before it. size : of the board, true over
+    written. moved : T (4, 4) of the board, or the station, from before to after. misfit : what is
+    left, in standard deviations.
+    """
+
+    kind: Literal["sign", "order", "board moved", "camera moved", "size"]
+    misfit: float
+    motor: int = -1
+    other: int = -1
+    station: int = -1
+    before: int = -1
+    configuration: int = -1
+    moved: Array = field(default_factory=lambda: np.eye(4))
+    size: float = 1.0
+
+
+def misfit(estimate: Estimate) -> float:
+    """How far off the poses are, in their standard deviations, root mean square of the better
+    BELIEVED of them, given up or not: outliers of another cause should hide nothing.
+    """
+    error = estimate.pose_residuals * estimate.statistics.pose_scale
+    if not error.size:
+        return 0.0
+    each = np.sort(np.mean(error**2, axis=1))
+    return float(np.sqrt(np.mean(each[: max(int(np.ceil(BELIEVED * len(each))), 1)])))
+
+
+SURE = 1.5
+"""Standard deviations that a mistake put right leaves, below which no other is tried."""
+BELIEVED = 0.85
+"""Share of the poses that a mistake put right has to explain."""
+CERTAIN = 12.0
+"""Standard deviations by which a board has to have moved, all six numbers together."""
+ENOUGH = 4.0
+"""Standard deviations that it may leave: a drawing's own errors are in them."""
+
+
+def in_doubt(estimate: Estimate) -> bool:
+    """Whether the poses disagree with the machine so much that a mistake is likely."""
+    lost = estimate.pose_weights < 0.5
+    return bool(lost.size) and (
+        estimate.statistics.pose_scale > BAD or lost.mean() > LOST or lost.sum() >= 2 * FEWEST
+    )
+
+
+def wrong_scale(estimate: Estimate, chance: float = 60.0) -> float:
+    """How much larger all lengths came out than the drawing's, 1 where no common factor explains
+    it: a board whose squares are larger than written makes the whole machine larger.
+
+    chance : chi2 by which the drawing has to speak for the factor.
+    """
+    machine = estimate.machine
+    table = machine.parameters
+    length = np.array([unit == "m" and kind != "radius" for unit, kind in zip(
+        table.units, table.kinds, strict=True)])  # fmt: skip
+    moved = length & (np.diag(estimate.covariance) > 0)
+    new, old = machine.values[moved], table.drawing[moved]
+    weight = 1 / table.tolerance[moved] ** 2
+    if not np.any(new):
+        return 1.0
+    back = float(np.sum(weight * new * old) / np.sum(weight * new**2))
+    gain = np.sum(weight * (new - old) ** 2) - np.sum(weight * (back * new - old) ** 2)
+    left = np.sum(weight * (back * new - old) ** 2)
+    return 1 / back if gain > chance and gain > left else 1.0
+
+
+def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate) -> Doubt | None:
+    """The mistake that explains the poses; None where none does.
+
+    machine : by the drawing. estimate : of these measurements.
+    """
+    before = misfit(estimate)
+    found: Doubt | None = None
+    for doubt in chain(
+        _movements(machine, measurements, estimate),
+        _signs(machine, measurements),
+        _sizes(machine, measurements, estimate),
+        _orders(machine, measurements),
+    ):
+        if found is None or doubt.misfit < found.misfit:
+            found = doubt
+        # a board that moved and a camera that moved are alike, so both are always tried
+        if found.misfit < SURE and doubt.kind not in ("board moved", "camera moved"):
+            break
+    return found if found and found.misfit < min(CURED * before, ENOUGH) else None
+
+
+def _signs(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
+    """Each motor's readings with the other sign."""
+    for motor in range(machine.n_joints):
+        sign = np.where(np.arange(machine.n_joints) == motor, -1.0, 1.0)
+        other = replace(measurements, joints=measurements.joints * sign)
+        low, high = machine.joint_ranges[motor]
+        inside = other.joints[:, motor]
+        slack = 0.2 * (high - low)
+        if np.any(inside < low - slack) or np.any(inside > high + slack):
+            continue
+        estimate = _tried(machine, other, None)
+        if estimate is not None:
+            yield Doubt("sign", misfit(estimate), motor=motor)
+
+
+def _orders(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
+    """Two motors' readings exchanged."""
+    for one, other in combinations(range(machine.n_joints), 2):
+        order = np.arange(machine.n_joints)
+        order[[one, other]] = order[[other, one]]
+        estimate = _tried(
+            machine, replace(measurements, joints=measurements.joints[:, order]), None
+        )
+        if estimate is not None:
+            yield Doubt("order", misfit(estimate), motor=one, other=other)
+
+
+def _tried(machine: Machine, measurements: Measurements, start: State | None) -> Estimate | None:
+    """The estimate from other measurements, from the drawing unless told; None where it fails."""
+    try:
+        if start is None:
+            start = start_from_poses(machine, measurements)
+        return bundle(machine, measurements, start)
+    except (PkmcalError, np.linalg.LinAlgError):
+        return None
+
+
+def _movements(machine: Machine, measurements: Measurements, estimate: Estimate) -> Iterator[Doubt]:
+    """A board, or a camera, elsewhere from some configuration on."""
+    poses, state = measurements.poses, estimate.state
+    for m in np.flatnonzero(measurements.on_platform):
+        for s in np.unique(poses.station[poses.mount == m]):
+            rows = np.flatnonzero((poses.mount == m) & (poses.station == s))
+            rows = rows[np.argsort(poses.configuration[rows], kind="stable")]
+            if len(rows) < 2 * FEWEST:
+                continue
+            at = _jump(measurements, estimate, rows)
+            later = rows[at:]
+            place = int(poses.configuration[rows[at - 1]]), int(poses.configuration[rows[at]])
+            body = state.T_camera_base[s] @ state.T_base_platform[poses.configuration[later]]
+            seen = poses.T_station_target[later]
+            mount = mean_pose(inverse(body) @ seen)
+            on = np.append(measurements.on_platform, True)
+            board = replace(
+                measurements,
+                poses=replace(poses, mount=_changed(poses.mount, later, len(state.T_mount))),
+                mounts=(*measurements.mounts, measurements.mounts[m]),
+            )
+            start = replace(
+                state, T_mount=np.concatenate([state.T_mount, mount[None]]), on_platform=on
+            )
+            tried = _tried(machine, board, start)
+            pair = np.array([m, -1])
+            if tried is not None and _certain(
+                tried.state.T_mount[pair], tried.mount_covariance[pair]
+            ):
+                change = tried.state.T_mount[-1] @ inverse(tried.state.T_mount[m])
+                yield Doubt(
+                    "board moved", misfit(tried), station=int(s), before=place[0],
+                    configuration=place[1], moved=change,
+                )  # fmt: skip
+            if len(measurements.edges):
+                continue  # its edges would have to move with the camera
+            yield from _camera_moved(machine, measurements, state, int(s), later, place)
+
+
+def _certain(T: Array, covariance: Array) -> bool:
+    """Whether two places (2, 4, 4) differ by more than their covariances (2, 6, 6) explain."""
+    off, spread = pose_difference(T[1], T[0]), covariance.sum(axis=0)
+    scale = np.sqrt(np.maximum(np.diag(spread), 1e-30))
+    white = np.linalg.solve(spread / scale / scale[:, None] + 1e-9 * np.eye(6), off / scale)
+    return bool(np.sqrt(white @ (off / scale)) > CERTAIN)
+
+
+def _camera_moved(
+    machine: Machine,
+    measurements: Measurements,
+    state: State,
+    s: int,
+    later: Integers,
+    place: tuple[int, int],
+) -> Iterator[Doubt]:
+    poses = measurements.poses
+    number = measurements.camera_of_station
+    there = state.T_base_platform[poses.configuration[later]] @ state.T_mount[poses.mount[later]]
+    station = mean_pose(poses.T_station_target[later] @ inverse(there))
+    camera = replace(
+        measurements,
+        poses=replace(poses, station=_changed(poses.station, later, measurements.n_stations)),
+        n_stations=measurements.n_stations + 1,
+        camera_of_station=np.append(number, number[s]),
+    )
+    start = replace(state, T_camera_base=np.concatenate([state.T_camera_base, station[None]]))
+    tried = _tried(machine, camera, start)
+    if tried is not None and _certain(
+        tried.state.T_camera_base[[s, -1]], tried.station_covariance[[s, -1]]
+    ):
+        change = inverse(tried.state.T_camera_base[-1]) @ tried.state.T_camera_base[s]
+        yield Doubt(
+            "camera moved", misfit(tried), station=s, before=place[0], configuration=place[1],
+            moved=change,
+        )  # fmt: skip
+
+
+def _changed(index: Integers, rows: Integers, value: int) -> Integers:
+    out = index.copy()
+    out[rows] = value
+    return out
+
+
+def _jump(measurements: Measurements, estimate: Estimate, rows: Integers) -> int:
+    """Where the board's place on the platform jumps: the number of rows before it.
+
+    The split that leaves the least spread about the two parts' medians, all six numbers in
+    units of their own spread.
+    """
+    poses, state = measurements.poses, estimate.state
+    k = poses.configuration[rows]
+    body = state.T_camera_base[poses.station[rows]] @ state.T_base_platform[k]
+    mount = state.T_mount[poses.mount[rows]]
+    off = pose_difference(inverse(body) @ poses.T_station_target[rows], mount)
+    scale = np.median(np.abs(off - np.median(off, axis=0)), axis=0)
+    off = off / np.maximum(scale, 1e-3 * max(scale.max(), 1e-12))
+    rest = [
+        sum(np.abs(part - np.median(part, axis=0)).sum() for part in (off[:at], off[at:]))
+        for at in range(FEWEST, len(rows) - FEWEST + 1)
+    ]
+    return FEWEST + int(np.argmin(rest))
+
+
+def _sizes(machine: Machine, measurements: Measurements, estimate: Estimate) -> Iterator[Doubt]:
+    """A board whose squares have another size: its distances are all wrong by one factor."""
+    poses = measurements.poses
+    boards = [m for m, mount in enumerate(measurements.mounts) if mount.name == "board"]
+    rows = np.flatnonzero(np.isin(poses.mount, boards) & measurements.on_platform[poses.mount])
+    if not boards or len(rows) < 2 * FEWEST:
+        return
+    state = start_state(machine, measurements, estimate.state.T_camera_base)
+    there = state.T_base_platform[poses.configuration[rows], :3, 3]
+    seen = poses.T_station_target[rows, :3, 3]
+    spread = np.sqrt(np.var(there, axis=0).sum() / np.var(seen, axis=0).sum())
+    T = poses.T_station_target.copy()
+    if abs(spread - 1) < OTHER_SIZE:
+        return
+    T[rows] = pose(T[rows, :3, :3], spread * T[rows, :3, 3])
+    other = replace(measurements, poses=replace(poses, T_station_target=T))
+    tried = _tried(machine, other, None)
+    if tried is not None:
+        yield Doubt("size", misfit(tried), size=float(spread))
+
+
+def check_poses(
+    session: Session,
+    measurements: Measurements,
+    estimate: Estimate,
+    richer: tuple[RicherModel, ...] = (),
+) -> None:
+    """Raise `InputError` where one of the usual mistakes explains why poses do not fit.
+
+    richer : models that were tried; where one of them fits, it is the model that is at fault.
+    """
+    if not in_doubt(estimate) or any(model.scale < BAD for model in richer):
+        return
+    doubt = find_doubt(session.machine, measurements, estimate)
+    if doubt is not None:
+        raise _error(session, doubt, estimate.statistics.pose_scale)
+
+
+def richer_models(
+    session: Session, measurements: Measurements, estimate: Estimate
+) -> tuple[RicherModel, ...]:
+    """How well the mechanism file's richer models fit, where this one is too poor for the poses."""
+    if estimate.statistics.pose_scale < POOR:
+        return ()
+    machine = session.machine
+    unknowns = machine.parameters.free_matrix().shape[1]
+    out: list[RicherModel] = []
+    for name in machine.document.models:
+        if name == session.model:
+            continue
+        try:
+            other = session.other_model(name)
+            alike = other.n_legs == machine.n_legs or not len(measurements.edges)
+            if other.parameters.free_matrix().shape[1] <= unknowns or not alike:
+                continue
+            start = start_state(other, measurements, estimate.state.T_camera_base)
+            found = bundle(other, measurements, start)
+        except (PkmcalError, np.linalg.LinAlgError):
+            continue
+        out.append(RicherModel(name, found.statistics.pose_scale))
+    return tuple(out)
+
+
+def scale_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
+    """A sentence where the whole machine came out larger or smaller than drawn."""
+    scale = wrong_scale(estimate)
+    if scale == 1.0 or not estimate.pose_weights.size:
+        return ()
+    more = "larger" if scale > 1 else "smaller"
+    cause = (
+        "the board's squares are not of the size that its file says. Measure them over as many as"
+        " there are"
+        if session.board
+        else "the table's lengths have another scale"
+    )
+    return (
+        f"All of the machine came out {abs(scale - 1):.2%} {more} than its drawing, as if {cause}:"
+        " every displacement of the platform is wrong by as much.",
+    )
+
+
+def _error(session: Session, doubt: Doubt, scale: float) -> InputError:
+    """The mistake in words."""
+    left = f"with that, the poses fit {doubt.misfit:.1f} times their noise"
+    joints = session.document["joints"]
+    if doubt.kind == "sign":
+        name = joints["columns"][doubt.motor]
+        return InputError(
+            f"the readings of {name} have the wrong sign",
+            where=f"{joints['file']}, column {name}",
+            found=f"poses that disagree with the readings {scale:.0f} times more than their noise",
+            expected=f"the readings with the other sign; {left}",
+            next_step="Turn the sign of this column round, or the axis in the mechanism file",
+        )
+    if doubt.kind == "order":
+        one, other = (joints["columns"][k] for k in (doubt.motor, doubt.other))
+        return InputError(
+            f"the readings of {one} and {other} are exchanged",
+            where=f"{joints['file']}, line 1",
+            found=f"poses that disagree with the readings {scale:.0f} times more than their noise",
+            expected=f"the two columns in the other order; {left}",
+            next_step="Exchange the two columns, or the motors in the mechanism file",
+        )
+    if doubt.kind == "size":
+        return InputError(
+            "the board has another size than its file says",
+            where=session.document["board"]["file"],
+            found=f"a board {doubt.size:.4f} times as large, by how far the platform moved",
+            expected=f"the size as measured with a ruler over many squares; {left}",
+            next_step=f"Multiply square and marker by {doubt.size:.4f}, if a ruler agrees",
+        )
+    what = "the board was moved on the platform" if doubt.kind == "board moved" else \
+        "the camera was moved"  # fmt: skip
+    turn = np.rad2deg(np.linalg.norm(rotation_vector(doubt.moved[:3, :3])))
+    shift = np.linalg.norm(doubt.moved[:3, 3]) * 1e3
+    before, after = (session.configurations[k] for k in (doubt.before, doubt.configuration))
+    return InputError(
+        f"{what} between configuration {before} and {after}",
+        where=f"session.yaml, stations.{session.station_names[doubt.station]}",
+        found=f"{shift:.1f} mm and {turn:.2f} degrees; {left}",
+        expected="a board screwed to the platform, and a camera that stands still",
+        next_step=f"Calibrate with the configurations before {after}, or with those from it on",
+    )
+
+
+FEWEST_POSES = 4
+"""Whole poses of one station from which the platform's turning is tested."""
+KEPT = {"one axis": "turn about one axis", "none": "do not turn"}
+
+
+def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tuple[bool, str]]:
+    """Whether the platform turns as the mechanism file says, by every station that saw it whole: in
+    doubt or not, and the words. on_platform : (M,) of the mounts.
+    """
+    motion = session.machine.document.motion
+    if motion == "spatial" or not len(poses):
+        return []
+    whole = (poses.rows == 6) & on_platform[poses.mount]
+    out: list[tuple[bool, str]] = []
+    for s in np.unique(poses.station[whole]).tolist():
+        part = poses.select(whole & (poses.station == s))
+        if len(part) >= FEWEST_POSES:
+            found = rotation_axis(part, motion)
+            doubt = _doubt(found)
+            said = found.sentence if doubt or found.tenable else _nearly(found)
+            out.append((doubt, f"{session.station_names[s]}: {said}"))
+    return out
+
+
+def _doubt(found: RotationAxis) -> bool:
+    """Noise that is stated a little too small is no reason to doubt a mechanism."""
+    return not found.tenable and found.chi2 > POOR**2 * found.dof
+
+
+def _nearly(found: RotationAxis) -> str:
+    off, noise = (np.rad2deg(np.sqrt(np.mean(x**2))) for x in (found.tilt, found.expected_tilt))
+    return (
+        f"The boards {KEPT[found.hypothesis]} but for {off:.3f}°, where their stated noise alone"
+        f" gives {noise:.3f}°."
+    )

@@ -1,0 +1,336 @@
+"""Recognising the machine in a session's photographs: what `check` and `calibrate` begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.boards.views import Boards, find_boards
+from pkmcal.errors import GeometryError, InputError
+from pkmcal.files import listed
+from pkmcal.observe import legs
+from pkmcal.observe.diagnose import unrecognised
+from pkmcal.observe.images import decode, decode_all
+from pkmcal.observe.predict import tubes_of
+from pkmcal.observe.stations import StationPose, View, find_station
+from pkmcal.session.load import Session, Station
+from pkmcal.session.photographs import label_of
+
+WORKERS = 2
+"""Threads beside one another: decoding and array work release Python's lock."""
+
+NEARLY = 2.0
+"""Tolerances of a centre by which legs may miss the platform at the drawing's nearest pose."""
+MOST = 0.5
+"""Share of the configurations that the drawing has to reach for the rest to be believed."""
+ALMOST_ALL = 0.9
+MOST_TURN = 90.0
+"""degrees"""
+
+NOWHERE = StationPose(np.eye(4), score=1.0, chance=1.0)
+"""Of a station for whose search there was no start."""
+
+
+def check_observable(session: Session) -> None:
+    """What the session's form allows but this observation cannot use."""
+    on_base = session.board_body == "base"
+    joining = [
+        station.name
+        for station in session.stations
+        if "board" in station.observe and station.T_camera_base is not None
+    ]
+    for station in session.stations:
+        # A board on the platform tells where the camera stands; one on the base, from another's.
+        told = "board" in station.observe and (joining or not on_base)
+        if station.T_camera_base is None and not told:
+            raise InputError(
+                "the station has no rough pose",
+                where=f"session.yaml, stations.{station.name}",
+                expected="pose: {position: [x, y, z], look_at: [x, y, z], up: [0, 0, 1]}",
+                next_step="Measure by hand where the camera stands; 10 cm and 10 degrees will do."
+                " Of stations that see one board fixed to the base, one pose is enough; those that"
+                " see one on the platform need none",
+            )
+    seen = [station.name for station in session.stations if "legs" in station.observe]
+    if seen and not any(leg.tubes for leg in session.machine.document.legs):
+        raise InputError(
+            "no leg of the drawing has visible cylinders",
+            where="mechanism.yaml, legs",
+            expected="tubes: [{radius: 0.014, from: 0.05, to: 0.25}] on the legs",
+            next_step="Measure the legs' radii with calipers",
+        )
+
+
+def read_photographs(session: Session) -> list[legs.Photographs]:
+    """The photographs of stations that observe legs, decoded and prepared for the search."""
+
+    def read(number: int) -> legs.Photographs:
+        station = session.stations[number]
+        paths = [p.path for p in station.photographs]
+        labels = [label_of(session.folder, path) for path in paths]
+        images = decode_all(paths, station.camera.image_size, labels)
+        rows = np.array([p.configuration for p in station.photographs])
+        return legs.photographs_of(number, station.camera, rows, session.joints, images)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return list(pool.map(read, legs_stations(session)))
+
+
+def legs_stations(session: Session) -> list[int]:
+    """Numbers of the stations that observe legs."""
+    return [k for k, station in enumerate(session.stations) if "legs" in station.observe]
+
+
+def platform_poses(session: Session, *, most: bool = False) -> Array:
+    """T_base_platform (K, 4, 4) of all configurations by the drawing, or which one has none.
+
+    most : be content where the drawing can take the readings of most configurations. What is
+    measured of the platform may tell the rest, for a motor's zero is drawn to degrees at best.
+    """
+    try:
+        found = session.machine.forward_result(session.joints)
+    except GeometryError as error:  # the drawing is the user's: it is at fault
+        raise InputError(
+            error.what,
+            where=session.document["mechanism"],
+            found=error.found,
+            expected=error.expected,
+            next_step=error.next_step,
+        ) from None
+    # near the ends of its workspace a drawing that is right to its tolerance may not close
+    near = found.converged | (found.error < NEARLY * session.machine.document.tolerance.center)
+    if near.all() or (most and near.mean() > MOST):
+        _check_turns(session, found.T_base_platform, near)
+        return found.T_base_platform
+    bad = [session.configurations[k] for k in np.flatnonzero(~near)]
+    _check_signs(session, bad)
+    raise InputError(
+        "the drawing's machine cannot take these readings: its legs do not meet the platform",
+        where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
+        found=f"a gap of {float(found.error.max()) * 1e3:.3g} mm",
+        expected="readings at which all legs reach the platform",
+        next_step="Check these readings, the order of their columns, and the drawing's centres",
+    )
+
+
+def _check_signs(session: Session, bad: list[str]) -> None:
+    """Raise `InputError` where one motor's readings with the other sign would close all loops."""
+    machine = session.machine
+    now = _taken(session, session.joints)
+    for column, name in enumerate(session.document["joints"]["columns"]):
+        turned = session.joints * np.where(np.arange(machine.n_joints) == column, -1.0, 1.0)
+        if _taken(session, turned) > max(ALMOST_ALL, now):
+            raise InputError(
+                f"the readings of {name} have the wrong sign",
+                where=f"{session.document['joints']['file']}, column {name}",
+                found=f"readings that the machine cannot take in configuration {listed(bad)}",
+                expected="the other sign of this column, with which its legs meet the platform",
+                next_step="Turn the sign of this column round, or the axis in the mechanism file",
+            )
+
+
+def _taken(session: Session, joints: Array) -> float:
+    """Share of the readings (K, m) that the drawing's machine can take."""
+    found = session.machine.forward_result(joints)
+    turn = _turn(found.T_base_platform) if _folds(session) else np.zeros(len(joints))
+    return float(np.mean(found.converged & (np.abs(turn) <= MOST_TURN)))
+
+
+def _folds(session: Session) -> bool:
+    """Whether the platform has side bars that allow no more than a quarter turn."""
+    joints = {leg.platform.joint for leg in session.machine.document.legs}
+    return bool(joints & {"bar", "hinged-bar"})
+
+
+def _turn(poses: Array) -> Array:
+    """Turns (K,) about z, degrees."""
+    return np.rad2deg(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+
+
+def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
+    """Raise `InputError` where an articulated platform would turn by more than its bars allow."""
+    if not _folds(session):
+        return
+    turn = _turn(poses)
+    bad = np.flatnonzero((np.abs(turn) > MOST_TURN) & usable)
+    if not bad.size:
+        return
+    _check_signs(session, [session.configurations[k] for k in bad])
+    worst = bad[np.argmax(np.abs(turn[bad]))]
+    raise InputError(
+        "the readings turn the platform beyond 90 degrees, where its side bars lie on each other",
+        where=f"{session.document['joints']['file']}, configuration"
+        f" {listed([session.configurations[k] for k in bad])}",
+        found=f"{turn[worst]:.1f} degrees (configuration {session.configurations[worst]})",
+        expected=f"less than {MOST_TURN:.0f} degrees to either side",
+        next_step="Check these readings, and the zero of the motors",
+    )
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """Where the search for each station's pose ended.
+
+    rough : the poses it began from, by hand, or through the board from a station that was found.
+    """
+
+    views: tuple[View, ...]
+    rough: tuple[Array, ...]
+    found: tuple[StationPose, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether the machine was recognised in every station's photographs."""
+        return all(pose.good for pose in self.found)
+
+
+def recognise(
+    session: Session,
+    photographs: list[legs.Photographs],
+    poses: Array,
+    rngs: list[np.random.Generator],
+    boards: Boards | None = None,
+    starts: Array | None = None,
+) -> Recognition:
+    """Look for the machine in the photographs of every station that observes legs, nothing raised.
+
+    poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``photographs``.
+    boards : on the base, give stations without a pose by hand a start, from the stations that were
+    found. starts : (S, 4, 4) of all stations where more is known than by hand, NaN where nothing.
+    """
+    boards = boards or Boards()
+    machine, tubes = session.machine, tubes_of(session.machine)
+    views = tuple(
+        View(machine, p.camera, tubes, p.joints, poses[p.configuration], p.tables)
+        for p in photographs
+    )
+    at = [p.station for p in photographs]
+    by_hand = [station.T_camera_base for station in session.stations]
+    if starts is not None:
+        known = zip(by_hand, starts[: len(by_hand)], strict=True)
+        by_hand = [T if T is not None or np.isnan(start).any() else start for T, start in known]
+    found = _searched(views, [by_hand[s] for s in at], rngs)
+    # Through the board a pose by hand would be off by its angle times the stations' distance, so
+    # the rest are searched from where the search has ended with those that were found.
+    good: list[Array | None] = [None] * len(by_hand)
+    for s, pose in zip(at, found, strict=True):
+        good[s] = pose.T_camera_base if pose and pose.good else None
+    ahead = boards.joined(good)
+    retried = [ahead[s] if good[s] is None else None for s in at]
+    again = _searched(views, retried, rngs)
+    # Of a station that is not found, a start is told all the same.
+    through = boards.joined(by_hand)
+    rough = [
+        second if pose and pose.good else through[s]
+        for s, second, pose in zip(at, retried, again, strict=True)
+    ]
+    return Recognition(
+        views,
+        tuple(np.eye(4) if T is None else T for T in rough),
+        tuple(_better(first, second) for first, second in zip(found, again, strict=True)),
+    )
+
+
+def _searched(
+    views: tuple[View, ...], starts: list[Array | None], rngs: list[np.random.Generator]
+) -> list[StationPose | None]:
+    """The search from each start that there is."""
+
+    def search(view: View, start: Array | None, rng: np.random.Generator) -> StationPose | None:
+        return None if start is None else find_station(view, start, rng)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return list(pool.map(search, views, starts, rngs))
+
+
+def _better(first: StationPose | None, second: StationPose | None) -> StationPose:
+    """The end of two searches, or of the one that there was."""
+    ends = [pose for pose in (first, second) if pose is not None]
+    return min(ends, key=lambda pose: pose.score, default=NOWHERE)
+
+
+def why_unrecognised(
+    session: Session,
+    photographs: list[legs.Photographs],
+    recognition: Recognition,
+    rng: np.random.Generator,
+) -> InputError:
+    """The error about the stations that were not recognised; the usual mix-ups are tried."""
+    return unrecognised(
+        [session.stations[p.station].name for p in photographs],
+        list(recognition.views),
+        list(recognition.rough),
+        list(recognition.found),
+        session.joints,
+        [p.configuration for p in photographs],
+        rng,
+    )
+
+
+def found_stations(
+    session: Session,
+    photographs: list[legs.Photographs],
+    rng: np.random.Generator,
+    boards: Boards | None = None,
+    starts: Array | None = None,
+) -> Array:
+    """Poses T_camera_base (S, 4, 4) of the stations that observe legs, or the reason why one is not
+    recognised; of the rest as ``starts`` has them, NaN where it has none.
+    """
+    if starts is None:
+        starts = np.full((len(session.station_names), 4, 4), np.nan)
+    if not photographs:
+        return starts
+    rngs = rng.spawn(len(photographs) + 1)
+    found = recognise(session, photographs, platform_poses(session), rngs[1:], boards, starts)
+    if not found.complete:
+        raise why_unrecognised(session, photographs, found, rngs[0])
+    out = starts.copy()
+    out[[p.station for p in photographs]] = [pose.T_camera_base for pose in found.found]
+    return out
+
+
+def boards_of(session: Session, photographs: list[legs.Photographs]) -> Boards:
+    """The session's board in its photographs; see :func:`pkmcal.boards.find_boards`.
+
+    Photographs that only show the board are decoded one by one, as they are looked at.
+    """
+    return find_boards(session, board_images(session, photographs))
+
+
+def board_images(
+    session: Session, photographs: list[legs.Photographs]
+) -> dict[int, Sequence[Integers]]:
+    """All stations' photographs by their number: decoded already, or when they are looked at."""
+    images: dict[int, Sequence[Integers]] = {p.station: p.images for p in photographs}
+    for number, station in enumerate(session.stations):
+        if number not in images:
+            images[number] = Pictures(session.folder, station)
+    return images
+
+
+class Pictures(Sequence[Integers]):
+    """A station's photographs, each decoded when it is looked at and not kept."""
+
+    def __init__(self, folder: Path, station: Station) -> None:
+        self._folder, self._station = folder, station
+
+    def __len__(self) -> int:
+        return len(self._station.photographs)
+
+    @overload
+    def __getitem__(self, index: int) -> Integers: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Integers]: ...
+    def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
+        """One photograph, grey levels (height, width)."""
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        path = self._station.photographs[index].path
+        return decode(path, self._station.camera.image_size, label_of(self._folder, path))

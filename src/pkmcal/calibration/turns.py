@@ -1,0 +1,250 @@
+"""Observation and identification in turns: what is known so far predicts where to look.
+
+The drawing and the rough poses find the machine in the photographs; legs found to a pixel give a
+first estimate; that predicts edges to a pixel, whose sub-pixel positions give the next. Boards and
+tables of poses need no prediction: they are measured once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.boards.views import Boards
+from pkmcal.calibration.gather import CameraRefinement, measurements_of
+from pkmcal.calibration.recognise import WORKERS
+from pkmcal.errors import InputError, ResultError
+from pkmcal.files import listed
+from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.problem import Estimate, State
+from pkmcal.identify.start import better_start
+from pkmcal.measurements import EdgeSet, Measurements, Observation, Rejection, concatenate
+from pkmcal.observe import legs
+from pkmcal.observe.repeats import combined
+from pkmcal.session.load import Session
+
+ROUNDS = 3
+"""Most looks at the edges, each from the estimate before."""
+SETTLED = 0.15
+"""Median distance (px) of edges from their prediction below which another look changes nothing:
+the first look corrects a pixel, the second what shading leaves, and profiles reach ten times as
+far."""
+FEWEST_EDGES = 24
+"""Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
+
+Progress = Callable[[str, float], None]
+"""Called with a sentence about the present step and the share that is done, 0 to 1."""
+
+
+class Turns(NamedTuple):
+    """What the last turn left."""
+
+    observation: Observation
+    measurements: Measurements
+    estimate: Estimate
+    cameras: CameraRefinement
+
+
+def take_turns(
+    session: Session,
+    photographs: list[legs.Photographs],
+    boards: Boards,
+    T_camera_base: Array,
+    cameras: CameraRefinement,
+    told: Progress,
+    lap: Callable[[str], None],
+) -> Turns:
+    """Observation and identification in turns, the search narrowing.
+
+    T_camera_base : (S, 4, 4) of all stations. lap : called with the name of a step that is done.
+    """
+    told("Finding the legs", 0.35)
+    machine = session.machine
+    # the nearest poses, where the drawing does not quite close: recognition has seen to it
+    poses = machine.forward_result(session.joints).T_base_platform
+    looks = _each(
+        photographs,
+        lambda p: legs.search(p, machine, T_camera_base[p.station], poses[p.configuration]),
+    )
+    measurements = measurements_of(session, boards, _edges(looks))
+    lap("observe")
+    estimate = bundle(machine, measurements, start_state(machine, measurements, T_camera_base))
+    lap("identify")
+    blur: dict[int, float | None] = {p.station: None for p in photographs}
+    for turn in range(ROUNDS):
+        told("Measuring edges and identifying", 0.45 + 0.5 * turn / ROUNDS)
+        cameras = cameras.moved(estimate)
+        photographs = [
+            replace(p, camera=cameras.camera(session.stations[p.station].camera_file))
+            for p in photographs
+        ]
+        look = partial(_measure, estimate=estimate, blur=blur, refine=cameras.active)
+        looks = _each(photographs, look)
+        blur = {p.station: look.blur for p, look in zip(photographs, looks, strict=True)}
+        measurements = measurements_of(session, boards, _edges(looks), cameras)
+        lap("observe")
+        known = replace(estimate.state, intrinsics=np.zeros_like(cameras.at))
+        start = better_start(machine, measurements, known) if turn == 0 else known
+        estimate = bundle(machine, measurements, start)
+        lap("identify")
+        if max(look.moved for look in looks) < SETTLED and not cameras.active:
+            break
+    observation = observation_of(session, looks, boards, measurements, estimate)
+    return Turns(observation, measurements, estimate, cameras)
+
+
+def identify_poses(
+    session: Session,
+    boards: Boards,
+    T_camera_base: Array,
+    cameras: CameraRefinement,
+    told: Progress,
+) -> Turns:
+    """The same without legs: what poses say does not depend on the estimate, but for the cameras
+    that are refined with it.
+    """
+    told("Identifying", 0.6)
+    machine = session.machine
+    measurements = measurements_of(session, boards, None, cameras)
+    start = _reached(session, measurements, start_state(machine, measurements, T_camera_base))
+    estimate = bundle(machine, measurements, start)
+    for turn in range(1, ROUNDS if cameras.active else 1):
+        told("Identifying with the cameras", 0.6 + 0.3 * turn / ROUNDS)
+        cameras = cameras.moved(estimate)
+        measurements = measurements_of(session, boards, None, cameras)
+        known = replace(estimate.state, intrinsics=np.zeros_like(cameras.at))
+        estimate = bundle(machine, measurements, known)
+    observation = observation_of(session, [], boards, measurements, estimate)
+    return Turns(observation, measurements, estimate, cameras)
+
+
+def _reached(session: Session, measurements: Measurements, start: State) -> State:
+    """The start where the drawing cannot take all readings: from a first estimate by the rest.
+
+    Raises `InputError` for readings that the machine so found cannot take either.
+    """
+    drawn = session.machine.forward_result(session.joints).converged
+    if drawn.all():
+        return start
+    poses = measurements.poses
+    first = replace(measurements, poses=poses.select(drawn[poses.configuration]))
+    estimate = bundle(session.machine, first, start)
+    found = estimate.machine.forward_result(session.joints)
+    bad = [session.configurations[k] for k in np.flatnonzero(~found.converged)]
+    if bad:
+        raise InputError(
+            "the machine cannot take these readings, neither as drawn nor as the other"
+            " configurations show it: its legs do not meet the platform",
+            where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
+            found=f"a gap of {float(found.error.max()) * 1e3:.3g} mm",
+            expected="readings at which all legs reach the platform",
+            next_step="Check these readings, or leave these configurations out",
+        )
+    return replace(estimate.state, T_base_platform=found.T_base_platform, internal=found.internal)
+
+
+def _measure(
+    photographs: legs.Photographs, estimate: Estimate, blur: dict[int, float | None], refine: bool
+) -> legs.StationEdges:
+    state = estimate.state
+    return legs.measure(
+        photographs,
+        estimate.machine,
+        state.T_camera_base[photographs.station],
+        state.T_base_platform[photographs.configuration],
+        blur[photographs.station],
+        refine_camera=refine,
+    )
+
+
+def _each(
+    photographs: list[legs.Photographs],
+    look: Callable[[legs.Photographs], legs.StationEdges],
+) -> list[legs.StationEdges]:
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return [combined(seen) for seen in pool.map(look, photographs)]
+
+
+def _edges(looks: list[legs.StationEdges]) -> EdgeSet:
+    edges = concatenate([look.edges for look in looks])
+    if len(edges) < FEWEST_EDGES:
+        raise ResultError(
+            f"only {len(edges)} edges of legs were found in all photographs",
+            expected=f"at least {FEWEST_EDGES}",
+            next_step="Look whether the photographs show the legs sharply and brightly enough",
+        )
+    return edges
+
+
+def observation_of(
+    session: Session,
+    looks: list[legs.StationEdges],
+    boards: Boards,
+    measurements: Measurements,
+    estimate: Estimate,
+) -> Observation:
+    """The last looks joined, with what the estimate gave up among the rejected."""
+    edges = concatenate([look.edges for look in looks]) if looks else EdgeSet.empty()
+    first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
+    nowhere = [np.zeros((0, 2))], [np.zeros(0, dtype=int)]
+    return Observation(
+        edges=edges,
+        rejected=tuple(r for look in looks for r in look.rejected)
+        + boards.rejected
+        + _edges_given_up(edges, estimate)
+        + _poses_given_up(session, measurements, estimate),
+        points=np.concatenate([look.points for look in looks] or nowhere[0]),
+        point_edge=np.concatenate(
+            [look.point_edge + k for look, k in zip(looks, first, strict=bool(looks))] or nowhere[1]
+        ),
+        T_camera_base=estimate.state.T_camera_base,
+        poses=measurements.poses,
+    )
+
+
+def _edges_given_up(edges: EdgeSet, estimate: Estimate) -> tuple[Rejection, ...]:
+    return tuple(
+        Rejection(
+            int(edges.station[k]),
+            int(edges.configuration[k]),
+            int(edges.leg[k]),
+            int(edges.tube[k]),
+            int(edges.side[k]),
+            _OUTLIER,
+        )
+        for k in np.flatnonzero(estimate.edge_weights < 0.5)
+    )
+
+
+def _poses_given_up(
+    session: Session, measurements: Measurements, estimate: Estimate
+) -> tuple[Rejection, ...]:
+    """Poses that do not fit the rest, with how far they lie off."""
+    poses = measurements.poses
+    lost = np.flatnonzero(estimate.pose_weights < 0.5)
+    error = np.linalg.norm(estimate.pose_residuals, axis=1)
+    return tuple(
+        Rejection(
+            int(poses.station[k]),
+            int(poses.configuration[k]),
+            -1,
+            -1,
+            -1,
+            (_OFF if poses.station[k] < len(session.stations) else _POINT_OFF).format(error[k]),
+        )
+        for k in lost
+    )
+
+
+_OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
+_OFF = (
+    "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
+    " machine, moved, or the readings are another configuration's"
+)
+_POINT_OFF = "the measurement lies {:.0f} standard deviations from where all others put it"

@@ -1,0 +1,294 @@
+"""What one step of control tells: velocities, how far it is, and why it stopped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.control.seen import (
+    Legs,
+    SeenMachine,
+    directions_of,
+    legs_at,
+    seen_ends,
+    true_edges,
+)
+from pkmcal.control.track import Sight, start_state, track
+from pkmcal.errors import GeometryError, InputError
+from pkmcal.geometry.cylinders import line_through
+from pkmcal.geometry.rigid import dot
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
+
+
+class Status(Enum):
+    """What the controller does with this sample; only the first two move the machine."""
+
+    RUNNING = "on its way to the goal"
+    CONVERGED = "at the goal"
+    LOST = "stopped: too few legs are seen"
+    NOT_FOUND = "stopped: the machine is not seen where its readings put it"
+    WRONG_ASSEMBLY = "stopped: the machine stands in another assembly than the start's"
+    TOO_FAR = "stopped: the goal is too far away"
+    CROSSING = "stopped: a singular pose lies between the machine and the goal"
+    SINGULAR = "stopped: the pose is nearly singular"
+    OUT_OF_RANGE = "stopped: the next move would leave a motor's range"
+    UNREACHABLE = "stopped: no pose of the machine fits the readings"
+
+    @property
+    def moves(self) -> bool:
+        """Whether velocities are given."""
+        return self in (Status.RUNNING, Status.CONVERGED)
+
+
+@dataclass(frozen=True)
+class Step:
+    """The answer to one sample; m readings, s seen legs.
+
+    joint_velocities : (m,) per second, in the readings' units; zero unless ``status.moves``.
+    error : root mean square angle (rad) of the law's error over the legs used; NaN without any.
+    remaining : (m,) by how much each reading is still off, as the law sees it; NaN when stopped
+    before that was known. sigma : (m,) its standard deviation by what the photograph shows, NaN
+    for edges given without one. converged : at the goal within the tolerance.
+    status, sentence : what is the matter, for programs and for people. warnings : what the
+    controller goes on with.
+    used : (s,) legs that entered the law. normals : (s, 2, 3) edges as measured, camera frame.
+    """
+
+    joint_velocities: Array
+    error: float
+    remaining: Array
+    sigma: Array
+    converged: bool
+    status: Status
+    sentence: str
+    warnings: tuple[str, ...]
+    used: Booleans
+    normals: Array
+
+
+def leg_list(numbers: list[int]) -> str:
+    """Legs counted from 1, for sentences: "legs 1, 2 and 5"."""
+    names = [str(j + 1) for j in numbers]
+    if len(names) < 2:
+        return f"leg {''.join(names)}"
+    return f"legs {', '.join(names[:-1])} and {names[-1]}"
+
+
+def motor_name(machine: Machine, column: int) -> str:
+    """A reading by the leg, or legs, that it drives."""
+    return leg_list(np.flatnonzero(machine.layout.actuated == column).tolist())
+
+
+def missing_clauses(
+    legs: Integers, used: Booleans, goal: Array, reasons: tuple[str, ...]
+) -> list[str]:
+    """One clause for every reason why seen legs (s,) are not used."""
+    missing: dict[str, list[int]] = {}
+    for k in np.flatnonzero(~used):
+        left_out = np.isnan(goal[k]).any()
+        why = "left out by the goal" if left_out else f"not seen ({reasons[k]})"
+        missing.setdefault(why, []).append(int(legs[k]))
+    return [
+        f"{leg_list(group)} {'are' if len(group) > 1 else 'is'} {why}"
+        for why, group in missing.items()
+    ]
+
+
+def vague_sentence(machine: Machine, sigma: Array) -> str:
+    """Which motor's way to the goal is known worst; sigma (m,)."""
+    k = int(np.nanargmax(sigma))
+    return (
+        f"what is seen tells where the motor of {motor_name(machine, k)} should be"
+        f" to {sigma[k] * 1e3:.2g} m{machine.joint_units[k]} only"
+    )
+
+
+def range_sentence(machine: Machine, ranges: Array, readings: Array, leaves: Booleans) -> str:
+    """Which motor would leave its range (m, 2)."""
+    k = int(np.argmax(leaves))
+    (low, high), unit = ranges[k], machine.joint_units[k]
+    return (
+        f"the motor of {motor_name(machine, k)} reads {readings[k]:.4g} {unit},"
+        f" its range is {low:.4g} to {high:.4g}"
+    )
+
+
+def leaving(
+    ranges: Array, readings: Array, velocities: Array, period: float
+) -> tuple[Booleans, Booleans]:
+    """Motors (m,) that the velocities would drive out of their range (m, 2) within a period, and
+    those that are outside already. Ranges that are NaN bound nothing.
+    """
+    after = readings + velocities * period
+    with np.errstate(invalid="ignore"):
+        low = (after < ranges[:, 0]) & (velocities < 0)
+        high = (after > ranges[:, 1]) & (velocities > 0)
+        outside = (readings < ranges[:, 0]) | (readings > ranges[:, 1])
+    return low | high, outside
+
+
+UNIT = 1e-6
+"""By how much a normal's length may differ from 1: six digits written to a file."""
+
+
+@dataclass(frozen=True)
+class GoalPhotograph:
+    """A photograph of the machine at the goal, (height, width) uint8, and its readings (m,)."""
+
+    image: Integers
+    readings: Array
+
+
+@dataclass(frozen=True)
+class Goal:
+    """normals : (s, 2, 3) edges to be seen, camera frame; NaN for legs that the goal leaves out.
+    aspect : sign of the closure's determinant there, 0 where it is not known.
+    """
+
+    normals: Array
+    aspect: float
+
+
+def goal_of(sight: Sight | None, seen: SeenMachine, goal: Array | GoalPhotograph) -> Goal:
+    """A platform pose (4, 4), edges (s, 2, 3) or a photograph as a goal.
+
+    Raises InputError for what cannot be one.
+    """
+    if isinstance(goal, GoalPhotograph):
+        return _of_photograph(sight, seen, goal)
+    array = np.asarray(goal, dtype=float)
+    if array.shape == (4, 4):
+        return _of_pose(seen, array)
+    if array.shape == (len(seen.legs), 2, 3):
+        return Goal(checked_normals(seen, array, "the goal's edges"), 0.0)
+    raise InputError(
+        what="the goal is neither a platform pose nor edges",
+        found=f"an array of shape {array.shape}",
+        expected=f"(4, 4), or ({len(seen.legs)}, 2, 3) for the {len(seen.legs)} seen legs",
+    )
+
+
+def checked_normals(seen: SeenMachine, normals: Array, name: str) -> Array:
+    """Edges (s, 2, 3) as given, NaN where a leg is not seen.
+
+    Raises InputError for what cannot be edges of these legs.
+    """
+    array = np.asarray(normals, dtype=float)
+    if array.shape != (len(seen.legs), 2, 3):
+        raise InputError(
+            what=f"{name} have the wrong shape",
+            found=str(array.shape),
+            expected=f"({len(seen.legs)}, 2, 3), two normals for each seen leg",
+        )
+    length = dot(array, array)
+    if np.any(np.abs(length - 1) > 2 * UNIT):  # NaN passes: a leg that is not seen
+        raise InputError(
+            what=f"{name} are not unit vectors",
+            found=f"length {float(np.sqrt(np.nanmax(np.abs(length - 1)) + 1)):.6g}",
+            expected="length 1, or NaN for a leg that is not seen",
+        )
+    return array
+
+
+def aspect_of(machine: Machine, legs: Legs) -> float:
+    """Sign of the determinant of the closure's rows by the machine's motion.
+
+    It changes only where the platform can move with all motors locked, so between poses of two
+    signs lies a singular one. 0 where axes or hinges make the rows more than the freedoms.
+    """
+    rows = legs.rows @ machine.layout.motion
+    if machine.layout.n_internal or rows.shape[-2] != rows.shape[-1]:
+        return 0.0
+    return float(np.sign(np.linalg.det(rows)))
+
+
+def check_sides(seen: SeenMachine, normals: Array, T_base_platform: Array) -> None:
+    """Raise InputError where edges (s, 2, 3) point along the legs from platform to base, seen from
+    a pose (4, 4) of the right assembly: the two sides are exchanged.
+    """
+    a, b = seen_ends(seen, T_base_platform)
+    known = np.isfinite(normals).all(axis=(-1, -2))
+    cosine = dot(directions_of(normals), line_through(a, b)[0])[known]
+    if cosine.size and np.median(cosine) < 0:
+        raise InputError(
+            what="the edges have their two sides exchanged",
+            expected="side 0 on the right of a leg, looking along it from base to platform",
+            next_step="see docs/conventions.md, Edges and sides",
+        )
+
+
+def _of_pose(seen: SeenMachine, T_base_platform: Array) -> Goal:
+    machine = seen.machine
+    if not np.isfinite(T_base_platform).all():
+        raise InputError("the goal's pose holds a value that is not a finite number")
+    _check_closes(seen, T_base_platform)
+    readings = machine.inverse(T_base_platform[None])[0]
+    ranges = machine.joint_ranges
+    with np.errstate(invalid="ignore"):
+        out = ~np.isfinite(readings) | (readings < ranges[:, 0]) | (readings > ranges[:, 1])
+    if out.any():
+        k = int(np.argmax(out))
+        unit = machine.joint_units[k]
+        raise InputError(
+            what=f"the goal is out of the machine's reach: {motor_name(machine, k)}",
+            found=f"a reading of {readings[k]:.4g} {unit}"
+            if np.isfinite(readings[k])
+            else "no reading that reaches it",
+            expected=f"{ranges[k, 0]:.4g} to {ranges[k, 1]:.4g} {unit}",
+            next_step="choose a goal inside the workspace",
+        )
+    edges = true_edges(seen, T_base_platform)
+    if np.isnan(edges).any():
+        raise InputError(
+            what="at the goal a leg passes through the camera's centre of projection",
+            next_step="check T_camera_base",
+        )
+    return Goal(edges, aspect_of(machine, legs_at(seen, T_base_platform)))
+
+
+def _check_closes(seen: SeenMachine, T_base_platform: Array) -> None:
+    """The machine can be there, and the pose is not singular."""
+    machine = seen.machine
+    readings = machine.inverse(T_base_platform[None])[0]
+    if not np.isfinite(readings).all():
+        return  # said better by what follows
+    found = machine.forward_result(readings, T_base_platform)
+    moved = np.abs(found.T_base_platform - T_base_platform).max()
+    if not bool(found.converged) or moved > UNIT:
+        raise InputError(
+            what="the machine cannot take the goal's pose",
+            expected=f"a pose that a machine of motion {machine.document.motion!r} can take",
+            next_step="give machine.forward(readings) of readings at the goal",
+        )
+    if float(found.singularity) < NEAR_SINGULAR:
+        raise InputError(
+            what="the goal is nearly singular: there the platform moves with its motors locked",
+            found=f"smallest singular value {float(found.singularity):.2g}",
+            expected=f"more than {NEAR_SINGULAR}; 1 is a good pose",
+        )
+
+
+def _of_photograph(sight: Sight | None, seen: SeenMachine, goal: GoalPhotograph) -> Goal:
+    if sight is None:
+        raise InputError(
+            "a goal photograph needs the camera", next_step="give camera to VisualServo"
+        )
+    readings = np.asarray(goal.readings, dtype=float)
+    found = track(sight, start_state(seen), goal.image, readings)
+    if not found.closed:
+        raise GeometryError(
+            what="no pose of the machine fits the readings of the goal photograph",
+            next_step="check that they are in metres or radians, in the order of the motors",
+        )
+    if not found.found.any():
+        raise GeometryError(
+            what="no leg was found in the goal photograph",
+            found=found.reasons[0],
+            next_step="check the camera, its place and the light",
+        )
+    legs = legs_at(seen, found.state.T_base_platform, readings)
+    return Goal(found.lines.normal, aspect_of(seen.machine, legs))

@@ -1,0 +1,367 @@
+"""Text, YAML with line numbers, and JSON: files read, and the phrases that messages are made of."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from pkmcal.errors import InputError
+
+LONGEST_SHOWN = 60
+"""Characters of a found value that a message quotes: enough to recognise it, short enough for
+one line."""
+
+
+def read_text(path: Path, label: str | None = None) -> str:
+    """Text of a UTF-8 file, without byte-order mark and with Unix line ends.
+
+    label : the file's name in messages; the path's last part unless told.
+    """
+    label = label or path.name
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(
+            "the file does not exist", where=label, expected=wanted_file(path)
+        ) from None
+    except IsADirectoryError:
+        raise InputError("this is a folder", where=label, expected="a file") from None
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(f"the file cannot be read ({reason})", where=label) from None
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            "the file is not UTF-8 text",
+            where=f"{label}, line {line}",
+            found=f"byte 0x{raw[error.start]:02x}",
+            expected="UTF-8",
+            next_step="Save it as UTF-8 in the editor",
+        ) from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def wanted_file(path: Path) -> str:
+    """Say, for a message, which file is missing, and the name like it that is there."""
+    folder = path.parent
+    if not folder.is_dir():
+        return f"a file {path} (its folder does not exist either)"
+    neighbour = closest(path.name, (entry.name for entry in folder.iterdir()))
+    return f"a file {path}" + (f" (there is {neighbour})" if neighbour else "")
+
+
+def closest(name: str, known: Iterable[str]) -> str | None:
+    """Return the known name that a misspelt one most likely means, or None."""
+    by_lower = {candidate.lower(): candidate for candidate in known}
+    # 0.6 is difflib's own threshold: one or two wrong letters in a short key.
+    matches = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
+    return by_lower[matches[0]] if matches else None
+
+
+def listed(names: Sequence[str], longest: int = 6) -> str:
+    """Join names for a sentence: "a, b and c", or "a, b, c and 12 more"."""
+    if len(names) <= 1:
+        return "".join(names)
+    if len(names) <= longest:
+        return f"{', '.join(names[:-1])} and {names[-1]}"
+    return f"{', '.join(names[: longest - 1])} and {len(names) - longest + 1} more"
+
+
+def shown(value: object) -> str:
+    """Quote a found value briefly."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    text = repr(value)
+    return text if len(text) <= LONGEST_SHOWN else text[: LONGEST_SHOWN - 1] + "…"
+
+
+Keys = tuple[str | int, ...]
+"""Where a value stands in a file: keys and zero-based list indices from the top."""
+
+MOST_VALUES = 200_000
+"""Values a file may expand to. A large machine has a thousand; aliases of aliases reach billions
+from one short line, and would fill the memory."""
+
+_TAG = "tag:yaml.org,2002:"
+_SCALARS = (
+    ("null", r"~|null|Null|NULL|", "~nN\0"),
+    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("int", r"[-+]?[0-9]+", "-+0123456789"),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?"
+        r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
+    ("merge", r"<<", "<"),
+)
+_CONSTRUCT: dict[str, Callable[[str], str | int | float | bool | None]] = {
+    "str": str,
+    "null": lambda _: None,
+    "bool": lambda text: text.lower() == "true",
+    # Decimal whatever the leading zeros; YAML 1.1 reads 010 as eight.
+    "int": int,
+    "float": lambda text: float(text.lower().replace(".inf", "inf").replace(".nan", "nan")),
+}
+
+
+@dataclass(frozen=True)
+class Document:
+    """A file's content and the line of each of its values.
+
+    label : the file's name in messages.
+    data : plain dicts, lists, str, int, float, bool and None; keys are str.
+    lines : line (from 1) by keys; a mapping's value has its key's line.
+    """
+
+    path: Path
+    label: str
+    data: dict[str, Any]
+    lines: Mapping[Keys, int]
+
+    def where(self, *keys: str | int) -> str:
+        """Name file, line and field, as in "session.yaml, line 12, stations.front.camera".
+
+        A field that is missing has its nearest parent's line, and none at the top.
+        """
+        known = keys
+        while known and known not in self.lines:
+            known = known[:-1]
+        line = f", line {self.lines[known]}" if known else ""
+        return f"{self.label}{line}" + (f", {field_path(keys)}" if keys else "")
+
+
+def field_path(keys: Keys) -> str:
+    """Write keys as a path; lists count from 1, as parameter names do: ``legs[1].base.center``."""
+    text = "".join(f"[{key + 1}]" if isinstance(key, int) else f".{key}" for key in keys)
+    return text.removeprefix(".")
+
+
+def read_yaml(path: Path | str, label: str | None = None) -> Document:
+    """Read a YAML file whose top is a mapping; every fault is an `InputError` with its line."""
+    path = Path(path)
+    return parse_yaml(read_text(path, label), path, label)
+
+
+def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
+    """As `read_yaml`, on text that is already in hand; `path` only names it."""
+    label = label or path.name
+    try:
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        if node is None:
+            raise InputError("the file is empty", where=label, expected="keys and values")
+        builder = _Builder(loader, label)
+        data = builder.value(node, ())
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f", line {mark.line + 1}" if mark else ""
+        # PyYAML's own words for a list after a mapping and the like are good enough to act on.
+        problem = error.problem or error.context or "cannot be understood"
+        raise InputError(
+            f"not valid YAML ({problem})",
+            where=label + line,
+            next_step="Check indentation, quotes and brackets on this line and the one above",
+        ) from None
+    except RecursionError:
+        raise InputError("the file is nested too deeply to be read", where=label) from None
+    except yaml.reader.ReaderError as error:
+        raise InputError(
+            "not a text file", where=label, found=f"character #x{error.character:04x}"
+        ) from None
+    if not isinstance(data, dict):
+        raise InputError(
+            "the top of the file is not a mapping",
+            where=label,
+            found=shown(data),
+            expected="lines of the form key: value",
+        )
+    return Document(path, label, data, builder.lines)
+
+
+def yaml_text(data: Mapping[str, Any]) -> str:
+    """Write plain data as YAML that `read_yaml` reads back the same; short lists stay on one line.
+
+    Keys keep their order; floats are written in full (shortest text with the same value).
+    """
+    style: dict[str, Any] = {"sort_keys": False, "default_flow_style": None, "width": 100}
+    return yaml.dump(dict(data), Dumper=_Dumper, allow_unicode=True, **style)
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader with YAML 1.2's scalars."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
+
+
+class _Dumper(yaml.SafeDumper):
+    """Its counterpart: quotes what `_Loader` would not read as text; never writes aliases."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
+
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002
+        return True
+
+
+def _text_node(dumper: _Dumper, text: str) -> yaml.ScalarNode:
+    # PyYAML leaves these line breaks bare between single quotes, and reads them back as blanks.
+    style = '"' if any(mark in text for mark in "\x85\u2028\u2029") else None
+    return dumper.represent_scalar(_TAG + "str", text, style=style)
+
+
+_Dumper.add_representer(str, _text_node)
+for _name, _pattern, _first in _SCALARS:
+    for _kind in (_Loader, _Dumper):
+        _kind.add_implicit_resolver(
+            _TAG + _name, re.compile(rf"(?:{_pattern})\Z"), [c.strip("\0") for c in _first]
+        )
+
+
+class _Builder:
+    """Turns a YAML node tree into plain data, noting lines and refusing what would be misread."""
+
+    def __init__(self, loader: _Loader, label: str) -> None:
+        self.loader = loader
+        self.label = label
+        self.lines: dict[Keys, int] = {}
+        self._open: set[int] = set()
+        self._count = 0
+
+    def value(self, node: yaml.Node, keys: Keys) -> Any:
+        """Plain data of a node that stands at `keys`."""
+        self.lines.setdefault(keys, node.start_mark.line + 1)
+        self._count += 1
+        if id(node) in self._open or self._count > MOST_VALUES:
+            raise self._error(node, "an alias (*) repeats without end, or far too often")
+        self._open.add(id(node))
+        try:
+            if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
+                return self._mapping(node, keys)
+            if isinstance(node, yaml.SequenceNode) and node.tag == _TAG + "seq":
+                return [self.value(child, (*keys, i)) for i, child in enumerate(node.value)]
+            return self._scalar(node)
+        finally:
+            self._open.discard(id(node))
+
+    def _mapping(self, node: yaml.MappingNode, keys: Keys) -> dict[str, Any]:
+        seen: dict[str, int] = {}
+        for key_node, _ in node.value:
+            key, line = self._key(key_node), key_node.start_mark.line + 1
+            if key in seen:
+                raise InputError(
+                    f"the key {key} stands twice, on lines {seen[key]} and {line}",
+                    where=f"{self.label}, line {line}, {field_path((*keys, key))}",
+                    next_step="Remove one of the two",
+                )
+            seen[key] = line
+        # Merges (<<) put their pairs first, so that a mapping's own keys win; writing the pairs
+        # back keeps an alias to this node from meeting them as duplicates.
+        self.loader.flatten_mapping(node)
+        pairs = {self._key(pair[0]): pair for pair in node.value}
+        node.value = list(pairs.values())
+        for key, (key_node, _) in pairs.items():
+            self.lines[(*keys, key)] = key_node.start_mark.line + 1
+        return {key: self.value(child, (*keys, key)) for key, (_, child) in pairs.items()}
+
+    def _scalar(self, node: yaml.Node) -> str | int | float | bool | None:
+        kind = node.tag.removeprefix(_TAG)
+        if not isinstance(node, yaml.ScalarNode) or kind not in _CONSTRUCT:
+            raise self._error(node, f"the tag {node.tag} is not allowed here")
+        try:
+            return _CONSTRUCT[kind](node.value)
+        except ValueError:
+            raise self._error(node, f"{shown(node.value)} is not a usable {kind}") from None
+
+    def _key(self, node: yaml.Node) -> str:
+        if not isinstance(node, yaml.ScalarNode):
+            raise self._error(node, "a key is a list or a mapping; it should be a word")
+        return node.value
+
+    def _error(self, node: yaml.Node, what: str) -> InputError:
+        return InputError(what, where=f"{self.label}, line {node.start_mark.line + 1}")
+
+
+_WIDEST = 160
+"""Characters up to which a list or an object stays on one line."""
+
+
+def plain(value: Any) -> Any:
+    """Arrays, tuples and NumPy numbers as JSON has them; what is not finite becomes null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def json_text(value: Any) -> str:
+    """Plain data as JSON text; short parts and rows of numbers stay on one line each."""
+    return _text(plain(value), "") + "\n"
+
+
+def _text(value: Any, indent: str) -> str:
+    line = _line(value)
+    if not isinstance(value, dict | list) or _is_row(value):
+        return line
+    nested = any(isinstance(item, dict | list) for item in _items(value))
+    if len(line) <= _WIDEST and not nested:
+        return line
+    inner = indent + " "
+    parts = [_text(item, inner) for item in _items(value)]
+    if isinstance(value, dict):
+        parts = [f"{_line(key)}: {part}" for key, part in zip(value, parts, strict=True)]
+    opened, closed = "{}" if isinstance(value, dict) else "[]"
+    return f"{opened}\n{inner}" + f",\n{inner}".join(parts) + f"\n{indent}{closed}"
+
+
+def _line(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)
+
+
+def _items(value: dict[str, Any] | list[Any]) -> list[Any]:
+    return list(value.values()) if isinstance(value, dict) else value
+
+
+def _is_row(value: Any) -> bool:
+    """A row of a matrix or a table, which is easier to read on one line however long it is."""
+    return isinstance(value, list) and all(isinstance(v, int | float | None) for v in value)
+
+
+def read_json(path: Path | str, label: str | None = None) -> Document:
+    """Read a JSON file whose top is an object; its values have no lines."""
+    path = Path(path)
+    label = label or path.name
+    try:
+        data = json.loads(read_text(path, label), parse_constant=_refuse)
+    except RecursionError:
+        raise InputError("the file is nested too deeply to be read", where=label) from None
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"not valid JSON ({error.msg})", where=f"{label}, line {error.lineno}"
+        ) from None
+    except ValueError as error:
+        raise InputError("not valid JSON", where=label, found=str(error)) from None
+    if not isinstance(data, dict):
+        raise InputError("the top of the file is not an object", where=label, found=shown(data))
+    return Document(path, label, data, {})
+
+
+def _refuse(constant: str) -> float:
+    raise ValueError(constant)

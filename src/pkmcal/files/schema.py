@@ -1,0 +1,224 @@
+"""A document checked against a pydantic schema; what is wrong comes back as one sentence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
+
+from pkmcal.errors import InputError
+from pkmcal.files.documents import Document, Keys, closest, field_path, listed, shown
+
+__all__ = ["Schema", "field_path", "validate"]
+
+JsonSchema = Mapping[str, Any]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Schema(BaseModel):
+    """Base of every file's schema: unknown keys refused, types exact, numbers finite.
+
+    A field's ``description`` completes "expected …" in the message about its absence, so write it
+    as a noun phrase: "the camera's file, for example cameras/front.yaml".
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+def validate(document: Document, model: type[Model]) -> Model:
+    """Return the document as a `model`, or raise one `InputError` about everything wrong in it.
+
+    The first fault in the file's order makes the sentence; the others are named after it, so that
+    they can be mended in one go.
+    """
+    try:
+        # By way of JSON, because there a list may become a tuple while types stay exact.
+        return model.model_validate_json(json.dumps(document.data))
+    except ValidationError as error:
+        faults = [_fault(document, model, details) for details in error.errors()]
+    # A required key that is misspelt is one mistake, not one unknown and one missing key.
+    meant = {(*fault.keys[:-1], fault.guess) for fault in faults if fault.guess}
+    faults = [fault for fault in faults if not (fault.missing and fault.keys in meant)]
+    faults.sort(key=lambda fault: fault.line)
+    first = faults[0].error
+    others = dict.fromkeys(str(fault.error.where) for fault in faults[1:])
+    others.pop(str(first.where), None)
+    if not others:
+        raise first
+    places = listed([place.removeprefix(f"{document.label}, ") for place in others])
+    raise InputError(
+        first.what,
+        where=first.where,
+        found=first.found,
+        expected=first.expected,
+        next_step=f"Then look at {places}",
+    )
+
+
+@dataclass(frozen=True)
+class _Fault:
+    """One of pydantic's errors: where in the file, which known key was meant, our error."""
+
+    line: int
+    keys: Keys
+    missing: bool
+    guess: str | None
+    error: InputError
+
+
+def _fault(document: Document, model: type[BaseModel], details: ErrorDetails) -> _Fault:
+    missing = details["type"] == "missing"
+    keys = _keys_in(document.data, details["loc"], missing=missing)
+    # An entry that a list lacks is told as a list that is too short.
+    short = missing and isinstance(keys[-1], int)
+    keys = keys[:-1] if short else keys
+    location = details["loc"][:-1] if short else details["loc"]
+    schemas = _schemas_at(model.model_json_schema(), location)
+    what, found, expected = _phrases(details, keys, schemas, short=short)
+    unknown = details["type"] == "extra_forbidden"
+    return _Fault(
+        line=document.lines.get(keys, document.lines.get(keys[:-1], 0)),
+        keys=keys,
+        missing=missing,
+        guess=closest(str(keys[-1]), _known_keys(schemas)) if unknown else None,
+        error=InputError(what, where=document.where(*keys), found=found, expected=expected),
+    )
+
+
+def _phrases(
+    details: ErrorDetails, keys: Keys, schemas: list[JsonSchema], *, short: bool
+) -> tuple[str, str | None, str | None]:
+    """What, found and expected of a fault."""
+    kind, context, value = details["type"], details.get("ctx", {}), details["input"]
+    if short:
+        wanted = max(len(schema.get("prefixItems", ())) for schema in schemas)
+        return _WHAT["too_short"], shown(value), _description(schemas) or f"{wanted} entries"
+    if kind == "missing":
+        return "this is missing", None, _description(schemas) or "a value"
+    if kind == "extra_forbidden":
+        known = _known_keys(schemas)
+        guess = closest(str(keys[-1]), known)
+        expected = f"{guess} (known here: {', '.join(known)})" if guess else listed(known, 12)
+        return "this key is not known", str(keys[-1]), expected or None
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        tags = context.get("expected_tags") or _tags(schemas)
+        return (
+            f"no valid {context['discriminator']}".replace("'", ""),
+            str(context["tag"]) if "tag" in context else None,
+            f"one of {tags}".replace("'", ""),
+        )
+    if kind in ("value_error", "assertion_error"):
+        # A schema's own validator wrote a whole sentence.
+        return str(context["error"]), None, None
+    limits = {name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in context.items()}
+    expected = (
+        _EXPECTED[kind].format_map(limits)
+        if kind in _EXPECTED
+        else details["msg"].removeprefix("Input should be ")
+    )
+    return _WHAT.get(kind, "this value cannot be used"), shown(value), expected
+
+
+_WHAT = {
+    "finite_number": "this is not a finite number",
+    "too_long": "this has too many entries",
+    "too_short": "this has too few entries",
+}
+
+_EXPECTED = {
+    "finite_number": "a number",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "text",
+    "list_type": "a list, such as [1, 2, 3]",
+    "tuple_type": "a list, such as [1, 2, 3]",
+    "dict_type": "keys and values",
+    "model_type": "keys and values",
+    "model_attributes_type": "keys and values",
+    "greater_than": "a number above {gt}",
+    "greater_than_equal": "a number of {ge} or more",
+    "less_than": "a number below {lt}",
+    "less_than_equal": "a number of {le} or less",
+    "literal_error": "{expected}",
+    "too_long": "at most {max_length}",
+    "too_short": "at least {min_length}",
+    "string_too_short": "text of {min_length} characters at least",
+}
+"""What each of pydantic's error types wants, in a reader's words; the rest keep pydantic's."""
+
+
+def _keys_in(data: Any, location: tuple[int | str, ...], *, missing: bool) -> Keys:
+    """Drop from a pydantic location what the file does not hold (names of union members)."""
+    keys: list[int | str] = []
+    for position, key in enumerate(location):
+        try:
+            data = data[key]
+        except (KeyError, IndexError, TypeError):
+            if not (missing and position == len(location) - 1):
+                continue
+        keys.append(key)
+    return tuple(keys)
+
+
+def _schemas_at(root: JsonSchema, location: tuple[int | str, ...]) -> list[JsonSchema]:
+    """JSON schemas (every member of a union) of a location; its parent's where it has none."""
+    found = _members(root, root)
+    for key in location:
+        children = [child for schema in found for child in _children(schema, key)]
+        if children:
+            found = [member for child in children for member in _members(root, child)]
+    return found
+
+
+def _members(root: JsonSchema, schema: JsonSchema) -> list[JsonSchema]:
+    """A schema with its references followed and its unions spread out."""
+    if "$ref" in schema:
+        name = schema["$ref"].rpartition("/")[2]
+        target = _members(root, root["$defs"][name])
+        # What stands beside a reference (a field's description) belongs to the field: put first.
+        beside = {key: value for key, value in schema.items() if key != "$ref"}
+        return [beside, *target] if beside else target
+    nested = [member for word in ("anyOf", "oneOf", "allOf") for member in schema.get(word, ())]
+    return [schema, *(deep for member in nested for deep in _members(root, member))]
+
+
+def _children(schema: JsonSchema, key: int | str) -> list[JsonSchema]:
+    """The schemas that one step down from `schema` may mean: a property, a tag, an entry."""
+    if isinstance(key, int):
+        entries = schema.get("prefixItems", ())
+        candidate = entries[key] if key < len(entries) else schema.get("items")
+        return [candidate] if isinstance(candidate, dict) else []
+    if key in schema.get("properties", {}):
+        return [schema["properties"][key]]
+    tagged = schema.get("discriminator", {}).get("mapping", {})
+    if key in tagged:
+        return [{"$ref": tagged[key]}]
+    patterns = list(schema.get("patternProperties", {}).values())
+    return [
+        child for child in (*patterns, schema.get("additionalProperties"))
+        if isinstance(child, dict)
+    ]  # fmt: skip
+
+
+def _known_keys(schemas: list[JsonSchema]) -> list[str]:
+    return sorted({name for schema in schemas for name in schema.get("properties", {})})
+
+
+def _description(schemas: list[JsonSchema]) -> str | None:
+    # A schema with properties is a model, whose description is its docstring, not the field's.
+    texts = [
+        schema["description"]
+        for schema in schemas
+        if "description" in schema and "properties" not in schema
+    ]
+    return texts[0].rstrip(".") if texts else None
+
+
+def _tags(schemas: list[JsonSchema]) -> str:
+    mappings = [schema.get("discriminator", {}).get("mapping", {}) for schema in schemas]
+    return ", ".join(tag for mapping in mappings for tag in mapping)

@@ -1,0 +1,220 @@
+"""What was measured: silhouette edges, poses of boards and targets, readings; plain and frozen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import perturb
+
+
+@dataclass(frozen=True)
+class PoseSet:
+    """N measured poses.
+
+    station : (N,) index into the session's stations. configuration : (N,) row of the readings.
+    mount : (N,) what the target is fixed to.
+    T_station_target : (N, 4, 4) target to station (camera or tracker) coordinates, m.
+    whiten : (N, 6, 6) for the left perturbation (omega, tau) of T_station_target, rad and m:
+        whiten @ error has unit covariance. Rows of what is not measured (a point's turn) are zero.
+    by_intrinsics : (N, 6, n) that perturbation by the camera's parameters, with the corners'
+        pixels held; n = 0 where nobody asked.
+    """
+
+    station: Integers
+    configuration: Integers
+    mount: Integers
+    T_station_target: Array
+    whiten: Array
+    by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 6, 0)))
+
+    def __post_init__(self) -> None:
+        """Poses without derivatives by intrinsics get empty ones, so that all select alike."""
+        if len(self.by_intrinsics) != len(self.station):
+            object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 6, 0)))
+
+    @classmethod
+    def empty(cls) -> PoseSet:
+        """No pose."""
+        none = np.zeros(0, dtype=int)
+        return cls(none, none, none, np.zeros((0, 4, 4)), np.zeros((0, 6, 6)))
+
+    def __len__(self) -> int:
+        return len(self.station)
+
+    @property
+    def rows(self) -> Integers:
+        """(N,) how many of its six numbers each measurement has."""
+        return np.any(self.whiten != 0, axis=-1).sum(axis=-1)
+
+    def select(self, mask: Booleans | Integers) -> PoseSet:
+        """The poses that a mask or an index picks."""
+        return PoseSet(*(getattr(self, f.name)[mask] for f in fields(self)))
+
+    def moved(self, change: Array) -> PoseSet:
+        """The poses as cameras with other parameters see them; change : (S, n), by station.
+
+        To first order: a camera's calibration is good to a thousandth, so what is left out is a
+        millionth.
+        """
+        n = self.by_intrinsics.shape[-1]
+        delta = (self.by_intrinsics @ change[self.station, :n, None])[..., 0]
+        return replace(self, T_station_target=perturb(self.T_station_target, delta))
+
+
+def concatenate_poses(sets: Sequence[PoseSet]) -> PoseSet:
+    """All poses in one set; cameras with fewer parameters get zeros for the rest."""
+    parts = [PoseSet.empty(), *sets]
+    widest = max(s.by_intrinsics.shape[-1] for s in parts)
+    padded = [
+        np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
+        for s in parts
+    ]
+    joined = {
+        f.name: np.concatenate([getattr(s, f.name) for s in parts])
+        for f in fields(PoseSet)
+        if f.name != "by_intrinsics"
+    }
+    return PoseSet(**joined, by_intrinsics=np.concatenate(padded))
+
+
+@dataclass(frozen=True)
+class EdgeSet:
+    """Silhouette edges of legs in photographs; N edges, flat arrays, all indices from 0.
+
+    station, configuration, leg, tube, side : (N,) where the edge was seen; side as in
+        :mod:`pkmcal.geometry.cylinders` (0 or 1).
+    normal : (N, 3) unit normal of the plane of edge and camera centre, camera frame,
+        pointing away from the leg's axis.
+    basis : (N, 3, 2) orthonormal tangent basis at the normal: shift first, tilt second.
+    covariance : (N, 2, 2) of the normal in that basis, rad^2.
+    shift : (N, 2) change of the normal, in that basis, when every point of the edge moves
+        outward by one pixel (rad/px).
+    span : (N, 2) first and last seen place along the leg, m from A.
+    by_intrinsics : (N, 2, n) change of the normal, in that basis, by the camera's parameters with
+        the edge's pixels held; n = 0 where nobody asked.
+    """
+
+    station: Integers
+    configuration: Integers
+    leg: Integers
+    tube: Integers
+    side: Integers
+    normal: Array
+    basis: Array
+    covariance: Array
+    shift: Array
+    span: Array
+    by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
+
+    def __post_init__(self) -> None:
+        """Edges without derivatives by intrinsics get empty ones, so that all select alike."""
+        if len(self.by_intrinsics) != len(self.station):
+            object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 2, 0)))
+
+    @classmethod
+    def empty(cls) -> EdgeSet:
+        """No edge, for sessions of boards alone."""
+        none = np.zeros(0, dtype=int)
+        shapes = ((3,), (3, 2), (2, 2), (2,), (2,))
+        return cls(none, none, none, none, none, *(np.zeros((0, *shape)) for shape in shapes))
+
+    def __len__(self) -> int:
+        return len(self.station)
+
+    def select(self, keep: Booleans | Integers) -> EdgeSet:
+        """The edges at a mask or at positions."""
+        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Something that was seen but left out, or looked for and not found, and why.
+
+    tube and side are -1 where the whole leg, leg -1 where the whole photograph is meant.
+    """
+
+    station: int
+    configuration: int
+    leg: int
+    tube: int
+    side: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the photographs of a session gave.
+
+    edges : the measurements.
+    rejected : what was left out, with its reason.
+    points, point_edge : (M, 2) sub-pixel edge points (px) and the edge that each supports,
+        for pictures and residuals.
+    T_camera_base : (S, 4, 4) poses of the stations as the search left them.
+    poses : of boards, and of trackers' targets.
+    """
+
+    edges: EdgeSet
+    rejected: tuple[Rejection, ...]
+    points: Array
+    point_edge: Integers
+    T_camera_base: Array
+    poses: PoseSet = field(default_factory=PoseSet.empty)
+
+
+def concatenate(sets: list[EdgeSet]) -> EdgeSet:
+    """Several edge sets as one; cameras with fewer parameters get zeros for the rest."""
+    widest = max(s.by_intrinsics.shape[-1] for s in sets)
+    padded = [
+        np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
+        for s in sets
+    ]
+    joined = {
+        f.name: np.concatenate([getattr(s, f.name) for s in sets])
+        for f in fields(EdgeSet)
+        if f.name != "by_intrinsics"
+    }
+    return EdgeSet(**joined, by_intrinsics=np.concatenate(padded))
+
+
+@dataclass(frozen=True)
+class Mount:
+    """What a board or a tracker's target is fixed to; its place there is estimated."""
+
+    name: str
+    body: Literal["base", "platform"]
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Everything that was measured, nothing that was assumed.
+
+    edges : silhouette edges. joints : (K, m) readings, m or rad. joint_noise : their
+    standard deviation. n_stations : S. camera_of_station : (S,) number of the camera (file)
+    that each station uses: one edge shift is estimated for each camera. intrinsics_factor :
+    (C, n, r) square roots F of the cameras' intrinsics' covariances F F^T, where these are to be
+    refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
+    those units from the calibration's values. poses : of boards or targets, each on one of the
+    ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
+    gives edges in photographs.
+    """
+
+    edges: EdgeSet
+    joints: Array
+    joint_noise: float
+    n_stations: int
+    camera_of_station: Integers
+    intrinsics_factor: Array = field(default_factory=lambda: np.zeros((1, 0, 0)))
+    intrinsics_at: Array = field(default_factory=lambda: np.zeros((1, 0)))
+    poses: PoseSet = field(default_factory=PoseSet.empty)
+    mounts: tuple[Mount, ...] = ()
+    shaded: bool = False
+
+    @property
+    def on_platform(self) -> Booleans:
+        """(M,) which of the mounts move with the platform."""
+        return np.array([mount.body == "platform" for mount in self.mounts], dtype=bool)

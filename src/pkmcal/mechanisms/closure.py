@@ -1,0 +1,675 @@
+"""The closure of every machine, |B_j - A_j| = length_j and what its joints' axes add.
+
+First where each limb finds its carriers, its parameters and its reading, made once from the file
+(:class:`LimbLayout`); then the rows and how they change with the pose, which is all that kinematics
+needs (:func:`rows_between`); then their derivatives by the parameters (:func:`closure`). What moves
+with the readings only, :func:`base_ends`, is apart, so that a search for the pose finds it once.
+
+All functions take the parameter vector as an array (..., P), so that a whole Monte-Carlo batch of
+machines is one call: leading axes of parameters, readings and poses broadcast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.batches import fresh, moments
+from pkmcal.geometry.rigid import dot
+from pkmcal.mechanisms.carriers.contract import (
+    ParameterKind,
+    base_carriers,
+    by_pose,
+    of_part,
+    platform_carriers,
+)
+from pkmcal.mechanisms.document import (
+    MOTIONS,
+    ActuatedLength,
+    MechanismDocument,
+    PassiveLength,
+)
+from pkmcal.mechanisms.joints import AngleLayout, angle_layout, angle_rows
+from pkmcal.mechanisms.motors import middles, motor_columns
+
+
+@dataclass(frozen=True)
+class CarrierGroup:
+    """The legs that one carrier kind serves.
+
+    legs : (g,) leg numbers from 0. index : (g, n) their parameters' positions, P where the file is
+    silent; there ``constants`` (g, n) has the value.
+    """
+
+    carrier: Any
+    legs: Integers
+    index: Integers
+    constants: Array
+    silent: Booleans
+
+    @cached_property
+    def complete(self) -> bool:
+        """Whether the file gives every number."""
+        return not self.silent.any()
+
+    def of(self, theta: Array) -> Array:
+        """The group's parameters (..., g, n) out of all, (..., P)."""
+        if self.complete:
+            return theta[..., self.index]
+        known = theta[..., np.where(self.silent, 0, self.index)]
+        return np.where(self.silent, self.constants, known)
+
+
+@dataclass(frozen=True)
+class LimbLayout:
+    """Where each leg finds its parameters; made once from the document.
+
+    base, platform : groups of legs by carrier.
+    rod : (L,) position of each rod's offset or constant length, -1 for a passive rod.
+    closing : (L,) legs whose length is an equation; all but the passive ones.
+    actuated : (L,) the reading's column, -1 for a leg without; middle : (L,) its mid-range.
+    internal : (L,) the column of the platform carrier's internal coordinate, -1 without.
+    rod_reads : (L,) whether the reading is the rod's own length (and not the carrier's motion).
+    base_axis, platform_axis : (L, 3) positions of the axes' parameters, -1 where none is one.
+    angles : the axes' equations. turning : positions (n, 3) of all directions among the
+    parameters that turn with the base frame, and with the platform frame.
+    radius : list of (tubes,) positions of each leg's radii.
+    motion : (6, d) directions in which the platform moves. n_parameters : P.
+    """
+
+    n_legs: int
+    base: tuple[CarrierGroup, ...]
+    platform: tuple[CarrierGroup, ...]
+    rod: Integers
+    closing: Booleans
+    actuated: Integers
+    middle: Array
+    internal: Integers
+    rod_reads: Booleans
+    base_axis: Integers
+    platform_axis: Integers
+    angles: AngleLayout
+    turning: tuple[Integers, Integers]
+    radius: tuple[Integers, ...]
+    motion: Array
+    n_parameters: int
+
+    @cached_property
+    def n_equations(self) -> int:
+        """Rows of the closure: lengths, then angles."""
+        return int(self.closing.sum()) + len(self.angles)
+
+    @cached_property
+    def all_close(self) -> bool:
+        """Whether the length of every leg is an equation."""
+        return bool(self.closing.all())
+
+    @cached_property
+    def driven_rows(self) -> Integers:
+        """Rows of the closure that belong to legs with a reading, in the legs' order."""
+        return np.flatnonzero(self.actuated[self.closing] >= 0)
+
+    @cached_property
+    def n_readings(self) -> int:
+        """Readings of a configuration, m."""
+        return int(self.actuated.max(initial=-1)) + 1
+
+    @cached_property
+    def n_internal(self) -> int:
+        """Internal coordinates of a pose."""
+        return int(self.internal.max(initial=-1)) + 1
+
+    @cached_property
+    def row_motor(self) -> Integers:
+        """The reading's column that enters each row of the closure, (E,), -1 where none."""
+        angles = np.full(len(self.angles), -1)
+        return np.concatenate([self.actuated[self.closing], angles])
+
+    @cached_property
+    def shares_motors(self) -> bool:
+        """Whether a reading enters several rows."""
+        return self.driven_rows.size > self.n_readings
+
+    @cached_property
+    def own_motion(self) -> Array:
+        """(6 + n, d + n): the pose's directions, then its internal coordinates."""
+        n, d = self.n_internal, self.motion.shape[1]
+        out = np.eye(6 + n, d + n)
+        out[:6, :d], out[6:, d:] = self.motion, np.eye(n)
+        out[:6, d:], out[6:, :d] = 0.0, 0.0
+        return out
+
+    @cached_property
+    def free(self) -> Booleans:
+        """(6,) which of (omega, tau) the motion has."""
+        return np.asarray(self.motion.any(axis=1))
+
+    @cached_property
+    def freedoms(self) -> slice:
+        """The same as a slice of the six."""
+        used = np.flatnonzero(self.free)
+        return slice(int(used[0]), int(used[-1]) + 1)
+
+    def by_own(self, rows: Closure | Rows) -> Array:
+        """Rows (..., E, d + n) by the pose's own freedoms, internal coordinates last."""
+        by_pose = rows.by_pose[..., self.freedoms]
+        if not self.n_internal:
+            return by_pose
+        return np.concatenate([by_pose, rows.by_internal], axis=-1)
+
+
+def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLayout:
+    """The layout of a document whose parameters stand at ``positions``."""
+    legs = document.legs
+    carriers = base_carriers()
+    reads = np.array([isinstance(leg.length, ActuatedLength) for leg in legs])
+    closing = np.array([not isinstance(leg.length, PassiveLength) for leg in legs])
+    base_axis, platform_axis = (_axis_index(document, s, positions) for s in ("base", "platform"))
+    return LimbLayout(
+        n_legs=len(legs),
+        base=_groups(document, "base", carriers, positions),
+        platform=_groups(document, "platform", platform_carriers(), positions),
+        rod=np.array([_rod_index(j, leg.length, positions) for j, leg in enumerate(legs)]),
+        closing=closing,
+        actuated=motor_columns(document),
+        middle=middles(document),
+        internal=_internal(document),
+        rod_reads=reads,
+        base_axis=base_axis,
+        platform_axis=platform_axis,
+        angles=angle_layout(document, base_axis, platform_axis),
+        turning=(_turning("base", positions), _turning("platform", positions)),
+        radius=tuple(
+            np.array(
+                [positions[f"legs[{j + 1}].tubes[{t + 1}].radius"] for t in range(len(leg.tubes))],
+                dtype=int,
+            )
+            for j, leg in enumerate(legs)
+        ),
+        motion=MOTIONS[document.motion],
+        n_parameters=len(positions),
+    )
+
+
+def _axis_index(document: MechanismDocument, side: str, positions: dict[str, int]) -> Integers:
+    """Positions (L, 3) of the axes' parameters on one side, -1 where there is none."""
+    names = [[f"legs[{j + 1}].{side}.axis.{c}" for c in "xyz"] for j in range(len(document.legs))]
+    return np.array([[positions.get(name, -1) for name in row] for row in names], dtype=int)
+
+
+def _turning(side: str, positions: dict[str, int]) -> Integers:
+    """Positions (n, 3) of the directions on one side, whoever has them; three in a row."""
+    first = [k for name, k in positions.items() if f".{side}." in name and name.endswith("axis.x")]
+    return np.array(first, dtype=int)[:, None] + np.arange(3)
+
+
+def _rod_index(leg: int, length: Any, positions: dict[str, int]) -> int:
+    if isinstance(length, PassiveLength):
+        return -1
+    field = "offset" if isinstance(length, ActuatedLength) else "constant"
+    return positions[f"legs[{leg + 1}].length.{field}"]
+
+
+def _groups(
+    document: MechanismDocument, side: str, carriers: dict[str, Any], positions: dict[str, int]
+) -> tuple[CarrierGroup, ...]:
+    nodes = [getattr(leg, side) for leg in document.legs]
+    kinds = [carriers[node.joint] for node in nodes]
+    groups: list[CarrierGroup] = []
+    for kind in dict.fromkeys(kinds):
+        legs = np.flatnonzero([k is kind for k in kinds])
+        names = [[f"legs[{j + 1}].{side}.{p.path}" for p in kind.parameters] for j in legs]
+        index = np.array([[positions.get(n, len(positions)) for n in row] for row in names])
+        constants = np.array([[_constant(nodes[j], p) for p in kind.parameters] for j in legs])
+        groups.append(CarrierGroup(kind, legs, index, constants, index == len(positions)))
+    return tuple(groups)
+
+
+def _constant(node: Any, kind: ParameterKind) -> float:
+    value = of_part(node, kind)
+    return kind.otherwise if value is None else value
+
+
+def _internal(document: MechanismDocument) -> Integers:
+    """The column of each leg's internal coordinate, by its bar; -1 without."""
+    carriers = platform_carriers()
+    nodes = [leg.platform for leg in document.legs]
+    bars = [node.bar if carriers[node.joint].turns else None for node in nodes]
+    known = sorted({bar for bar in bars if bar is not None})
+    return np.array([-1 if bar is None else known.index(bar) for bar in bars], dtype=int)
+
+
+class BaseEnds(NamedTuple):
+    """What the readings decide; leading axes broadcast.
+
+    a, by_reading : (..., L, 3), the limbs' ends, m, and their derivatives by the legs' readings.
+    length : (..., L) of the rods, m; NaN for passive ones.
+    """
+
+    a: Array
+    by_reading: Array
+    length: Array
+
+
+class PlatformEnds(NamedTuple):
+    """What the pose decides: b, arm (..., L, 3), m, base frame; B moves by ``omega x arm + tau``.
+
+    by_internal : (..., L, 3, n) by the pose's internal coordinates.
+    """
+
+    b: Array
+    arm: Array
+    by_internal: Array
+
+
+class Rows(NamedTuple):
+    """The closure's rows, (..., E): lengths of the legs that close, then the axes' equations.
+
+    value : m. by_pose : (..., E, 6). by_internal : (..., E, n), n = 0 for a rigid platform.
+    u : (..., L, 3) unit directions from A to B of all legs. distance : (..., L) m.
+    w : (..., A, 3) what the limbs' lines are square to, by the axes' equations.
+    """
+
+    value: Array
+    by_pose: Array
+    by_internal: Array
+    u: Array
+    distance: Array
+    w: Array
+
+
+def pose_rows(
+    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array | None = None
+) -> Rows:
+    """The rows at readings (..., m) and poses (..., 4, 4); theta (..., P), internal (..., n)."""
+    base = base_ends(layout, theta, readings)
+    return rows_between(layout, theta, base, platform_ends(layout, theta, poses, internal), poses)
+
+
+def base_ends(layout: LimbLayout, theta: Array, readings: Array) -> BaseEnds:
+    """The base side at readings (..., m), m or rad."""
+    q = leg_readings(layout, readings)
+    placed = [g.carrier.place(g.of(theta), q[..., g.legs]) for g in layout.base]
+    a, by_reading = (_gathered(layout.base, side) for side in zip(*placed, strict=True))
+    return BaseEnds(a, by_reading, _lengths(layout, theta, q))
+
+
+def platform_ends(
+    layout: LimbLayout,
+    theta: Array,
+    poses: Array,
+    internal: Array | None = None,
+    parameters: tuple[Array, ...] | None = None,
+) -> PlatformEnds:
+    """The platform side at poses T_base_platform (..., 4, 4) and internal coordinates (..., n).
+
+    parameters : each group's out of theta, for whoever asks often.
+    """
+    at_legs = poses[..., None, :, :]
+    parameters = platform_parameters(layout, theta) if parameters is None else parameters
+    placed = [
+        g.carrier.place(own, at_legs, own_internal(layout, g, internal))
+        for g, own in zip(layout.platform, parameters, strict=True)
+    ]
+    b, arm = (_gathered(layout.platform, side) for side in zip(*placed, strict=True))
+    if not layout.n_internal:
+        return PlatformEnds(b, arm, b[..., None][..., :0])
+    by_internal = fresh(b, (*b.shape, layout.n_internal))
+    by_internal[...] = 0.0
+    for g, own in zip(layout.platform, parameters, strict=True):
+        if g.carrier.turns:
+            by = g.carrier.by_internal(own, at_legs, own_internal(layout, g, internal))
+            by_internal[..., g.legs, :, layout.internal[g.legs]] = np.moveaxis(by, -2, 0)
+    return PlatformEnds(b, arm, by_internal)
+
+
+def platform_parameters(layout: LimbLayout, theta: Array) -> tuple[Array, ...]:
+    """Each platform group's parameters (..., g, n)."""
+    return tuple(g.of(theta) for g in layout.platform)
+
+
+def own_internal(layout: LimbLayout, group: CarrierGroup, internal: Array | None) -> Array | None:
+    """The internal coordinates (..., g) of a group's legs."""
+    if internal is None or not group.carrier.turns:
+        return None
+    return internal[..., layout.internal[group.legs]]
+
+
+def rows_between(
+    layout: LimbLayout, theta: Array, base: BaseEnds, platform: PlatformEnds, poses: Array
+) -> Rows:
+    """|B - A| - length, and the axes' equations; [B] eq. 4, [A] eq. 7 and 13, [C] eq. 4."""
+    line, distance = limb_lines(base, platform)
+    u = line / distance[..., None]
+    rows = Rows(
+        value=distance - base.length,
+        by_pose=_by_pose(platform.arm, u),
+        by_internal=_by_internal(u, platform.by_internal),
+        u=u,
+        distance=distance,
+        w=u[..., :0, :],
+    )
+    if not layout.all_close:
+        rows = rows._replace(
+            value=rows.value[..., layout.closing],
+            by_pose=rows.by_pose[..., layout.closing, :],
+            by_internal=rows.by_internal[..., layout.closing, :],
+        )
+    return _with_angles(layout, theta, poses, line, platform, rows) if len(layout.angles) else rows
+
+
+def limb_lines(base: BaseEnds, platform: PlatformEnds) -> tuple[Array, Array]:
+    """B - A (..., L, 3) and how long it is (..., L), m."""
+    line = platform.b - base.a
+    return line, np.sqrt(dot(line, line))
+
+
+def _with_angles(
+    layout: LimbLayout, theta: Array, poses: Array, line: Array, platform: PlatformEnds, rows: Rows
+) -> Rows:
+    """The same with the axes' equations below."""
+    leg = layout.angles.leg
+    angles = angle_rows(layout.angles, theta, poses[..., :3, :3], line[..., leg, :])
+    by_pose = _by_pose(platform.arm[..., leg, :], angles.by_line)
+    by_pose[..., :3] += angles.by_turn
+    by_internal = _by_internal(angles.by_line, platform.by_internal[..., leg, :, :])
+    return rows._replace(
+        value=stacked(rows.value[..., None], angles.value[..., None])[..., 0],
+        by_pose=stacked(rows.by_pose, by_pose),
+        by_internal=stacked(rows.by_internal, by_internal),
+        w=angles.by_line,
+    )
+
+
+def by_readings(layout: LimbLayout, base: BaseEnds, rows: Rows) -> Array:
+    """Derivatives (..., E) of the rows by their legs' own readings, zero where there is none."""
+    by = -dot(rows.u, base.by_reading) - layout.rod_reads
+    by = by if layout.all_close else by[..., layout.closing]
+    if not len(layout.angles):
+        return by
+    angles = -dot(rows.w, base.by_reading[..., layout.angles.leg, :])
+    return stacked(by[..., None], angles[..., None])[..., 0]
+
+
+def _by_pose(arm: Array, w: Array) -> Array:
+    """Rows (..., 6) of a point's motion along directions w (..., 3): (arm x w, w)."""
+    out = fresh(w, (*np.broadcast_shapes(arm.shape, w.shape)[:-1], 6))
+    moments(arm, w, out[..., :3])
+    out[..., 3:] = w
+    return out
+
+
+def _by_internal(w: Array, by_internal: Array) -> Array:
+    """Derivatives (..., 3, n) of the points, along directions w (..., 3): (..., n)."""
+    if not by_internal.shape[-1]:
+        return by_internal[..., 0, :]
+    out = w[..., 0, None] * by_internal[..., 0, :]
+    for k in (1, 2):
+        out += w[..., k, None] * by_internal[..., k, :]
+    return out
+
+
+def leg_readings(layout: LimbLayout, readings: Array) -> Array:
+    """Readings (..., m) spread over the legs (..., L), zero for legs without one."""
+    return np.where(layout.actuated >= 0, readings[..., np.maximum(layout.actuated, 0)], 0.0)
+
+
+def rod_lengths(layout: LimbLayout, theta: Array, readings: Array) -> Array:
+    """Length of every rod (..., L), m: reading + offset, or the constant; [B] eq. 4.
+
+    NaN for passive rods, whose length nobody knows.
+    """
+    return _lengths(layout, theta, leg_readings(layout, readings))
+
+
+def _lengths(layout: LimbLayout, theta: Array, leg_reading: Array) -> Array:
+    own = np.where(layout.closing, theta[..., layout.rod], np.nan)
+    return own + np.where(layout.rod_reads, leg_reading, 0.0)
+
+
+def _gathered(groups: tuple[CarrierGroup, ...], points: tuple[Array, ...]) -> Array:
+    """Groups' points (..., g, 3) in the order of the legs, (..., L, 3)."""
+    if len(groups) == 1:
+        return points[0]
+    count = sum(len(g.legs) for g in groups)
+    shape = np.broadcast_shapes(*(p.shape[:-2] for p in points))
+    out = fresh(points[0], (*shape, count, 3))
+    for group, point in zip(groups, points, strict=True):
+        out[..., group.legs, :] = point
+    return out
+
+
+def stacked(first: Array, second: Array) -> Array:
+    """Rows (..., E, n) of both, one below the other; leading axes broadcast."""
+    shape = np.broadcast_shapes(first.shape[:-2], second.shape[:-2])
+    split = first.shape[-2]
+    out = fresh(first, (*shape, split + second.shape[-2], first.shape[-1]))
+    out[..., :split, :], out[..., split:, :] = first, second
+    return out
+
+
+@dataclass(frozen=True)
+class LimbEnds:
+    """Both ends of all limbs with derivatives; leading axes broadcast, then L legs.
+
+    a, b : (..., L, 3) m, base frame.
+    a_index, b_index : (L, n) parameters that each end depends on, P where there are fewer.
+    a_by, b_by : (..., L, 3, n) derivatives by those parameters.
+    a_by_reading : (..., L, 3). arm : (..., L, 3), what of b turns with the platform.
+    n_parameters : P. b_by_internal : (..., L, 3, n) by the pose's internal coordinates.
+    """
+
+    a: Array
+    b: Array
+    a_index: Integers
+    b_index: Integers
+    a_by: Array
+    b_by: Array
+    a_by_reading: Array
+    arm: Array
+    n_parameters: int
+    b_by_internal: Array
+
+    @cached_property
+    def b_by_pose(self) -> Array:
+        """(..., L, 3, 6) derivatives of b by the pose's six numbers."""
+        return by_pose(self.arm)
+
+
+@dataclass(frozen=True)
+class Closure:
+    """The closure's rows, (..., E): lengths of the legs that close, then the axes' equations.
+
+    value : m. u : (..., L, 3) unit directions from A to B of all legs. distance : (..., L) m.
+    by_pose : (..., E, 6). by_internal : (..., E, n), n = 0 for a rigid platform.
+    by_reading : (..., E) by the leg's own reading, zero where it has none.
+    index, by_theta : (E, n) parameters that each row depends on, P where there is none, and the
+    derivatives (..., E, n) by them.
+    """
+
+    value: Array
+    u: Array
+    distance: Array
+    by_pose: Array
+    by_internal: Array
+    by_reading: Array
+    index: Integers
+    by_theta: Array
+    ends: LimbEnds
+
+
+def limb_ends(
+    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array | None = None
+) -> LimbEnds:
+    """Both ends of every limb.
+
+    theta : (..., P). readings : (..., m). poses : T_base_platform (..., 4, 4).
+    internal : (..., n) the poses' internal coordinates; zero where they are not given.
+    """
+    base = base_ends(layout, theta, readings)
+    platform = platform_ends(layout, theta, poses, internal)
+    return _with_parameters(layout, theta, readings, poses, internal, base, platform)
+
+
+def _with_parameters(
+    layout: LimbLayout,
+    theta: Array,
+    readings: Array,
+    poses: Array,
+    internal: Array | None,
+    base: BaseEnds,
+    platform: PlatformEnds,
+) -> LimbEnds:
+    """The ends with their derivatives by the parameters."""
+    q, at_legs = leg_readings(layout, readings), poses[..., None, :, :]
+    a_by = [g.carrier.by_parameters(g.of(theta), q[..., g.legs]) for g in layout.base]
+    b_by = [
+        g.carrier.by_parameters(g.of(theta), at_legs, own_internal(layout, g, internal))
+        for g in layout.platform
+    ]
+    all_a_by, a_index = _gather(layout, layout.base, a_by)
+    all_b_by, b_index = _gather(layout, layout.platform, b_by)
+    shape = np.broadcast_shapes(theta.shape[:-1], readings.shape[:-1])
+    a, by_reading = (
+        np.broadcast_to(x, (*shape, layout.n_legs, 3)) for x in (base.a, base.by_reading)
+    )
+    return LimbEnds(
+        a,
+        platform.b,
+        a_index,
+        b_index,
+        all_a_by,
+        all_b_by,
+        by_reading,
+        platform.arm,
+        layout.n_parameters,
+        platform.by_internal,
+    )
+
+
+def _gather(
+    layout: LimbLayout, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]
+) -> tuple[Array, Integers]:
+    """Carriers' derivatives put in the order of the legs, parameters padded to a common count."""
+    if len(groups) == 1:
+        return by_parameters[0], groups[0].index
+    width = max(g.index.shape[1] for g in groups)
+    index = np.full((layout.n_legs, width), layout.n_parameters)
+    shape = np.broadcast_shapes(*(by.shape[:-3] for by in by_parameters))
+    out = np.zeros((*shape, layout.n_legs, 3, width))
+    for group, by in zip(groups, by_parameters, strict=True):
+        n = group.index.shape[1]
+        index[group.legs, :n] = group.index
+        out[..., group.legs, :, :n] = by
+    return out, index
+
+
+def closure(
+    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array | None = None
+) -> Closure:
+    """The closure's residuals and their exact derivatives; [B] eq. 4, [A] eq. 7 and 13, [C] eq. 4.
+
+    theta : (..., P). readings : (..., m). poses : T_base_platform (..., 4, 4).
+    internal : (..., n) the poses' internal coordinates; zero where they are not given.
+    """
+    base = base_ends(layout, theta, readings)
+    platform = platform_ends(layout, theta, poses, internal)
+    rows = rows_between(layout, theta, base, platform, poses)
+    ends = _with_parameters(layout, theta, readings, poses, internal, base, platform)
+    index, by_theta = _length_parameters(layout, rows.u, ends)
+    if len(layout.angles):
+        line = (ends.b - ends.a)[..., layout.angles.leg, :]
+        angles = _angle_parameters(layout, theta, poses, line, ends)
+        index, by_theta = _padded(layout, (index, by_theta), angles)
+    return Closure(
+        value=rows.value,
+        u=rows.u,
+        distance=rows.distance,
+        by_pose=rows.by_pose,
+        by_internal=rows.by_internal,
+        by_reading=by_readings(layout, base, rows),
+        index=index,
+        by_theta=by_theta,
+        ends=ends,
+    )
+
+
+def _length_parameters(layout: LimbLayout, u: Array, ends: LimbEnds) -> tuple[Integers, Array]:
+    """Parameters (E, n) of |B - A| - length of the legs that close, and derivatives (..., E, n)."""
+    keep = layout.closing
+    parts = (-along(u, ends.a_by), along(u, ends.b_by), np.full((1, 1), -1.0))
+    rod = np.where(keep, layout.rod, layout.n_parameters)[:, None]
+    index = np.concatenate([ends.a_index, ends.b_index, rod], axis=1)
+    by_theta = _side_by_side(parts)
+    return (index, by_theta) if layout.all_close else (index[keep], by_theta[..., keep, :])
+
+
+def _side_by_side(parts: tuple[Array, ...]) -> Array:
+    """Derivatives (..., E, n) joined along their last axis; leading axes broadcast."""
+    shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    whole = [np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts]
+    return np.concatenate(whole, axis=-1)
+
+
+def along(u: Array, by: Array) -> Array:
+    """Derivatives (..., 3, n) of a point, along a direction (..., 3): (..., n)."""
+    return (u[..., None, :] @ by)[..., 0, :]
+
+
+def _angle_parameters(
+    layout: LimbLayout, theta: Array, poses: Array, line: Array, ends: LimbEnds
+) -> tuple[Integers, Array]:
+    """The same of the axes' equations."""
+    angles, leg = layout.angles, layout.angles.leg
+    rows = angle_rows(angles, theta, poses[..., :3, :3], line)
+    parts = (
+        -along(rows.by_line, ends.a_by[..., leg, :, :]),
+        along(rows.by_line, ends.b_by[..., leg, :, :]),
+        rows.by_base_axis,
+        rows.by_platform_axis,
+    )
+    none = layout.n_parameters
+    index = (
+        ends.a_index[leg],
+        ends.b_index[leg],
+        np.where(angles.on_base[:, None], angles.base, none),
+        np.where(angles.on_platform[:, None], angles.platform, none),
+    )
+    return np.concatenate(index, axis=1), _side_by_side(parts)
+
+
+def _padded(
+    layout: LimbLayout, lengths: tuple[Integers, Array], angles: tuple[Integers, Array]
+) -> tuple[Integers, Array]:
+    """Length rows, then angle rows; parameters padded to a common count."""
+    width = max(lengths[0].shape[1], angles[0].shape[1])
+    index, by_theta = [], []
+    for own, by in (lengths, angles):
+        spare = width - own.shape[1]
+        index.append(np.pad(own, ((0, 0), (0, spare)), constant_values=layout.n_parameters))
+        by_theta.append(np.pad(by, [(0, 0)] * (by.ndim - 1) + [(0, spare)]))
+    return np.concatenate(index), stacked(*by_theta)
+
+
+def on_tangents(layout: LimbLayout, theta: Array, drawing: Array) -> Array:
+    """Directions among theta (..., P) made as long as they must be to end on the tangent plane of
+    the drawing's (P,); see :meth:`pkmcal.mechanisms.parameters.ParameterTable.on_tangents`.
+    """
+    axes = np.concatenate(layout.turning)
+    if not axes.size:
+        return theta
+    out = np.array(theta)
+    out[..., axes] = theta[..., axes] / dot(theta[..., axes], drawing[axes])[..., None]
+    return out
+
+
+def dense(rows: Closure, n_parameters: int) -> Array:
+    """Derivatives of the rows by all parameters, (..., E, P)."""
+    out = np.zeros((*rows.by_theta.shape[:-1], n_parameters + 1))
+    place = np.broadcast_to(rows.index, rows.by_theta.shape)
+    np.put_along_axis(out, place, rows.by_theta, axis=-1)
+    return out[..., :n_parameters]

@@ -1,0 +1,183 @@
+"""The schema of ``mechanism.yaml``; docs/files.md spells it out for people.
+
+A limb in it: what carries its two ends (a carrier's own schema), the rod between them, and what a
+camera sees of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
+
+import numpy as np
+from pydantic import AfterValidator, Discriminator, Field, Tag
+from pydantic_core import PydanticKnownError
+
+from pkmcal.arrays import Array
+from pkmcal.files import Schema
+from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
+from pkmcal.mechanisms.parameters import EVERY
+
+
+def _increasing(value: tuple[float, float]) -> tuple[float, float]:
+    if not 0 < value[0] < value[1]:
+        raise ValueError("should be two increasing positive lengths [min, max]")
+    return value
+
+
+class ActuatedLength(Schema):
+    """``length: {actuated: true, offset: 0.0, range: [min, max]}``; length = reading + offset."""
+
+    actuated: Literal[True]
+    offset: float = 0.0
+    range: Annotated[tuple[float, float], AfterValidator(_increasing)] | None = None
+
+
+class ConstantLength(Schema):
+    """``length: {actuated: false, constant: 0.48}``: a rod of one length, metres."""
+
+    actuated: Literal[False]
+    constant: Annotated[float, Field(gt=0, description="the rod's length in metres")]
+
+
+class PassiveLength(Schema):
+    """``length: {passive: true}``: free to change, nobody reads it; it adds no equation."""
+
+    passive: Literal[True]
+
+
+def rod_kind(value: Any) -> str:
+    """Which of the three a ``length`` in the file is, told apart so that errors name its fields.
+
+    Tags are no keys of a file, or an error's place would be taken for the key.
+    """
+    if isinstance(value, Schema):
+        value = value.model_dump()
+    if not isinstance(value, dict):
+        return "actuated rod"
+    if value.get("passive"):
+        return "passive rod"
+    return "constant rod" if value.get("actuated") is False else "actuated rod"
+
+
+Rod = Annotated[
+    Annotated[ActuatedLength, Tag("actuated rod")]
+    | Annotated[ConstantLength, Tag("constant rod")]
+    | Annotated[PassiveLength, Tag("passive rod")],
+    Discriminator(rod_kind),
+]
+
+OFFSET = ParameterKind("offset", "m", "offset")
+CONSTANT = ParameterKind("constant", "m", "offset", label="rod length")
+
+
+Motion = Literal["spatial", "planar", "translation", "schoenflies"]
+MOTIONS: dict[str, Array] = {
+    "spatial": np.eye(6),
+    "planar": np.eye(6)[:, [2, 3, 4]],
+    "translation": np.eye(6)[:, 3:],
+    "schoenflies": np.eye(6)[:, 2:],
+}
+"""Columns: the directions (omega, tau) in which the platform can move, base frame; neighbours."""
+
+
+def _one_of(schemas: Iterable[type[Schema]], key: str) -> Any:
+    """The union of the schemas, told apart by one key, so that errors name the right field."""
+    kinds = tuple(dict.fromkeys(schemas))
+    if len(kinds) == 1:
+        return kinds[0]
+    return Annotated[Union[kinds], Field(discriminator=key)]  # noqa: UP007 - made at run time
+
+
+if TYPE_CHECKING:  # a type checker cannot see what the carriers' folder holds
+    BaseNode = Any
+    PlatformNode = Any
+else:
+    BaseNode = _one_of((c.schema for c in base_carriers().values()), "joint")
+    PlatformNode = _one_of((c.schema for c in platform_carriers().values()), "joint")
+
+
+class Tube(Schema):
+    """One visible cylinder of a leg; ``from`` and ``to`` in metres from A along the leg."""
+
+    radius: Annotated[float, Field(gt=0)]
+    start: Annotated[float, Field(alias="from", ge=0)]
+    stop: Annotated[float, Field(alias="to")]
+
+    def model_post_init(self, _context: Any) -> None:
+        """A tube has a length."""
+        if self.stop <= self.start:
+            raise ValueError("tube's 'to' should be greater than its 'from'")
+
+
+class Leg(Schema):
+    """One limb: its carriers, its rod, and what a camera sees of it."""
+
+    base: BaseNode
+    platform: PlatformNode
+    length: Rod
+    tubes: tuple[Tube, ...] = ()
+
+
+class Tolerance(Schema):
+    """Standard deviations of the drawing's values, metres; of axes and angles, radians."""
+
+    center: Annotated[float, Field(gt=0)] = 0.002
+    offset: Annotated[float, Field(gt=0)] = 0.002
+    radius: Annotated[float, Field(gt=0)] = 0.0001
+    axis: Annotated[float, Field(gt=0, lt=1)] = 0.005
+    arm: Annotated[float, Field(gt=0)] = 0.001
+    angle: Annotated[float, Field(gt=0, lt=1)] = 0.02
+
+
+class Home(Schema):
+    """A pose in the middle of the workspace; it decides which assembly the machine has."""
+
+    position: tuple[float, float, float]
+    rotation_vector: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:
+    if len(legs) < 2:
+        raise ValueError("a parallel machine has at least two legs")
+    carriers = base_carriers()
+    if not any(isinstance(x.length, ActuatedLength) or carriers[x.base.joint].driven for x in legs):
+        raise ValueError("a machine has at least one leg with actuated: true")
+    return legs
+
+
+def _several(group: tuple[str, ...]) -> tuple[str, ...]:
+    """A tie has two members at least; one that stands for all legs counts as several."""
+    if len(group) < 2 and not any(EVERY in entry for entry in group):
+        counts = {"field_type": "Tuple", "min_length": 2, "actual_length": len(group)}
+        raise PydanticKnownError("too_short", counts)
+    return group
+
+
+Ties = tuple[Annotated[tuple[str, ...], AfterValidator(_several)], ...]
+
+
+class Model(Schema):
+    """What a machine's model holds and ties, or the other file that describes it."""
+
+    fixed: tuple[str, ...] = ()
+    tied: Ties = ()
+    mechanism: str | None = None
+
+    def model_post_init(self, _context: Any) -> None:
+        """Another file has roles of its own."""
+        if self.mechanism is not None and (self.fixed or self.tied):
+            raise ValueError("a model with 'mechanism' takes 'fixed' and 'tied' from that file")
+
+
+class MechanismDocument(Schema):
+    """A whole mechanism file."""
+
+    name: str
+    motion: Motion
+    legs: Annotated[tuple[Leg, ...], AfterValidator(_some_legs)]
+    tolerance: Tolerance = Tolerance()
+    home: Home | None = None
+    fixed: tuple[str, ...] = ()
+    tied: Ties = ()
+    models: dict[str, Model] = Field(default_factory=dict)

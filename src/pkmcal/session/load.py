@@ -1,0 +1,395 @@
+"""A session on disk: photographs, joint readings, cameras and the machine's drawing.
+
+`load_session` checks everything that can be checked without looking into the photographs, before
+any work is spent; each fault is an `InputError` with file, line and field.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.cameras import Camera, load_camera
+from pkmcal.errors import InputError
+from pkmcal.files import (
+    Document,
+    Keys,
+    Table,
+    listed,
+    read_csv,
+    read_yaml,
+    shown,
+    validate,
+    wanted_file,
+)
+from pkmcal.geometry.rigid import pose
+from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
+from pkmcal.session.poses import PoseTable, read_poses
+from pkmcal.session.readings import check_readings
+from pkmcal.session.schema import (
+    Body,
+    SessionDocument,
+    StationDocument,
+    TrackerStationDocument,
+    Vector,
+)
+
+__all__ = [
+    "Photograph",
+    "Session",
+    "SessionDocument",
+    "Station",
+    "load_session",
+    "look_at_pose",
+    "photograph_header",
+]
+
+FILE = "session.yaml"
+VERSION = 1
+# A camera nearer to what it looks at than this has two equal points written, not a view.
+_NEAREST = 1e-6  # m
+# Under a degree between view and up, a rough up of a few digits leaves the roll to chance.
+_LEAST_ANGLE = np.deg2rad(1.0)
+
+
+@dataclass(frozen=True)
+class Station:
+    """One camera in one place.
+
+    camera_file : as session.yaml names it.
+    T_camera_base : (4, 4) rough pose, base to camera coordinates in m; None where not given.
+    photographs : by configuration and repeat.
+    observe : legs, board, or both, in this order.
+    """
+
+    name: str
+    camera: Camera
+    camera_file: str
+    T_camera_base: Array | None
+    photographs: tuple[Photograph, ...]
+    observe: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session, checked.
+
+    configurations : K names, in the order of joints.csv.
+    joints : (K, m) readings, m or rad, in the order of the machine's actuated legs.
+    joint_noise : standard deviation of a reading, m or rad.
+    board : file that describes the calibration board, where a station observes one.
+    board_body : what the board is fixed to, base or platform.
+    document : session.yaml with defaults, readings and found photographs written out.
+    warnings : sentences about what is not wrong but should be known.
+    trackers : what measured without photographs; in numbers of stations they follow these.
+    model : the machine's model by its name in the mechanism file, None for the file's own.
+    mechanism : where the machine came from, for other models of it.
+    """
+
+    folder: Path
+    machine: Machine
+    configurations: tuple[str, ...]
+    joints: Array
+    joint_noise: float
+    stations: tuple[Station, ...]
+    board: Path | None
+    document: dict[str, Any]
+    warnings: tuple[str, ...] = ()
+    board_body: Body = "platform"
+    trackers: tuple[PoseTable, ...] = ()
+    model: str | None = None
+    mechanism: Path | str = ""
+
+    @property
+    def station_names(self) -> tuple[str, ...]:
+        """Names of all stations, trackers last, as measurements number them."""
+        return tuple(station.name for station in (*self.stations, *self.trackers))
+
+    def other_model(self, name: str | None) -> Machine:
+        """Another model of the same machine."""
+        return load_mechanism(self.mechanism, model=name)
+
+
+def load_session(folder: Path | str, model: str | None = None) -> Session:
+    """Read and check the session in `folder` (session.yaml itself may be named instead).
+
+    model : one of the models that the mechanism file names.
+    """
+    folder, document = _read(Path(folder))
+    schema = validate(document, SessionDocument)
+    machine, source = _machine(folder, document, schema.mechanism, model)
+    joints_file = _existing(folder, document, schema.joints.file, ("joints", "file"))
+    table = read_csv(joints_file, label=schema.joints.file)
+    warnings = check_readings(table, machine.joint_ranges, schema.joints.noise, machine.joint_units)
+    board = _board(folder, document, schema)
+    warnings += _of_little_use(document, schema)
+    stations = tuple(
+        _station(folder, document, name, station, table.names)
+        for name, station in schema.cameras.items()
+    )
+    trackers = tuple(
+        _tracker(folder, document, name, station, table.names)
+        for name, station in schema.trackers.items()
+    )
+    _check_distinct(document, stations)
+    warnings += _unphotographed(table, stations, trackers)
+    return Session(
+        folder=folder,
+        machine=machine,
+        configurations=table.names,
+        joints=table.values,
+        joint_noise=schema.joints.noise,
+        stations=stations,
+        board=board,
+        document=_resolved(folder, schema, table, stations),
+        warnings=tuple(warnings),
+        board_body=schema.board.fixed_to if schema.board else "platform",
+        trackers=trackers,
+        model=model,
+        mechanism=source,
+    )
+
+
+def look_at_pose(position: Vector, look_at: Vector, up: Vector) -> Array:
+    """Pose T_camera_base (4, 4) of a camera at `position` that sees `look_at` in its middle.
+
+    All in base coordinates, m. Camera axes: z forward, x right, y down; `up` points to the
+    image's upper edge and need not be square to the view. Raises `InputError` where the three do
+    not fix a pose.
+    """
+    eye, target, above = (np.asarray(v, dtype=float) for v in (position, look_at, up))
+    forward = target - eye
+    if np.linalg.norm(forward) < _NEAREST:
+        raise InputError(
+            "the camera looks at its own position",
+            found=f"look_at {list(look_at)}",
+            expected="a point in the middle of the image, away from position",
+        )
+    # Lengths taken out first, so that the angle below is one between unit vectors.
+    forward = forward / np.linalg.norm(forward)
+    above = above / max(float(np.abs(above).max()), np.finfo(float).tiny)
+    right = np.cross(forward, above)
+    angle = np.arctan2(np.linalg.norm(right), abs(float(forward @ above)))
+    if angle < _LEAST_ANGLE:
+        raise InputError(
+            "up does not fix how the camera is turned about its view",
+            found=f"up {list(up)}, {np.rad2deg(angle):.2g} degrees from the line of sight",
+            expected="a direction across the view, towards the image's upper edge",
+        )
+    right = right / np.linalg.norm(right)
+    R_camera_base = np.stack([right, np.cross(forward, right), forward])
+    return pose(R_camera_base, -R_camera_base @ eye)
+
+
+def _read(folder: Path) -> tuple[Path, Document]:
+    """The session's folder and file; its version is looked at before anything else in it."""
+    if folder.name == FILE and folder.is_file():
+        folder = folder.parent
+    if not folder.is_dir():
+        raise InputError("there is no such session folder", where=str(folder))
+    if not (folder / FILE).is_file():
+        below = sorted(path.parent.name for path in folder.glob(f"*/{FILE}"))
+        raise InputError(
+            f"the folder holds no {FILE}",
+            where=str(folder),
+            found=f"sessions in {listed(below)} below it" if below else None,
+            next_step="Name the session's folder; pkmcal new DIR makes one to fill in",
+        )
+    document = read_yaml(folder / FILE)
+    version = document.data.get("pkmcal", VERSION)
+    if type(version) is not int or version != VERSION:
+        raise InputError(
+            "this version of the session's format is not known",
+            where=document.where("pkmcal"),
+            found=shown(version),
+            expected=str(VERSION),
+            next_step="Use the pkmcal that wrote it, or a newer one",
+        )
+    return folder, document
+
+
+def _existing(folder: Path, document: Document, name: str, keys: Keys) -> Path:
+    """The path of a file that session.yaml names, relative to it."""
+    path = folder / name
+    if path.is_file():
+        return path
+    raise InputError(
+        "this is a folder, not a file" if path.exists() else "there is no such file",
+        where=document.where(*keys),
+        found=name,
+        expected="a file" if path.exists() else wanted_file(path),
+    )
+
+
+def _machine(
+    folder: Path, document: Document, source: str, model: str | None
+) -> tuple[Machine, Path | str]:
+    """The machine, and what to load other models of it from."""
+    looks_like_path = source.endswith((".yaml", ".yml")) or "/" in source
+    if looks_like_path or (folder / source).is_file():
+        path = _existing(folder, document, source, ("mechanism",))
+        return load_mechanism(path, label=source, model=model), path
+    return load_mechanism(source, label=document.where("mechanism"), model=model), source
+
+
+def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | None:
+    """The board's file, and whether those that observe it can use it."""
+    users = schema.observers("board")
+    if schema.board is None:
+        if users:
+            raise InputError(
+                f"station {listed(users)} observes a board, and none is described",
+                where=document.where("stations", users[0], "observe"),
+                expected="a line board: board.yaml at the top level",
+            )
+        return None
+    if schema.board.fixed_to == "base":
+        _check_base_board(document, schema, users)
+    written = document.data["board"]
+    keys: Keys = ("board",) if isinstance(written, str) else ("board", "file")
+    return _existing(folder, document, schema.board.file, keys)
+
+
+def _check_base_board(document: Document, schema: SessionDocument, users: list[str]) -> None:
+    """A board on the base joins stations that observe legs; alone it tells nothing."""
+    legs = schema.observers("legs")
+    alone = [name for name in users if name not in legs]
+    if not alone:
+        return
+    who = "no station observes legs" if not legs else f"station {listed(alone)} observes no legs"
+    raise InputError(
+        f"the board is fixed to the base, which does not move, and {who}",
+        where=document.where("stations", alone[0], "observe"),
+        found="board",
+        expected="[legs, board], in the same photographs",
+        next_step="If the board is on the platform, write board: {file: "
+        f"{schema.board.file if schema.board else 'board.yaml'}, fixed_to: platform}}",
+    )
+
+
+def _of_little_use(document: Document, schema: SessionDocument) -> list[str]:
+    """A board that is described, and serves nothing."""
+    users = schema.observers("board")
+    if schema.board is None:
+        return []
+    if not users:
+        return [f"{document.where('board')}: no station observes the board."]
+    if schema.board.fixed_to == "base" and len(users) == 1:
+        return [
+            f"{document.where('board')}: only station {users[0]} observes the board on the base;"
+            " it takes two for a board to join them."
+        ]
+    return []
+
+
+def _station(
+    folder: Path, document: Document, name: str, station: StationDocument, names: tuple[str, ...]
+) -> Station:
+    keys: Keys = ("stations", name)
+    camera_file = _existing(folder, document, station.camera, (*keys, "camera"))
+    camera = load_camera(camera_file, label=station.camera)
+    T_camera_base = None
+    if station.pose is not None:
+        try:
+            T_camera_base = look_at_pose(**station.pose.model_dump())
+        except InputError as error:
+            raise error.located(document.where(*keys, "pose")) from None
+    where = document.where(*keys, "images")
+    photographs = find_photographs(folder, station.images, names, where)
+    for photo in photographs:
+        _check_size(folder, photo, camera, station.camera)
+    return Station(name, camera, station.camera, T_camera_base, photographs, station.observe)
+
+
+def _tracker(
+    folder: Path,
+    document: Document,
+    name: str,
+    station: TrackerStationDocument,
+    names: tuple[str, ...],
+) -> PoseTable:
+    """One tracker's table."""
+    given = station.tracker
+    path = _existing(folder, document, given.poses, ("stations", name, "tracker", "poses"))
+    noise = given.noise
+    return read_poses(path, given.poses, names, noise.position, noise.rotation, name)
+
+
+def _check_size(folder: Path, photo: Photograph, camera: Camera, camera_file: str) -> None:
+    label = _inside(folder, photo.path)
+    width, height = size = photograph_header(photo.path, label)
+    if size == tuple(camera.image_size):
+        return
+    turned = (height, width) == tuple(camera.image_size)
+    raise InputError(
+        "the photograph has another size than its camera",
+        where=label,
+        found=f"{width}x{height}",
+        expected=f"{camera.image_size[0]}x{camera.image_size[1]} ({camera_file})",
+        next_step="It was turned by a quarter; keep photographs as the sensor gives them"
+        if turned
+        else "Use unscaled, uncropped photographs, or the camera file of this resolution",
+    )
+
+
+def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
+    """The same photographs under two stations are a line copied and not changed."""
+    owners: dict[tuple[Path, str], str] = {}
+    for station in stations:
+        for photo in station.photographs:
+            others = {owners.setdefault((photo.path, w), station.name) for w in station.observe}
+            for other in others - {station.name}:
+                raise InputError(
+                    f"station {station.name} has the photographs of station {other}",
+                    where=document.where("stations", station.name, "images"),
+                    found=photo.path.name,
+                    expected="its own photographs; a station is one camera in one place",
+                )
+
+
+def _unphotographed(
+    table: Table, stations: tuple[Station, ...], trackers: tuple[PoseTable, ...]
+) -> list[str]:
+    taken = {photo.configuration for station in stations for photo in station.photographs}
+    taken |= {int(k) for tracker in trackers for k in tracker.configuration}
+    if len(taken) < 2:
+        raise InputError(
+            "only one configuration was measured"
+            if trackers
+            else "only one configuration has photographs",
+            where=table.label,
+            found=table.names[min(taken)],
+            expected="two at least; one cannot tell a joint's place from its offset",
+        )
+    missing = [name for row, name in enumerate(table.names) if row not in taken]
+    if not missing:
+        return []
+    return [
+        f"{table.label}: no station has {'measured' if trackers else 'a photograph of'}"
+        f" configuration {listed(missing)}"
+        f" ({len(missing)} of {len(table.names)}); their readings are not used."
+    ]
+
+
+def _resolved(
+    folder: Path, schema: SessionDocument, table: Table, stations: tuple[Station, ...]
+) -> dict[str, Any]:
+    """session.yaml with everything that was found for it, in plain data."""
+    document = schema.model_dump(mode="json")
+    document["joints"]["columns"] = list(table.columns)
+    document["joints"]["readings"] = dict(zip(table.names, table.values.tolist(), strict=True))
+    for station in stations:
+        entry = document["stations"][station.name]
+        entry["observe"] = station.observe[0] if len(station.observe) == 1 else station.observe
+        entry["photographs"] = [_inside(folder, photo.path) for photo in station.photographs]
+    return document
+
+
+def _inside(folder: Path, path: Path) -> str:
+    """A path as session.yaml would write it."""
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)

@@ -1,0 +1,207 @@
+"""poses.csv: what a laser tracker, a measuring machine or a probe saw of the platform.
+
+One row a configuration: whole poses (x, y, z and a quaternion qw, qx, qy, qz or a rotation vector
+rx, ry, rz), points (x, y, z), or heights above a flat bed (z). All in metres and radians, in the
+tracker's own frame, which may stand anywhere; the bed's frame has its z axis upwards, as the base.
+What is measured is a target fixed to the platform; where on it, the calibration finds out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.errors import InputError
+from pkmcal.files import Table, closest, listed, read_csv
+from pkmcal.geometry.rigid import pose, register, rotation
+from pkmcal.measurements import PoseSet
+
+Kind = Literal["poses", "points", "heights"]
+POINT, QUATERNION, VECTOR = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")
+HEADERS: dict[tuple[str, ...], Kind] = {
+    (*POINT, *QUATERNION): "poses",
+    (*POINT, *VECTOR): "poses",
+    POINT: "points",
+    ("z",): "heights",
+}
+"""Columns of each kind of table, in any order."""
+FEWEST = {"poses": 3, "points": 4, "heights": 7}
+"""Rows that fix the tracker's place, and leave something that is known."""
+UNIT = 1e-3
+"""By which a quaternion may be longer or shorter than one: three written digits leave as much."""
+TOO_LARGE = 30.0
+"""Times the machine's own motion from which a table's lengths are in another unit."""
+
+
+@dataclass(frozen=True)
+class PoseTable:
+    """A tracker's measurements.
+
+    name : of the station. kind : of the table. configuration : (N,) rows of the session's readings.
+    T : (N, 4, 4) T_tracker_target; a point's turn, and all but a height's z, mean nothing.
+    position, rotation : standard deviations, m and rad.
+    """
+
+    name: str
+    label: str
+    kind: Kind
+    configuration: Integers
+    T: Array
+    position: float
+    rotation: float | None
+
+    def poses(self, station: int, mount: int) -> PoseSet:
+        """The measurements; what is not measured has rows of zeros."""
+        n = len(self.configuration)
+        known = {"poses": (0, 1, 2, 3, 4, 5), "points": (3, 4, 5), "heights": (5,)}[self.kind]
+        sigma = np.repeat([self.rotation or 1.0, self.position], 3)
+        whiten = np.diag(np.where(np.isin(np.arange(6), known), 1 / sigma, 0.0))
+        return PoseSet(
+            station=np.full(n, station),
+            configuration=self.configuration,
+            mount=np.full(n, mount),
+            T_station_target=self.T,
+            whiten=np.broadcast_to(whiten, (n, 6, 6)).copy(),
+        )
+
+    def start(self, T_base_platform: Array) -> Array | None:
+        """A first T_tracker_base (4, 4) from the platform's poses (K, 4, 4) by the drawing; None
+        for whole poses, which tell it themselves.
+        """
+        there = T_base_platform[self.configuration, :3, 3]
+        if self.kind == "poses":
+            return None
+        if self.kind == "points":
+            good = np.isfinite(there).all(axis=1)
+            return register(there[good], self.T[good, :3, 3])
+        shift = np.nanmean(self.T[:, 2, 3] - there[:, 2])
+        return pose(np.eye(3), np.array([0.0, 0.0, shift]))
+
+
+def read_poses(
+    path: Path,
+    label: str,
+    names: tuple[str, ...],
+    position: float,
+    rotation_noise: float | None,
+    name: str = "tracker",
+) -> PoseTable:
+    """Read a table; every fault is an InputError with line and column.
+
+    names : the session's configurations. position, rotation_noise : standard deviations. name :
+    of the station.
+    """
+    table = read_csv(path, label=label)
+    kind = _kind(table)
+    if kind == "poses" and rotation_noise is None:
+        raise InputError(
+            "the poses' orientations have no stated noise",
+            where=label,
+            found=f"columns {', '.join(table.columns)}",
+            expected="noise: {position: ..., rotation: ...} of the tracker, in radians",
+            next_step="Leave the columns of the turn out, if only points were measured",
+        )
+    rows = _rows(table, names)
+    if len(rows) < FEWEST[kind]:
+        raise InputError(
+            f"too few {kind} to say where the tracker stands",
+            where=label,
+            found=f"{len(rows)} rows",
+            expected=f"{FEWEST[kind]} at least",
+        )
+    column = {head: table.values[:, k] for k, head in enumerate(table.columns)}
+    nothing = np.zeros(len(rows))
+    t = np.stack([column.get(axis, nothing) for axis in POINT], axis=-1)
+    T = pose(_turn(table, column), t)
+    return PoseTable(name, label, kind, rows, T, position, rotation_noise)
+
+
+def _kind(table: Table) -> Kind:
+    """Which table it is, by its header."""
+    found = set(table.columns)
+    for columns, kind in HEADERS.items():
+        if found == set(columns):
+            return kind
+    known = sorted({name for columns in HEADERS for name in columns})
+    strange = [name for name in table.columns if name not in known]
+    guess = closest(strange[0], known) if strange else None
+    raise InputError(
+        "this column is not known" if strange else "these columns together mean nothing",
+        where=f"{table.label}, line 1",
+        found=strange[0] if strange else listed(table.columns, 12),
+        expected=guess or "configuration and " + "; or ".join(", ".join(c) for c in HEADERS),
+    )
+
+
+def _rows(table: Table, names: tuple[str, ...]) -> Integers:
+    """The readings' row of each of the table's."""
+    number = {name: k for k, name in enumerate(names)}
+    for row, name in enumerate(table.names):
+        if name not in number:
+            short = {known.lstrip("0"): known for known in names}.get(name.lstrip("0"))
+            raise InputError(
+                "this configuration has no joint readings",
+                where=table.where(row),
+                found=name,
+                expected=short or f"one of the readings' {len(names)}: {listed(names)}",
+                next_step="Write the names alike; spreadsheets drop leading zeros"
+                if short
+                else None,
+            )
+    return np.array([number[name] for name in table.names], dtype=int)
+
+
+def _turn(table: Table, column: dict[str, Array]) -> Array:
+    """Rotations (N, 3, 3); none for points."""
+    if "qw" in column:
+        q = np.stack([column[name] for name in QUATERNION], axis=-1)
+        length = np.linalg.norm(q, axis=1)
+        bad = np.flatnonzero(np.abs(length - 1) > UNIT)
+        if bad.size:
+            raise InputError(
+                "the quaternion is not of length one",
+                where=f"{table.where(int(bad[0]))}, columns {', '.join(QUATERNION)}",
+                found=f"{length[bad[0]]:.4g}",
+                expected="1; the scalar part is qw",
+            )
+        q = q / np.where(q[:, 0] < 0, -length, length)[:, None]
+        half = np.arctan2(np.linalg.norm(q[:, 1:], axis=1), q[:, 0])
+        return rotation(2 * q[:, 1:] / np.maximum(np.sinc(half / np.pi), 1e-12)[:, None])
+    if "rx" in column:
+        vector = np.stack([column[name] for name in VECTOR], axis=-1)
+        size = np.linalg.norm(vector, axis=1)
+        bad = np.flatnonzero(size > 2 * np.pi)
+        if bad.size:
+            raise InputError(
+                "the rotation vector is longer than a whole turn",
+                where=f"{table.where(int(bad[0]))}, columns {', '.join(VECTOR)}",
+                found=f"{size[bad[0]]:.4g}",
+                expected="radians, at most 3.1416",
+                next_step="If these are degrees, multiply them by pi/180",
+            )
+        return rotation(vector)
+    return np.broadcast_to(np.eye(3), (len(table.names), 3, 3))
+
+
+def check_lengths(table: PoseTable, T_base_platform: Array) -> None:
+    """Raise `InputError` where the table's lengths are not metres.
+
+    T_base_platform : (K, 4, 4) by the drawing, NaN where it has none.
+    """
+    there = T_base_platform[table.configuration, :3, 3]
+    moved = float(np.nanmax(np.nanstd(there, axis=0)))
+    measured = table.T[:, :3, 3] if table.kind != "heights" else table.T[:, 2:3, 3]
+    spread = float(np.max(np.std(measured, axis=0)))
+    if spread <= TOO_LARGE * max(moved, 1e-6):
+        return
+    raise InputError(
+        "the table's lengths look like millimetres",
+        where=table.label,
+        found=f"positions that vary by {spread:.4g}",
+        expected=f"metres; the platform itself moves by {moved:.3g} by its readings",
+        next_step="Divide x, y and z by 1000",
+    )

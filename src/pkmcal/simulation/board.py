@@ -1,0 +1,390 @@
+"""A calibration board in the simulated scene: its print to the last module, and a place for it.
+
+The board is a thin plate whose print is part of its shape: black and white are faces of their
+own, so the renderer averages over the pixels between them as it does along every silhouette, and
+a printed corner is right to a hundredth of a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, final
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.boards.board import Board, board_from_document
+from pkmcal.boards.find import dictionary, marker_bits
+from pkmcal.cameras import Camera
+from pkmcal.errors import GeometryError
+from pkmcal.geometry.rigid import apply, cross, inverse, pose, rotation
+from pkmcal.mechanisms import Machine
+from pkmcal.session.schema import Body
+from pkmcal.simulation.casting import Part
+from pkmcal.simulation.drives import reaches
+from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts
+from pkmcal.simulation.shapes import Box, Cylinder, Shape, turned
+from pkmcal.simulation.surfaces import Material, Pattern, SmoothNoise
+
+THICKNESS = 0.004
+"""m."""
+HOLDER = 0.08
+"""Radius of the rod that holds a board on the platform, in the platform's radius."""
+BLACK = 0.06
+"""Light that printed black sends back, as a share of white's."""
+SQUARES = {"base": (6, 5), "platform": (5, 4)}
+"""Of the board made to measure: large squares are read from afar."""
+SIZE = 1.4
+"""Diagonal of that board with its margin, in radii of the base."""
+ON_PLATFORM, IN_PICTURE = 2.0, 0.75
+"""Diagonal of a board on the platform with its margin, in radii of that; and at least, in radii of
+the space that the machine needs: cameras stand so far away that they see all of it."""
+LOOKED_AT = 6
+"""Configurations at which the places for a board are tried."""
+SLANTED = 0.6
+"""Cosine of the angle between normal and line of sight below which a board is read less well."""
+ASKEW = 0.25
+"""rad; by which a standing board leans, and turns, from the middle of the cameras."""
+LEAST_SEEN = 0.4
+"""Share of a board's corners that every station has to see, on average."""
+
+
+@dataclass(frozen=True)
+class Print:
+    """What is printed: cells between x (nx + 1,) and y (ny + 1,), m, board frame; dark (ny, nx)."""
+
+    x: Array
+    y: Array
+    dark: Booleans
+
+    @classmethod
+    def of(cls, board: Board) -> Print:
+        """A board's cells: squares, and inside them the modules of the markers."""
+        data = board.document
+        if board.type == "chessboard":
+            columns, rows = (n + 1 for n in board.counts)
+            i, j = np.mgrid[:rows, :columns]
+            edges = [data["square"] * (np.arange(n + 1) - 1.0) for n in (columns, rows)]
+            return cls(edges[0], edges[1], (i + j) % 2 == 0)
+        return _charuco(data) if board.type == "charuco" else _markers(data)
+
+    def dark_at(self, x: Array, y: Array) -> Booleans:
+        """Whether points (n,) of the board's plane are black; white outside the print."""
+        i, j = np.searchsorted(self.y, y) - 1, np.searchsorted(self.x, x) - 1
+        inside = (i >= 0) & (j >= 0) & (i < len(self.y) - 1) & (j < len(self.x) - 1)
+        return self.dark[i * inside, j * inside] & inside
+
+
+def _charuco(data: dict[str, Any]) -> Print:
+    columns, rows = data["squares"]
+    square, marker, bits = data["square"], data["marker"], marker_bits(data["dictionary"]) + 2
+    margin = (square - marker) / 2
+    cells = np.array([0.0, *(margin + marker * np.arange(bits + 1) / bits)])
+    parity = int(bool(data.get("legacy")) and rows % 2 == 0)
+    dark = np.zeros((rows, bits + 2, columns, bits + 2), dtype=bool)
+    number = 0
+    for i, j in np.ndindex(rows, columns):
+        if (i + j) % 2 == parity:
+            dark[i, :, j] = True
+        else:
+            dark[i, 1:-1, j, 1:-1] = _modules(data["dictionary"], number)
+            number += 1
+    x, y = (
+        np.append((np.arange(n)[:, None] * square + cells).ravel(), n * square)
+        for n in (columns, rows)
+    )
+    return Print(x, y, dark.reshape(rows * (bits + 2), -1))
+
+
+def _markers(data: dict[str, Any]) -> Print:
+    columns, rows = data["markers"]
+    bits = marker_bits(data["dictionary"]) + 2
+    cells = data["marker"] * np.arange(bits + 1) / bits
+    dark = np.zeros((rows, bits + 1, columns, bits + 1), dtype=bool)
+    for k, (i, j) in enumerate(np.ndindex(rows, columns)):
+        dark[i, :-1, j, :-1] = _modules(data["dictionary"], data.get("first_id", 0) + k)
+    step = data["marker"] + data["gap"]
+    x, y = (
+        np.append((np.arange(n)[:, None] * step + cells).ravel(), n * step) for n in (columns, rows)
+    )
+    return Print(x, y, dark.reshape(rows * (bits + 1), -1))
+
+
+def _modules(name: str, number: int) -> Booleans:
+    """A marker's modules, its black border included."""
+    import cv2
+
+    picture = cv2.aruco.generateImageMarker(dictionary(name), number, marker_bits(name) + 2)
+    return np.asarray(picture) < 128
+
+
+@final
+@dataclass(frozen=True)
+class Sheet(Shape):
+    """A printed plate: a box with T_outer_board (4, 4), printed on one face."""
+
+    box: Box
+    T_outer_board: Array
+    print: Print
+
+    @classmethod
+    def at(cls, board: Board, T_outer_board: Array) -> Sheet:
+        """A board with a white margin of half a square round its print."""
+        printed = Print.of(board)
+        low = np.array([printed.x[0], printed.y[0]])
+        high = np.array([printed.x[-1], printed.y[-1]])
+        margin = 0.5 * (board.document.get("square") or board.document["marker"])
+        middle = np.array([*(low + high) / 2, THICKNESS / 2])
+        half = np.array([*(high - low) / 2 + margin, THICKNESS / 2])
+        box = Box(apply(T_outer_board, middle), T_outer_board[:3, :3].T, half)
+        return cls(box, T_outer_board, printed)
+
+    def enter(self, origin: Array, d: Array) -> Array:
+        """The plate's."""
+        return self.box.enter(origin, d)
+
+    def normal(self, points: Array) -> Array:
+        """The plate's."""
+        return self.box.normal(points)
+
+    def local(self, points: Array) -> Array:
+        """In the board's frame."""
+        T = inverse(self.T_outer_board)
+        return turned(T[:3, :3], points) + T[:3, 3:]
+
+    def face(self, points: Array) -> Integers:
+        """White, black, and the plate's other sides."""
+        q = self.local(points)
+        dark = self.print.dark_at(q[0], q[1])
+        return np.where(q[2] < THICKNESS / 2, dark.astype(np.int16), np.int16(2)).astype(np.int16)
+
+    def balls(self) -> tuple[Array, Array]:
+        """The plate's."""
+        return self.box.balls()
+
+
+@final
+@dataclass(frozen=True)
+class Printed(Pattern):
+    """Black and white by the print, at points in the board's frame."""
+
+    print: Print
+
+    def factor(self, q: Array) -> Array:
+        """1 on white, and on the plate's sides and back."""
+        dark = self.print.dark_at(q[0], q[1]) & (q[2] < THICKNESS / 2)
+        return np.where(dark, BLACK, 1.0)
+
+
+def board_part(board: Board, T_base_board: Array) -> Part:
+    """The board as a part of the scene, matt."""
+    sheet = Sheet.at(board, T_base_board)
+    return Part(sheet, Material(0.75, Printed(sheet.print)))
+
+
+def holder_part(
+    board: Board, T_platform_board: Array, T_base_platform: Array, discs: Discs
+) -> Part:
+    """The rod that holds a board on the platform, from under its plate to the board's back."""
+    low, high = board.points.min(axis=0), board.points.max(axis=0)
+    back = (low + high) / 2 + np.array([0.0, 0.0, THICKNESS])
+    lift = discs.platform_side * discs.thickness * np.array([0.0, 0.0, 1.0])
+    start = apply(T_base_platform, discs.platform + lift)
+    end = apply(T_base_platform @ T_platform_board, back)
+    length = float(np.linalg.norm(end - start))
+    shape = Cylinder(start, (end - start) / length, HOLDER * discs.platform_radius, length)
+    return Part(shape, Material(0.05))
+
+
+def board_for(machine: Machine, on: Body = "base") -> Board:
+    """A ChArUco board in proportion to the machine: SIZE, or ON_PLATFORM and IN_PICTURE."""
+    discs = discs_of(machine)
+    diagonal = SIZE * discs.base_radius
+    if on == "platform":
+        points = np.concatenate([ends.reshape(-1, 3) for ends in reaches(machine)])
+        centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        space = float(np.linalg.norm(points - centre, axis=1).max())
+        diagonal = max(ON_PLATFORM * discs.platform_radius, IN_PICTURE * space)
+    squares = SQUARES[on]
+    square = round(diagonal / float(np.hypot(squares[0] + 1, squares[1] + 1)), 3)
+    return board_from_fields(
+        {
+            "type": "charuco",
+            "squares": list(squares),
+            "square": square,
+            "marker": round(0.75 * square, 4),
+            "dictionary": "DICT_4X4_50",
+        }
+    )
+
+
+def board_from_fields(fields: dict[str, Any]) -> Board:
+    """A board of board.yaml's fields."""
+    from pathlib import Path
+
+    from pkmcal.files import Document
+
+    return board_from_document(Document(Path(), "", fields, {}))
+
+
+def place_board(
+    machine: Machine,
+    board: Board,
+    cameras: tuple[Camera, ...],
+    T_camera_base: Array,
+    T_base_platform: Array,
+    joints: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """T_base_board (4, 4): on the base, beside it or standing behind it, where it is seen best.
+
+    T_camera_base : (S, 4, 4). T_base_platform (K, 4, 4) and joints (K, m) : configurations. The
+    corners seen are counted past the machine's parts; the station that sees least decides.
+    """
+    discs = discs_of(machine)
+    eyes = inverse(T_camera_base)[:, :3, 3]
+    places = [*_lying(board, discs, rng), *_standing(board, discs, eyes, rng)]
+    few = np.unique(np.linspace(0, len(joints) - 1, LOOKED_AT).astype(int))
+    finish = Finish.from_noise(SmoothNoise.from_rng(rng))
+    scenes = [machine_parts(machine, discs, finish, T_base_platform[k], joints[k]) for k in few]
+    seen = np.array(
+        [
+            min(
+                np.mean([_share_seen(board, T, parts, eye, place) for parts in scenes])
+                for eye, T in zip(cameras, T_camera_base, strict=True)
+            )
+            for place in places
+        ]
+    )
+    best = int(np.argmax(seen))
+    if seen[best] < LEAST_SEEN:
+        raise GeometryError(
+            "there is no place on the base where all stations see the board",
+            found=f"{seen[best]:.0%} of its corners at most",
+            expected=f"{LEAST_SEEN:.0%}",
+            next_step="put the stations higher, or use a wider lens",
+        )
+    return places[best]
+
+
+def place_on_platform(
+    machine: Machine,
+    board: Board,
+    cameras: tuple[Camera, ...],
+    T_camera_base: Array,
+    T_base_platform: Array,
+    joints: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """T_platform_board (4, 4): on a bracket above the platform's plate, leaning to where the
+    stations see it best; arguments as of :func:`place_board`.
+    """
+    discs = discs_of(machine)
+    few = np.unique(np.linspace(0, len(joints) - 1, LOOKED_AT).astype(int))
+    finish = Finish.from_noise(SmoothNoise.from_rng(rng))
+    scenes = [
+        (k, machine_parts(machine, discs, finish, T_base_platform[k], joints[k])) for k in few
+    ]
+    places = _brackets(board, discs, rng)
+    seen = np.array(
+        [
+            min(
+                np.mean([_share_seen(board, T, parts, eye, T_base_platform[k] @ place)
+                         for k, parts in scenes])
+                for eye, T in zip(cameras, T_camera_base, strict=True)
+            )
+            for place in places
+        ]
+    )  # fmt: skip
+    best = int(np.argmax(seen))
+    if seen[best] < LEAST_SEEN:
+        raise GeometryError(
+            "there is no place on the platform where all stations see the board",
+            found=f"{seen[best]:.0%} of its corners at most",
+            expected=f"{LEAST_SEEN:.0%}",
+            next_step="put the stations on one side of the machine, or use one",
+        )
+    return places[best]
+
+
+def _brackets(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
+    """Boards above the platform's plate, their faces away from the base and to all sides."""
+    low, high = board.points.min(axis=0), board.points.max(axis=0)
+    reach = 0.6 * float(np.linalg.norm(high - low))
+    up = np.array([0.0, 0.0, discs.platform_side])
+    # below a plate, the board would stand in its shadow
+    out_of = discs.platform_radius if discs.platform_side < 0 else 0.0
+    out: list[Array] = []
+    for way, lean in product(2 * np.pi * (np.arange(12) + rng.random()) / 12, (0.3, 0.8, 1.3)):
+        side = np.array([np.cos(way), np.sin(way), 0.0])
+        into = -(np.cos(lean) * up + np.sin(lean) * side)
+        right = cross(up, into)
+        right = right / np.linalg.norm(right)
+        rot = np.stack([right, cross(into, right), into], axis=-1)
+        rot = rotation(rng.normal(0, 0.05, 3)) @ rot
+        centre = (
+            discs.platform + (discs.thickness + np.sin(lean) * reach + 0.01) * up + out_of * side
+        )
+        out.append(pose(rot, centre - rot @ ((low + high) / 2)))
+    return out
+
+
+def _lying(board: Board, discs: Discs, rng: np.random.Generator) -> list[Array]:
+    """Lying on the base disc, and beside it, turned as by hand; printed face to the platform."""
+    low, high = board.points.min(axis=0), board.points.max(axis=0)
+    up = discs.side
+    # x, y, z of the board, z into it: away from the platform
+    flat = np.diag([1.0, -up, -up])
+    radius = discs.base_radius + 0.65 * float(np.linalg.norm(high - low))
+    ring = 2 * np.pi * (np.arange(12) + rng.random()) / 12
+    spots = [np.zeros(2), *(radius * np.stack([np.cos(ring), np.sin(ring)], axis=-1))]
+    heights = [THICKNESS, *np.full(len(ring), THICKNESS - discs.thickness)]
+    out: list[Array] = []
+    for spot, height in zip(spots, heights, strict=True):
+        lean = rotation(np.array([*rng.normal(0, 0.01, 2), rng.uniform(-np.pi, np.pi)]))
+        centre = discs.base + np.array([*spot, up * height])
+        # a board that leans stands on its lowest corner
+        rise = up * 0.02 * float(np.linalg.norm(high - low))
+        rot = lean @ flat
+        out.append(pose(rot, centre + np.array([0, 0, rise]) - rot @ ((low + high) / 2)))
+    return out
+
+
+def _standing(board: Board, discs: Discs, eyes: Array, rng: np.random.Generator) -> list[Array]:
+    """Upright behind the machine, higher and higher, its face to the middle of the cameras."""
+    way = (eyes - discs.base).mean(axis=0)[:2]
+    if np.linalg.norm(way) < 0.4 * np.linalg.norm((eyes - discs.base)[:, :2], axis=1).mean():
+        return []  # cameras all round: none would see its back
+    way = np.append(way / np.linalg.norm(way), 0.0)
+    low, high = board.points.min(axis=0), board.points.max(axis=0)
+    out: list[Array] = []
+    for depth, aside, height in product(
+        (0.6, 1.2), (-1.2, -0.6, 0.0, 0.6, 1.2), np.arange(0.2, 2.6, 0.15)
+    ):
+        # x to the right of who looks at it, y down, z into it
+        right = np.cross([0.0, 0.0, 1.0], way)
+        flat = np.stack([right, [0.0, 0.0, -1.0], -way], axis=-1)
+        # seen straight on, a board hardly tells its tilt
+        slant = rotation(ASKEW * right) @ rotation(np.array([0.0, 0.0, ASKEW]))
+        rot = rotation(rng.normal(0, 0.05, 3)) @ slant @ flat
+        centre = discs.base + discs.base_radius * (aside * right - depth * way)
+        centre = centre + discs.side * height * discs.base_radius * np.array([0, 0, 1])
+        out.append(pose(rot, centre - rot @ ((low + high) / 2)))
+    return out
+
+
+def _share_seen(
+    board: Board, T_camera_base: Array, parts: list[Part], camera: Camera, T_base_board: Array
+) -> float:
+    """Share of the board's corners that a camera sees past a machine's parts, less on a slant."""
+    points = apply(T_base_board, board.points)
+    pixels = camera.project(apply(T_camera_base, points))
+    eye = inverse(T_camera_base)[:3, 3]
+    rays = points - eye
+    distance = np.linalg.norm(rays, axis=1)
+    rays = (rays / distance[:, None]).T
+    facing = np.clip(T_base_board[:3, 2] @ rays / SLANTED, 0, 1)
+    hit = np.min([part.shape.enter(eye, rays) for part in parts], axis=0)
+    seen = camera.in_image(pixels, margin=10.0) & (hit > distance - 1e-4)
+    return float(np.mean(seen * facing))

@@ -1,0 +1,369 @@
+"""The scene of a session: the machine as its drawing shows it, in a room with a table.
+
+The room, the lamps and the surfaces are drawn from one seed and stay for the whole session, as
+in a laboratory; only the machine moves. Sizes follow the machine's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import apply, rotation
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.simulation.casting import Part, Scene
+from pkmcal.simulation.driven_parts import (
+    beams,
+    crank_parts,
+    motor_radius,
+    nacelle_parts,
+    slider_parts,
+)
+from pkmcal.simulation.drives import Drives, drives_of, reaches, side_bars
+from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
+from pkmcal.simulation.surfaces import (
+    Checks,
+    Clouds,
+    Finish,
+    Lamp,
+    Lighting,
+    Material,
+    Slats,
+    SmoothNoise,
+    WavyStripes,
+)
+
+Z = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Discs:
+    """The two plates that carry the joints, and what moves the legs' ends on the base.
+
+    base, platform : (3,) centre of the face towards the joints; base frame, platform frame.
+    base_radius, platform_radius : m. side : +1 where the platform stands above the base along
+    the frames' z, -1 below. platform_side : the same for the platform's plate and its joints.
+    thickness : m.
+    """
+
+    base: Array
+    platform: Array
+    base_radius: float
+    platform_radius: float
+    side: float
+    platform_side: float
+    thickness: float
+    drives: Drives
+
+
+_POSTS = 3.5, 7.5
+"""Heights of the posts on a planar machine's plates, platform and base, in radii of a joint. A
+plate over the legs would hide them; one close below them would show their shadows for edges."""
+_COLUMN = 0.12, 12.0
+"""Radius and length of what a hanging machine hangs on, in radii of its base; the room ends it."""
+_BED = 4.0
+"""Height of what guides stand on below the platform's lowest joints, in the platform's radius:
+a tool or a board has room under the platform."""
+_AROUND = {False: (0.26, 0.13), True: (0.42, 0.28)}
+_DIRECT = 0.7
+"""Light from above and below, and the share of the lamps' that is left where it is soft, round
+machines with thin rods: in hard light these end, for a camera, where their lit side does."""
+_ASIDE = 1.2
+"""rad; how far a lamp that lights a board stands to either side of the cameras, at most."""
+_FLANGE = 0.3
+"""Radius of an articulated platform's tool flange, in that of a rigid one's plate."""
+
+
+def discs_of(machine: Machine) -> Discs:
+    """Plates outside the joints, along the frames' z, as wide as the joints need.
+
+    A planar machine's plates both lie below its legs, the platform's over the base's.
+    """
+    ends = limb_ends(machine.layout, machine.values, np.zeros(machine.n_joints), np.eye(4))
+    a, b = np.array(ends.a), np.array(ends.b)
+    rise = float(apply(machine.home(), b)[:, 2].mean() - a[:, 2].mean())
+    side = -1.0 if rise < -1e-3 else 1.0
+    balls, drives = _ball_radii(machine), drives_of(machine)
+    ball = float(balls.max())
+    held, room = _held(machine, drives, balls[:, 0])
+    width_a, width_b = (
+        float(np.linalg.norm(p[..., :2] - p[..., :2].mean(axis=0), axis=1).max())
+        for p in (held[:, :2], b)
+    )
+    base, platform = held.mean(axis=0), b.mean(axis=0)
+    planar = machine.document.motion == "planar"
+    near, far = (p[0, :, 2].mean() for p in reaches(machine))
+    lift, drop = _POSTS if planar else (2.2, 2.2)
+    over = -side if planar else -1.0 if far - near < -1e-3 else 1.0
+    drop = max(drop * ball, room, _BED * width_b if drives.upright.any() else 0.0)
+    base[2] = (side * held[:, 2]).min() * side - side * drop
+    platform[2] = (over * b[:, 2]).max() * over + over * lift * ball
+    thickness = max(0.012, 0.8 * ball)
+    return Discs(
+        base, platform, width_a + max(3.5 * ball, room), width_b + 2.0 * ball, side, over,
+        thickness, drives,
+    )  # fmt: skip
+
+
+def _held(machine: Machine, drives: Drives, balls: Array) -> tuple[Array, float]:
+    """Points (n, 3) beyond which the base plate lies, and by how much at least, m.
+
+    Of joints and cranks where they are; of guides all that their carriages and the platform reach.
+    """
+    if drives.slider.any():
+        a, b = reaches(machine)
+        reached = (a, b) if drives.upright.any() else (a,)
+        points = np.concatenate([drives.ends.reshape(-1, 3), *(p.reshape(-1, 3) for p in reached)])
+        return points, 6.0 * float(balls.max())
+    cranks = zip(drives.arm[drives.crank], balls[drives.crank], strict=True)
+    sizes = [motor_radius(arm, ball) for arm, ball in cranks]
+    return drives.foot, 1.3 * max(sizes, default=0.0)
+
+
+def machine_parts(
+    machine: Machine, discs: Discs, finish: Finish, T_base_platform: Array, joints: Array
+) -> list[Part]:
+    """The machine at one pose (4, 4) and its readings (m,)."""
+    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    balls = _ball_radii(machine)
+    bars = side_bars(machine)
+    parts = _base(discs, balls[:, 0], finish)
+    parts += _platform(discs, bars, np.array(ends.b), balls[:, 1], T_base_platform, finish)
+    for j in range(machine.n_legs):
+        driven = bool(discs.drives.crank[j] or discs.drives.slider[j])
+        bare = finish.forearm if driven else finish.steel
+        parts += _leg(machine, j, ends.a[j], ends.b[j], finish, bare)
+        parts += _base_end(discs, j, ends.a[j], balls[:, 0], finish)
+    return parts
+
+
+def _base(discs: Discs, balls: Array, finish: Finish) -> list[Part]:
+    """The base plate, and what it hangs on; or beams in its place, for guides that lie."""
+    up = discs.side * Z
+    parts = beams(discs.drives, balls, finish)
+    if not parts:
+        parts = [Part(Cylinder(discs.base, -up, discs.base_radius, discs.thickness), finish.base)]
+    if discs.side < 0 and discs.drives.any:
+        radius, length = (size * discs.base_radius for size in _COLUMN)
+        parts.append(Part(Cylinder(discs.base - discs.thickness * up, -up, radius, length),
+                          finish.base))  # fmt: skip
+    return parts
+
+
+def _base_end(discs: Discs, j: int, a: Array, balls: Array, finish: Finish) -> list[Part]:
+    """What holds leg j's end at a (3,) on the base."""
+    drives, up = discs.drives, discs.side * Z
+    if drives.crank[j]:
+        return crank_parts(drives, j, a, balls, discs.base, up, finish)
+    if drives.slider[j]:
+        return slider_parts(drives, j, a, balls, discs.base, finish)
+    return _joint(a, -up, float((a - discs.base) @ up), balls[j], finish)
+
+
+def _platform(
+    discs: Discs,
+    bars: tuple[Integers, ...],
+    b: Array,
+    balls: Array,
+    T_base_platform: Array,
+    finish: Finish,
+) -> list[Part]:
+    """The platform's plate with the tool's holder, and its joints b (L, 3) or the bars to them."""
+    up = discs.platform_side * T_base_platform[:3, 2]
+    centre = apply(T_base_platform, discs.platform)
+    radius = discs.platform_radius * (_FLANGE if bars else 1.0)
+    top = centre + discs.thickness * up
+    parts = [
+        Part(Cylinder(centre, up, radius, discs.thickness), finish.platform),
+        Part(Cylinder(top, up, 0.28 * discs.platform_radius, 1.5 * discs.thickness), finish.joint),
+    ]
+    if bars:
+        parts += nacelle_parts(bars, b, balls, centre, up, finish)
+        return parts + [Part(Ball(p, r), finish.joint) for p, r in zip(b, balls, strict=True)]
+    for p, r in zip(b, balls, strict=True):
+        parts += _joint(p, up, float((centre - p) @ up), float(r), finish)
+    return parts
+
+
+def _joint(centre: Array, way: Array, height: float, radius: float, finish: Finish) -> list[Part]:
+    """A ball, and the post from it to its plate."""
+    post = Cylinder(centre, way, 0.6 * radius, height)
+    return [Part(Ball(centre, radius), finish.joint), Part(post, finish.joint)]
+
+
+def _leg(
+    machine: Machine, j: int, a: Array, b: Array, finish: Finish, bare: Material
+) -> list[Part]:
+    """The leg's tubes, cut off where the leg ends, and the neck between joint and first tube.
+
+    bare : of all but the first of several tubes.
+    """
+    length = float(np.linalg.norm(b - a))
+    u = (b - a) / length
+    tubes = machine.document.legs[j].tubes
+    parts: list[Part] = []
+    for t, (tube, radius) in enumerate(zip(tubes, machine.radii()[j], strict=True)):
+        stop = min(tube.stop, length)
+        if stop > tube.start:
+            material = finish.paint if t == 0 and len(tubes) > 1 else bare
+            shape = Cylinder(a + tube.start * u, u, float(radius), stop - tube.start)
+            parts.append(Part(shape, material))
+    if tubes and tubes[0].start > 0:
+        neck = Cylinder(a, u, 0.8 * float(machine.radii()[j][0]), tubes[0].start)
+        parts.append(Part(neck, finish.joint))
+    return parts
+
+
+def _ball_radii(machine: Machine) -> Array:
+    """Joint balls a little wider than the tube that they hold, (L, 2) m at A and at B."""
+    spare = 0.01
+    return np.array(
+        [[1.2 * r[0], 1.5 * r[-1]] if len(r) else [spare, spare] for r in machine.radii()]
+    )
+
+
+@dataclass(frozen=True)
+class Room:
+    """Everything but the machine: parts and lamps."""
+
+    parts: tuple[Part, ...]
+    lighting: Lighting
+
+    def with_machine(self, parts: list[Part]) -> Scene:
+        """The scene with the machine in one pose."""
+        return Scene((*parts, *self.parts), self.lighting)
+
+
+def room_of(
+    discs: Discs,
+    reach: float,
+    noise: SmoothNoise,
+    rng: np.random.Generator,
+    lit_from: float | None = None,
+) -> Room:
+    """A room around a machine; cameras stand within ``reach`` (m) of the base disc's centre.
+
+    lit_from : azimuth (rad) about which the key lamp stands, where a plate would shade a board.
+    """
+    size = max(discs.base_radius, discs.platform_radius)
+    reach = max(reach, 2.5 * size)
+    middle = discs.base - discs.side * discs.thickness * Z
+    if discs.side < 0:  # a machine that hangs from its base has no table under it
+        middle = middle - 4.0 * size * Z
+    parts = _table(middle, size, noise, rng)
+    floor = middle[2] - 2.2 * size
+    parts += _walls(middle, floor, reach, noise, rng)
+    for azimuth in 2 * np.pi * (np.arange(11) + rng.uniform(-0.4, 0.4, 11)) / 11:
+        parts.append(_furniture(middle, floor, size, reach, azimuth, noise, rng))
+    lamps = _lamps(middle, size, reach, rng, lit_from, discs.drives.any)
+    bulbs = [
+        Part(Ball(lamp.place, lamp.radius), Material(0.0, emission=3.0), False) for lamp in lamps
+    ]
+    return Room((*parts, *bulbs), Lighting(lamps, *_AROUND[discs.drives.any]))
+
+
+def _table(middle: Array, size: float, noise: SmoothNoise, rng: np.random.Generator) -> list[Part]:
+    half = np.array([1.75, 1.6, 0.05]) * size
+    turn = rotation(rng.uniform(-np.pi, np.pi) * Z)
+    pattern = WavyStripes(noise, 0.42 * size, 0.42)
+    top = Box(middle - half[2] * Z, turn, half)
+    leg = Box(middle - size * Z, turn, np.array([0.5, 0.5, 0.9]) * size)
+    return [
+        Part(top, Material(0.30, pattern, gloss=0.04, sharpness=8.0)),
+        Part(leg, Material(0.05)),
+    ]
+
+
+def _walls(
+    middle: Array, floor: float, reach: float, noise: SmoothNoise, rng: np.random.Generator
+) -> list[Part]:
+    """Floor, ceiling and four walls, none of them plain."""
+    patterns = [
+        Slats(0.17 * reach, np.inf, 0.35),
+        Clouds(noise, 0.045 * reach, 0.30),
+        WavyStripes(noise, 0.5 * reach, 0.25),
+        Clouds(noise, 0.012 * reach, 0.16),
+    ]
+    turn = rng.uniform(0, 2 * np.pi)
+    parts = [
+        Part(
+            Wall(np.array([*middle[:2], floor]), Z),
+            Material(0.32, Slats(0.12 * reach, 0.06 * reach, 0.3)),
+            False,
+        ),
+        Part(
+            Wall(np.array([*middle[:2], floor + 4.5 * reach]), -Z),
+            Material(0.6, Slats(0.6 * reach, 0.6 * reach, 0.7)),
+            False,
+        ),
+    ]
+    for k, pattern in enumerate(np.array(patterns, dtype=object)[rng.permutation(4)]):
+        angle = turn + np.pi / 2 * k
+        inward = -np.array([np.cos(angle), np.sin(angle), 0.0])
+        wall = Wall(middle - inward * reach * rng.uniform(2.6, 3.4), inward)
+        parts.append(Part(wall, Material(rng.uniform(0.12, 0.3), pattern), False))
+    return parts
+
+
+def _furniture(
+    middle: Array,
+    floor: float,
+    size: float,
+    reach: float,
+    azimuth: float,
+    noise: SmoothNoise,
+    rng: np.random.Generator,
+) -> Part:
+    """A box or a post behind the cameras' ring, which the camera opposite sees."""
+    distance = reach * rng.uniform(1.45, 2.3)
+    place = middle + distance * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    height = middle[2] - floor + size * rng.uniform(0.1, 2.6)
+    place[2] = floor
+    material = [
+        Material(0.45, Checks(0.3 * size, 0.18)),
+        Material(0.04),
+        Material(0.35, Clouds(noise, 0.05 * size, 0.45)),
+        Material(0.12, Checks(0.22 * size, 0.3)),
+        Material(0.6, Clouds(noise, 0.2 * size, 0.1)),
+    ][rng.integers(5)]
+    if rng.random() < 0.25:
+        return Part(Cylinder(place, Z, size * rng.uniform(0.06, 0.2), height), material, False)
+    lean = rotation(np.array([*rng.normal(0, 0.03, 2), rng.uniform(-np.pi, np.pi)]))
+    half = np.array([*rng.uniform(0.1, 0.45, 2) * size, height / 2])
+    return Part(Box(place + lean.T @ (half[2] * Z), lean, half), material, False)
+
+
+def _lamps(
+    middle: Array,
+    size: float,
+    reach: float,
+    rng: np.random.Generator,
+    lit_from: float | None,
+    soft: bool,
+) -> tuple[Lamp, ...]:
+    """A key lamp with shadows, a weaker one across, one from above and behind."""
+    azimuth = rng.uniform(0, 2 * np.pi)
+    if lit_from is not None:
+        azimuth = lit_from + _ASIDE * (azimuth / np.pi - 1)
+    share = _DIRECT if soft else 1.0
+    lamps: list[Lamp] = []
+    for turn, elevation, distance, power in (
+        (0.0, rng.uniform(40, 60), 1.8, 1.25),
+        (rng.uniform(100, 150), rng.uniform(20, 35), 1.9, 0.55),
+        (rng.uniform(200, 260), rng.uniform(55, 75), 2.2, 0.45),
+    ):
+        a, e = azimuth + np.deg2rad(turn), np.deg2rad(elevation)
+        way = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+        lamps.append(
+            Lamp(
+                middle + (distance * reach) * way + size * Z,
+                0.16 * size,
+                share * power,
+                distance * reach,
+                shadows=not lamps,
+            )
+        )
+    return tuple(lamps)

@@ -1,0 +1,263 @@
+"""A whole session on disk, as a user would make it, with the truth beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.boards.board import Board
+from pkmcal.cameras import Camera
+from pkmcal.errors import GeometryError, InputError
+from pkmcal.files import csv_text, staged_folder, yaml_text
+from pkmcal.geometry.rigid import pose, rotation
+from pkmcal.mechanisms import Machine, mechanism_text
+from pkmcal.simulation.board import board_part, holder_part
+from pkmcal.simulation.casting import Part
+from pkmcal.simulation.render import Sensor, View, photograph, render
+from pkmcal.simulation.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
+from pkmcal.simulation.surfaces import SmoothNoise
+from pkmcal.simulation.truth import FILE, Settings, Truth, draw_truth, stream, truth_document
+
+Progress = Callable[[int, int], None]
+
+
+def simulate_session(
+    folder: Path | str,
+    drawing: Machine,
+    camera: Camera | Sequence[Camera],
+    settings: Settings | None = None,
+    *,
+    seed: int = 0,
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> Truth:
+    """Write a session into a new folder, whole or not at all; the truth goes to truth.json.
+
+    camera : one for all stations, or one a station. workers : threads that render; the result
+    does not depend on their number. progress : called with photographs done and in all.
+    """
+    settings = settings or Settings()
+    folder = Path(folder)
+    cameras = _cameras(camera, settings)
+    _check(folder, drawing)
+    truth = draw_truth(drawing, cameras, settings, seed)
+    with staged_folder(folder) as stage:
+        _write_texts(stage, drawing, cameras, settings, truth)
+        _write_photographs(stage, cameras, settings, truth, workers, progress)
+    return truth
+
+
+@dataclass(frozen=True)
+class Studio:
+    """Everything that photographs of one session share; views : by station; fixed : to the base."""
+
+    truth: Truth
+    discs: Discs
+    finish: Finish
+    room: Room
+    views: tuple[View, ...]
+    sensor: Sensor
+    fixed: tuple[Part, ...] = ()
+    board: Board | None = None
+
+    @classmethod
+    def of(cls, truth: Truth, cameras: Sequence[Camera], settings: Settings) -> Studio:
+        """Draw the room, and work out each camera's rays once."""
+        seeds = stream(truth.seed, "room").spawn(2)
+        noise = SmoothNoise.from_rng(np.random.default_rng(seeds[0]))
+        discs = discs_of(truth.machine)
+        places = np.array([pose.position for pose in truth.rough])
+        reach = float(np.linalg.norm(places - discs.base, axis=1).max())
+        way = (places - discs.base).mean(axis=0)
+        read = truth.T_platform_board is not None and discs.drives.any
+        lit_from = float(np.arctan2(way[1], way[0])) if read else None
+        room = room_of(discs, reach, noise, np.random.default_rng(seeds[1]), lit_from)
+        known = {id(camera): View.of(camera) for camera in {id(c): c for c in cameras}.values()}
+        views = tuple(known[id(camera)] for camera in cameras)
+        fixed: tuple[Part, ...] = ()
+        if settings.board is not None and truth.T_base_board is not None:
+            fixed = (board_part(settings.board, truth.T_base_board),)
+        finish = Finish.from_noise(noise, flat=truth.machine.document.motion == "planar")
+        return cls(truth, discs, finish, room, views, settings.sensor, fixed, settings.board)
+
+    def photographs(self, index: int, shake: tuple[float, float] = (0.0, 0.0)) -> list[Integers]:
+        """The repeats (8 bits, (H, W)) of the session's photograph number ``index``.
+
+        A camera that stands still receives the same light each time, and only the noise differs;
+        shake : standard deviations of its motion, m and rad.
+        """
+        seeds = stream(self.truth.seed, "photographs").spawn(len(self.truth.photographs))[index]
+        children = (seeds, *seeds.spawn(self.truth.repeats - 1))
+        rngs = [np.random.default_rng(child) for child in children]
+        still = self.truth.T_camera_base[self.truth.photographs[index, 0]]
+        if not any(shake):
+            light = self._light(index, still, rngs[0])
+            return [photograph(light, self.sensor, rng) for rng in rngs]
+        moved = [_shaken(shake, rng) @ still for rng in rngs]
+        lights = [self._light(index, T, rng) for T, rng in zip(moved, rngs, strict=True)]
+        return [photograph(x, self.sensor, rng) for x, rng in zip(lights, rngs, strict=True)]
+
+    def _light(self, index: int, T_camera_base: Array, rng: np.random.Generator) -> Array:
+        """Light (H, W) on a camera at a pose, of photograph number ``index``."""
+        station, k = self.truth.photographs[index]
+        poses, joints = self.truth.T_base_platform, self.truth.joints
+        parts = machine_parts(self.truth.machine, self.discs, self.finish, poses[k], joints[k])
+        on_platform = self.truth.T_platform_board
+        if on_platform is not None and self.board is not None:
+            parts.append(board_part(self.board, poses[k] @ on_platform))
+            parts.append(holder_part(self.board, on_platform, poses[k], self.discs))
+        scene = self.room.with_machine([*parts, *self.fixed])
+        return render(scene, self.views[station], T_camera_base, rng)
+
+
+def _shaken(shake: tuple[float, float], rng: np.random.Generator) -> Array:
+    """Motion (4, 4) of a camera about its own place; shake : standard deviations, m and rad."""
+    turn, move = rng.standard_normal((2, 3))
+    return pose(rotation(shake[1] * turn), shake[0] * move)
+
+
+def _cameras(camera: Camera | Sequence[Camera], settings: Settings) -> tuple[Camera, ...]:
+    """One camera for each station."""
+    n = settings.n_stations
+    cameras = (camera,) * n if isinstance(camera, Camera) else tuple(camera)
+    if len(cameras) != n or n == 0:
+        raise InputError(
+            what="the simulation needs one camera for all stations, or one for each",
+            found=f"{len(cameras)} cameras for {n} stations",
+            expected=f"1 or {n}",
+        )
+    return cameras
+
+
+def _check(folder: Path, drawing: Machine) -> None:
+    """Raise InputError for what would waste the work."""
+    if folder.is_dir() and any(folder.iterdir()):
+        raise InputError(
+            what="the folder for the simulated session is not empty",
+            where=str(folder),
+            expected="a new or empty folder",
+            next_step="name another folder, or remove what is in this one",
+        )
+    if not any(len(radii) for radii in drawing.radii()):
+        raise InputError(
+            what=f"mechanism {drawing.name!r} has no tubes, so its photographs would show no legs",
+            expected="tubes: [{radius: ..., from: ..., to: ...}] on its legs",
+        )
+    if drawing.layout.n_internal:
+        raise InputError(
+            what=f"mechanism {drawing.name!r} has side bars that turn on hinges, and how far they"
+            " turn is not known where it is drawn",
+            expected="platform joints other than hinged-bar",
+            next_step="simulate the machine with one rod a forearm, such as h4",
+        )
+    try:
+        drawing.home()
+    except GeometryError as error:  # the drawing is the user's: it is at fault
+        raise InputError(
+            error.what, found=error.found, expected=error.expected, next_step=error.next_step
+        ) from None
+
+
+def _write_texts(
+    stage: Path, drawing: Machine, cameras: Sequence[Camera], settings: Settings, truth: Truth
+) -> None:
+    """Everything but the photographs."""
+    same = all(camera is cameras[0] for camera in cameras)
+    files = {
+        name: "cameras/camera.yaml" if same else f"cameras/{name}.yaml" for name in truth.stations
+    }
+    driven = np.flatnonzero(drawing.layout.actuated >= 0)
+    columns = [f"leg{j + 1}" for j in driven]
+    if drawing.layout.shares_motors:
+        columns = [f"motor{k + 1}" for k in range(drawing.n_joints)]
+    texts = {
+        "mechanism.yaml": mechanism_text(drawing),
+        "session.yaml": yaml_text(_session_document(settings, truth, files)),
+        "joints.csv": csv_text(columns, truth.configurations, truth.readings),
+        FILE: json.dumps(truth_document(truth), indent=1) + "\n",
+    }
+    if settings.board is not None:
+        texts["board.yaml"] = yaml_text(settings.board.document)
+    for name, camera in zip(truth.stations, cameras, strict=True):
+        texts[files[name]] = yaml_text(camera.document())
+    for name, text in texts.items():
+        path = stage / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _session_document(
+    settings: Settings, truth: Truth, camera_files: dict[str, str]
+) -> dict[str, Any]:
+    board = settings.board is not None
+    name_of = "{configuration}" + _repeat_part(settings, "{repeat}")
+    return {
+        "pkmcal": 1,
+        "mechanism": "mechanism.yaml",
+        "joints": {"file": "joints.csv", "noise": settings.joint_noise},
+        "stations": {
+            name: {
+                "camera": camera_files[name],
+                "images": f"images/{name}/{name_of}.png",
+                "observe": list(settings.observe) if board else "legs",
+                "pose": {
+                    "position": list(pose.position),
+                    "look_at": list(pose.look_at),
+                    "up": list(pose.up),
+                },
+            }
+            for name, pose in zip(truth.stations, truth.rough, strict=True)
+        },
+        **({"board": {"file": "board.yaml", "fixed_to": settings.board_on}} if board else {}),
+    }
+
+
+def _write_photographs(
+    stage: Path,
+    cameras: Sequence[Camera],
+    settings: Settings,
+    truth: Truth,
+    workers: int,
+    progress: Progress | None,
+) -> None:
+    """Render and write all photographs; NumPy releases the interpreter, so threads are enough."""
+    studio = Studio.of(truth, cameras, settings)
+    for name in truth.stations:
+        (stage / "images" / name).mkdir(parents=True)
+    total = len(truth.photographs)
+    with ThreadPoolExecutor(max(1, workers)) as pool:
+        jobs = [pool.submit(_write_one, stage, studio, settings, k) for k in range(total)]
+        try:
+            for done, job in enumerate(as_completed(jobs), start=1):
+                job.result()
+                if progress is not None:
+                    progress(done * truth.repeats, total * truth.repeats)
+        finally:
+            for job in jobs:
+                job.cancel()
+
+
+def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> None:
+    import cv2
+
+    truth = studio.truth
+    station, k = truth.photographs[index]
+    folder = stage / "images" / truth.stations[station]
+    for repeat, picture in enumerate(studio.photographs(index, settings.shake)):
+        ok, data = cv2.imencode(".png", picture)
+        if not ok:
+            raise OSError(f"photograph {index} could not be encoded as PNG")
+        name = f"{truth.configurations[k]}{_repeat_part(settings, str(repeat + 1))}.png"
+        (folder / name).write_bytes(data.tobytes())
+
+
+def _repeat_part(settings: Settings, text: str) -> str:
+    """What stands after the configuration in a photograph's name."""
+    return f"_{text}" if settings.repeats > 1 else ""

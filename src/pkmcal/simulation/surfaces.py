@@ -1,0 +1,251 @@
+"""How surfaces look: patterns on them, and the light that they send to the camera."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.simulation.shapes import Cylinder, Shape, inner
+
+NOISE_SIZE = 256
+
+
+@dataclass(frozen=True)
+class SmoothNoise:
+    """Smooth random values that repeat after ``NOISE_SIZE`` cells; table (size, size), sd 1."""
+
+    table: Array
+
+    @classmethod
+    def from_rng(cls, rng: np.random.Generator) -> SmoothNoise:
+        """White noise whose amplitude falls with frequency, as in clouds and stains."""
+        k = np.fft.fftfreq(NOISE_SIZE) * NOISE_SIZE
+        scale = np.hypot(k[:, None], k[None, :]) / (NOISE_SIZE / 4)
+        # nothing is left at the cell's size, where bilinear interpolation would show
+        gain = np.exp(-2 * scale**2) / (0.02 + scale) ** 1.2
+        white = np.fft.fft2(rng.normal(size=(NOISE_SIZE, NOISE_SIZE)))
+        table = np.fft.ifft2(white * gain).real
+        table -= table.mean()
+        return cls((table / table.std()).astype(np.float32))
+
+    def at(self, u: Array, v: Array) -> Array:
+        """Bilinear values (n,) at positions (n,) in cells."""
+        fu, fv = np.floor(u), np.floor(v)
+        i, j = fu.astype(np.int64) % NOISE_SIZE, fv.astype(np.int64) % NOISE_SIZE
+        i1, j1 = (i + 1) % NOISE_SIZE, (j + 1) % NOISE_SIZE
+        du, dv = u - fu, v - fv
+        t = self.table
+        top = t[i, j] * (1 - dv) + t[i, j1] * dv
+        bottom = t[i1, j] * (1 - dv) + t[i1, j1] * dv
+        return top * (1 - du) + bottom * du
+
+
+class Pattern(ABC):
+    """A factor on the albedo, by the place on the surface in the shape's own frame."""
+
+    @abstractmethod
+    def factor(self, q: Array) -> Array:
+        """(n,) factors, about 1, at local points (3, n)."""
+
+
+@final
+@dataclass(frozen=True)
+class Clouds(Pattern):
+    """Stains: smooth noise of a cell size (m) and contrast."""
+
+    noise: SmoothNoise
+    cell: float
+    contrast: float
+
+    def factor(self, q: Array) -> Array:
+        """Slanted coordinates, so that no face of a box is without variation."""
+        value = self.noise.at(
+            (q[0] + 0.6 * q[2]) / self.cell + 31.7, (q[1] - 0.45 * q[2]) / self.cell + 8.3
+        )
+        return np.clip(1 + self.contrast * value, 0.15, 2.5)
+
+
+@final
+@dataclass(frozen=True)
+class WavyStripes(Pattern):
+    """Stripes of a period (m) with soft wandering borders, as light through blinds or wood."""
+
+    noise: SmoothNoise
+    period: float
+    contrast: float
+
+    def factor(self, q: Array) -> Array:
+        """Phase shifted by noise."""
+        wander = self.noise.at(q[0] / self.period * 5 + 3.1, q[1] / self.period * 5 + 7.9)
+        wave = np.sin(2 * np.pi * (0.9 * q[0] + 0.43 * q[1]) / self.period + 1.4 * wander)
+        return 1 + self.contrast * np.tanh(1.8 * wave)
+
+
+@final
+@dataclass(frozen=True)
+class Checks(Pattern):
+    """Checks of a size (m); dark ones at ``dark`` of the light ones; borders soft over a tenth."""
+
+    size: float
+    dark: float
+
+    def factor(self, q: Array) -> Array:
+        """Product of square waves, offset so that a face at a border is not all border."""
+        wave = np.ones(q.shape[1])
+        for axis in range(3):
+            wave = wave * np.tanh(12 * np.cos(np.pi * (q[axis] / self.size + 0.21)))
+        return self.dark + (1 - self.dark) * (0.5 + 0.5 * wave)
+
+
+@final
+@dataclass(frozen=True)
+class Slats(Pattern):
+    """Boards with narrow dark joints, as panels or tiles: widths (m) both ways."""
+
+    width: float
+    height: float
+    dark: float
+
+    def factor(self, q: Array) -> Array:
+        """A joint is a twelfth of the width, with soft borders: thinner ones would flicker."""
+        seam = np.zeros(q.shape[1])
+        for axis, size in ((0, self.width), (1, self.height)):
+            if np.isfinite(size):
+                gap = np.abs((q[axis] / size) % 1.0 - 0.5)
+                seam = np.maximum(seam, np.clip((gap - 0.45) * 35, 0, 1))
+        return 1 - (1 - self.dark) * seam
+
+
+@dataclass(frozen=True)
+class Material:
+    """A surface.
+
+    albedo : diffuse reflectance. pattern : factor on it. gloss, sharpness : strength and
+    exponent of a Blinn-Phong highlight. brushed : the highlight is drawn out along a cylinder's
+    axis, narrow across (turned steel; Ward's model). mirror : share of the surroundings
+    reflected. emission : light of its own.
+    """
+
+    albedo: float = 0.5
+    pattern: Pattern | None = None
+    gloss: float = 0.0
+    sharpness: float = 30.0
+    brushed: bool = False
+    mirror: float = 0.0
+    emission: float = 0.0
+
+
+@dataclass(frozen=True)
+class Finish:
+    """Materials of the machine's parts; telescopic tubes from the base end to the platform end.
+
+    forearm : of rods that a motor on the base moves, dull as drawn aluminium or glass fibre are.
+    """
+
+    paint: Material
+    steel: Material
+    forearm: Material
+    joint: Material
+    base: Material
+    platform: Material
+
+    @classmethod
+    def from_noise(cls, noise: SmoothNoise, flat: bool = False) -> Finish:
+        """White paint, turned steel, blackened joints, a stained base, a milled platform.
+
+        flat : the legs lie open to the lamps above, and white ones would be overexposed.
+        """
+        return cls(
+            paint=Material(
+                0.42 if flat else 0.8, Clouds(noise, 0.012, 0.03), gloss=0.3, sharpness=40.0
+            ),
+            steel=Material(0.38, Clouds(noise, 0.004, 0.05), gloss=0.45, brushed=True, mirror=0.3),
+            forearm=Material(0.5, Clouds(noise, 0.008, 0.04), gloss=0.08, sharpness=15.0),
+            joint=Material(0.035, gloss=0.45, sharpness=60.0, mirror=0.06),
+            base=Material(0.16, Clouds(noise, 0.015, 0.25), gloss=0.05, sharpness=12.0),
+            platform=Material(0.27, Clouds(noise, 0.02, 0.08), gloss=0.12, sharpness=10.0),
+        )
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A round lamp: place (3,) and radius (m), radiance given to a white surface facing it at
+    distance ``reach`` (m), and whether it casts shadows.
+    """
+
+    place: Array
+    radius: float
+    power: float
+    reach: float
+    shadows: bool = False
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Lamps, and the light from everywhere: from above (+z) and from below."""
+
+    lamps: tuple[Lamp, ...]
+    sky: float
+    ground: float
+
+
+_BRUSH_ACROSS, _BRUSH_ALONG = 0.13, 0.75
+"""Ward roughness of turned steel across and along the axis."""
+
+
+def radiance(
+    shape: Shape, material: Material, points: Array, to_camera: Array, lit: Array, light: Lighting
+) -> Array:
+    """Light (n,) from one shape's points (3, n) towards the camera, 1 being white in full light.
+
+    to_camera : unit (3, n). lit : (n,) visible part of the lamp that casts shadows.
+    """
+    n = shape.normal(points)
+    albedo = np.full(points.shape[1], material.albedo)
+    if material.pattern is not None:
+        albedo = albedo * material.pattern.factor(shape.local(points))
+    up = 0.5 + 0.5 * n[2]
+    diffuse = light.ground + (light.sky - light.ground) * up
+    shine = np.zeros(points.shape[1])
+    axis = shape.axis if material.brushed and isinstance(shape, Cylinder) else None
+    for lamp in light.lamps:
+        to_lamp = lamp.place[:, None] - points
+        dist2 = np.einsum("in,in->n", to_lamp, to_lamp)
+        to_lamp = to_lamp / np.sqrt(dist2)
+        power = lamp.power * lamp.reach**2 / dist2 * (lit if lamp.shadows else 1.0)
+        facing = np.maximum(np.einsum("in,in->n", n, to_lamp), 0.0)
+        diffuse = diffuse + power * facing
+        if material.gloss > 0:
+            shine = shine + power * _highlight(material, axis, n, to_lamp, to_camera) * (facing > 0)
+    out = material.emission + albedo * diffuse + material.gloss * shine
+    if material.mirror > 0:
+        out = out + material.mirror * _surroundings(n, to_camera, light)
+    return out
+
+
+def _highlight(
+    material: Material, axis: Array | None, n: Array, to_lamp: Array, to_camera: Array
+) -> Array:
+    """Blinn-Phong's lobe (n,), or Ward's without its constant factor where brushed."""
+    h = to_lamp + to_camera
+    h = h / np.sqrt(np.maximum(np.einsum("in,in->n", h, h), 1e-12))
+    hn = np.maximum(np.einsum("in,in->n", h, n), 1e-3)
+    if axis is None:
+        return hn**material.sharpness
+    along = inner(h, axis)
+    across2 = np.maximum(1 - along**2 - hn**2, 0.0)
+    return np.exp(-(across2 / _BRUSH_ACROSS**2 + along**2 / _BRUSH_ALONG**2) / hn**2)
+
+
+def _surroundings(n: Array, to_camera: Array, light: Lighting) -> Array:
+    """What polished steel mirrors (n,): a dark floor, a bright ceiling, two windows."""
+    cosine = np.einsum("in,in->n", n, to_camera)
+    x, y, z = 2 * cosine * n - to_camera
+    up = 1 / (1 + np.exp(-6 * z))
+    band = np.exp(-(((x * 0.8 - y * 0.6) - 0.35) ** 2) / 0.02) * (z > -0.3)
+    band = band + 0.7 * np.exp(-(((x * 0.5 + y * 0.87) + 0.5) ** 2) / 0.03) * (z > -0.3)
+    return light.ground + (light.sky - light.ground) * up + 0.5 * light.sky * band

@@ -1,0 +1,288 @@
+"""What is true in a simulated session, and how it is drawn.
+
+The same seed and settings give the same truth. Streams of random numbers are separate for the
+machine, the stations, the configurations, the readings, the room and each photograph, so that
+changing one setting does not reshuffle the rest.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.boards.board import Board
+from pkmcal.cameras import Camera
+from pkmcal.errors import GeometryError, InputError
+from pkmcal.files import read_text
+from pkmcal.geometry.rigid import inverse
+from pkmcal.mechanisms import Machine
+from pkmcal.session.schema import Body
+from pkmcal.simulation.board import place_board, place_on_platform
+from pkmcal.simulation.configurations import draw_configurations, unfolded
+from pkmcal.simulation.render import Sensor
+from pkmcal.simulation.stations import StationPose, default_stations, rough_pose, share_in_image
+
+FILE = "truth.json"
+_STREAMS = ("machine", "stations", "configurations", "readings", "room", "photographs", "board")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a simulated session is like.
+
+    stations : how many, or where they stand. configurations : photographed by each station.
+    shared : every station photographs the same configurations; otherwise each its own.
+    tolerance : true values differ from the drawing by this many times its tolerances.
+    joint_noise : standard deviation of a reading, m. rough_position, rough_angle : by how much
+    the session's station poses are off, m and rad. extreme : share of configurations with legs
+    near the ends of their ranges. board : seen by every station, fixed to ``board_on``. observe :
+    what the session says of the stations that see one. repeats :
+    photographs of each configuration from each station, with sensor noise of their own. shake :
+    standard deviations (m, rad) by which the camera moves between them.
+    """
+
+    stations: int | tuple[StationPose, ...] = 3
+    configurations: int = 15
+    shared: bool = False
+    tolerance: float = 1.0
+    joint_noise: float = 3e-6
+    rough_position: float = 0.05
+    rough_angle: float = float(np.deg2rad(5))
+    extreme: float = 0.5
+    sensor: Sensor = field(default_factory=Sensor)
+    board: Board | None = None
+    board_on: Body = "base"
+    observe: tuple[str, ...] = ("legs", "board")
+    repeats: int = 1
+    shake: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def n_stations(self) -> int:
+        """Number of stations."""
+        return self.stations if isinstance(self.stations, int) else len(self.stations)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a user never has. Frames: the base frame that the true machine's centres stand in.
+
+    machine : with its true values. stations, configurations : names, S and K.
+    T_camera_base : (S, 4, 4). rough : poses written into the session.
+    T_base_platform : (K, 4, 4). joints : (K, m) exact readings. readings : (K, m) with noise.
+    photographs : (M, 2) station and configuration of each photograph. seed : of everything.
+    T_base_board, T_platform_board : (4, 4) of the board, where there is one. repeats : photographs
+    of each pair.
+    """
+
+    machine: Machine
+    stations: tuple[str, ...]
+    configurations: tuple[str, ...]
+    T_camera_base: Array
+    rough: tuple[StationPose, ...]
+    T_base_platform: Array
+    joints: Array
+    readings: Array
+    photographs: Integers
+    seed: int
+    T_base_board: Array | None = None
+    repeats: int = 1
+    T_platform_board: Array | None = None
+
+
+def stream(seed: int, name: str) -> np.random.SeedSequence:
+    """The seed of one of the session's streams of random numbers."""
+    return np.random.SeedSequence(seed).spawn(len(_STREAMS))[_STREAMS.index(name)]
+
+
+def true_machine(drawing: Machine, scale: float, rng: np.random.Generator) -> Machine:
+    """A machine as it might be built: normal deviations of ``scale`` tolerances.
+
+    Fixed parameters keep their drawing value, tied ones move together; an axis is turned.
+    """
+    table = drawing.parameters
+    tolerance = table.tolerances_free()
+    step = table.free_matrix() @ (scale * tolerance * rng.standard_normal(len(tolerance)))
+    return drawing.with_values(table.unit_axes(drawing.values + step))
+
+
+def draw_truth(
+    drawing: Machine, cameras: tuple[Camera, ...], settings: Settings, seed: int
+) -> Truth:
+    """A true machine, stations, configurations and readings; cameras : one a station."""
+    rngs = {name: np.random.default_rng(stream(seed, name)) for name in _STREAMS}
+    machine = true_machine(drawing, settings.tolerance, rngs["machine"])
+    poses = settings.stations
+    if isinstance(poses, int):
+        seen = settings.board_on if settings.board is not None else None
+        poses = default_stations(drawing, cameras, rngs["stations"], seen)
+    T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
+    rough = tuple(
+        rough_pose(
+            T,
+            float(np.linalg.norm(np.subtract(pose.look_at, pose.position))),
+            settings.rough_position,
+            settings.rough_angle,
+            rngs["stations"],
+        )
+        for T, pose in zip(T_camera_base, poses, strict=True)
+    )
+    T_base_platform, joints, photographs = _configurations(
+        drawing, machine, cameras, T_camera_base, settings, rngs["configurations"]
+    )
+    board = None
+    if settings.board is not None:
+        place = place_board if settings.board_on == "base" else place_on_platform
+        seen = (T_camera_base, T_base_platform, joints, rngs["board"])
+        board = place(machine, settings.board, cameras, *seen)
+    noise = settings.joint_noise * rngs["readings"].standard_normal(joints.shape)
+    return Truth(
+        machine=machine,
+        stations=tuple(f"station{k + 1}" for k in range(len(poses))),
+        configurations=tuple(f"{k:04d}" for k in range(len(joints))),
+        T_camera_base=T_camera_base,
+        rough=rough,
+        T_base_platform=T_base_platform,
+        joints=joints,
+        readings=joints + noise,
+        photographs=photographs,
+        seed=seed,
+        T_base_board=board if settings.board_on == "base" else None,
+        repeats=settings.repeats,
+        T_platform_board=board if settings.board_on == "platform" else None,
+    )
+
+
+def _configurations(
+    drawing: Machine,
+    machine: Machine,
+    cameras: tuple[Camera, ...],
+    T_camera_base: Array,
+    settings: Settings,
+    rng: np.random.Generator,
+) -> tuple[Array, Array, Integers]:
+    """Poses, readings, and which station photographs which: legs must be in the picture.
+
+    A controller that moves the machine by its drawing only goes where that closes.
+    """
+    n = settings.configurations
+    wanted = n if settings.shared else n * len(cameras)
+    poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
+    by_drawing = drawing.forward_result(joints)
+    reached = by_drawing.converged & unfolded(drawing, by_drawing.T_base_platform)
+    poses, joints = poses[reached], joints[reached]
+    share = np.stack(
+        [
+            share_in_image(machine, camera, T, poses, joints)
+            for camera, T in zip(cameras, T_camera_base, strict=True)
+        ]
+    )
+    # a leg may lose its end to the border; a picture with half a machine is a bad photograph
+    seen = (share.mean(axis=-1) > 0.8) & (share.min(axis=-1) > 0.4)
+    groups = [seen.all(axis=0)] if settings.shared else list(seen)
+    taken = np.zeros(len(poses), dtype=bool)
+    chosen: list[Integers] = []
+    for k, good in enumerate(groups):
+        rows = np.flatnonzero(good & ~taken)[:n]
+        if rows.size < n:
+            raise _out_of_sight(k, int(rows.size), n)
+        taken[rows] = True
+        chosen.append(rows)
+    stations = range(len(cameras))
+    pairs = (
+        [(s, k) for s in stations for k in range(n)]
+        if settings.shared
+        else [(s, s * n + k) for s in stations for k in range(n)]
+    )
+    rows = np.concatenate(chosen)
+    return poses[rows], joints[rows], np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def _out_of_sight(station: int, found: int, wanted: int) -> GeometryError:
+    return GeometryError(
+        what=f"station {station + 1} does not see the legs in enough configurations",
+        found=str(found),
+        expected=str(wanted),
+        next_step="move the station back, or use a wider lens",
+    )
+
+
+def truth_document(truth: Truth) -> dict[str, Any]:
+    """The content of ``truth.json``; m, rad, frames as in the project's conventions.
+
+    ``parameters`` are the true values by name; ``stations`` hold 4x4 ``T_camera_base``;
+    ``configurations`` hold 4x4 ``T_base_platform`` and the exact readings ``joints``;
+    ``photographs`` are pairs of names, each taken ``repeats`` times (once where absent). No
+    estimator reads this file.
+    """
+    names = truth.machine.parameters.names
+    return {
+        "pkmcal_truth": 1,
+        "convention": "length = reading + offset; x_camera = T_camera_base x_base; "
+        "x_base = T_base_platform x_platform; m",
+        "seed": truth.seed,
+        "mechanism": truth.machine.name,
+        "parameters": dict(zip(names, truth.machine.values.tolist(), strict=True)),
+        "stations": {
+            name: {"T_camera_base": T.tolist()}
+            for name, T in zip(truth.stations, truth.T_camera_base, strict=True)
+        },
+        "configurations": {
+            name: {"T_base_platform": T.tolist(), "joints": q.tolist()}
+            for name, T, q in zip(
+                truth.configurations, truth.T_base_platform, truth.joints, strict=True
+            )
+        },
+        "photographs": [
+            [truth.stations[s], truth.configurations[k]] for s, k in truth.photographs.tolist()
+        ],
+        **({} if truth.T_base_board is None else {"T_base_board": truth.T_base_board.tolist()}),
+        **(
+            {}
+            if truth.T_platform_board is None
+            else {"T_platform_board": truth.T_platform_board.tolist()}
+        ),
+        **({"repeats": truth.repeats} if truth.repeats > 1 else {}),
+    }
+
+
+def load_truth(folder: Path | str, drawing: Machine) -> Truth:
+    """Read ``truth.json`` of a simulated session, for scoring; drawing : the session's machine.
+
+    Readings and rough poses are the session's; here the exact readings stand for the former.
+    """
+    path = Path(folder) / FILE
+    data = json.loads(read_text(path))
+    if data.get("pkmcal_truth") != 1:
+        raise InputError("not the truth of a simulated session", where=str(path))
+    values = [data["parameters"][name] for name in drawing.parameters.names]
+    stations, configurations = tuple(data["stations"]), tuple(data["configurations"])
+    joints = np.array([c["joints"] for c in data["configurations"].values()])
+    T_camera_base = np.array([s["T_camera_base"] for s in data["stations"].values()])
+    return Truth(
+        machine=drawing.with_values(np.array(values)),
+        stations=stations,
+        configurations=configurations,
+        T_camera_base=T_camera_base,
+        rough=tuple(_as_pose(T) for T in T_camera_base),
+        T_base_platform=np.array([c["T_base_platform"] for c in data["configurations"].values()]),
+        joints=joints,
+        readings=joints,
+        photographs=np.array(
+            [[stations.index(s), configurations.index(k)] for s, k in data["photographs"]]
+        ),
+        seed=data["seed"],
+        T_base_board=np.array(data["T_base_board"]) if "T_base_board" in data else None,
+        repeats=data.get("repeats", 1),
+        T_platform_board=np.array(data["T_platform_board"]) if "T_platform_board" in data else None,
+    )
+
+
+def _as_pose(T_camera_base: Array) -> StationPose:
+    T = inverse(T_camera_base)
+    position, forward, up = T[:3, 3], T[:3, 2], -T[:3, 1]
+    return StationPose(*(tuple(v.tolist()) for v in (position, position + forward, up)))
