@@ -10,6 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from pkmcal.report.camera import camera_report_html
 
 from pkmcal.boards.board import Detection, chessboard
 from pkmcal.boards.camera import calibrate_camera, calibrate_photographs, views_of
@@ -25,7 +26,6 @@ from pkmcal.boards.selection import positions
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
-from pkmcal.report.camera_page import camera_report_html
 from test_boards import CAMERAS, render, view
 
 BOARD = chessboard((8, 6), 0.03)

@@ -13,7 +13,7 @@ from pkmcal.commands.comparison import compare
 from pkmcal.geometry import great_circles
 from pkmcal.geometry.cylinders import edge_normals, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
-from pkmcal.identify import linear
+from pkmcal.papers import linear
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.stations import StationPose
 

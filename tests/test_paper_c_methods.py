@@ -10,19 +10,19 @@ import pytest
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.hand_eye import start_from_poses
-from pkmcal.identify.inverse_kinematic import (
+from pkmcal.measurements import Mount, PoseSet
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms.document import MOTIONS
+from pkmcal.papers.hand_eye import start_from_poses
+from pkmcal.papers.inverse_kinematic import (
     fit_session,
     inverse_kinematic,
     pose_problem,
     turn_between,
     unknown_names,
 )
-from pkmcal.identify.measured_platform import seen_platform, taken
-from pkmcal.identify.rotation_axis import facing, rotation_axis
-from pkmcal.measurements import Mount, PoseSet
-from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.document import MOTIONS
+from pkmcal.papers.measured_platform import seen_platform, taken
+from pkmcal.papers.rotation_axis import facing, rotation_axis
 from pkmcal.reproduce.paper_c_simulation import Settings, measurements, model, simulate
 from test_hand_eye import anywhere, measured, platform_poses, seen_from, true_machine
 

@@ -11,7 +11,8 @@ from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.tool import pose_by_parameters, tool_point
 from pkmcal.observe.predict import legs_in_camera
-from pkmcal.report import parameters, pictures, rejections, residuals
+from pkmcal.report import parameters, pictures, residuals
+from pkmcal.report import provenance as rejections
 from pkmcal.report.charts import ticks_between
 from pkmcal.report.page import report_views
 from pkmcal.report.provenance import camera_position_covariance

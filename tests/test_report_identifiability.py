@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.identify.conditions import conditions
 from pkmcal.identify.unidentified import explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.papers.conditions import conditions
 from pkmcal.report.identifiability import STUB, section
 from pkmcal.report.page import report_html
 from test_report_case import Verdict, make_case

@@ -11,7 +11,7 @@ import pytest
 
 from conftest import run
 from pkmcal.commands.reproduce import Paper
-from pkmcal.identify.axis_measurements import AxisNoise
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.report.reproduction import reproduction_html
 from pkmcal.reproduce import Options, reproduce
 from pkmcal.reproduce import paper_a_expected as expected

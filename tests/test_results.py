@@ -8,14 +8,14 @@ import shutil
 
 import numpy as np
 import pytest
+from pkmcal.calibration.results import base_camera_covariance, check_output, document_of, load
+from pkmcal.report.calibration import save
 
-from pkmcal import results
+from pkmcal.calibration import results
 from pkmcal.errors import InputError
 from pkmcal.files import json_text
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.result_document import base_camera_covariance, document_of
-from pkmcal.results import check_output, load, save
 
 
 @pytest.fixture

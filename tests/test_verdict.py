@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pkmcal.calibration.results import identifiability_of
 
 from pkmcal.files import json_text
 from pkmcal.identify.bundle import bundle, what_data_tell
-from pkmcal.identify.conditions import conditions
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.unidentified import Findings, explain, seen_legs
 from pkmcal.identify.verdict import LEFT_OPEN, judge
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.papers.conditions import conditions
 from pkmcal.report.parameters import parameter_groups, unidentified
-from pkmcal.result_document import identifiability_of
 from test_words import heaved, make, moved
 
 

@@ -9,6 +9,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pkmcal.calibration.results import load
+from pkmcal.report.calibration import save
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
@@ -18,7 +20,6 @@ from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.bundle import start_state
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
-from pkmcal.results import load, save
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import demo_camera

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from pkmcal.report.calibration import save
 
 import pkmcal
 from pkmcal.arrays import Array
@@ -30,8 +31,8 @@ from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.measurements import Measurements
 from pkmcal.observe import legs
-from pkmcal.report import page, templating
-from pkmcal.results import save
+from pkmcal.report import page
+from pkmcal.report import page as templating
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
 from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera

@@ -25,11 +25,17 @@ from pkmcal.calibration.recognise import (
     recognise,
     why_unrecognised,
 )
-from pkmcal.check_board import BoardCheck, BoardsCheck, check_boards
-from pkmcal.check_joints import JointCheck, joint_checks, joint_findings
-from pkmcal.check_poses import pose_findings
+from pkmcal.check.check import (
+    BoardCheck,
+    BoardsCheck,
+    JointCheck,
+    check_boards,
+    joint_checks,
+    joint_findings,
+    pose_findings,
+)
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.files import listed, plain
+from pkmcal.files import plain
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.observe import legs
@@ -39,6 +45,7 @@ from pkmcal.outcome import Finding, Level, wrong
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.session.photographs import label_of
 from pkmcal.session.starter import untouched_files
+from pkmcal.wording import listed
 
 OVEREXPOSED = 0.25
 """Share of saturated pixels on the legs beyond which edges are lost: a highlight takes a tenth."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.files import listed
 from pkmcal.outcome import Finding, Level
 from pkmcal.session.load import Session
+from pkmcal.wording import listed
 
 LITTLE_USED = 0.5
 """Share of a joint's range below which its configurations are crowded."""

@@ -16,10 +16,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
 from pkmcal.calibration.recognise import read_photographs
-from pkmcal.check import Finding, Level
+from pkmcal.check.check import Finding, Level
 from pkmcal.errors import InputError
 from pkmcal.files import plain
-from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe import legs
 from pkmcal.observe.predict import legs_in_camera
@@ -38,6 +37,7 @@ from pkmcal.observe.repeats import (
     pixel_units,
     same_edges,
 )
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 
 SHARED = 0.3

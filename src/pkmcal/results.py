@@ -12,20 +12,20 @@ from pydantic import ConfigDict, Field
 
 from pkmcal import __version__
 from pkmcal.arrays import Array, Booleans
+from pkmcal.calibration.results import FORMAT, document_of
 from pkmcal.errors import InputError
 from pkmcal.files import (
     Document,
     Schema,
     check_writable,
     json_text,
-    listed,
     read_json,
     staged_folder,
     validate,
 )
 from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document, mechanism_text
 from pkmcal.outcome import Verdict
-from pkmcal.result_document import FORMAT, document_of
+from pkmcal.wording import listed
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration

@@ -15,12 +15,12 @@ import numpy as np
 
 from pkmcal.arrays import Booleans, Integers
 from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
+from pkmcal.calibration.results import SavedCalibration, load
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import plain
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
-from pkmcal.results import SavedCalibration, load
 from pkmcal.session.load import Session, load_session
 from pkmcal.validate.figures import holdout_document, judged_document, reading_units
 from pkmcal.validate.held import Prediction, predict

@@ -16,11 +16,11 @@ import numpy as np
 
 from pkmcal.arrays import Booleans
 from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
+from pkmcal.calibration.results import SavedCalibration, load
 from pkmcal.errors import InputError
-from pkmcal.files import listed, plain
+from pkmcal.files import plain
 from pkmcal.identify.assembly import seen_configurations
 from pkmcal.outcome import Verdict
-from pkmcal.results import SavedCalibration, load
 from pkmcal.session.load import Session, load_session
 from pkmcal.validate.holdouts import select
 from pkmcal.validate.independence import check_machine, known_rows
@@ -29,6 +29,7 @@ from pkmcal.watching.figures import judgement_document
 from pkmcal.watching.judged import Judgement, judge
 from pkmcal.watching.lens import magnified
 from pkmcal.watching.words import Circumstances, verdict_of
+from pkmcal.wording import listed
 
 __all__ = ["ALPHA", "Watch", "check_alpha", "watch"]
 

@@ -22,15 +22,15 @@ from pkmcal.calibration.recognise import (
 )
 from pkmcal.calibration.turns import Progress, identify_poses, take_turns
 from pkmcal.identify.bundle import what_data_tell
-from pkmcal.identify.conditions import conditions
-from pkmcal.identify.paper_methods import Method as PaperMethod
-from pkmcal.identify.paper_methods import by_paper
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.unidentified import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
+from pkmcal.papers.conditions import conditions
+from pkmcal.papers.methods import Method as PaperMethod
+from pkmcal.papers.methods import by_paper
 from pkmcal.session.load import Session, load_session
 from pkmcal.validate.aside import set_aside
 from pkmcal.validate.holdouts import HoldOut, chosen, judged_without

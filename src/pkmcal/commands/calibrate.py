@@ -67,7 +67,8 @@ def calibrate(
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""
     from pkmcal.calibration.calibrate import calibrate as run
-    from pkmcal.results import check_output, save
+    from pkmcal.calibration.results import check_output
+    from pkmcal.report.calibration import save
     from pkmcal.session.load import load_session
 
     loaded = load_session(session, model)

@@ -91,7 +91,8 @@ def camera(
 def of_session(folder: Path) -> tuple[list[Path], Path]:
     """A session's photographs of its board, all of one camera, and the board's file."""
     from pkmcal.errors import InputError
-    from pkmcal.files import listed, read_yaml
+    from pkmcal.files import read_yaml
+    from pkmcal.wording import listed
 
     session = read_yaml(folder / "session.yaml")
     stations: dict[str, Any] = session.data.get("stations") or {}
@@ -166,7 +167,7 @@ def save(found: CameraCalibration, paths: list[Path], folder: Path, forms: list[
 
     from pkmcal.cameras.files import save_camera, write_camera
     from pkmcal.files import json_text, staged_folder
-    from pkmcal.report.camera_page import camera_report_html
+    from pkmcal.report.camera import camera_report_html
 
     page = camera_report_html(found, paths)
     with staged_folder(folder) as stage:
@@ -182,7 +183,7 @@ def save(found: CameraCalibration, paths: list[Path], folder: Path, forms: list[
 
 def tell(out: Console, found: CameraCalibration, folder: Path, files: list[str]) -> None:
     """The result in a sentence, its numbers, what should be known, and the files."""
-    from pkmcal.report.camera_page import headline, parameter_rows
+    from pkmcal.report.camera import headline, parameter_rows
 
     out.print(headline(found), style="bold")
     table = console.plain_table()

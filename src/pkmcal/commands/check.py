@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from pkmcal.check import JointCheck, SessionCheck, StationCheck
+    from pkmcal.check.check import JointCheck, SessionCheck, StationCheck
 
 LAST_WORDS = {
     0: "Nothing is wrong. Next: pkmcal calibrate {}",
@@ -45,13 +45,13 @@ def check(
     as_json: console.Json = False,
 ) -> int:
     """Find what is wrong with a session before any work is spent."""
-    from pkmcal.check import check_session
+    from pkmcal.check.check import check_session
 
     with console.progress() as told:
         found = check_session(session, seed=seed, progress=told)
     study = None
     if repeat and found.exit_code < 2:
-        from pkmcal.repeatability import study_repeats
+        from pkmcal.check.repeats import study_repeats
 
         with console.progress() as told:
             study = study_repeats(session, seed=seed, progress=told)
@@ -149,7 +149,7 @@ def _boards(found: SessionCheck) -> Table:
 
 def _joints(joints: tuple[JointCheck, ...]) -> Table:
     table = console.plain_table("", "Joint", "Lowest", "Highest", "Of its range", "Near the ends")
-    from pkmcal.check_joints import LITTLE_USED
+    from pkmcal.check.check import LITTLE_USED
 
     for joint in joints:
         known = math.isfinite(joint.used)

@@ -38,8 +38,9 @@ def demo(
     as_json: console.Json = False,
 ) -> int:
     """Simulate, calibrate, compare with the truth, open the report."""
+    from pkmcal.calibration.results import check_output
     from pkmcal.commands.comparison import compare
-    from pkmcal.results import check_output, save
+    from pkmcal.report.calibration import save
 
     session, result = out / SESSION, out / CALIBRATION
     _make_room(out)

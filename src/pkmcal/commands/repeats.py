@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from pkmcal.repeatability import LegScatter, RepeatStudy
+    from pkmcal.check.repeats import LegScatter, RepeatStudy
 
 LEGEND = """\
    Standard deviations of one photograph, pooled over the configurations.
@@ -23,7 +23,7 @@ LEGEND = """\
 
 def tell_repeats(out: Console, study: RepeatStudy) -> None:
     """The table, beside the paper's, then what made the repeats differ."""
-    from pkmcal.repeatability import PAPER
+    from pkmcal.check.repeats import PAPER
 
     table = console.plain_table(
         "Station", "Leg", "Photos", "ψ", "θ", "x", "z", "Shift", "Tilt"

@@ -14,7 +14,8 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files.documents import closest, listed, read_text, shown
+from pkmcal.files.documents import closest, read_text, shown
+from pkmcal.wording import listed
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)|#.*", re.IGNORECASE)

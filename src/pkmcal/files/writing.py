@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pkmcal.errors import InputError
-from pkmcal.files.documents import listed
+from pkmcal.wording import listed
 
 
 def check_writable(folder: Path | str) -> None:

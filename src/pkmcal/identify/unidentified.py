@@ -25,9 +25,9 @@ from pkmcal.identify.tool import platform_by_parameters
 from pkmcal.mechanisms import Machine
 
 if TYPE_CHECKING:
-    from pkmcal.identify.conditions import Condition
     from pkmcal.identify.covariance import Direction, Identifiability
     from pkmcal.measurements import EdgeSet, Measurements
+    from pkmcal.papers.conditions import Condition
 
 INSIDE = (0.999, 0.95)
 """Shares of a change (squared) that lie in the open space for it to explain part of that space:
@@ -44,6 +44,21 @@ FEWEST, CHEAP = 20, 10.0
 HELD = 1e-6
 """Metres a metre (or a radian) of a held value that free values leave undone, at most, for it to be
 a convention: both are derivatives at one machine, alike but for rounding."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One of [A]'s conditions, counted by :mod:`pkmcal.papers.conditions`.
+
+    equation : its number in the paper. needed, available : counts. met : needed <= available.
+    text : what is counted, a sentence for people.
+    """
+
+    equation: str
+    needed: int
+    available: int
+    met: bool
+    text: str
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
 from pkmcal.errors import InputError
 from pkmcal.observe.images import decode
 from pkmcal.outcome import Figure
-from pkmcal.report import charts, templating
+from pkmcal.report import charts
+from pkmcal.report import page as templating
 from pkmcal.wording import brief, count, decimals, number
 
 LARGEST_WIDTH = 640

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.identify.conditions import Condition
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import ParameterTable
+from pkmcal.papers.conditions import Condition
 from pkmcal.report.charts import Bar, BarChart
 from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, count, joined

@@ -9,19 +9,19 @@ from pkmcal.identify.problem import Estimate
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.measurements import Observation
 from pkmcal.report import (
-    figure,
     headline,
     identifiability,
     parameters,
     pictures,
     poses,
     provenance,
-    rejections,
     residuals,
     scene,
-    templating,
     validation_page,
 )
+from pkmcal.report import page as templating
+from pkmcal.report import provenance as rejections
+from pkmcal.report import scene as figure
 from pkmcal.session.load import Session
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from pkmcal.outcome import Check, Figure, Part
-from pkmcal.report import figure, templating
+from pkmcal.report import page as templating
+from pkmcal.report import scene as figure
 
 
 @dataclass(frozen=True)

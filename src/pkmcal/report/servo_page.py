@@ -12,7 +12,9 @@ from pkmcal.control.source import Controlled
 from pkmcal.control.study import Outcome, Plan, Study, study
 from pkmcal.control.words import Judgement, judgement, named
 from pkmcal.outcome import Figure, Plot, Row, Table
-from pkmcal.report import figure, servo_figures, templating
+from pkmcal.report import page as templating
+from pkmcal.report import scene as figure
+from pkmcal.report import servo_figures
 from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2

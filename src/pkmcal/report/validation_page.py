@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.outcome import Figure, Row, Table
-from pkmcal.report import charts, templating
+from pkmcal.report import charts
+from pkmcal.report import page as templating
 from pkmcal.session.load import Session
 from pkmcal.validate.figures import Figures, figures, promised, reading_units
 from pkmcal.validate.holdouts import HoldOut, Judged

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pkmcal.outcome import Figure, Row, Table
-from pkmcal.report import charts, templating
+from pkmcal.report import charts
+from pkmcal.report import page as templating
 from pkmcal.watching.chances import POWER, ChiSquare
 from pkmcal.watching.judged import LegTest, Suspect
 from pkmcal.watching.words import cameras_of, said, signed

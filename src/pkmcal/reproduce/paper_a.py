@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Figure
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.report.reproduction import Reproduction
 from pkmcal.reproduce import Options
 from pkmcal.reproduce.paper_a_charts import LABELS

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Check
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.reproduce.paper_a_study import (
     BOUND,
     CORRECTED,

@@ -10,11 +10,11 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import apply, inverse, perturb, register, rotation_vector
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.covariance import information
-from pkmcal.identify.four_step import Form, FourSteps, centres_from_axes, solve
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
 from pkmcal.identify.residuals import BatchState, Problem
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward
+from pkmcal.papers.four_step import Form, FourSteps, centres_from_axes, solve
 from pkmcal.reproduce.paper_a_simulation import Settings, Truth, measured_axes
 from pkmcal.solver import RESTART_DAMPING
 

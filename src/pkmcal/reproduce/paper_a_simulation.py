@@ -16,13 +16,13 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, look_at
 from pkmcal.identify.assembly import prior_rows
-from pkmcal.identify.axis_measurements import AxisNoise, as_edges, from_coordinates, to_coordinates
-from pkmcal.identify.four_step import Axes
 from pkmcal.identify.gauge import ThreeCentres, freedoms
 from pkmcal.identify.residuals import Blocks, Data, Problem
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
+from pkmcal.papers.axis_measurements import AxisNoise, as_edges, from_coordinates, to_coordinates
+from pkmcal.papers.four_step import Axes
 
 
 @dataclass(frozen=True)

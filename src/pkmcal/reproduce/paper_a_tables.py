@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.outcome import Part, Plot, Row, Table
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.reproduce.paper_a_charts import LABELS, by_poses, figure_4
 from pkmcal.reproduce.paper_a_expected import (
     AFTER,

@@ -12,13 +12,12 @@ from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.assembly import assemble
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.hand_eye import Pair, PairProblem, size_of, solve_pairs
-from pkmcal.identify.implicit import Form
-from pkmcal.identify.inverse_kinematic import PoseFit, fit_poses, pose_problem
 from pkmcal.identify.problem import State
 from pkmcal.identify.residuals import BatchState, Problem
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
+from pkmcal.papers.hand_eye import Pair, PairProblem, size_of, solve_pairs
+from pkmcal.papers.inverse_kinematic import Form, PoseFit, fit_poses, pose_problem
 from pkmcal.reproduce.paper_c_simulation import Settings, Truth, measurements, workspace
 from pkmcal.solver import eliminate, minimise
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.implicit import Form
-from pkmcal.identify.rotation_axis import rotation_axis
+from pkmcal.papers.inverse_kinematic import Form
+from pkmcal.papers.rotation_axis import rotation_axis
 from pkmcal.reproduce.paper_c_methods import (
     Errors,
     Fitted,

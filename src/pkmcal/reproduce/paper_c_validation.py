@@ -12,9 +12,9 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import inverse as inverted
 from pkmcal.geometry.rigid import rotation_vector
-from pkmcal.identify.measured_platform import taken
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse
+from pkmcal.papers.measured_platform import taken
 from pkmcal.reproduce.paper_c_methods import Fitted
 from pkmcal.reproduce.paper_c_simulation import (
     MIDDLE,

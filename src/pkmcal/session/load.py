@@ -15,17 +15,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
-from pkmcal.files import (
-    Document,
-    Keys,
-    Table,
-    listed,
-    read_csv,
-    read_yaml,
-    shown,
-    validate,
-    wanted_file,
-)
+from pkmcal.files import Document, Keys, Table, read_csv, read_yaml, shown, validate, wanted_file
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
@@ -38,6 +28,7 @@ from pkmcal.session.schema import (
     TrackerStationDocument,
     Vector,
 )
+from pkmcal.wording import listed
 
 __all__ = [
     "Photograph",

@@ -9,11 +9,11 @@ import numpy as np
 
 from pkmcal.arrays import Booleans
 from pkmcal.errors import InputError
-from pkmcal.files import listed
 from pkmcal.session.load import Session
+from pkmcal.wording import listed
 
 if TYPE_CHECKING:
-    from pkmcal.results import SavedCalibration
+    from pkmcal.calibration.results import SavedCalibration
 
 FAR = 10.0
 """Tolerances by which two drawings of one machine may differ: a corrected number, not another

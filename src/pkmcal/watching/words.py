@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Booleans
-from pkmcal.files import listed
 from pkmcal.outcome import Verdict
 from pkmcal.session.load import Session
 from pkmcal.watching.chances import POWER
 from pkmcal.watching.judged import Finding, Judgement, LegTest, Suspect
-from pkmcal.wording import SCALES, brief, count, decimals, named, number
+from pkmcal.wording import SCALES, brief, count, decimals, listed, named, number
 
 NOISIER = 1.5
 """Times the calibration's noise from which on the photographs are no longer the same kind."""

@@ -16,18 +16,18 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference, register
-from pkmcal.identify import linear
-from pkmcal.identify.assembly import Assembled, assemble, batch_of
+from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import data_share
-from pkmcal.identify.four_step import four_step
-from pkmcal.identify.four_step_boards import mount_poses
 from pkmcal.identify.gauge import apply, centre_index, default_gauge
-from pkmcal.identify.hand_eye import start_from_poses
-from pkmcal.identify.inverse_kinematic import inverse_kinematic
 from pkmcal.identify.problem import Estimate, State, Statistics
-from pkmcal.identify.residuals import BatchState
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.papers import linear
+from pkmcal.papers.four_step import four_step
+from pkmcal.papers.four_step_base import with_boards
+from pkmcal.papers.hand_eye import start_from_poses
+from pkmcal.papers.inverse_kinematic import inverse_kinematic
+from pkmcal.solver import NONE
 
 Method = Literal["four-step", "linear", "inverse-kinematic"]
 REPETITIONS = 60
@@ -45,31 +45,19 @@ def by_paper(
     guess = joint.state.T_camera_base
     state = _solve(method, machine, measurements, guess)
     rng = np.random.default_rng(seed)
-    repeats = _repeated(method, machine, measurements, guess, rng)
+    repeats: list[State] = []
+    failed: list[ResultError] = []
+    for _ in range(REPETITIONS):
+        try:
+            repeats.append(_solve(method, machine, _noisy(measurements, rng), guess))
+        except ResultError as error:
+            failed.append(error)
+    if len(failed) > len(repeats):
+        raise failed[0]
     theta = np.cov(np.stack([r.theta for r in repeats]), rowvar=False)
     turns = np.stack([pose_difference(r.T_camera_base, state.T_camera_base) for r in repeats])
     stations = np.stack([np.cov(turns[:, s], rowvar=False) for s in range(turns.shape[1])])
     return _estimate(machine.with_values(state.theta), measurements, state, theta, stations)
-
-
-def _repeated(
-    method: Method,
-    machine: Machine,
-    measurements: Measurements,
-    guess: Array,
-    rng: np.random.Generator,
-) -> list[State]:
-    """The method with noise added once more, again and again; most repetitions must go through."""
-    found: list[State] = []
-    failed: list[ResultError] = []
-    for _ in range(REPETITIONS):
-        try:
-            found.append(_solve(method, machine, _noisy(measurements, rng), guess))
-        except ResultError as error:
-            failed.append(error)
-    if len(failed) > len(found):
-        raise failed[0]
-    return found
 
 
 def _solve(method: Method, machine: Machine, measurements: Measurements, guess: Array) -> State:
@@ -102,14 +90,13 @@ def linear_state(machine: Machine, measurements: Measurements) -> State:
             found=f"{known.sum(axis=1).min()} legs at one of them",
             next_step="Use the joint method (bundle), which is the default",
         )
-    sizes = [
-        linear.procrustes_scale(a[k], drawing[k]) for a, k in zip(found.centres, known, strict=True)
-    ]
-    centres = found.centres / np.array(sizes)[:, None, None]
-    stations = np.stack([register(drawing[k], a[k]) for a, k in zip(centres, known, strict=True)])
-    spread = np.trace(found.covariance, axis1=-2, axis2=-1)
-    weight = np.where(known, 1 / np.where(known, spread, 1.0), 0.0)
-    in_base = move(inverse(stations)[:, None], np.where(known[..., None], centres, 0.0))
+    centres, stations = np.zeros(found.centres.shape), np.zeros((len(known), 4, 4))
+    for s, (a, k) in enumerate(zip(found.centres, known, strict=True)):
+        centres[s, k] = a[k] / linear.procrustes_scale(a[k], drawing[k])
+        stations[s] = register(drawing[k], centres[s, k])
+    variance = np.trace(found.covariance, axis1=-2, axis2=-1)
+    weight = np.where(known, 1 / np.where(known, variance, 1.0), 0.0)
+    in_base = move(inverse(stations)[:, None], centres)
     total = weight.sum(axis=0)
     mean = np.einsum("sl,slc->lc", weight, in_base) / np.where(total > 0, total, 1.0)[:, None]
     theta = machine.values.copy()
@@ -119,10 +106,7 @@ def linear_state(machine: Machine, measurements: Measurements) -> State:
         rise = theta[base_index[:, 2]] - drawing[:, 2]
         theta[platform_index[:, 2]] = machine.platform_centers()[:, 2] + rise
     poses = machine.with_values(theta).forward_result(measurements.joints, machine.home())
-    n_cameras = int(np.max(measurements.camera_of_station)) + 1
-    state = State(theta, stations, poses.T_base_platform, np.zeros(n_cameras))
-    boards = mount_poses(measurements, state)
-    return replace(state, T_mount=boards, on_platform=measurements.on_platform)
+    return with_boards(measurements, theta, stations, poses.T_base_platform)
 
 
 def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements:
@@ -134,80 +118,67 @@ def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements
     noise = measurements.joint_noise * rng.normal(size=measurements.joints.shape)
     poses = measurements.poses
     # what was not measured has no noise
-    move = (np.linalg.pinv(poses.whiten) @ rng.normal(size=(len(poses), 6, 1)))[..., 0]
+    moved = (np.linalg.pinv(poses.whiten) @ rng.normal(size=(len(poses), 6, 1)))[..., 0]
     return replace(
         measurements,
         edges=replace(edges, normal=normal),
         joints=measurements.joints + noise,
-        poses=replace(poses, T_station_target=perturb(poses.T_station_target, move)),
+        poses=replace(poses, T_station_target=perturb(poses.T_station_target, moved)),
     )
 
 
 def _estimate(
     machine: Machine, measurements: Measurements, state: State, theta: Array, stations: Array
 ) -> Estimate:
-    """The method's result with its residuals; edges far off the rest have weight 0."""
-    assembled = assemble(machine, measurements, default_gauge(machine), use_drawing=False)
+    """The method's result with its residuals; edges far off the rest have weight 0.
+
+    theta : (P, P) and stations (S, 6, 6) covariances.
+    """
+    gauge = default_gauge(machine)
+    assembled = assemble(machine, measurements, gauge, use_drawing=False)
     batch = batch_of(machine, assembled, state)
-    rows = assembled.problem.block_residuals(batch)[0][assembled.row, assembled.place]
-    rows = np.nan_to_num(rows)
-    distance = np.sqrt(np.sum(rows**2, axis=-1))
+    edges = assembled.problem.block_residuals(batch)[0][assembled.row, assembled.place]
+    edges = np.nan_to_num(edges)
+    distance = np.sqrt(np.sum(edges**2, axis=-1))
     middle = float(np.median(distance)) if distance.size else 0.0
     scale = max(middle / np.sqrt(2 * np.log(2)), 1.0)
-    off = _pose_residuals(assembled, batch)
-    count = float(measurements.poses.rows.sum())
-    pose_scale = max(float(np.sqrt(np.sum(off**2) / count)) if count else 1.0, 1.0)
-    weight = (distance < 6.5 * scale).astype(float)
+    weight = (distance < NONE * scale).astype(float)
+    poses = assembled.problem.pose_residuals(batch)[0, assembled.pose_row, assembled.pose_place]
+    n_poses, n_edges = float(measurements.poses.rows.sum()), float(2 * weight.sum())
+    pose_scale = max(float(np.sqrt(np.sum(poses**2) / n_poses)) if n_poses else 1.0, 1.0)
+    chi2 = float(np.sum(weight[:, None] * (edges / scale) ** 2))
+    # closures are zero to rounding, as poses come from the readings
+    joints = machine.inverse(state.T_base_platform) - measurements.joints
     return Estimate(
         machine=machine,
         state=state,
         covariance=theta,
         station_covariance=stations,
         edge_shift_sigma=np.zeros(len(state.edge_shift)),
-        edge_residuals=rows / scale,
-        pose_residuals=off / pose_scale,
-        pose_weights=np.ones(len(off)),
+        edge_residuals=edges / scale,
+        pose_residuals=poses / pose_scale,
+        pose_weights=np.ones(len(poses)),
         mount_covariance=np.zeros((len(state.T_mount), 6, 6)),
         edge_weights=weight,
-        joint_residuals=_joint_residuals(machine, measurements, state),
-        data_share=data_share(machine, state.theta, theta, default_gauge(machine)),
+        joint_residuals=joints / measurements.joint_noise,
+        data_share=data_share(machine, state.theta, theta, gauge),
         configurations=assembled.seen,
-        statistics=replace(
-            _statistics(rows, weight, scale),
-            chi2_poses=float(np.sum(off**2)) / pose_scale**2,
-            n_poses=count,
-            dof_poses=count,
+        statistics=Statistics(
+            chi2=chi2,
+            dof=n_edges,
+            chi2_edges=chi2,
+            n_edges=n_edges,
+            chi2_joints=0.0,
+            n_joints=0,
+            chi2_drawing=0.0,
+            n_drawing=0,
+            steps=0,
+            stopped="closed form",
+            noise_scale=scale,
+            chi2_poses=float(np.sum(poses**2)) / pose_scale**2,
+            n_poses=n_poses,
+            dof_poses=n_poses,
             pose_scale=pose_scale,
         ),
-        gauge=default_gauge(machine).name,
-    )
-
-
-def _pose_residuals(assembled: Assembled, batch: BatchState) -> Array:
-    """Whitened residuals of the boards' poses, (N, 6)."""
-    rows = assembled.problem.pose_residuals(batch)
-    return rows[0, assembled.pose_row, assembled.pose_place]
-
-
-def _joint_residuals(machine: Machine, measurements: Measurements, state: State) -> Array:
-    """Closures in standard deviations; zero to rounding, as poses come from the readings."""
-    predicted = machine.inverse(state.T_base_platform)
-    return (predicted - measurements.joints) / measurements.joint_noise
-
-
-def _statistics(rows: Array, weight: Array, scale: float) -> Statistics:
-    chi2 = float(np.sum(weight[:, None] * (rows / scale) ** 2))
-    count = float(2 * weight.sum())
-    return Statistics(
-        chi2=chi2,
-        dof=count,
-        chi2_edges=chi2,
-        n_edges=count,
-        chi2_joints=0.0,
-        n_joints=0,
-        chi2_drawing=0.0,
-        n_drawing=0,
-        steps=0,
-        stopped="closed form",
-        noise_scale=scale,
+        gauge=gauge.name,
     )

@@ -139,22 +139,29 @@ def laid(
     centred[..., :n, :] -= mean[..., None, :]
     target[..., :n, :] -= seen[..., None, :]
     h = np.swapaxes(target, -1, -2) @ (w[..., None] * centred)
-    rot = _rotation_within(h, motion)
+    if motion.shape[1] == 6:
+        rot = nearest_rotation(h)
+    else:
+        omega = np.zeros(h.shape[:-1])
+        if motion[2].any():  # about z
+            omega[..., 2] = np.arctan2(h[..., 1, 0] - h[..., 0, 1], h[..., 0, 0] + h[..., 1, 1])
+        rot = rotation(omega)
     shift = seen - (rot @ mean[..., None])[..., 0]
     return pose(rot, shift @ motion[3:] @ motion[3:].T)
 
 
-def _rotation_within(h: Array, motion: Array) -> Array:
-    """The rotation (..., 3, 3) that maximises tr(R^T H) and that the motion allows."""
-    if motion.shape[1] == 6:
-        u, _, vt = np.linalg.svd(h)
-        u = u.copy()
-        u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-        return u @ vt
-    omega = np.zeros(h.shape[:-1])
-    if motion[2].any():  # planar, about z
-        omega[..., 2] = np.arctan2(h[..., 1, 0] - h[..., 0, 1], h[..., 0, 0] + h[..., 1, 1])
-    return rotation(omega)
+def nearest_rotation(h: Array) -> Array:
+    """The rotations R (..., 3, 3) that maximise tr(R^T H); reflections are excluded."""
+    u, _, vt = np.linalg.svd(h)
+    u = u.copy()
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
+
+
+def extent(points: Array) -> float:
+    """Root mean square distance (m) of points (n, 3) from their mean."""
+    away = points - points.mean(axis=0)
+    return float(np.sqrt(np.mean(dot(away, away))))
 
 
 def loose(items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY_MOTION) -> Array:
@@ -257,3 +264,26 @@ def minimise_dense(
 ) -> Solution:
     """Batched Levenberg-Marquardt on plain vectors (B, n)."""
     return minimise(Dense(rows, np.arange(len(start))), start)
+
+
+def points_by(
+    criterion: Callable[[Array, Integers], tuple[Array, Array]],
+    drawing: Array,
+    gauge: Array,
+    n_runs: int,
+) -> Array:
+    """Points (B, n, 3) by a criterion on them, their frame held by the gauge's rows (c, 3 n).
+
+    criterion : function of points (b, n, 3) and the runs' numbers (b,), gives values (b, r) in m
+    (or m^2) and their derivatives (b, r, n, 3). drawing : (n, 3), the start.
+    """
+
+    def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
+        value, jac = criterion(x.reshape(len(x), *drawing.shape), runs)
+        held = (x - drawing.ravel()) @ gauge.T
+        by_gauge = np.broadcast_to(gauge, (len(x), *gauge.shape))
+        jac = np.concatenate([jac.reshape(*value.shape, drawing.size), by_gauge], axis=1)
+        return np.concatenate([value, held], axis=1) / SCALE, jac / SCALE
+
+    start = np.broadcast_to(drawing.ravel(), (n_runs, drawing.size)).copy()
+    return minimise_dense(rows, start).state.reshape(-1, *drawing.shape)

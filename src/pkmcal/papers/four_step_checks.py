@@ -12,15 +12,12 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
-from pkmcal.identify.four_step_axes import Axes, in_base
-from pkmcal.identify.four_step_base import Items
-from pkmcal.identify.four_step_boards import Views
-from pkmcal.identify.four_step_model import Legs, legs_of
-from pkmcal.identify.four_step_offsets import COLLAPSED, deviations
-from pkmcal.identify.registration import fixes_pose, loose, parts_of
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.carriers.fixed import FixedPoint
-from pkmcal.mechanisms.carriers.rigid import RigidPlatform
+from pkmcal.papers.four_step_base import Items, Views
+from pkmcal.papers.four_step_platform import COLLAPSED, deviations
+from pkmcal.papers.leg_axes import Axes, in_base
+from pkmcal.papers.legs import Legs, legs_of
+from pkmcal.papers.registration import fixes_pose, loose, parts_of
 
 FLAT = 1e-3
 """Singular value of the distances' derivatives by the offsets, of 1 a photograph at most, below
@@ -32,10 +29,10 @@ BUNDLE = "use the joint method (bundle)"
 
 def can_be_tried(machine: Machine, edges: int) -> None:
     """[A] is about legs with a joint fixed to each body, and its steps about pictures of them."""
-    base, platform = machine.layout.base, machine.layout.platform
-    if any(g.carrier is not FixedPoint for g in base) or any(
-        g.carrier is not RigidPlatform for g in platform
-    ):
+    carried = any(group.carrier.driven for group in machine.layout.base)
+    for group in machine.layout.platform:
+        carried |= group.carrier.turns or group.carrier.floats
+    if carried:
         raise ResultError(
             what="the four steps are for legs with one joint on the base and one on the platform",
             found=f"mechanism {machine.name!r} with joints that move on cranks, slides or bars",
@@ -65,10 +62,11 @@ def stations_are_fixed(items: Items, views: Views, machine: Machine) -> None:
     if not few.size:
         return
     seen = items.centres_seen[views.of_station[few[0]]]
+    which = f" (legs {listed(np.flatnonzero(seen))})" if seen.any() else ""
     need = "two or more" if legs_of(machine).planar else "three or more that are not on one line"
     raise ResultError(
         what=f"station {few[0] + 1} sees too few legs for the four steps",
-        found=f"{seen.sum()} base centres{_legs_in_brackets(seen)}",
+        found=f"{seen.sum()} base centres{which}",
         expected=f"{need}, each leg seen in two directions",
         next_step=f"give the station's pose, fix a board to the base, or {BUNDLE}",
     )
@@ -76,7 +74,7 @@ def stations_are_fixed(items: Items, views: Views, machine: Machine) -> None:
 
 def stations_are_joined(items: Items, views: Views) -> None:
     """The stations share enough legs, or a board, to become one frame ([A] 3.3)."""
-    free = _free(items)
+    free = free_ways(items)
     if not free.shape[-1]:
         return
     seen = items.seen[items.fixed()]
@@ -96,12 +94,8 @@ def stations_are_joined(items: Items, views: Views) -> None:
     )
 
 
-def is_loose(items: Items) -> bool:
-    """Whether the views leave some base joints free to move against others."""
-    return _free(items).shape[-1] > 0
-
-
-def _free(items: Items) -> Array:
+def free_ways(items: Items) -> Array:
+    """Ways (L + D, 3, f) in which the views leave base joints free to move against others."""
     return loose(items.drawing, items.seen[items.fixed()], items.n_directions)
 
 
@@ -170,7 +164,7 @@ def lengths_are_fixed(
     base (1, L, 3), T_camera_base (1, S, 4, 4) and offsets q0 (1, L) as the steps found them.
     """
     legs = legs_of(machine)
-    _not_collapsed(legs, q0[0])
+    not_collapsed(legs, q0[0])
     seen = axes.seen & usable[axes.station][:, None] & legs.closing
     merged = in_base(replace(axes, seen=seen), T_camera_base)
     a = np.broadcast_to(base[:, None], merged.u.shape)
@@ -192,7 +186,8 @@ def lengths_are_fixed(
     )
 
 
-def _not_collapsed(legs: Legs, q0: Array) -> None:
+def not_collapsed(legs: Legs, q0: Array) -> None:
+    """No constant length in the false minimum of [A] 14, where both its joints fall together."""
     short = np.flatnonzero(legs.constant & (q0 < COLLAPSED * legs.rod))
     if short.size:
         raise ResultError(
@@ -220,7 +215,3 @@ def listed(numbers: Integers) -> str:
     """Leg numbers for people, from 1."""
     words = [str(k + 1) for k in numbers]
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
-
-
-def _legs_in_brackets(seen: Booleans) -> str:
-    return f" (legs {listed(np.flatnonzero(seen))})" if seen.any() else ""

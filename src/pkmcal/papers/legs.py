@@ -19,8 +19,8 @@ class Legs:
     """The joints of a machine as drawn, m; each body in its own frame.
 
     base, platform : (L, 3) centres. base_axes, platform_axes : (L, 3) unit, NaN without one.
-    base_revolute, platform_revolute, torsion : (L,) legs with these axes; torsion where both
-    ends are universal joints whose axes count.
+    base_revolute, platform_revolute : (L,) legs that are square to an axis on that body, [A] 7;
+    torsion : legs that cannot twist, with an axis on each.
     rod : (L,) offsets and constant lengths. closing : (L,) legs with a length.
     constant : (L,) legs of constant length.
     planar : all axes are the plane's normal. motion : (6, d) of the platform.
@@ -44,6 +44,11 @@ class Legs:
         """Directions on the base that photographs show, (D, 3): revolute axes, or the normal."""
         return UP[None] if self.planar else self.base_axes[self.base_revolute]
 
+    @property
+    def framed(self) -> bool:
+        """Whether the frames that the steps hold are the machine's own: by three centres each."""
+        return self.motion.shape[1] == 6 and bool(self.closing.all())
+
 
 def legs_of(machine: Machine) -> Legs:
     """The machine's joints as its drawing has them."""
@@ -53,19 +58,20 @@ def legs_of(machine: Machine) -> Legs:
         np.where(index >= 0, drawing[index], np.nan)
         for index in (layout.base_axis, layout.platform_axis)
     )
-    ends = [(leg.base.joint, leg.platform.joint) for leg in machine.document.legs]
-    on_base, on_platform = (np.isfinite(axes[:, 0]) for axes in (base_axes, platform_axes))
-    base_revolute = on_base & np.array([end[0] == "revolute" for end in ends])
-    platform_revolute = on_platform & np.array([end[1] == "revolute" for end in ends])
+    angles = layout.angles
+
+    def having(equation: Booleans) -> Booleans:
+        return np.isin(np.arange(len(base)), angles.leg[equation])
+
     closing = layout.rod >= 0
     return Legs(
         base=base,
         platform=platform,
         base_axes=base_axes,
         platform_axes=platform_axes,
-        base_revolute=base_revolute,
-        platform_revolute=platform_revolute,
-        torsion=on_base & on_platform & ~base_revolute & ~platform_revolute,
+        base_revolute=having(angles.on_base & ~angles.on_platform),
+        platform_revolute=having(angles.on_platform & ~angles.on_base),
+        torsion=having(angles.on_base & angles.on_platform),
         rod=np.where(closing, drawing[layout.rod], 0.0),
         closing=closing,
         constant=closing & (layout.actuated < 0),
@@ -98,12 +104,12 @@ def platform_gauge(machine: Machine, legs: Legs) -> Array:
     As many as the platform's motion has directions: the others are not free, as the base
     frame is known by now.
     """
-    d, n = legs.motion.shape[1], len(legs.platform)
+    n = len(legs.platform)
     if legs.planar:
         rows = np.zeros((3, n, 3))
         rows[:, legs.closing] = _plane_rows(legs.platform[legs.closing])
         return rows.reshape(3, -1)
-    if d == 6 and legs.closing.all():
+    if legs.framed:
         rows = default_gauge(machine).constraints(machine)[6:]
         return rows[:, centre_index(machine.layout)[1].ravel()]
     p = legs.platform - legs.platform[legs.closing].mean(axis=0)

@@ -7,28 +7,13 @@ the Jacobian; these numbers are for comparison with the paper and for a first lo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pkmcal.arrays import Booleans, Integers
-from pkmcal.identify.four_step_checks import listed
+from pkmcal.identify.unidentified import Condition
 from pkmcal.mechanisms import Machine
-
-
-@dataclass(frozen=True)
-class Condition:
-    """One condition of [A].
-
-    equation : its number in the paper. needed, available : counts. met : needed <= available.
-    text : what is counted, a sentence for people.
-    """
-
-    equation: str
-    needed: int
-    available: int
-    met: bool
-    text: str
+from pkmcal.papers.four_step_checks import listed
+from pkmcal.papers.legs import legs_of
 
 
 def conditions(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
@@ -57,13 +42,12 @@ def base(machine: Machine, seen: Booleans) -> Condition:
     Equations: sum over stations of C(n, 2) + C(r, 2) + r(n - 1). A planar machine's axes are
     all its normal; their products say nothing of the plane's points and are not counted.
     """
-    n = seen.shape[1]
+    n, legs = seen.shape[1], legs_of(machine)
     count = seen.sum(axis=1)
-    if _planar(machine):
+    if legs.planar:
         text = "products of vectors between base joints, for their places in the plane"
         return _condition("10, 12", 1 + 2 * (n - 2), int(_pairs(count).sum()), text)
-    revolute = np.array([leg.base.joint == "revolute" for leg in machine.document.legs])
-    revolute &= machine.layout.base_axis[:, 0] >= 0
+    revolute = legs.base_revolute
     r = (seen & revolute).sum(axis=1)
     available = _pairs(count) + _pairs(r) + r * np.maximum(count - 1, 0)
     needed = 3 + 3 * (n - 3) + 2 * int(revolute.sum())
@@ -87,7 +71,7 @@ def platform(machine: Machine, seen: Booleans) -> Condition:
     """
     closing = machine.layout.closing
     n = int(closing.sum())
-    needed = 1 + 2 * (n - 2) if _planar(machine) else 3 + 3 * (n - 3)
+    needed = 1 + 2 * (n - 2) if legs_of(machine).planar else 3 + 3 * (n - 3)
     available = int(_pairs((seen & closing).sum(axis=1)).sum())
     text = "distances between platform joints of legs with a length, for their places"
     return _condition("17", needed, available, text)
@@ -98,14 +82,11 @@ def at_once(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
 
     Legs with a revolute joint count among the three themselves, passive ones do not.
     """
-    closing = machine.layout.closing
-    count = (seen & closing).sum(axis=1)
+    legs = legs_of(machine)
+    count = (seen & legs.closing).sum(axis=1)
     out: list[Condition] = []
-    for j, leg in enumerate(machine.document.legs):
-        passive = not closing[j]
-        revolute = leg.platform.joint == "revolute" and machine.layout.platform_axis[j, 0] >= 0
-        if not passive and not revolute:
-            continue
+    for j in np.flatnonzero(~legs.closing | legs.platform_revolute):
+        passive = not legs.closing[j]
         most = int(np.max(np.where(seen[:, j], count, 0), initial=0))
         what = f"passive leg {j + 1}" if passive else f"the revolute axis of leg {j + 1}"
         text = f"legs with a length seen at once, for {what} on the platform"
@@ -114,13 +95,9 @@ def at_once(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
 
 
 def _condition(equation: str, needed: int, available: int, text: str) -> Condition:
-    return Condition(f"[A] {equation}", needed, available, available >= needed, text)
+    return Condition(f"[A] {equation}", needed, available, needed <= available, text)
 
 
 def _pairs(n: Integers) -> Integers:
     """C(n, 2)."""
     return n * (n - 1) // 2
-
-
-def _planar(machine: Machine) -> bool:
-    return machine.document.motion == "planar"

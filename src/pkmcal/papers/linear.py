@@ -174,16 +174,21 @@ def centres(
     edges = measurements.edges
     group = edges.station * machine.n_legs + edges.leg
     n_groups = measurements.n_stations * machine.n_legs
-    place, width = _places(group, n_groups)
+    # each edge's place in its group, as many places as the largest group has edges
+    order = np.argsort(group, kind="stable")
+    place = np.empty(len(group), dtype=int)
+    place[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order])
+    width = int(place.max(initial=-1)) + 1
 
-    def spread(values: Array, tail: tuple[int, ...] = ()) -> Array:
-        out = np.zeros((n_groups, width, *tail))
+    def padded(values: Array) -> Array:
+        out = np.zeros((n_groups, width, *values.shape[1:]))
         out[group, place] = values
         return out
 
-    n, present = spread(edges.normal, (3,)), spread(np.ones(len(edges)))
-    radius = spread(edge_radii(machine, edges))
-    noise = spread(edges.basis @ edges.covariance @ np.swapaxes(edges.basis, -1, -2), (3, 3))
+    n, present, radius = (
+        padded(values) for values in (edges.normal, np.ones(len(edges)), edge_radii(machine, edges))
+    )
+    noise = padded(edges.basis @ edges.covariance @ np.swapaxes(edges.basis, -1, -2))
     rng = np.random.default_rng(0) if rng is None else rng
     a, weight, covariance = solve(n, radius, present, noise, method, rng)
     shape = (measurements.n_stations, machine.n_legs)
@@ -248,14 +253,6 @@ def procrustes_scale(points: Array, drawing: Array) -> float:
     u, s, vt = np.linalg.svd(p.T @ d)
     s[-1] *= np.sign(np.linalg.det(u @ vt))
     return float(s.sum() / np.sum(d**2))
-
-
-def _places(group: Integers, n_groups: int) -> tuple[Integers, int]:
-    """Each edge's place in its group, and the largest group's size."""
-    order = np.argsort(group, kind="stable")
-    place = np.empty(len(group), dtype=int)
-    place[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order])
-    return place, int(np.bincount(group, minlength=n_groups).max())
 
 
 def edge_radii(machine: Machine, edges: EdgeSet) -> Array:

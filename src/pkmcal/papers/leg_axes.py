@@ -15,10 +15,10 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
-from pkmcal.identify import linear
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import leg_readings
+from pkmcal.papers import linear
 
 ONE_DIRECTION = 1e-6
 """Ratio of eigenvalues below which a leg counts as seen in one direction only, for its centre."""
@@ -55,6 +55,16 @@ class Axes:
             point=self.point[:, :, legs],
             readings=self.readings[:, :, legs],
             information=None if self.information is None else self.information[:, :, legs],
+        )
+
+    def of_runs(self, runs: Integers) -> Axes:
+        """Some runs only."""
+        return replace(
+            self,
+            u=self.u[runs],
+            point=self.point[runs],
+            readings=self.readings[runs],
+            information=None if self.information is None else self.information[runs],
         )
 
 
@@ -106,33 +116,27 @@ def revolute_axes(
     sight than across it; with it, each equation counts by the noise that it has along v.
     """
     of_group = (group == np.arange(n_groups)[:, None]).astype(float)
-    weight = np.broadcast_to(seen, u.shape[:-1]).astype(float)
-    v, values = _least(of_group, weight, u)
+    u = np.where(seen[..., None], u, 0.0)
+
+    def least_along(weight: Array) -> tuple[Array, Array]:
+        """Eigenvalues and -vectors of the weighted sum of u u^T in each group."""
+        weighted = np.where(seen, weight, 0.0)[..., None] * u
+        normal = np.einsum("sc,bcli,bclj->bslij", of_group, weighted, u, optimize=True)
+        return np.linalg.eigh(normal)
+
+    values, vectors = least_along(np.ones(u.shape[:-1]))
     fixed = np.all(values[..., 1] > ONE_PLANE * values[..., 2], axis=0)
     if information is not None:
-        spread = _spread(information, u, seen)
+        # covariances of the directions, across them, up to one factor
+        size = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
+        known = seen[..., None, None] & (size > 0)
+        along = size * (u[..., :, None] * u[..., None, :])
+        covariance = np.linalg.inv(np.where(known, information + along, np.eye(3)))
         for _ in range(REWEIGHTED):
-            mine = np.einsum("sc,bsli->bcli", of_group, v)
-            noise = dot(mine, (spread @ mine[..., None])[..., 0])
-            v, _ = _least(of_group, weight / np.maximum(noise, 1e-300), u)
-    return v, fixed
-
-
-def _least(of_group: Array, weight: Array, u: Array) -> tuple[Array, Array]:
-    """The direction least along weighted ones in each group, and the eigenvalues."""
-    weighted = np.where(weight[..., None] > 0, weight[..., None] * u, 0.0)
-    u = np.where(weight[..., None] > 0, u, 0.0)
-    normal = np.einsum("sc,bcli,bclj->bslij", of_group, weighted, u, optimize=True)
-    values, vectors = np.linalg.eigh(normal)
-    return vectors[..., 0], values
-
-
-def _spread(information: Array, u: Array, seen: Booleans) -> Array:
-    """Covariances (..., 3, 3) of directions, across them, up to one factor; identity unseen."""
-    size = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
-    along = u[..., :, None] * u[..., None, :]
-    known = seen[..., None, None] & (size > 0)
-    return np.linalg.inv(np.where(known, information + size * along, np.eye(3)))
+            v = np.einsum("sc,bsli->bcli", of_group, vectors[..., 0])
+            noise = dot(v, (covariance @ v[..., None])[..., 0])
+            vectors = least_along(1 / np.maximum(noise, 1e-300))[1]
+    return vectors[..., 0], fixed
 
 
 def plane_normals(
@@ -182,22 +186,29 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
     """Leg axes of a session (B = 1) from the edges that count, [A] 4-5.
 
     The direction is what is least along the normals, over all edges of the leg in a
-    photograph; both sides are needed, or the direction would be arbitrary.
+    photograph; both sides are needed, or the direction would be arbitrary. weights : (N,).
     """
-    edges = measurements.edges
+    edges, n_legs = measurements.edges, machine.n_legs
+    radius = linear.edge_radii(machine, edges)
     photo, index = np.unique(
         edges.station * len(measurements.joints) + edges.configuration, return_inverse=True
     )
-    n_legs = machine.n_legs
-    u, point, seen, information = _axes_of_groups(
-        edges,
-        linear.edge_radii(machine, edges),
-        weights,
-        index * n_legs + edges.leg,
-        len(photo) * n_legs,
-    )
+    group, n = index * n_legs + edges.leg, len(photo) * n_legs
+    weight = np.where(weights > 0.5, 1 / np.trace(edges.covariance, axis1=1, axis2=2), 0.0)
+    weighted = weight[:, None] * edges.normal
+    information, right, sides = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((2, n, 3))
+    np.add.at(information, group, weighted[:, :, None] * edges.normal[:, None])
+    np.add.at(right, group, -radius[:, None] * weighted)
+    np.add.at(sides, (edges.side, group), weighted)
+    seen: Booleans = np.all(np.linalg.norm(sides, axis=-1) > 0, axis=0)
+    total = np.maximum(np.bincount(group, weight, n), 1e-300)
+    normal = np.where(seen[:, None, None], information / total[:, None, None], np.eye(3))
+    u = np.linalg.eigh(normal)[1][..., 0]
+    u = u * np.where(dot(u, cross(sides[1], sides[0])) < 0, -1.0, 1.0)[:, None]
+    # n.M = -R in the plane across the axis, and u.M = 0
+    fixed = normal + u[:, :, None] * u[:, None, :]
+    point = np.linalg.solve(fixed, (right / total[:, None])[..., None])[..., 0]
     station, configuration = np.divmod(photo, len(measurements.joints))
-    readings = leg_readings(machine.layout, measurements.joints[configuration])
     full = (1, len(photo), n_legs)
     return Axes(
         station,
@@ -205,32 +216,9 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
         seen.reshape(full[1:]),
         u.reshape(*full, 3),
         point.reshape(*full, 3),
-        readings[None],
+        leg_readings(machine.layout, measurements.joints[configuration])[None],
         information.reshape(*full, 3, 3),
     )
-
-
-def _axes_of_groups(
-    edges: EdgeSet, radius: Array, weights: Array, group: Integers, n_groups: int
-) -> tuple[Array, Array, Booleans, Array]:
-    """Direction, point (n, 3), whether both sides count, and information of each group."""
-    weight = np.where(weights > 0.5, 1 / np.trace(edges.covariance, axis1=1, axis2=2), 0.0)
-    weighted = weight[:, None] * edges.normal
-    information, right = np.zeros((n_groups, 3, 3)), np.zeros((n_groups, 3))
-    sides = np.zeros((2, n_groups, 3))
-    np.add.at(information, group, weighted[:, :, None] * edges.normal[:, None])
-    np.add.at(right, group, -radius[:, None] * weighted)
-    np.add.at(sides, (edges.side, group), weighted)
-    both = np.linalg.norm(sides, axis=-1) > 0
-    seen = both[0] & both[1]
-    total = np.maximum(np.bincount(group, weight, n_groups), 1e-300)
-    normal = np.where(seen[:, None, None], information / total[:, None, None], np.eye(3))
-    u = np.linalg.eigh(normal)[1][..., 0]
-    u = u * np.where(dot(u, cross(sides[1], sides[0])) < 0, -1.0, 1.0)[:, None]
-    # n.M = -R in the plane across the axis, and u.M = 0
-    fixed = normal + u[:, :, None] * u[:, None, :]
-    point = np.linalg.solve(fixed, (right / total[:, None])[..., None])[..., 0]
-    return u, point, seen, information
 
 
 def through_centres(machine: Machine, edges: EdgeSet, centres: Array) -> EdgeSet:

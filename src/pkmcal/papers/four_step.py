@@ -1,10 +1,9 @@
 """[A] section 3: four steps from leg axes to the machine, as printed and corrected.
 
 1. base joints in each station's camera frame: centres ([A] 6, or [B] 14 on the edges
-   themselves), revolute axes (7) — ``four_step_axes``;
-2. base joints in one frame (8-9), or by a board on the base (3.3) — ``four_step_base``,
-   ``four_step_boards``;
-3. offsets of the readings and constant lengths (13-14) — ``four_step_offsets``;
+   themselves), revolute axes (7) — ``leg_axes``;
+2. base joints in one frame (8-9), or by a board on the base (3.3) — ``four_step_base``;
+3. offsets of the readings and constant lengths (13-14) and
 4. platform joints: centres (16), revolute axes (18, 7), passive legs (19), universal axes by
    the inverse kinematics — ``four_step_platform``.
 
@@ -25,9 +24,37 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import dot
-from pkmcal.identify import four_step_checks as checks
-from pkmcal.identify import linear
-from pkmcal.identify.four_step_axes import (
+from pkmcal.identify.gauge import BestFit, centre_index, default_gauge
+from pkmcal.identify.gauge import apply as in_gauge
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.papers import four_step_checks as checks
+from pkmcal.papers import linear
+from pkmcal.papers.four_step_base import (
+    Base,
+    Items,
+    Views,
+    apart,
+    base_by_products,
+    base_by_registration,
+    gathered_directions,
+    gathered_points,
+    joined_by_boards,
+    rough_rotations,
+    together,
+    with_boards,
+    with_signs,
+)
+from pkmcal.papers.four_step_platform import (
+    offsets,
+    passive_centres,
+    platform_axes,
+    platform_by_distances,
+    platform_by_registration,
+    universal_axes,
+)
+from pkmcal.papers.leg_axes import (
     Axes,
     axes_from_edges,
     centres_from_axes,
@@ -36,50 +63,10 @@ from pkmcal.identify.four_step_axes import (
     revolute_axes,
     through_centres,
 )
-from pkmcal.identify.four_step_base import (
-    Base,
-    Items,
-    base_by_products,
-    base_by_registration,
-    rough_rotations,
-    with_signs,
-)
-from pkmcal.identify.four_step_boards import (
-    Views,
-    apart,
-    gathered_directions,
-    gathered_points,
-    joined_by_boards,
-    mount_poses,
-    together,
-)
-from pkmcal.identify.four_step_model import Legs, base_gauge, legs_of, platform_gauge
-from pkmcal.identify.four_step_offsets import offsets
-from pkmcal.identify.four_step_platform import (
-    passive_centres,
-    platform_axes,
-    platform_by_distances,
-    platform_by_registration,
-    universal_axes,
-)
-from pkmcal.identify.gauge import BestFit, centre_index, default_gauge
-from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.problem import State
-from pkmcal.identify.registration import Body, fixes_pose, laid
-from pkmcal.measurements import Measurements
-from pkmcal.mechanisms import Machine
+from pkmcal.papers.legs import Legs, base_gauge, legs_of, platform_gauge
+from pkmcal.papers.registration import Body, extent, fixes_pose, laid, nearest_rotation
 
-__all__ = [
-    "Axes",
-    "Form",
-    "FourSteps",
-    "axes_from_edges",
-    "base_items",
-    "centres_from_axes",
-    "four_step",
-    "solve",
-    "through_centres",
-]
+__all__ = ["Axes", "Form", "FourSteps", "centres_from_axes", "four_step", "solve"]
 
 Form = Literal["corrected", "printed"]
 VAGUE = 0.1
@@ -106,6 +93,9 @@ class FourSteps:
     T_base_platform: Array
     configuration: Integers
     posed: Booleans
+
+
+# ------------------------------------------------------------------ the steps on leg axes
 
 
 def base_items(
@@ -152,63 +142,23 @@ def solve(
     axes = replace(axes, seen=axes.seen & usable[:, None])
     merged = in_base(axes, T_camera_base)
     if form == "corrected":
-        q0, platform = _ends(machine, legs, merged, base)
+        q0, platform = _ends(machine, legs, merged, base.centres)
     else:
         a_photo = np.where(found[..., None], a_camera, 0.0)[:, axes.station]
         q0, platform = _ends_printed(machine, legs, axes, a_photo)
-    return _rest(machine, legs, merged, base, q0, platform, T_camera_base, form)
-
-
-def _with_length(axes: Axes, legs: Legs) -> Axes:
-    return replace(axes, seen=axes.seen & legs.closing)
-
-
-def _ends(machine: Machine, legs: Legs, merged: Axes, base: Base) -> tuple[Array, Array]:
-    """Offsets and platform centres, corrected: steps 3 and 4 in the base frame."""
-    a = np.broadcast_to(base.centres[:, None], merged.u.shape)
-    with_length = _with_length(merged, legs)
-    q0 = offsets(with_length, a, legs.rod, "corrected")
-    b = a + (merged.readings + q0[:, None])[..., None] * merged.u
-    posed = fixes_pose(legs.platform, with_length.seen, motion=legs.motion)
-    gauge = platform_gauge(machine, legs)
-    platform = platform_by_registration(
-        b[:, posed], with_length.seen[posed], legs.platform, gauge, legs.motion
-    )
-    return q0, platform
-
-
-def _ends_printed(machine: Machine, legs: Legs, axes: Axes, a_photo: Array) -> tuple[Array, Array]:
-    """Offsets and platform centres as printed: each photograph in its camera frame."""
-    with_length = _with_length(axes, legs)
-    q0 = offsets(with_length, a_photo, legs.rod, "printed")
-    b = a_photo + (axes.readings + q0[:, None])[..., None] * axes.u
-    gauge = platform_gauge(machine, replace(legs, motion=np.eye(6)))
-    if legs.planar:  # distances say nothing of the heights, which are the base's
-        heights = np.eye(legs.platform.size)[2::3]
-        gauge = np.concatenate([platform_gauge(machine, legs), heights])
-    return q0, platform_by_distances(b, with_length.seen, axes.station, legs.platform, gauge)
-
-
-def _rest(
-    machine: Machine,
-    legs: Legs,
-    merged: Axes,
-    base: Base,
-    q0: Array,
-    platform: Array,
-    T_camera_base: Array,
-    form: Form,
-) -> FourSteps:
-    """Poses ([A] 18), then passive legs (19) and axes on the platform."""
     if legs.planar:  # a leg lies level, so both its ends have one height
         rise = legs.platform[:, 2] - legs.base[:, 2]
-        platform = np.concatenate([platform[..., :2], (base.centres[..., 2] + rise)[..., None]], -1)
+        platform[..., 2] = base.centres[..., 2] + rise
+
+    # each configuration's pose ([A] 18), by the legs with a length
     seen = merged.seen & legs.closing
     b = base.centres[:, None] + (merged.readings + q0[:, None])[..., None] * merged.u
     posed = fixes_pose(legs.platform, seen, motion=legs.motion)
     weight = np.broadcast_to(seen, b.shape[:-1]).astype(float)
     if form == "printed" and legs.motion.shape[1] == 3 and not legs.planar:
-        platform = _turned_with_base(platform, b[:, posed], weight[:, posed])
+        # distances leave a translating platform turned against the base frame
+        rot = laid(platform[:, None], b[:, posed], weight[:, posed])[..., :3, :3].mean(axis=1)
+        platform = platform @ np.swapaxes(nearest_rotation(rot), -1, -2)
     T = laid(platform[:, None], b, weight, motion=legs.motion)
     if legs.planar:  # the platform frame keeps the height that the drawing gives it
         T[..., 2, 3] = np.mean(legs.base[:, 2] - legs.platform[:, 2])
@@ -223,11 +173,30 @@ def _rest(
     )
 
 
-def _turned_with_base(platform: Array, b: Array, weight: Array) -> Array:
-    """A translating platform's centres (B, L, 3) turned as the base frame is, from its ends b."""
-    rot = laid(platform[:, None], b, weight)[..., :3, :3].mean(axis=1)
-    u, _, vt = np.linalg.svd(rot)
-    return platform @ np.swapaxes(u @ vt, -1, -2)
+def _ends(machine: Machine, legs: Legs, merged: Axes, base: Array) -> tuple[Array, Array]:
+    """Offsets (B, L) and platform centres (B, L, 3), corrected: in the base frame."""
+    with_length = replace(merged, seen=merged.seen & legs.closing)
+    a = np.broadcast_to(base[:, None], merged.u.shape)
+    q0 = offsets(with_length, a, legs.rod, "corrected")
+    b = a + (merged.readings + q0[:, None])[..., None] * merged.u
+    posed = fixes_pose(legs.platform, with_length.seen, motion=legs.motion)
+    gauge = platform_gauge(machine, legs)
+    platform = platform_by_registration(
+        b[:, posed], with_length.seen[posed], legs.platform, gauge, legs.motion
+    )
+    return q0, platform
+
+
+def _ends_printed(machine: Machine, legs: Legs, axes: Axes, a_photo: Array) -> tuple[Array, Array]:
+    """The same as printed: each photograph in its camera frame, a_photo (B, C, L, 3)."""
+    with_length = replace(axes, seen=axes.seen & legs.closing)
+    q0 = offsets(with_length, a_photo, legs.rod, "printed")
+    b = a_photo + (axes.readings + q0[:, None])[..., None] * axes.u
+    gauge = platform_gauge(machine, replace(legs, motion=np.eye(6)))
+    if legs.planar:  # distances say nothing of the heights, which are the base's
+        heights = np.eye(legs.platform.size)[2::3]
+        gauge = np.concatenate([platform_gauge(machine, legs), heights])
+    return q0, platform_by_distances(b, with_length.seen, axes.station, legs.platform, gauge)
 
 
 def _axes(
@@ -275,6 +244,9 @@ def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Ar
     return (rot[:, None, :3, :3] @ out[..., None])[..., 0]
 
 
+# ------------------------------------------------------------------ the steps on a session
+
+
 def four_step(
     machine: Machine,
     measurements: Measurements,
@@ -311,17 +283,17 @@ def four_step(
     stations = steps.T_camera_base[0]
     if T_camera_base_guess is not None:
         stations = np.where(usable[:, None, None], stations, T_camera_base_guess)
-    state = _state(machine, measurements, steps, stations)
-    legs = legs_of(machine)
-    if legs.motion.shape[1] == 6 and legs.closing.all():
-        return state  # in those frames already
+    theta = _parameters(machine, steps)
+    poses = _poses(machine.with_values(theta), measurements, steps, machine.home())
+    state = with_boards(measurements, theta, stations, poses)
+    if legs_of(machine).framed:
+        return state  # in the machine's own frames already
     return in_gauge(machine, state, default_gauge(machine))
 
 
 def _well_known(found: linear.LinearCentres, machine: Machine) -> Booleans:
     """Base centres (S, L) that their edges fix, to a part of the base's own size at least."""
-    spread = machine.base_centers() - machine.base_centers().mean(axis=0)
-    size = np.sqrt(np.mean(dot(spread, spread)))
+    size = extent(machine.base_centers())
     finite = np.all(np.isfinite(found.centres), axis=-1)
     covariance = np.where(finite[..., None, None], found.covariance, np.eye(3))
     return finite & (np.linalg.eigvalsh(covariance)[..., -1] < (VAGUE * size) ** 2)
@@ -342,17 +314,14 @@ def _views(
     if guess is None:
         checks.stations_are_fixed(items, views, machine)
         checks.stations_are_joined(items, views)
-    elif checks.is_loose(items):
-        return together(guess, len(on_base))
+    elif checks.free_ways(items).shape[-1]:
+        return together(guess)
     return views
 
 
-def _state(
-    machine: Machine, measurements: Measurements, steps: FourSteps, stations: Array
-) -> State:
-    """The steps' result (B = 1) as values of all unknowns."""
-    layout = machine.layout
-    theta = machine.values.copy()
+def _parameters(machine: Machine, steps: FourSteps) -> Array:
+    """The machine's parameters (P,) with what the steps found (B = 1)."""
+    layout, theta = machine.layout, machine.values.copy()
     base_index, platform_index = centre_index(layout)
     theta[base_index], theta[platform_index] = steps.base[0], steps.platform[0]
     closing = layout.rod >= 0
@@ -363,11 +332,7 @@ def _state(
     ):
         has = index[:, 0] >= 0
         theta[index[has]] = axes[0, has]
-    poses = _poses(machine.with_values(theta), measurements, steps, machine.home())
-    n_cameras = int(np.max(measurements.camera_of_station)) + 1
-    state = State(theta, stations, poses, np.zeros(n_cameras))
-    boards = mount_poses(measurements, state)
-    return replace(state, T_mount=boards, on_platform=measurements.on_platform)
+    return theta
 
 
 def _poses(machine: Machine, measurements: Measurements, steps: FourSteps, home: Array) -> Array:
@@ -383,7 +348,6 @@ def _poses(machine: Machine, measurements: Measurements, steps: FourSteps, home:
     if lost.any():
         start = poses.copy()
         start[steps.configuration] = steps.T_base_platform[0]
-        again = machine.forward_result(measurements.joints[lost], start[lost])
         poses = poses.copy()
-        poses[lost] = again.T_base_platform
+        poses[lost] = machine.forward_result(measurements.joints[lost], start[lost]).T_base_platform
     return poses

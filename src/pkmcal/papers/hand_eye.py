@@ -30,7 +30,7 @@ from pkmcal.geometry.rigid import (
     skew,
 )
 from pkmcal.identify.mounts import mean_pose
-from pkmcal.identify.pose_rows import turn_jacobian
+from pkmcal.identify.pose_rows import PoseBlocks, PoseData, pose_rows
 from pkmcal.identify.problem import State
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -71,14 +71,14 @@ class PairProblem:
     shift: float
     size: float
 
+    @property
+    def _sigma(self) -> Array:
+        return np.repeat([self.turn, self.shift], 3)
+
     def differences(self, state: Pair) -> Array:
         """Errors (B, K, 6) of the predicted poses, in standard deviations, without weights."""
         predicted = state.T_camera_base[:, None] @ self.body @ state.T_mount[:, None]
         return pose_difference(predicted, self.seen) / self._sigma
-
-    @property
-    def _sigma(self) -> Array:
-        return np.repeat([self.turn, self.shift], 3)
 
     def residuals(self, state: Pair) -> Values:
         """Weighted errors and the mount's place."""
@@ -87,21 +87,22 @@ class PairProblem:
 
     def linearize(self, state: Pair) -> Linear:
         """Residuals and exact Jacobian: six numbers of the camera, six of the mount."""
-        values = self.residuals(state)
+        one = np.zeros((self.body.shape[1], 1), dtype=int)
+        blocks = PoseBlocks(one, one, one == 0, np.ones(1, dtype=bool), one)
+        data = PoseData(
+            self.seen[:, :, None], np.diag(1 / self._sigma), self.weight[:, :, None],
+            np.zeros((1, 1, 1, 6, 0)),
+        )  # fmt: skip
         camera, mount = state.T_camera_base[:, None], state.T_mount[:, None]
-        rot = camera[..., :3, :3] @ self.body[..., :3, :3]
-        arm = self.body[..., :3, :3] @ mount[..., :3, 3:] + self.body[..., :3, 3:]
-        place = (camera[..., :3, :3] @ arm)[..., 0]
-        turn = turn_jacobian(self.differences(state)[..., :3] * self.turn)
-        by = np.zeros((*values.value.shape, 12))
-        by[..., :3, :3], by[..., :3, 6:9] = turn, turn @ rot
-        by[..., 3:, :3], by[..., 3:, 3:6] = -skew(place), np.eye(3)
-        by[..., 3:, 9:] = rot
-        by = np.sqrt(self.weight)[..., None, None] * by / self._sigma[:, None]
-        usable = np.ones(values.value.shape, dtype=bool)
-        prior = np.eye(12)[9:] / self.size
+        rows = pose_rows(blocks, data, camera, self.body, mount, np.zeros((1, 1, 0)))
+        value = rows.value[:, :, 0]
         return Linear(
-            values.value, by, np.zeros((*usable.shape, 0)), usable, values.shared_value, prior
+            value,
+            np.concatenate([rows.by_station, rows.by_mount], axis=-1)[:, :, 0],
+            np.zeros((*value.shape, 0)),
+            np.ones(value.shape, dtype=bool),
+            state.T_mount[:, :3, 3] / self.size,
+            np.eye(12)[9:] / self.size,
         )
 
     def moved(self, state: Pair, shared: Array, own: Array) -> Pair:
@@ -126,25 +127,20 @@ def solve_pairs(body: Array, seen: Array, size: float) -> Pair:
     starts = [_placed(body, seen, *turns) for turns in _turns(body, seen)]
     n, runs = len(starts), len(body)
     every = Pair(*(np.concatenate(parts) for parts in zip(*starts, strict=True)))
-    tiled = [np.concatenate([part] * n) for part in (body, seen)]
-    weight = np.ones(tiled[0].shape[:2])
-    problem = PairProblem(tiled[0], tiled[1], weight, TURN, SHIFT * size, size)
+    body, seen = (np.concatenate([part] * n) for part in (body, seen))
+    problem = PairProblem(body, seen, np.ones(body.shape[:2]), TURN, SHIFT * size, size)
+    apart = np.zeros(body.shape[:2])
     for _ in range(ROUNDS):
         every = minimise(problem, every).state
-        problem = replace(problem, weight=_weights(problem, every))
-    apart = np.linalg.norm(problem.differences(every), axis=-1)
+        apart = np.linalg.norm(problem.differences(every), axis=-1)
+        # weights that fall beyond the poses' usual disagreement, after Cauchy
+        usual = np.maximum(np.median(apart, axis=1, keepdims=True), 1e-9)
+        problem = replace(problem, weight=1 / (1 + (apart / (2.4 * usual)) ** 2))
     best = np.argmin(np.median(apart, axis=1).reshape(n, runs), axis=0)
     chosen = best * runs + np.arange(runs)
     pair = take(every, chosen)
     _check_told(problem.select(chosen), pair)
     return pair
-
-
-def _weights(problem: PairProblem, pair: Pair) -> Array:
-    """Weights (B, K) that fall beyond the poses' usual disagreement, after Cauchy."""
-    distance = np.linalg.norm(problem.differences(pair), axis=-1)
-    usual = np.maximum(np.median(distance, axis=1, keepdims=True), 1e-9)
-    return 1 / (1 + (distance / (2.4 * usual)) ** 2)
 
 
 def _check_told(problem: PairProblem, pair: Pair) -> None:
@@ -171,28 +167,22 @@ def _turns(body: Array, seen: Array) -> list[tuple[Array, Array]]:
     are equal, where it does not turn all four: of what they leave open, the nearest to the turn
     that lays the positions on one another.
     """
-    m = _summed(quaternion(body[..., :3, :3]), quaternion(seen[..., :3, :3]))
-    u, _, vt = np.linalg.svd(m)
+    q_body, q_seen = (quaternion(poses[..., :3, :3]) for poses in (body, seen))
+    # signs by the turns from the first pose, which both sides share
+    sign = np.sign(dot(q_body, q_body[:, :1]) * dot(q_seen, q_seen[:, :1]))
+    sign = np.where(sign == 0, 1.0, sign)
+    # q_camera . (q_seen conj(q_mount) conj(q_body)) is linear in q_mount
+    conjugate = np.diag([1.0, -1.0, -1.0, -1.0])
+    each = _left(q_seen) @ _right(q_body @ conjugate) @ conjugate
+    u, _, vt = np.linalg.svd(np.sum(sign[..., None, None] * each, axis=1))
     laid = quaternion(register(body[..., :3, 3], seen[..., :3, 3])[..., :3, :3])
     along = np.swapaxes(u, -1, -2) @ laid[..., None]
-    out = []
+    out: list[tuple[Array, Array]] = []
     for rank in RANKS:
         kept = along * (np.arange(4) < rank)[:, None]
         camera, mount = u @ kept, np.swapaxes(vt, -1, -2) @ kept
         out.append((matrix(camera[..., 0]), matrix(mount[..., 0])))
     return out
-
-
-def _summed(body: Array, seen: Array) -> Array:
-    """``sum_k s_k N_k`` (B, 4, 4) with ``q_camera^T N_k q_mount = q_seen . (q_camera q_body
-    q_mount)``. Signs s_k by the turns from the first pose, which both sides share.
-    """
-    sign = np.sign(dot(body, body[:, :1]) * dot(seen, seen[:, :1]))
-    sign = np.where(sign == 0, 1.0, sign)
-    # q_camera . (q_seen conj(q_mount) conj(q_body)) is linear in q_mount
-    conjugate = np.diag([1.0, -1.0, -1.0, -1.0])
-    n = _left(seen) @ _right(body @ conjugate) @ conjugate
-    return np.sum(sign[..., None, None] * n, axis=1)
 
 
 def _left(q: Array) -> Array:
@@ -249,98 +239,69 @@ def start_from_poses(
     Raises InputError for a station that nothing ties to the machine.
     """
     found = machine.forward_result(measurements.joints)
-    shape = (measurements.n_stations, 4, 4)
-    stations = np.full(shape, np.nan) if known is None else np.array(known, dtype=float)
-    mounts = np.full((len(measurements.mounts), 4, 4), np.nan)
+    n_stations = measurements.n_stations
     usable = found.converged & np.isfinite(found.T_base_platform).all(axis=(-1, -2))
     poses = np.where(usable[:, None, None], found.T_base_platform, np.nan)
-    stations, mounts = _spread(machine, measurements, poses, stations, mounts)
+    stations = np.full((n_stations, 4, 4), np.nan) if known is None else np.array(known, float)
+    stations, mounts = _carried_on(machine, measurements, poses, stations)
     lost = np.flatnonzero(np.isnan(stations[:, 0, 0]))
     if lost.size:
         raise InputError(
-            what=f"nothing ties station {lost[0] + 1} of {len(stations)} to the machine",
+            what=f"nothing ties station {lost[0] + 1} of {n_stations} to the machine",
             expected=f"a board on the platform in {LEAST} configurations, a board that another"
             " station also sees, or a rough pose",
             next_step="give the station's pose: in session.yaml",
         )
-    n_cameras = int(np.max(measurements.camera_of_station)) + 1
-    unseen = np.isnan(mounts[:, 0, 0])
-    mounts[unseen] = np.eye(4)
     return State(
         machine.values,
         stations,
         found.T_base_platform,
-        np.zeros(n_cameras),
-        T_mount=mounts,
+        np.zeros(int(np.max(measurements.camera_of_station)) + 1),
+        T_mount=np.where(np.isnan(mounts), np.eye(4), mounts),
         on_platform=measurements.on_platform,
         internal=found.internal,
     )
 
 
-def _spread(
-    machine: Machine, measurements: Measurements, poses: Array, stations: Array, mounts: Array
+def _carried_on(
+    machine: Machine, measurements: Measurements, poses: Array, stations: Array
 ) -> tuple[Array, Array]:
-    """Stations and mounts, what is known carried on to what shares a pose with it."""
-    seen = measurements.poses
-    body = np.where(
-        measurements.on_platform[seen.mount][:, None, None],
-        poses[seen.configuration] if len(seen) else np.zeros((0, 4, 4)),
-        np.eye(4),
-    )
+    """Stations (S, 4, 4) and mounts (M, 4, 4), NaN where nothing tells them: what is known carried
+    on to what shares a pose with it, and where that ends, the pair that most poses tie.
+
+    poses : T_base_platform (K, 4, 4), NaN where unknown.
+    """
+    seen, on_platform = measurements.poses, measurements.on_platform
+    stations, mounts = stations.copy(), np.full((len(on_platform), 4, 4), np.nan)
+    moving = on_platform[seen.mount]
+    body = np.tile(np.eye(4), (len(seen), 1, 1))
+    body[moving] = poses[seen.configuration[moving]]
     good = np.isfinite(body[:, 0, 0])
+    target = seen.T_station_target
     while True:
-        carried = _carried(measurements, body, good, stations, mounts)
-        if carried is not None:
-            stations, mounts = carried
-            continue
-        pair = _best_pair(measurements, good, stations)
-        if pair is None:
-            return stations, mounts
-        s, m = pair
-        rows = good & (seen.station == s) & (seen.mount == m)
-        solved = solve_pairs(body[None, rows], seen.T_station_target[None, rows], size_of(machine))
-        stations, mounts = stations.copy(), mounts.copy()
-        stations[s], mounts[m] = solved.T_camera_base[0], solved.T_mount[0]
-
-
-def _carried(
-    measurements: Measurements, body: Array, good: Array, stations: Array, mounts: Array
-) -> tuple[Array, Array] | None:
-    """One more mount by a known station, or station by a known mount; None where there is none."""
-    seen = measurements.poses
-    has_station = np.isfinite(stations[seen.station, 0, 0])
-    has_mount = np.isfinite(mounts[seen.mount, 0, 0])
-    for known, new, of in (
-        (has_station, ~has_mount, seen.mount),
-        (has_mount, ~has_station, seen.station),
-    ):
-        rows = good & known & new
-        if not rows.any():
-            continue
-        one = int(of[np.flatnonzero(rows)[0]])
-        rows = rows & (of == one)
-        stations, mounts = stations.copy(), mounts.copy()
-        measured, moved = seen.T_station_target[rows], body[rows]
-        if of is seen.mount:
-            mounts[one] = mean_pose(inverse(stations[seen.station[rows]] @ moved) @ measured)
+        has_station = np.isfinite(stations[seen.station, 0, 0])
+        has_mount = np.isfinite(mounts[seen.mount, 0, 0])
+        to_mount, to_station = good & has_station & ~has_mount, good & has_mount & ~has_station
+        if to_mount.any():
+            m = seen.mount[to_mount][0]
+            rows = to_mount & (seen.mount == m)
+            T_camera_body = stations[seen.station[rows]] @ body[rows]
+            mounts[m] = mean_pose(inverse(T_camera_body) @ target[rows])
+        elif to_station.any():
+            s = seen.station[to_station][0]
+            rows = to_station & (seen.station == s)
+            stations[s] = mean_pose(target[rows] @ inverse(body[rows] @ mounts[seen.mount[rows]]))
         else:
-            stations[one] = mean_pose(measured @ inverse(moved @ mounts[seen.mount[rows]]))
-        return stations, mounts
-    return None
-
-
-def _best_pair(measurements: Measurements, good: Array, stations: Array) -> tuple[int, int] | None:
-    """The unknown station and the mount on the platform with the most poses, LEAST at least."""
-    seen, n_mounts = measurements.poses, len(measurements.mounts)
-    fit = good & np.isnan(stations[seen.station, 0, 0])
-    fit &= measurements.on_platform[seen.mount] if n_mounts else False
-    count = np.bincount(
-        (seen.station * n_mounts + seen.mount)[fit], minlength=measurements.n_stations * n_mounts
-    )
-    if not count.size or count.max() < LEAST:
-        return None
-    s, m = divmod(int(np.argmax(count)), n_mounts)
-    return s, m
+            fit = good & moving & ~has_station
+            pair, count = np.unique(
+                [seen.station[fit], seen.mount[fit]], axis=1, return_counts=True
+            )
+            if count.max(initial=0) < LEAST:
+                return stations, mounts
+            s, m = pair[:, np.argmax(count)]
+            rows = good & (seen.station == s) & (seen.mount == m)
+            solved = solve_pairs(body[None, rows], target[None, rows], size_of(machine))
+            stations[s], mounts[m] = solved.T_camera_base[0], solved.T_mount[0]
 
 
 def size_of(machine: Machine) -> float:

@@ -13,16 +13,16 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.geometry.rigid import cross, dot, rotation, rotation_vector, skew
-from pkmcal.identify.measured_platform import taken
+from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector, skew
 from pkmcal.identify.pose_rows import turn_jacobian
 from pkmcal.measurements import PoseSet
 from pkmcal.mechanisms.document import MOTIONS
+from pkmcal.papers.measured_platform import taken
+from pkmcal.papers.registration import nearest_rotation
 
 Turning = Literal["none", "one axis", "any"]
-TURNS: dict[str, Turning] = {
-    "spatial": "any", "planar": "one axis", "schoenflies": "one axis", "translation": "none",
-}  # fmt: skip
+TURNS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}
+"""By how many turns a machine's motion has."""
 LEAST_TURN = np.radians(10.0)
 """Turns (rad) between two poses below which their axis is left out: noise grows as 1 / turn."""
 DOUBT = 1e-3
@@ -32,7 +32,6 @@ SLACK = 2.0
 of a photograph is itself known to some 40 % only (lens, print, shading)."""
 STEPS = 10
 MOST_PAIRS = 200_000
-Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -89,41 +88,37 @@ def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
 
     Needs one pose more than the hypothesis has unknowns: three to turn about an axis.
     """
-    hypothesis = TURNS[motion]
-    rot = poses.T_station_target[:, :3, :3]
-    noise = np.linalg.inv(np.swapaxes(poses.whiten, -1, -2) @ poses.whiten)[:, :3, :3]
-    if hypothesis == "any":
-        off, covariance, frames = np.zeros((len(rot), 0)), np.zeros((len(rot), 0, 0)), None
-        unknowns = 0
-    elif hypothesis == "one axis":
-        off, covariance, frames = _about_one(rot, noise)
-        unknowns = 4
-    else:
-        off, covariance = _unturned(rot, noise)
-        frames, unknowns = None, 3
-    chi2 = float(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0]))
-    dof = max(off.size - unknowns, 0)
-    none = np.full(3, np.nan)
-    spread = _pairwise(rot, noise)
-    return RotationAxis(
-        hypothesis=hypothesis,
-        axis_camera=none if frames is None else frames.camera[:, 2],
-        axis_board=none if frames is None else frames.board[2],
-        tilt=np.linalg.norm(off, axis=-1),
-        expected_tilt=np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)),
-        spread=spread.found,
-        expected_spread=spread.expected,
-        pairs=spread.pairs,
-        chi2=chi2,
-        dof=dof,
-        p_value=_p_value(chi2, dof),
-    )
-
-
-def _p_value(chi2: float, dof: int) -> float:
     from scipy.stats import chi2 as distribution
 
-    return float(distribution.sf(chi2, dof)) if dof else 1.0
+    hypothesis = TURNS[int(MOTIONS[motion][:3].any(axis=1).sum())]
+    rot = poses.T_station_target[:, :3, :3]
+    noise = np.linalg.inv(np.swapaxes(poses.whiten, -1, -2) @ poses.whiten)[:, :3, :3]
+    axis_camera = axis_board = np.full(3, np.nan)
+    if hypothesis == "any":
+        unknowns, off, covariance = 0, np.zeros((len(rot), 0)), np.zeros((len(rot), 0, 0))
+    elif hypothesis == "one axis":
+        unknowns = 4
+        off, covariance, frames = _about_one(rot, noise)
+        axis_camera, axis_board = frames.camera[:, 2], frames.board[2]
+    else:
+        unknowns = 3
+        off, covariance = _unturned(rot, noise)
+    chi2 = float(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0]))
+    dof = max(off.size - unknowns, 0)
+    spread, expected_spread, pairs = _pairwise(rot, noise)
+    return RotationAxis(
+        hypothesis=hypothesis,
+        axis_camera=axis_camera,
+        axis_board=axis_board,
+        tilt=np.linalg.norm(off, axis=-1),
+        expected_tilt=np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)),
+        spread=spread,
+        expected_spread=expected_spread,
+        pairs=pairs,
+        chi2=chi2,
+        dof=dof,
+        p_value=float(distribution.sf(chi2, dof)) if dof else 1.0,
+    )
 
 
 class Frames(NamedTuple):
@@ -155,32 +150,33 @@ def facing(direction: Array) -> Array:
 def _about_one(rot: Array, noise: Array) -> tuple[Array, Array, Frames]:
     """Tilts (N, 2), their covariance and the frames, by maximum likelihood."""
     frames = axis_frames(rot)
-    motion = MOTIONS["schoenflies"]
-    whole = np.zeros((len(rot), 4, 4))
-    whole[:, 3, 3] = 1.0
-    for last in (*[False] * STEPS, True):
-        back = np.swapaxes(frames.camera, -1, -2)
-        own = back @ rot @ np.swapaxes(frames.board, -1, -2)
-        whole[:, :3, :3] = own
-        t = taken(motion, whole)
-        by = t.off_by[..., :3]
-        covariance = by @ back @ noise @ frames.camera @ np.swapaxes(by, -1, -2)
-        if last:
-            return t.off, covariance, frames
+    for _ in range(STEPS):
+        off, by, own, covariance = _tilts(rot, noise, frames)
         # camera turns by its own x, y; the board by the axis' x, y: what they do to the tilts
         jac = np.concatenate([-by[..., :2], -(by @ own)[..., :2]], axis=-1)
         weigh = np.linalg.inv(np.linalg.cholesky(covariance))
-        rows, value = (weigh @ jac).reshape(-1, 4), (weigh @ t.off[..., None]).ravel()
+        rows, value = (weigh @ jac).reshape(-1, 4), (weigh @ off[..., None]).ravel()
         step = -np.linalg.lstsq(rows, value, rcond=1e-9)[0]
         turns = np.concatenate([step.reshape(2, 2), np.zeros((2, 1))], axis=1)
         frames = Frames(frames.camera @ rotation(turns[0]), rotation(turns[1]) @ frames.board)
-    raise AssertionError  # the last turn returns
+    off, _, _, covariance = _tilts(rot, noise, frames)
+    return off, covariance, frames
+
+
+def _tilts(rot: Array, noise: Array, frames: Frames) -> tuple[Array, Array, Array, Array]:
+    """Tilts (N, 2) of turns told in the frames, their change (N, 2, 3) by the turns (N, 3, 3) in
+    those, the latter themselves, and the tilts' covariance (N, 2, 2).
+    """
+    back = np.swapaxes(frames.camera, -1, -2)
+    own = back @ rot @ np.swapaxes(frames.board, -1, -2)
+    found = taken(MOTIONS["schoenflies"], pose(own, np.zeros((len(rot), 3))))
+    by = found.off_by[..., :3]
+    return found.off, by, own, by @ back @ noise @ frames.camera @ np.swapaxes(by, -1, -2)
 
 
 def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
     """Turns (N, 3) from the weighted mean orientation, and their covariance."""
-    u, _, vt = np.linalg.svd(rot.mean(axis=0))
-    mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    mean = nearest_rotation(rot.mean(axis=0))
     weight = np.linalg.inv(noise)
     for _ in range(STEPS):
         off = rotation_vector(rot @ mean.T)
@@ -191,14 +187,9 @@ def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
     return off, by @ noise @ np.swapaxes(by, -1, -2)
 
 
-class _Spread(NamedTuple):
-    found: float
-    expected: float
-    pairs: int
-
-
-def _pairwise(rot: Array, noise: Array) -> _Spread:
-    """Axes of the turns between two poses, in the camera frame: how far they spread.
+def _pairwise(rot: Array, noise: Array) -> tuple[float, float, int]:
+    """Axes of the turns between two poses, in the camera frame: how far they spread (rad), what
+    noise alone would give, and their number.
 
     A turn phi with noise n of its two poses moves the axis by n / (2 sin(phi / 2)) across.
     """
@@ -210,7 +201,7 @@ def _pairwise(rot: Array, noise: Array) -> _Spread:
     angle = np.sqrt(dot(turn, turn))
     used = angle > LEAST_TURN
     if used.sum() < 2:
-        return _Spread(np.nan, np.nan, int(used.sum()))
+        return np.nan, np.nan, int(used.sum())
     i, j, turn, angle = i[used], j[used], turn[used], angle[used]
     axis = turn / angle[:, None]
     main = np.linalg.eigh(axis.T @ axis)[1][:, -1]
@@ -225,4 +216,4 @@ def _pairwise(rot: Array, noise: Array) -> _Spread:
     covariance = covariance + back @ noise[i] @ np.swapaxes(back, -1, -2)
     expected = np.sqrt(np.mean(np.trace(covariance, axis1=-2, axis2=-1)))
     found = np.sqrt(np.mean(np.arctan2(apart, dot(axis, mean)) ** 2))
-    return _Spread(float(found), float(expected), len(axis))
+    return float(found), float(expected), len(axis)

@@ -45,29 +45,16 @@ def seen_platform(T_camera_base: Array, T_camera_board: Array, T_platform_board:
     rot = back @ T_camera_board[..., :3, :3] @ np.swapaxes(T_platform_board[..., :3, :3], -1, -2)
     board = (back @ (T_camera_board[..., :3, 3:] - T_camera_base[..., :3, 3:]))[..., 0]
     arm = (rot @ T_platform_board[..., :3, 3:])[..., 0]
-    shape = np.broadcast_shapes(rot.shape[:-2], board.shape[:-1])
-    back, rot = np.broadcast_to(back, (*shape, 3, 3)), np.broadcast_to(rot, (*shape, 3, 3))
-    camera = -(back @ T_camera_base[..., :3, 3:])[..., 0]
-    lever = skew(arm)
-    eye = np.broadcast_to(np.eye(3), (*shape, 3, 3))
-    return Seen(
-        pose(rot, board - arm),
-        _columns(eye, -skew(board - arm - camera), eye),
-        _columns(-rot, -lever @ rot, -rot),
-        _columns(back, lever @ back, back),
-    )
+    place, camera = board - arm, -(back @ T_camera_base[..., :3, 3:])[..., 0]
 
+    def by(turn: Array, lever: Array) -> Array:
+        """The pose's change where what is perturbed turns and shifts it by ``turn``."""
+        out = np.zeros((*place.shape[:-1], 6, 6))
+        out[..., :3, :3] = out[..., 3:, 3:] = turn
+        out[..., 3:, :3] = skew(lever) @ turn
+        return out
 
-def _columns(turn_by_turn: Array, shift_by_turn: Array, shift_by_shift: Array) -> Array:
-    """Derivative (..., 6, 6) of (omega, tau) by another (omega, tau)."""
-    shape = np.broadcast_shapes(turn_by_turn.shape, shift_by_turn.shape)[:-2]
-    out = np.zeros((*shape, 6, 6))
-    out[..., :3, :3], out[..., 3:, :3], out[..., 3:, 3:] = (
-        turn_by_turn,
-        shift_by_turn,
-        shift_by_shift,
-    )
-    return out
+    return Seen(pose(rot, place), by(np.eye(3), camera - place), by(-rot, arm), by(back, arm))
 
 
 def taken(motion: Array, whole: Array) -> Taken:
