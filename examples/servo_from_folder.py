@@ -13,7 +13,6 @@ import sys
 from pathlib import Path
 
 from pkmcal.calibration.results import load
-
 from pkmcal.control.loop import VisualServo
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.observe.images import decode

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from pkmcal.commands.cli import main
 
+from pkmcal.commands.cli import main
 from rendered import once
 
 

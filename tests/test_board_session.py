@@ -9,7 +9,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from pkmcal.check.check import Level, check_session
 
 from conftest import run
 from pkmcal.boards.views import Boards, StationBoard, find_boards
@@ -19,6 +18,7 @@ from pkmcal.calibration.recognise import (
     found_stations,
     read_photographs,
 )
+from pkmcal.check.check import Level, check_session
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism

@@ -7,6 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+
+from conftest import run
 from pkmcal.check.check import (
     JointCheck,
     Level,
@@ -16,8 +18,6 @@ from pkmcal.check.check import (
     check_session,
     joint_findings,
 )
-
-from conftest import run
 from pkmcal.session.load import load_session
 
 GOOD = StationCheck("front", 15, True, 0.2, 0.04, 0.08, 5.5, 0.05, 0.01, 0.8)

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pkmcal.calibration.results import load
-from pkmcal.commands.cli import main
 
 import pkmcal
 from conftest import run
+from pkmcal.calibration.results import load
 from pkmcal.cameras import load_camera
+from pkmcal.commands.cli import main
 from pkmcal.files import read_csv
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.session.starter import TO_FILL, template_files

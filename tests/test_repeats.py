@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pkmcal.check.check import Level
-from pkmcal.check.repeats import _findings, _Look, _station_row
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
+from pkmcal.check.check import Level
+from pkmcal.check.repeats import _findings, _Look, _station_row
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pkmcal.calibration.results import identifiability_of
 
+from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
 from pkmcal.identify.bundle import bundle, what_data_tell
 from pkmcal.identify.sentences import Sentence

@@ -9,17 +9,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pkmcal.calibration.results import load
-from pkmcal.report.calibration import save
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.results import load
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.bundle import start_state
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import demo_camera

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from pkmcal.report.calibration import save
 
 import pkmcal
 from pkmcal.arrays import Array
@@ -33,6 +32,7 @@ from pkmcal.measurements import Measurements
 from pkmcal.observe import legs
 from pkmcal.report import page
 from pkmcal.report import page as templating
+from pkmcal.report.calibration import save
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
 from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera

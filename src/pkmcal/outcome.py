@@ -14,6 +14,8 @@ from typing import Any, Literal
 from pkmcal.errors import PkmcalError
 
 Source = Literal["paper", "prototype", "ours"]
+Mark = Literal["good", "note", "doubtful", "wrong"]
+"""What to think of something: a level of a finding, or that all is well."""
 
 
 @dataclass(frozen=True)
@@ -65,18 +67,25 @@ class Figure:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a table: its name, its cells in text, and whose figures they are."""
+    """One line of a table: its name, its cells in text, and whose figures they are.
+
+    mark : what to think of it, as a sign before its name.
+    """
 
     name: str
     cells: tuple[str, ...]
     source: Source = "ours"
+    mark: Mark | None = None
 
 
 @dataclass(frozen=True)
 class Table:
     """``columns`` has one name more than a row has cells: the first is of the rows' names.
 
-    brief : short enough for a terminal. folded : shown on the page when asked for.
+    note : under it on the page. brief : short enough for a terminal. folded : shown on the page
+    when asked for. first : columns that a terminal shows, the rows' names among them; None for
+    all. words : places of columns that hold words, which stand to the left. legend : lines under
+    it on a terminal.
     """
 
     title: str
@@ -85,13 +94,17 @@ class Table:
     note: str = ""
     brief: bool = True
     folded: bool = False
+    first: int | None = None
+    words: tuple[int, ...] = ()
+    legend: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A Plotly figure (data, layout, config) with colours named as in :mod:`report.figure`.
+    """A Plotly figure (data, layout, config) with colours named as in :mod:`report.scene`.
 
     width : px below which it is scrolled sideways. alt : what it shows, for who cannot see it.
+    frames : of an animation.
     """
 
     name: str
@@ -101,17 +114,7 @@ class Plot:
     figure: dict[str, Any]
     height: int = 460
     width: int = 0
-
-
-@dataclass(frozen=True)
-class Part:
-    """A section: paragraphs, then plots, then tables."""
-
-    name: str
-    title: str
-    text: tuple[str, ...] = ()
-    plots: tuple[Plot, ...] = ()
-    tables: tuple[Table, ...] = ()
+    frames: tuple[dict[str, Any], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -130,23 +133,63 @@ class Check:
 
 
 @dataclass(frozen=True)
+class Part:
+    """A section of the page, in this order: what follows ``title``, one after the other.
+
+    text : paragraphs. said : sentences that the terminal tells, too. html : made by a template of
+    :mod:`report`, which escapes what it shows: photographs, charts. notes : small print.
+    menu : its name in the page's navigation, where that is shorter.
+    """
+
+    name: str
+    title: str
+    text: tuple[str, ...] = ()
+    said: tuple[str, ...] = ()
+    plots: tuple[Plot, ...] = ()
+    html: str = ""
+    tables: tuple[Table, ...] = ()
+    checks: tuple[Check, ...] = ()
+    notes: tuple[str, ...] = ()
+    menu: str = ""
+
+
+@dataclass(frozen=True)
 class Outcome:
     """What a command found, for people and for programs.
 
-    command : its name. verdict : may the result be used. figures : cards at the page's top.
-    parts : sections of the page; the terminal shows their brief tables. notes : what to look at
-    besides the verdict's warnings. document : everything as plain data, m and rad.
+    command : its name. title : of the page. kicker : above the title, such as a session's name.
+    subject : what was looked at, in a sentence. verdict : may the result be used. stamp : the
+    verdict in a word or three. level : how bad it is if the result may not be used.
+    figures : cards at the page's top; a terminal shows them where no part has a brief table.
+    parts : sections of the page. findings : what to look at besides the verdict's warnings.
+    closing : a terminal's last words before the files. document : everything as plain data, m
+    and rad. summary : what ``--json`` prints instead, where that is less. texts : further files
+    by their names.
     """
 
     command: str
     title: str
     verdict: Verdict
+    kicker: str = ""
+    subject: str = ""
+    stamp: str = ""
+    level: Level = Level.WRONG
     figures: tuple[Figure, ...] = ()
     parts: tuple[Part, ...] = ()
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    closing: str = ""
     document: dict[str, Any] = field(default_factory=dict[str, Any])
+    summary: dict[str, Any] | None = None
+    texts: dict[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def mark(self) -> Mark:
+        """The sign of the verdict."""
+        return "good" if self.verdict.usable else self.level.value
 
     @property
     def exit_code(self) -> int:
-        """0 done; 1 it ran, but the result should not be used."""
+        """0 done; 1 it ran, but the result should not be used; 2 the input is wrong."""
+        if any(finding.level is Level.WRONG for finding in self.findings):
+            return 2
         return 0 if self.verdict.usable else 1

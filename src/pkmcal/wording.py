@@ -1,4 +1,4 @@
-"""Numbers and parameter names as people read them."""
+"""Words and numbers for people: lists, counts, magnitudes, parameters' names."""
 
 from __future__ import annotations
 

@@ -12,7 +12,8 @@ import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
+
+    from pkmcal.outcome import Table
 
 Progress = Callable[[str, float], None]
 
@@ -25,6 +26,10 @@ MARKS = {
     "doubtful": "[yellow]![/]",
     "wrong": "[red]✗[/]",
 }
+STYLES = {"paper": "yellow", "prototype": "dim", "ours": ""}
+"""Of a table's rows, by whose figures they are."""
+WIDEST_NAME = 32
+"""Letters of a row's name up to which it stays on one line."""
 
 
 def out() -> Console:
@@ -82,15 +87,29 @@ def print_files(console: Console, files: Iterable[tuple[str, str]]) -> None:
         console.print(f"  {escaped(path):{widest}}  [dim]{what}[/]", soft_wrap=True)
 
 
-def plain_table(*headings: str) -> Table:
-    """A table without lines; columns but the first two, a mark and a name, are numbers."""
-    from rich.table import Table
+def print_table(console: Console, table: Table) -> None:
+    """A table without lines: its title, as many columns as a terminal is to show, its legend."""
+    from rich.table import Table as Rich
 
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", show_header=bool(headings))
-    for place, heading in enumerate(headings):
-        left = place < 2
-        table.add_column(heading, justify="left" if left else "right", no_wrap=not left)
-    return table
+    columns = table.columns[: table.first]
+    marked = any(row.mark for row in table.rows)
+    shown = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    if marked:
+        shown.add_column()
+    short = max((len(row.name) for row in table.rows), default=0) <= WIDEST_NAME
+    for place, heading in enumerate(columns):
+        left = place == 0 or place in table.words
+        shown.add_column(heading, justify="left" if left else "right", no_wrap=not place and short)
+    for row in table.rows:
+        mark = [MARKS[row.mark] if row.mark else ""] if marked else []
+        cells = (escaped(text) for text in (row.name, *row.cells)[: len(columns)])
+        shown.add_row(*mark, *cells, style=STYLES[row.source])
+    console.print()
+    if table.title:
+        console.print(table.title, style="bold", markup=False)
+    console.print(shown)
+    for line in table.legend:
+        console.print(f"   {line}", style="dim", markup=False)
 
 
 def escaped(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Small charts as frozen views; the template ``charts.html.j2`` only draws them.
+"""Small charts as frozen views; the template ``charts.html.j2`` only draws them as SVG.
 
 Coordinates are SVG units in a box ``WIDTH`` wide, so that text keeps its size on a phone.
 """
@@ -7,11 +7,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.report import page
 from pkmcal.wording import count, number
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
 
 WIDTH = 360.0
 ROW = 18.0
@@ -36,10 +41,21 @@ class Box:
     leg: int | None
     quantiles: tuple[float, float, float, float, float]
 
+    @property
+    def name(self) -> str:
+        """The label as far as there is room for it."""
+        return self.label if len(self.label) <= LONGEST else self.label[: LONGEST - 1] + "…"
+
 
 @dataclass(frozen=True)
 class RowChart:
-    """Boxes one under the other on one scale; ``band``: where nine tenths are expected."""
+    """Boxes one under the other on one scale; ``band``: where nine tenths are expected.
+
+    note : small words beside the title.
+    """
+
+    width: ClassVar[float] = WIDTH
+    row: ClassVar[float] = ROW
 
     title: str
     unit: str
@@ -49,6 +65,7 @@ class RowChart:
     high: float
     ticks: tuple[tuple[float, str], ...]
     band: float | None
+    note: str = ""
 
     @property
     def left(self) -> float:
@@ -79,7 +96,12 @@ class Bar:
 
 @dataclass(frozen=True)
 class BarChart:
-    """Bars side by side from zero; ``curve`` is a line to compare them with, in bars and value."""
+    """Bars side by side from zero; ``curve`` is a line to compare them with, in bars and value.
+
+    note : small words beside the title.
+    """
+
+    width: ClassVar[float] = WIDTH
 
     title: str
     unit: str
@@ -90,6 +112,7 @@ class BarChart:
     labels: tuple[tuple[float, str], ...]
     curve: tuple[tuple[float, float], ...] = ()
     height: float = 200.0
+    note: str = ""
 
     @property
     def step(self) -> float:
@@ -140,7 +163,7 @@ def box(label: str, values: Array, unit: str, places: int, leg: int | None = Non
 
 
 def row_chart(
-    title: str, unit: str, boxes: list[Box], band: float | None, alt: str
+    title: str, unit: str, boxes: list[Box], band: float | None, alt: str, note: str = ""
 ) -> RowChart | None:
     """A chart symmetric about zero that holds the boxes and the band; None without boxes.
 
@@ -151,7 +174,9 @@ def row_chart(
     reaches = [max(abs(b.quantiles[0]), abs(b.quantiles[4])) for b in boxes]
     reach = min(max(reaches), OVER * float(np.median(reaches)))
     high = 1.08 * max(reach, (band or 0.0) * 1.3, 1e-12)
-    return RowChart(title, unit, alt, tuple(boxes), -high, high, ticks_between(-high, high), band)
+    return RowChart(
+        title, unit, alt, tuple(boxes), -high, high, ticks_between(-high, high), band, note
+    )
 
 
 def bar_chart(
@@ -161,6 +186,7 @@ def bar_chart(
     labels: tuple[tuple[float, str], ...],
     alt: str,
     curve: tuple[tuple[float, float], ...] = (),
+    note: str = "",
 ) -> BarChart | None:
     """Bars on a scale that holds them, their expected ranges and the curve; None without bars."""
     if not bars:
@@ -169,4 +195,10 @@ def bar_chart(
     tops += [bar.expected[1] for bar in bars if bar.expected]
     high = 1.06 * max(*tops, 1e-12)
     ticks = ticks_between(0.0, high, 4)
-    return BarChart(title, unit, alt, tuple(bars), high, ticks, labels, curve)
+    return BarChart(title, unit, alt, tuple(bars), high, ticks, labels, curve, note=note)
+
+
+def panels(*charts: BarChart | RowChart | None, remarks: tuple[str, ...] = ()) -> Markup | str:
+    """Charts beside each other, under what is remarkable in them; nothing without any."""
+    there = [chart for chart in charts if chart]
+    return page.render("panels.html.j2", charts=there, remarks=remarks) if there else ""

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.outcome import Figure, Row, Table
-from pkmcal.report import charts
-from pkmcal.report import page as templating
+from pkmcal.report import charts, page
 from pkmcal.session.load import Session
 from pkmcal.validate.figures import Figures, figures, promised, reading_units
 from pkmcal.validate.holdouts import HoldOut, Judged
@@ -44,7 +43,7 @@ def joints_of(session: Session) -> Joints:
 
 def validation_html(v: Validation) -> str:
     """One HTML page that needs nothing else: no network, no other file."""
-    return templating.render(
+    return page.render(
         "validation.html.j2",
         v=v,
         verdict=v.verdict,

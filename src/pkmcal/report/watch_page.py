@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pkmcal.outcome import Figure, Row, Table
-from pkmcal.report import charts
-from pkmcal.report import page as templating
+from pkmcal.report import charts, page
 from pkmcal.watching.chances import POWER, ChiSquare
 from pkmcal.watching.judged import LegTest, Suspect
 from pkmcal.watching.words import cameras_of, said, signed
@@ -24,7 +23,7 @@ LARGE = 2.0
 
 def watch_html(w: Watch) -> str:
     """One HTML page that needs nothing else: no network, no other file."""
-    return templating.render(
+    return page.render(
         "watch.html.j2",
         w=w,
         verdict=w.verdict,

@@ -18,6 +18,7 @@ from pkmcal.geometry.batches import turned
 from pkmcal.geometry.rigid import cross, dot, rotation, skew
 from pkmcal.mechanisms.carriers.contract import (
     Chain,
+    Direction,
     PlatformCarrier,
     Site,
     direction_by_frame,

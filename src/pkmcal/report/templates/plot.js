@@ -1,7 +1,11 @@
-// Plots: Plotly, unpacked from the page itself. Each plot names the element that holds its figure.
+// Plots: Plotly, unpacked from the page itself; figures and an animation's pictures by their names.
 (() => {
-  const plots = [...document.querySelectorAll("[data-figure]")];
-  const figures = plots.map((plot) => JSON.parse(document.getElementById(plot.dataset.figure).textContent));
+  const plots = [...document.querySelectorAll("[data-plot]")];
+  const read = (what, plot) => {
+    const held = document.getElementById(`${what}-${plot.dataset.plot}`);
+    return held && JSON.parse(held.textContent);
+  };
+  const figures = plots.map((plot) => read("figure", plot));
   const style = getComputedStyle(document.documentElement);
   const themed = (node) => {
     if (typeof node === "string" && node.startsWith("--")) return style.getPropertyValue(node).trim();
@@ -22,12 +26,16 @@
     document.head.append(script);
     for (const plot of plots) plot.replaceChildren();
     await draw();
-    for (const plot of plots) plot.dataset.drawn = "yes";
+    for (const plot of plots) {
+      const frames = read("frames", plot);
+      if (frames) await Plotly.addFrames(plot, frames);
+      plot.dataset.drawn = "yes";
+    }
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   };
   const failed = () => {
     for (const plot of plots) {
-      plot.textContent = plot.dataset.otherwise;
+      plot.textContent = "This browser cannot draw the plot; tables and charts have its figures.";
       plot.classList.add("small");
     }
   };

@@ -1,6 +1,5 @@
-// The table sorts by a column; a third click gives the order of the file back.
-(() => {
-  const table = document.getElementById("parameter-table");
+// A table with data-sort sorts by a column; a third click gives the order of the file back.
+for (const table of document.querySelectorAll("table.sorted")) {
   const bodies = [...table.tBodies];
   const rows = bodies.map((body) => [...body.rows]);
   const key = (row, by) => {
@@ -29,4 +28,4 @@
       bodies[0].append(...rows.flat().sort(compare));
     });
   }
-})();
+}

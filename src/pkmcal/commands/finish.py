@@ -1,0 +1,136 @@
+"""The end of every command: its outcome written, told to people or programs, and judged.
+
+``files`` are the names of what is written, in the order in which they are told, each with what it
+is for a person. ``NAME.html`` gets the outcome's page and ``NAME.json`` its document, where the
+outcome holds no text of that name itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pkmcal.commands import console
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pkmcal.outcome import Figure, Outcome
+
+PAGE = "open it in a browser"
+NUMBERS = "everything, for programs"
+
+
+def finish(
+    outcome: Outcome,
+    folder: Path,
+    files: Mapping[str, str],
+    *,
+    as_json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Write the files, tell what was found, and return the exit code.
+
+    quiet : say nothing of a result that may be used, and one sentence of another.
+    """
+    with console.progress(as_json or quiet) as told:
+        told("Writing the report", 0.97)
+        write(outcome, folder, files)
+    return tell(outcome, folder, files, as_json=as_json, quiet=quiet)
+
+
+def write(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> None:
+    """Write the files, whole or not at all."""
+    from pkmcal.files import write_folder
+
+    write_folder(folder, contents(outcome, files))
+
+
+def tell(
+    outcome: Outcome,
+    folder: Path,
+    files: Mapping[str, str],
+    *,
+    as_json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Tell what was found and where it stands, and return the exit code."""
+    if as_json:
+        console.print_json(printed(outcome, folder, files))
+    elif not quiet:
+        out = console.out()
+        tell_people(out, outcome)
+        if files:
+            out.print()
+            console.print_files(out, [(str(folder / name), what) for name, what in files.items()])
+    elif not outcome.verdict.usable:
+        verdict = outcome.verdict
+        console.print_error(" ".join([verdict.headline, *verdict.reasons]))
+    return outcome.exit_code
+
+
+def contents(outcome: Outcome, files: Mapping[str, str]) -> dict[str, str]:
+    """The text of each of the files."""
+    from pkmcal.files import json_text
+    from pkmcal.report.page import page_html
+
+    texts = dict(outcome.texts)
+    for name in files:
+        if name in texts:
+            continue
+        texts[name] = page_html(outcome) if name.endswith(".html") else json_text(outcome.document)
+    return texts
+
+
+def printed(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> dict[str, Any]:
+    """The one JSON object of a command."""
+    return {
+        "exit_code": outcome.exit_code,
+        **({"files": {name: str(folder / name) for name in files}} if files else {}),
+        **(outcome.document if outcome.summary is None else outcome.summary),
+    }
+
+
+def tell_people(out: Console, outcome: Outcome) -> None:
+    """What a command found, for people: the verdict, numbers, and what to look at."""
+    verdict, findings = outcome.verdict, outcome.findings
+    if outcome.subject:
+        console.print_points(out, [("", outcome.subject)])
+        out.print()
+    console.print_points(out, [(console.MARKS[outcome.mark], verdict.headline)])
+    console.print_points(out, [("  [red]•[/]", reason) for reason in verdict.reasons])
+    if not any(table.brief for part in outcome.parts for table in part.tables):
+        _tell_figures(out, outcome.figures)
+    for part in outcome.parts:
+        for table in part.tables:
+            if table.brief:
+                console.print_table(out, table)
+        if part.said:
+            out.print()
+            console.print_points(out, [("", text) for text in part.said])
+    checks = [check for part in outcome.parts for check in part.checks]
+    for points in (
+        [
+            *((console.MARKS[finding.level], finding.text) for finding in findings),
+            *((console.MARKS["doubtful"], text) for text in verdict.warnings),
+            *(("[cyan]→[/]", text) for text in verdict.advice),
+        ],
+        [(console.MARKS["good" if c.passed else "wrong"], c.sentence) for c in checks],
+    ):
+        if points:
+            out.print()
+            console.print_points(out, points)
+    if outcome.closing:
+        out.print()
+        out.print(outcome.closing, style="yellow", markup=False)
+
+
+def _tell_figures(out: Console, figures: tuple[Figure, ...]) -> None:
+    if not figures:
+        return
+    out.print()
+    widest = max(len(card.question) for card in figures)
+    for card in figures:
+        values = ", ".join(v + unit if unit == "°" else f"{v} {unit}" for v, unit in card.values)
+        out.print(f"  {card.question:{widest}}  [bold]{values}[/]", soft_wrap=True)
