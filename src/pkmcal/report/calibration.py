@@ -75,7 +75,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
         texts=texts_of(c, open_, held_out),
         summary={
             "verdict": asdict(c.verdict),
-            **told.summary,
+            **(told.summary or {}),
             "session_warnings": c.session.warnings,
             "holdout": held_out,
             "timings": c.timings,
