@@ -17,6 +17,7 @@ from pkmcal.mechanisms.carriers.contract import (
     Chain,
     Direction,
     Interval,
+    Site,
     direction_by_frame,
     moved_direction,
     moved_point,
