@@ -117,12 +117,16 @@ def test_samples_of_a_machine_without_ranges(tmp_path):
 # Carriers as elementary joints
 
 
+def each(carriers):
+    return sorted(set(carriers.values()), key=lambda carrier: carrier.__name__)
+
+
 def swung(chain, angle):
     """The arms (n, 3) turned by angles (n,)."""
     return (rotation(angle[:, None] * chain.axis) @ chain.arm[..., None])[..., 0]
 
 
-@pytest.mark.parametrize("carrier", set(base_carriers().values()), ids=lambda c: c.__name__)
+@pytest.mark.parametrize("carrier", each(base_carriers()), ids=lambda c: c.__name__)
 def test_every_base_carriers_chain_is_its_place(carrier):
     rng = np.random.default_rng(0)
     parameters, q = rng.normal(size=(20, len(carrier.parameters))), rng.normal(size=20)
@@ -137,7 +141,7 @@ def test_every_base_carriers_chain_is_its_place(carrier):
     assert carrier.driven == (chain.motion != "fixed")
 
 
-@pytest.mark.parametrize("carrier", set(platform_carriers().values()), ids=lambda c: c.__name__)
+@pytest.mark.parametrize("carrier", each(platform_carriers()), ids=lambda c: c.__name__)
 def test_every_platform_carriers_chain_is_its_place(carrier):
     rng = np.random.default_rng(1)
     parameters, phi = rng.normal(size=(20, len(carrier.parameters))), rng.normal(size=20)

@@ -607,7 +607,7 @@ def _cylinder(
     if np.linalg.norm(stop - start) < radius / 10:  # MuJoCo takes no cylinder without a length
         return
     shape = {"fromto": numbers(start, stop), "size": numbers(radius), "rgba": COLOURS[look]}
-    geom = SubElement(parent, "geom", type="cylinder", **shape)
+    geom = SubElement(parent, "geom", {"type": "cylinder", **shape})
     if name:
         geom.set("name", name)
 
