@@ -7,6 +7,7 @@ any work is spent; each fault is an `InputError` with file, line and field.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -384,3 +385,14 @@ def _resolved(
 def _inside(folder: Path, path: Path) -> str:
     """A path as session.yaml would write it."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
+
+
+def digests(session: Session) -> dict[str, list[str]]:
+    """Short digests of the photographs' files by configuration."""
+    out: dict[str, list[str]] = {}
+    for station in session.stations:
+        for photo in station.photographs:
+            name = session.configurations[photo.configuration]
+            digest = blake2b(photo.path.read_bytes(), digest_size=8).hexdigest()
+            out.setdefault(name, []).append(digest)
+    return out

@@ -1,4 +1,6 @@
-"""What a look at a calibrated machine says: still so, changed and where, or too little to tell."""
+"""What judgements say: is the calibrated machine better than its drawing, by how much, and how sure
+(validate); is it still so, has it changed and where, or do the data tell too little (watch).
+"""
 
 from __future__ import annotations
 
@@ -7,14 +9,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Booleans
+from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.words_names import named
+from pkmcal.judge.changes import POWER, ChangeTests, Explanation, LegTest, Suspect
+from pkmcal.judge.comparison import Comparison, Ratio, ratio, rms
+from pkmcal.judge.holdouts import HoldOut
+from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
-from pkmcal.session.load import Session
-from pkmcal.watching.chances import POWER
-from pkmcal.watching.judged import Finding, Judgement, LegTest, Suspect
 from pkmcal.wording import SCALES, brief, count, decimals, listed, number
 
+MOSTLY_NOISE = 2**0.5
+"""Factor on the photographs' noise within which that is more than half of the mean square."""
+POOR = 2.0
+"""Factor by which a region's errors must exceed those of the configurations in use to be told."""
 NOISIER = 1.5
 """Times the calibration's noise from which on the photographs are no longer the same kind."""
 STEEL = 12e-6
@@ -25,22 +32,160 @@ MOST_OTHERS = 4
 """Causes named beside the best; more are a table's."""
 
 
+def amount(value: float, unit: str) -> str:
+    """``0.07 mm``, ``0.3°``."""
+    scale, name = SCALES[unit]
+    return brief(value * scale) + ("" if name == "°" else " ") + name
+
+
+def factor(value: float) -> str:
+    """A factor with the digits that it deserves."""
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def better(gain: Ratio) -> str:
+    """``14 (±3)``."""
+    return f"{factor(gain.value)} (±{factor(gain.sigma)})"
+
+
+def validation_verdict(
+    judged: Comparison | None, holdouts: Sequence[HoldOut], machine: Machine
+) -> Verdict:
+    """The verdict on new data, or, without any, on the regions held out, pooled."""
+    units = machine.joint_units
+    unit = units[0] if len(set(units)) == 1 else None
+    groups = [judged] if judged else [h.left_out for h in holdouts]
+    before, after = (
+        np.concatenate([getattr(g, name) for g in groups]) for name in ("before", "after")
+    )
+    floor = rms(np.concatenate([np.full(len(g.rows), g.floor) for g in groups]))
+    gain = ratio(before, after)
+    reasons = [*_not_better(gain), *_broken(groups, units)]
+    headline = _validation_headline(gain, before, after, unit, bool(judged))
+    warnings = _regions(holdouts, unit)
+    return Verdict(
+        not reasons, headline, tuple(reasons), tuple(warnings), tuple(_noise(after, floor, unit))
+    )
+
+
+def _validation_headline(
+    gain: Ratio, before: Array, after: Array, unit: str | None, new: bool
+) -> str:
+    where = "" if new else " of regions that it did not see"
+    if gain.high < 1:
+        core = (
+            f"The drawing predicts the readings{where} {factor(1 / gain.value)} times better than"
+            " the calibrated machine"
+        )
+    elif gain.better:
+        core = (
+            f"The calibrated machine predicts the readings{where} {better(gain)} times better than"
+            " the drawing"
+        )
+    else:
+        core = (
+            f"The calibrated machine is not shown to predict the readings{where} better than the"
+            f" drawing: {better(gain)} times"
+        )
+    if unit is None:
+        return core + "."
+    sign = "," if not gain.better and gain.high >= 1 else ":"
+    return f"{core}{sign} {amount(rms(after), unit)} against {amount(rms(before), unit)}."
+
+
+def _not_better(gain: Ratio) -> list[str]:
+    if gain.better:
+        return []
+    if gain.high < 1:
+        return [
+            "The calibration made the machine worse: use the drawing, and look for mixed-up files,"
+            " a machine that was changed, or a camera's calibration that is not its own."
+        ]
+    return [
+        f"On these data it may be {factor(gain.low)} to {factor(gain.high)} times as good as the"
+        " drawing (95 %): too few configurations, or too much noise in them, to tell."
+    ]
+
+
+def _broken(groups: Sequence[Comparison], units: tuple[str, ...]) -> list[str]:
+    """Residuals that the deviations do not promise: the first group's that has such."""
+    for group in groups:
+        if not group.promise.usual:
+            return [_too_large(group, units)]
+        if not group.promise.steady:
+            return [_in_common(group, units)]
+    return []
+
+
+def _too_large(group: Comparison, units: tuple[str, ...]) -> str:
+    said = ""
+    if len(set(units)) == 1:
+        found = rms(group.figures(group.calibrated).joint_rms)
+        promised = rms(group.promise.joint_rms)
+        said = f" ({amount(found, units[0])}, promised {amount(promised, units[0])})"
+    return (
+        f"The residuals are {factor(group.promise.factor)} times larger than the calibration's"
+        f" deviations and the photographs' noise promise{said}; chance does not explain that."
+        " The machine has changed since, or something that the model leaves out moves it."
+    )
+
+
+def _in_common(group: Comparison, units: tuple[str, ...]) -> str:
+    test = group.promise
+    worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
+    off = amount(abs(float(test.common[worst])), units[worst])
+    sigma = amount(float(test.common_sigma[worst]), units[worst])
+    more = "more" if test.common[worst] > 0 else "less"
+    return (
+        f"In all configurations alike, joint {worst + 1} reads {off} (±{sigma}) {more} than"
+        " predicted, which the calibration's deviations do not explain: its homing, its length or a"
+        " joint has changed since, or the calibration is wrong by as much."
+    )
+
+
+def _noise(after: Array, floor: float, unit: str | None) -> list[str]:
+    if unit is None or rms(after) > MOSTLY_NOISE * floor:
+        return []
+    return [
+        f"What is left is mostly the photographs' own noise, {amount(floor, unit)}: the machine may"
+        " be better still. Several stations that see the same configurations would tell."
+    ]
+
+
+def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[str]:
+    """Regions in which a calibration of the rest is poor."""
+    out: list[str] = []
+    for item in holdouts:
+        off, usual = rms(item.left_out.after), rms(item.used.after)
+        if off < POOR * usual:
+            continue
+        how = f": {amount(off, unit)} against {amount(usual, unit)}" if unit else ""
+        out.append(
+            f"Extrapolation is poor where the platform is {item.region.name}"
+            f" ({count(len(item.left_out.rows), 'configuration')}, left out){how}. Photograph"
+            " configurations there before the machine works there."
+        )
+    return out
+
+
 @dataclass(frozen=True)
-class Circumstances:
+class LookedAt:
     """What a verdict says besides the tests.
 
     configurations : K names. known, seen : (K,) used by the calibration, and looked at. noisier :
-    times the calibration's factor on the stated noise of edges. session : for names.
+    times the calibration's factor on the stated noise of edges. cameras : names.
     """
 
     configurations: tuple[str, ...]
     known: Booleans
     seen: Booleans
     noisier: float
-    session: Session | None = None
+    cameras: tuple[str, ...] = ()
 
 
-def verdict_of(judged: Judgement, around: Circumstances) -> Verdict:
+def watch_verdict(judged: ChangeTests, around: LookedAt) -> Verdict:
     """The verdict; usable means still as calibrated."""
     warnings = _warnings(around)
     if judged.changed:
@@ -130,8 +275,8 @@ def _vector(suspect: Suspect, short: bool) -> str:
     return f"{text}, ({parts}) mm in the {cause.part} frame"
 
 
-def _changed(judged: Judgement, around: Circumstances, warnings: tuple[str, ...]) -> Verdict:
-    cameras = cameras_of(around.session)
+def _changed(judged: ChangeTests, around: LookedAt, warnings: tuple[str, ...]) -> Verdict:
+    cameras = around.cameras
     findings = judged.findings
     if not findings:
         return Verdict(False, "The machine is not as calibrated.", (_unnamed(judged),), warnings)
@@ -142,7 +287,7 @@ def _changed(judged: Judgement, around: Circumstances, warnings: tuple[str, ...]
             " the machine: whether the machine is as calibrated cannot be told."
         )
     else:
-        headline = f"The machine is not as calibrated: {_headline(findings)}."
+        headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
     reasons = [_reason(f, k, cameras) for k, f in enumerate(findings)]
     if judged.left.dof and judged.left.chance < UNEXPLAINED:
         reasons.append(
@@ -152,7 +297,7 @@ def _changed(judged: Judgement, around: Circumstances, warnings: tuple[str, ...]
     return Verdict(False, headline, tuple(reasons), warnings, _next(findings))
 
 
-def _headline(findings: Sequence[Finding]) -> str:
+def _changes_headline(findings: Sequence[Explanation]) -> str:
     """What changed, in short."""
     causes = [f.suspect.cause for f in findings if f.suspect.cause.part not in ("scale", "camera")]
     if not causes:
@@ -163,7 +308,7 @@ def _headline(findings: Sequence[Finding]) -> str:
     return f"{named(legs)} {verb} changed" + (", or another that looks the same" if rivals else "")
 
 
-def _reason(finding: Finding, place: int, cameras: Sequence[str]) -> str:
+def _reason(finding: Explanation, place: int, cameras: Sequence[str]) -> str:
     """One finding: what, how much, as after what, and what it may be instead."""
     begin = "Most likely it is" if place == 0 else "Besides,"
     text = f"{begin} {said(finding.suspect, cameras)}{_cause_in_words(finding.suspect)}."
@@ -195,7 +340,7 @@ def _cause_in_words(suspect: Suspect) -> str:
     return ", as after focusing or with a lens that was touched" if cause.part == "camera" else ""
 
 
-def _unnamed(judged: Judgement) -> str:
+def _unnamed(judged: ChangeTests) -> str:
     """Something changed, and no single cause stands out."""
     legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
     if legs:
@@ -207,7 +352,7 @@ def _unnamed(judged: Judgement) -> str:
     )
 
 
-def _next(findings: Sequence[Finding]) -> tuple[str, ...]:
+def _next(findings: Sequence[Explanation]) -> tuple[str, ...]:
     parts = {f.suspect.cause.part for f in findings}
     if parts == {"camera"}:
         return ("Calibrate the camera again, or set its focus back, and look once more.",)
@@ -224,7 +369,7 @@ def _next(findings: Sequence[Finding]) -> tuple[str, ...]:
     return ("Look at this part of the machine, then calibrate again.",)
 
 
-def _would_have(judged: Judgement) -> str:
+def _would_have(judged: ChangeTests) -> str:
     """What would have been found, in words."""
     zeros = [leg for leg in judged.legs if leg.zero is not None and leg.zero.dof]
     sizes = np.array([leg.detects_zero for leg in zeros])
@@ -260,7 +405,7 @@ def _blind(legs: Sequence[LegTest]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _warnings(around: Circumstances) -> tuple[str, ...]:
+def _warnings(around: LookedAt) -> tuple[str, ...]:
     out: list[str] = []
     both = around.known & around.seen
     if both.any():
@@ -278,14 +423,9 @@ def _warnings(around: Circumstances) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _advice(judged: Judgement) -> tuple[str, ...]:
+def _advice(judged: ChangeTests) -> tuple[str, ...]:
     wide = [leg for leg in judged.legs if leg.zero is None and leg.whole.dof]
     if wide:
         who = named(j for leg in wide for j in leg.legs)
         return (f"Of {who}, which has no reading, only the joints are tested.",)
     return ()
-
-
-def cameras_of(session: Session | None) -> tuple[str, ...]:
-    """Camera files of a session, in the order of their numbers."""
-    return tuple(dict.fromkeys(s.camera_file for s in session.stations)) if session else ()

@@ -1,42 +1,75 @@
-"""The page of a look at a calibrated machine: its tests as tables and pictures."""
+"""What a look at a calibrated machine found, as an outcome: its tests as tables and pictures."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pkmcal.identify.words_names import named
-from pkmcal.outcome import Figure, Row, Table
-from pkmcal.report import charts, page
-from pkmcal.watching.chances import POWER, ChiSquare
-from pkmcal.watching.judged import LegTest, Suspect
-from pkmcal.watching.words import cameras_of, said, signed
+from pkmcal.judge.changes import POWER, ChiSquare, LegTest, Suspect
+from pkmcal.judge.watch import Watch, cameras_of
+from pkmcal.judge.words import amount, said, signed
+from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
+from pkmcal.report import charts
 from pkmcal.wording import SCALES, brief, count, number
-
-if TYPE_CHECKING:
-    from pkmcal.watch import Watch
 
 NONE = "–"
 LARGE = 2.0
 """Standard deviations from which on a configuration's residuals stand out."""
+HOW = (
+    "Nothing is calibrated anew. The machine is held as the calibration left it; every pose of the"
+    " platform, and where cameras and boards stand, are found from the new data. What is left over"
+    " is weighed by the noise of these data and by the calibration's own covariance, as far as"
+    " poses, stations, edge shifts and shading cannot take it up. Each leg is then tested for a"
+    " change of its numbers: a score test, chi-square of as many degrees of freedom as these data"
+    " see.",
+    "A camera's place costs six freedoms, also where it was left in place: what moves all of the"
+    " machine against its camera is not seen, and is no change of the machine. Directions in which"
+    " a change by the drawing's whole tolerance would make less than one standard deviation are"
+    " left out.",
+)
 
 
-def watch_html(w: Watch) -> str:
-    """One HTML page that needs nothing else: no network, no other file."""
-    return page.render(
-        "watch.html.j2",
-        w=w,
+def outcome_of(w: Watch) -> Outcome:
+    """Everything that ``pkmcal watch`` tells and writes."""
+    found, bars = _findings_table(w), _by_configuration(w)
+    parts = (
+        Part(
+            "legs",
+            "Tests",
+            html=charts.panels(_statistics(w), _zeros(w)),
+            tables=(legs_table(w), _others_table(w)),
+        ),
+        Part("causes", "Causes", tables=(found,)) if found else None,
+        Part("residuals", "Residuals", html=charts.panels(bars)) if bars else None,
+        _how(w),
+    )
+    return Outcome(
+        command="watch",
+        title=f"Watch of {w.calibration.machine.name}",
+        kicker=f"session {w.session.folder.resolve().name}",
         verdict=w.verdict,
         stamp=stamp(w),
-        cards=cards(w),
-        legs=legs_table(w),
-        others=others_table(w),
-        findings=findings_table(w),
-        pictures=[p for p in (statistics(w), zeros(w)) if p],
-        residuals=[p for p in (by_configuration(w),) if p],
-        left_out=[n for n, k in zip(w.session.configurations, w.known, strict=True) if k],
+        level=Level.WRONG if w.judged.changed else Level.DOUBTFUL,
+        figures=_cards(w),
+        parts=tuple(part for part in parts if part),
+        findings=tuple(Finding(Level.DOUBTFUL, text) for text in w.session.warnings),
+        document=w.document(),
     )
+
+
+def _how(w: Watch) -> Part:
+    poses = w.session.board or w.session.trackers
+    allowed = (
+        "Several tests are made, so each chance is adjusted: noise is drawn 20 000 times through"
+        " the same tests, and the share in which any of them comes out as small is told. So"
+        f" {w.judged.alpha:g} of machines that did not change are flagged. The noise is"
+        f" {w.noise_scale:.2f} times the stated one of edges"
+        + (f" and {w.pose_scale:.2f} times that of poses" if poses else "")
+        + ": the larger of the calibration's and these data's."
+    )
+    known = [n for n, k in zip(w.session.configurations, w.known, strict=True) if k]
+    left_out = f"Left out, for the calibration had seen them: {', '.join(known)}."
+    return Part("how", "How it was computed", (*HOW, allowed), notes=(left_out,) if known else ())
 
 
 def stamp(w: Watch) -> str:
@@ -47,7 +80,7 @@ def stamp(w: Watch) -> str:
     return "Changed" if w.judged.changed and parts != {"camera"} else "Cannot be told"
 
 
-def cards(w: Watch) -> tuple[Figure, ...]:
+def _cards(w: Watch) -> tuple[Figure, ...]:
     """The main numbers."""
     judged = w.judged
     named_tests = [(named(leg.legs), leg.chance) for leg in judged.legs]
@@ -84,11 +117,8 @@ def cards(w: Watch) -> tuple[Figure, ...]:
     return tuple(out)
 
 
-def legs_table(w: Watch, brief: bool = False) -> Table:
-    """One row a leg: statistics, chance, its zero's change, and what would have been found.
-
-    brief : without the joints' columns, for a terminal.
-    """
+def legs_table(w: Watch) -> Table:
+    """One row a leg: statistics, chance, its zero's change, and what would have been found."""
     rows = [
         Row(
             named(leg.legs).capitalize(),
@@ -98,26 +128,30 @@ def legs_table(w: Watch, brief: bool = False) -> Table:
                 chance_text(leg.chance),
                 _zero(leg),
                 _size(leg.detects_zero, leg.unit),
-                *([] if brief else [_span(leg.detects_base), _span(leg.detects_platform)]),
+                _span(leg.detects_base),
+                _span(leg.detects_platform),
             ),
         )
         for leg in w.judged.legs
     ]
-    columns = ("Leg", "χ² / degrees", "of its zero", "chance", "zero off by", "found from")
-    more = () if brief else ("base joint, mm", "platform joint, mm")
+    columns = (
+        "Leg", "χ² / degrees", "of its zero", "chance", "zero off by", "found from",
+        "base joint, mm", "platform joint, mm",
+    )  # fmt: skip
     return Table(
         "Legs",
-        (*columns, *more),
+        columns,
         tuple(rows),
         "χ² of all numbers of a leg, and of the zero of its reading alone. Chance: of as much in a"
         " machine that did not change, all tests allowed for. Zero off by: if nothing else"
         " changed. Found from: the smallest change of that zero, and of the joints in the direction"
         f" seen best and worst, that has a {POWER:.0%} probability to be found. A leg that changed"
         " moves the tests of the others, too.",
+        first=6,
     )
 
 
-def others_table(w: Watch) -> Table:
+def _others_table(w: Watch) -> Table:
     """Tests of all legs together."""
     j = w.judged
     scale = j.scale_change
@@ -137,10 +171,11 @@ def others_table(w: Watch) -> Table:
         rows,
         "A common factor is seen against the readings: a frame that warmed, or readings of another"
         " scale.",
+        brief=False,
     )
 
 
-def findings_table(w: Watch) -> Table | None:
+def _findings_table(w: Watch) -> Table | None:
     """What explains a change, best first, with what these data cannot tell from it."""
     rows: list[Row] = []
     cameras = cameras_of(w.session)
@@ -155,6 +190,7 @@ def findings_table(w: Watch) -> Table | None:
         tuple(rows),
         "Causes are compared by how likely they make the data, changes of a tolerance's size being"
         " usual; those that a hundred to one does not separate stand under the best with “or”.",
+        brief=False,
     )
 
 
@@ -188,10 +224,7 @@ def _zero(leg: LegTest) -> str:
 
 
 def _size(value: float, unit: str) -> str:
-    if not np.isfinite(value):
-        return NONE
-    factor, name = SCALES[unit]
-    return f"{brief(value * factor)}{'' if name == '°' else ' '}{name}"
+    return amount(value, unit) if np.isfinite(value) else NONE
 
 
 def _span(sizes: tuple[float, float]) -> str:
@@ -199,7 +232,7 @@ def _span(sizes: tuple[float, float]) -> str:
     return NONE if texts == [NONE, NONE] else " to ".join(texts)
 
 
-def statistics(w: Watch) -> charts.BarChart | None:
+def _statistics(w: Watch) -> charts.BarChart | None:
     """Each leg's larger statistic, as a share of its threshold."""
     bars = [
         _bar(named(leg.legs), [t for t in (leg.whole, leg.zero) if t and t.dof], w.judged.level)
@@ -229,7 +262,7 @@ def _bar(label: str, tests: list[ChiSquare], level: float) -> charts.Bar:
     return charts.Bar(label, f"{label}: {'; '.join(texts)}", share, quiet=share < 1)
 
 
-def zeros(w: Watch) -> charts.RowChart | None:
+def _zeros(w: Watch) -> charts.RowChart | None:
     """Changes of the readings' zeros: middle half and nine tenths of what they may be."""
     legs = [leg for leg in w.judged.legs if leg.change is not None and leg.zero and leg.zero.dof]
     if not legs or len({leg.unit for leg in legs}) > 1:
@@ -253,10 +286,10 @@ def zeros(w: Watch) -> charts.RowChart | None:
     )
 
 
-def by_configuration(w: Watch) -> charts.BarChart | None:
+def _by_configuration(w: Watch) -> charts.BarChart | None:
     """Residuals of each configuration with the machine held, root mean square."""
     rows = np.flatnonzero(w.seen)
-    values = [float(w.found.residuals[k]) for k in rows]
+    values = [float(w.residuals[k]) for k in rows]
     names = [w.session.configurations[k] for k in rows]
     bars = [
         charts.Bar(
@@ -265,12 +298,12 @@ def by_configuration(w: Watch) -> charts.BarChart | None:
         for name, value in zip(names, values, strict=True)
         if np.isfinite(value)
     ]
-    last = len(bars) - 1
     return charts.bar_chart(
         "Residuals by configuration, the machine held as calibrated",
         "standard deviations",
         bars,
-        tuple((k + 0.5, bars[k].label) for k in sorted({0, last // 2, last}) if bars),
+        charts.ends_and_middle(bars),
         f"Residuals of {count(len(bars), 'configuration')}",
         ((0.0, 1.0), (float(len(bars)), 1.0)),
+        "line: expected of noise alone",
     )

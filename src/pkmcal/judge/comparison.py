@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
-from pkmcal.validate.drawn import Errors
+from pkmcal.arrays import Array, Integers
+from pkmcal.judge.prediction import Prediction, ReadingErrors, errors_on
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
 
 REPEATS = 4000
 """Bootstrap draws: percentiles of the ratio are then known to a hundredth or two."""
@@ -65,6 +68,131 @@ class Promise:
     def kept(self) -> bool:
         """Whether the deviations may be believed."""
         return self.usual and self.steady
+
+    @property
+    def joint_rms(self) -> Array:
+        """Root mean squares (m,) of the readings' residuals that are promised, m or rad."""
+        return weighed(self.expected, self.by_noise)[1]
+
+
+@dataclass(frozen=True)
+class WeighedErrors:
+    """Of one machine, weighed by how well each configuration was seen; m and rad.
+
+    joint_mean, joint_rms : (m,) of the readings' residuals ([C] Table 3). position, orientation :
+    root mean squares of the tool point's errors.
+    """
+
+    joint_mean: Array
+    joint_rms: Array
+    position: float
+    orientation: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A calibrated machine beside the drawing on n configurations.
+
+    rows : (n,) which. calibrated, drawing : their errors there. before, after : (n,) root mean
+    squares of each configuration's residuals by the drawing and by the calibrated machine, weighed
+    by how well the photographs see them (:class:`Weights`), m or rad; floor : what the photographs'
+    noise alone gives. ratio : before over after. promise : the residuals against the deviations.
+    """
+
+    rows: Integers
+    calibrated: ReadingErrors
+    drawing: ReadingErrors
+    before: Array
+    after: Array
+    floor: float
+    ratio: Ratio
+    promise: Promise
+
+    def figures(self, errors: ReadingErrors) -> WeighedErrors:
+        """Of the drawing's or the calibrated machine's errors."""
+        sigma = self.promise.by_noise
+        mean, root = weighed(errors.residuals, sigma)
+        each = np.sqrt(np.mean(sigma**2, axis=1))
+        position, orientation = (
+            float(weighed(values, each)[1]) for values in (errors.position, errors.orientation)
+        )
+        return WeighedErrors(mean, root, position, orientation)
+
+    def document(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """For programs, m and rad; names : K, of the configurations.
+
+        weighed_rms is the verdict's, by how well each direction was seen.
+        """
+        test = self.promise
+        machines = {
+            "drawing": (self.drawing, self.before),
+            "calibrated": (self.calibrated, self.after),
+        }
+        return {
+            "configurations": [names[row] for row in self.rows],
+            **{
+                name: {
+                    "weighed_rms": rms(weighed_by_pose),
+                    **asdict(self.figures(errors)),
+                    "residuals": errors.residuals,
+                    "tool_position": errors.position,
+                    "tool_orientation": errors.orientation,
+                }
+                for name, (errors, weighed_by_pose) in machines.items()
+            },
+            "times_better": asdict(self.ratio),
+            "photographs_noise": self.floor,
+            "promise": {
+                "chi2": test.chi2,
+                "dof": test.dof,
+                "chance": test.chance,
+                "factor": test.factor,
+                "kept": test.kept,
+                "common": test.common,
+                "common_sigma": test.common_sigma,
+                "common_chance": test.common_chance,
+                "joint_rms": test.joint_rms,
+            },
+        }
+
+
+def compare(
+    drawing: Machine,
+    covariance: Array,
+    measurements: Measurements,
+    found: Prediction,
+    by_drawing: Prediction | None,
+    rows: Integers,
+) -> Comparison:
+    """A prediction of the calibrated machine, beside the drawing, on configurations ``rows``.
+
+    covariance : (P, P) of the calibrated machine. by_drawing : the drawing's own prediction;
+    without it the drawing is judged on the calibrated machine's poses, else on those that suit it
+    best.
+    """
+    seen = np.flatnonzero(found.seen)
+    m = measurements.joints.shape[1]
+    place = np.searchsorted(seen, rows)
+    flat = (place[:, None] * m + np.arange(m)).reshape(-1)
+    noise, by = found.noise[np.ix_(flat, flat)], found.by_machine[flat]
+    weights = Weights.by(np.einsum("kikj->kij", noise.reshape(len(rows), m, len(rows), m)))
+    new = found.errors.of(rows)
+    old = errors_on(drawing, measurements.joints[seen], found.T_base_platform[seen]).of(place)
+    if by_drawing is not None:
+        own = by_drawing.errors.of(rows)
+        if rms(weights.of(own.residuals)) < rms(weights.of(old.residuals)):
+            old = own
+    before, after = weights.of(old.residuals), weights.of(new.residuals)
+    return Comparison(
+        rows=rows,
+        calibrated=new,
+        drawing=old,
+        before=before,
+        after=after,
+        floor=weights.floor,
+        ratio=ratio(before, after),
+        promise=promise(new.residuals, noise, by @ covariance @ by.T),
+    )
 
 
 def rms(values: Array) -> float:
@@ -159,15 +287,3 @@ class Weights:
         """Root mean square (n,) of each configuration's residuals (n, m), m or rad."""
         square = np.einsum("ki,kij,kj->k", residuals, self.matrices, residuals)
         return np.sqrt(square / residuals.shape[-1])
-
-
-def blocks(covariance: Array, m: int) -> Array:
-    """Each configuration's own part (n, m, m) of a covariance (n m, n m)."""
-    n = len(covariance) // m
-    return np.einsum("kikj->kij", covariance.reshape(n, m, n, m))
-
-
-def fairest(own: Errors, laid: Errors, weights: Weights) -> Errors:
-    """The drawing's errors on the poses that suit it best: its own, or the calibrated machine's."""
-    by_own, by_laid = (rms(weights.of(errors.residuals)) for errors in (own, laid))
-    return own if by_own < by_laid else laid

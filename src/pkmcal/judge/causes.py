@@ -1,22 +1,31 @@
-"""What may have changed, as directions of the machine's parameters: legs, their parts, warming."""
+"""What may have changed, as directions of the machine's parameters: legs, their parts, warming.
+
+Beside them stands a camera whose picture became larger. Focus, temperature and a lens that was
+touched change the focal length first; its effect on edges and boards is not a machine's, but some
+of it looks like one.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.cameras import Camera
 from pkmcal.identify.gauge import centre_index
+from pkmcal.judge.held import MAGNIFIED
+from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
-from pkmcal.watching.evidence import SIZE
 from pkmcal.wording import split_name
 
-Part = Literal["zero", "rod", "arm", "base", "platform", "hinge", "all", "pair", "scale", "camera"]
+LegPart = Literal[
+    "zero", "rod", "arm", "base", "platform", "hinge", "all", "pair", "scale", "camera"
+]
 
-PARTS: dict[str, Part] = {
+PARTS: dict[str, LegPart] = {
     "length.offset": "zero",
     "base.angle": "zero",
     "base.along": "zero",
@@ -28,17 +37,19 @@ PARTS: dict[str, Part] = {
 }
 """The part of a leg by how a parameter's path begins; the first that fits."""
 
+FOCAL = ("focal.x", "focal.y")
+
 
 @dataclass(frozen=True)
 class Cause:
     """A change that is looked for.
 
     columns : (P + C, k), the change of the machine's parameters (m, rad), then of the cameras'
-    magnification, by k numbers, each in ``sizes`` (k,): a drawing's tolerance, or SIZE. legs : from
-    0. unit : of the k numbers: m, rad, or nothing for a ratio.
+    magnification, by k numbers, each in ``sizes`` (k,): a drawing's tolerance, or MAGNIFIED.
+    legs : from 0. unit : of the k numbers: m, rad, or nothing for a ratio.
     """
 
-    part: Part
+    part: LegPart
     legs: tuple[int, ...]
     columns: Array
     sizes: Array
@@ -81,14 +92,14 @@ def common_scale(machine: Machine, n_cameras: int = 0) -> Cause:
         [u == "m" and k != "axis" for u, k in zip(table.units, table.kinds, strict=True)]
     )
     column = np.pad(np.where(lengths, machine.values, 0.0), (0, n_cameras))[:, None]
-    return Cause("scale", tuple(range(machine.n_legs)), column, np.array([SIZE]), "")
+    return Cause("scale", tuple(range(machine.n_legs)), column, np.array([MAGNIFIED]), "")
 
 
 def magnification(machine: Machine, camera: int, n_cameras: int) -> Cause:
     """A camera's picture larger by a factor, by its excess over 1."""
     column = np.zeros((len(machine.parameters) + n_cameras, 1))
     column[len(machine.parameters) + camera] = 1.0
-    return Cause("camera", (), column, np.array([SIZE]), "", camera)
+    return Cause("camera", (), column, np.array([MAGNIFIED]), "", camera)
 
 
 def single_causes(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
@@ -116,14 +127,25 @@ def joined(causes: Sequence[Cause]) -> Cause:
     )
 
 
-def part_of(name: str) -> Part | None:
+def part_of(name: str) -> LegPart | None:
     """The part of a leg that a parameter belongs to; None for its tubes' radii."""
     path = split_name(name)[1]
     return next((part for start, part in PARTS.items() if path.startswith(start)), None)
 
 
-def _of_names(machine: Machine, part: Part, legs: tuple[int, ...], n_cameras: int) -> Cause:
-    """The parameters of some legs' part, each changed by itself; two rods of an arm as well."""
+def joint_of(machine: Machine, side: str, leg: int, n_cameras: int = 0) -> Cause:
+    """A leg's joint on one side, base or platform, moved by a vector."""
+    index = centre_index(machine.layout)[side == "platform"][leg]
+    columns = np.eye(len(machine.parameters) + n_cameras)[:, index]
+    part: LegPart = "base" if side == "base" else "platform"
+    return Cause(part, (leg,), columns, machine.parameters.tolerance[index], "m")
+
+
+def _of_names(machine: Machine, part: LegPart, legs: tuple[int, ...], n_cameras: int) -> Cause:
+    """The parameters of some legs' part, each changed by itself; two rods of an arm as well.
+
+    A motor's zero is one number, however many rods hang on it.
+    """
     table = machine.parameters
     rows = [
         k
@@ -134,19 +156,10 @@ def _of_names(machine: Machine, part: Part, legs: tuple[int, ...], n_cameras: in
     ]
     tolerance = table.tolerance[rows]
     columns = np.eye(len(table) + n_cameras)[:, rows]
-    columns, tolerance = _shared(machine, part, legs, columns, tolerance)
+    if part == "zero" and len(legs) > 1 and len(rows) > 1:
+        columns, tolerance = columns.sum(axis=1, keepdims=True), tolerance[:1]
     units = {table.units[k] for k in rows}
     return Cause(part, legs, columns, tolerance, units.pop() if len(units) == 1 else "m")
-
-
-def _shared(
-    machine: Machine, part: Part, legs: tuple[int, ...], columns: Array, sizes: Array
-) -> tuple[Array, Array]:
-    """A motor's zero is one number, however many rods hang on it."""
-    if part != "zero" or len(legs) == 1 or columns.shape[1] < 2:
-        return columns, sizes
-    del machine
-    return columns.sum(axis=1, keepdims=True), sizes[:1]
 
 
 def _neighbours(machine: Machine, side: str) -> list[tuple[int, int]]:
@@ -171,5 +184,68 @@ def _together(machine: Machine, side: str, pair: tuple[int, int], n_cameras: int
     columns = np.zeros((len(machine.parameters) + n_cameras, 3))
     for leg in pair:
         columns[index[leg], np.arange(3)] = 1.0
-    part: Part = "base" if side == "base" else "platform"
+    part: LegPart = "base" if side == "base" else "platform"
     return Cause(part, pair, columns, machine.parameters.tolerance[index[pair[0]]], "m")
+
+
+def magnified(
+    measurements: Measurements, observation: Observation, cameras: Sequence[Camera]
+) -> Measurements:
+    """The measurements with one more unknown a camera: the excess of its focal lengths over the
+    calibrated ones, relative.
+
+    cameras : (S,) of the stations that have one, which come first. Edges get their answer by the
+    pixels that support them; a board's pose has it by its corners.
+    """
+    number = np.asarray(measurements.camera_of_station)
+    n_cameras = int(number.max(initial=-1)) + 1
+    poses = measurements.poses
+    return replace(
+        measurements,
+        edges=replace(
+            measurements.edges, by_intrinsics=_edges_magnified(observation, cameras)[..., None]
+        ),
+        poses=replace(poses, by_intrinsics=_poses_magnified(measurements, cameras)[..., None]),
+        intrinsics_factor=np.ones((n_cameras, 1, 1)),
+        intrinsics_at=np.zeros((n_cameras, 1)),
+    )
+
+
+def _focal(camera: Camera) -> Array:
+    """Change (n,) of the parameters when the focal lengths grow by their own size."""
+    focal = np.isin(np.array(camera.parameter_names), FOCAL)
+    return np.where(focal, camera.parameters, 0.0)
+
+
+def _edges_magnified(observation: Observation, cameras: Sequence[Camera]) -> Array:
+    """Turns (N, 2) of the measured normals, their pixels held, by the relative excess.
+
+    A plane that holds the rays r has ``r . n = 0``; as rays turn by dr, ``r . dn = -n . dr``, least
+    squares over an edge's points.
+    """
+    edges, at = observation.edges, observation.point_edge
+    ray, turn = np.zeros((2, len(at), 3))
+    for station, camera in enumerate(cameras):
+        mine = edges.station[at] == station
+        ray[mine] = camera.ray(observation.points[mine])
+        by = camera.ray_jacobians(observation.points[mine])[1]
+        turn[mine] = by @ _focal(camera)
+    good = np.isfinite(ray + turn).all(axis=1)
+    rows = np.einsum("ni,nij->nj", ray[good], edges.basis[at[good]])
+    value = -np.einsum("ni,ni->n", turn[good], edges.normal[at[good]])
+    normal, right = np.zeros((len(edges), 2, 2)), np.zeros((len(edges), 2))
+    np.add.at(normal, at[good], rows[:, :, None] * rows[:, None])
+    np.add.at(right, at[good], rows * value[:, None])
+    return (np.linalg.pinv(normal, hermitian=True) @ right[..., None])[..., 0]
+
+
+def _poses_magnified(measurements: Measurements, cameras: Sequence[Camera]) -> Array:
+    """Changes (N, 6) of the boards' poses, corners held, by the relative excess; a tracker's 0."""
+    poses = measurements.poses
+    out = np.zeros((len(poses), 6))
+    if not poses.by_intrinsics.shape[-1]:
+        return out
+    for station, camera in enumerate(cameras):
+        mine, focal = poses.station == station, _focal(camera)
+        out[mine] = poses.by_intrinsics[mine, :, : len(focal)] @ focal
+    return out

@@ -8,30 +8,26 @@ is tested for a change of each leg. Nothing is calibrated anew.
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Booleans
-from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
-from pkmcal.calibration.results import SavedCalibration, load
+from pkmcal.arrays import Array, Booleans
+from pkmcal.calibration.aside import select
+from pkmcal.calibration.calibrate import Calibration, Progress
+from pkmcal.calibration.results import SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import plain
 from pkmcal.identify.assembly import seen_configurations
+from pkmcal.judge.causes import magnified
+from pkmcal.judge.changes import ChangeTests, judge
+from pkmcal.judge.held import Held, Trust, evidence, hold
+from pkmcal.judge.new_data import known_rows, look, read
+from pkmcal.judge.words import LookedAt, watch_verdict
 from pkmcal.outcome import Verdict
-from pkmcal.session.load import Session, load_session
-from pkmcal.validate.holdouts import select
-from pkmcal.validate.independence import check_machine, known_rows
-from pkmcal.watching.evidence import Evidence, Trust, evidence
-from pkmcal.watching.figures import judgement_document
-from pkmcal.watching.judged import Judgement, judge
-from pkmcal.watching.lens import magnified
-from pkmcal.watching.words import Circumstances, verdict_of
-from pkmcal.wording import listed
-
-__all__ = ["ALPHA", "Watch", "check_alpha", "watch"]
+from pkmcal.session.load import Session
 
 FORMAT = 1
 ALPHA = 0.01
@@ -43,7 +39,8 @@ LEAST_ALPHA, MOST_ALPHA = 1e-6, 0.2
 class Watch:
     """Everything that a look at a calibrated machine found.
 
-    calibration : as read back. judged : the tests. found : what they were made on. known : (K,)
+    calibration : as read back. judged : the tests. residuals : (K,) root mean squares of each
+    configuration's residuals with the machine held, in standard deviations. known : (K,)
     configurations that the calibration had used, left out. seen : (K,) those that were looked at.
     noise_scale, pose_scale : factors on the stated noise that were used.
     """
@@ -51,8 +48,8 @@ class Watch:
     calibration: SavedCalibration
     session: Session
     verdict: Verdict
-    judged: Judgement
-    found: Evidence
+    judged: ChangeTests
+    residuals: Array
     known: Booleans
     seen: Booleans
     noise_scale: float
@@ -66,7 +63,7 @@ class Watch:
             {
                 "pkmcal_watch": FORMAT,
                 "verdict": asdict(self.verdict),
-                **judgement_document(self.judged, self.calibration.machine),
+                **self.judged.document(self.calibration.machine),
                 "configurations": [n for n, flag in zip(names, self.seen, strict=True) if flag],
                 "known_configurations": [
                     n for n, flag in zip(names, self.known, strict=True) if flag
@@ -97,7 +94,40 @@ def watch(
     check_alpha(alpha)
     told = progress or (lambda _text, _share: None)
     with threadpool_limits(1, "blas"):  # as in calibrate
-        return _watch(calibration, session, alpha, seed, told)
+        began = time.perf_counter()
+        saved, session = read(calibration, session)
+        _check_usable(saved)
+        known = known_rows(saved, session)
+        _check_new(known, np.ones_like(known))
+        looked = look(saved, session, seed, told, 0.9)
+        seen = seen_configurations(looked.measurements)
+        _check_new(known, seen)
+
+        told("Testing for changes", 0.9)
+        old = saved.document.get("statistics") or {}
+        before = float(old.get("noise_scale", 1.0))
+        trust = Trust.of(looked.estimate, before, float(old.get("pose_scale", 1.0)))
+        held = _hold_new(saved, session, looked, trust, ~known)
+        judged = judge(evidence(held, saved.covariance), saved.machine, alpha)
+        around = LookedAt(
+            session.configurations,
+            known,
+            seen,
+            trust.noise_scale / before,
+            cameras_of(session),
+        )
+        return Watch(
+            calibration=saved,
+            session=session,
+            verdict=watch_verdict(judged, around),
+            judged=judged,
+            residuals=held.residuals(),
+            known=known,
+            seen=seen & ~known,
+            noise_scale=trust.noise_scale,
+            pose_scale=trust.pose_scale,
+            timings={**looked.timings, "all": time.perf_counter() - began},
+        )
 
 
 def check_alpha(alpha: float) -> None:
@@ -111,75 +141,31 @@ def check_alpha(alpha: float) -> None:
         )
 
 
-def _watch(
-    calibration: SavedCalibration | Path | str,
-    session: Session | Path | str,
-    alpha: float,
-    seed: int,
-    told: Progress,
-) -> Watch:
-    """:func:`watch`, step by step."""
-    began = time.perf_counter()
-    saved = calibration if isinstance(calibration, SavedCalibration) else load(calibration)
-    if not isinstance(session, Session):
-        session = load_session(session)
-    _check_usable(saved)
-    check_machine(saved, session)
-    known = known_rows(saved, session)
-    _check_new(known, np.ones_like(known))
-    # The calibrated machine, free within its drawing's tolerances, is the best guess of where to
-    # look, and lets a leg that has changed be measured for what it is.
-    looked = calibrate(
-        replace(session, machine=saved.machine),
-        seed=seed,
-        progress=lambda text, share: told(text, 0.9 * share),
-    )
-    told("Testing for changes", 0.9)
-    old = saved.document.get("statistics") or {}
-    before = float(old.get("noise_scale", 1.0))
-    trust = Trust.of(looked.estimate, before, float(old.get("pose_scale", 1.0)))
-    found, seen = _evidence(saved, session, looked, trust, ~known)
-    _check_new(known, seen)
-    judged = judge(found, saved.machine, alpha)
-    around = Circumstances(session.configurations, known, seen, trust.noise_scale / before, session)
-    return Watch(
-        calibration=saved,
-        session=session,
-        verdict=verdict_of(judged, around),
-        judged=judged,
-        found=found,
-        known=known,
-        seen=seen & ~known,
-        noise_scale=trust.noise_scale,
-        pose_scale=trust.pose_scale,
-        timings={**looked.timings, "all": time.perf_counter() - began},
-    )
+def cameras_of(session: Session) -> tuple[str, ...]:
+    """Camera files of a session, in the order of their numbers."""
+    return tuple(dict.fromkeys(station.camera_file for station in session.stations))
 
 
-def _evidence(
+def _hold_new(
     saved: SavedCalibration, session: Session, looked: Calibration, trust: Trust, keep: Booleans
-) -> tuple[Evidence, Booleans]:
-    """The evidence of the configurations to keep (K,), and which were seen."""
+) -> Held:
+    """The calibrated machine held on the configurations to keep, (K,)."""
     data = looked.measurements
     cameras = [station.camera for station in session.stations]
     wide = magnified(data, looked.observation, cameras) if cameras else None
-    seen = seen_configurations(data)
-    _check_new(~keep, seen)
     kept = Trust(
         trust.edges[keep[data.edges.configuration]],
         trust.poses[keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]],
         trust.noise_scale,
         trust.pose_scale,
     )
-    found = evidence(
+    return hold(
         saved.machine,
-        saved.covariance,
         select(data, keep),
         looked.estimate.state,
         kept,
         select(wide, keep) if wide else None,
     )
-    return found, seen
 
 
 def _check_usable(saved: SavedCalibration) -> None:
@@ -201,7 +187,7 @@ def _check_new(known: Booleans, seen: Booleans) -> None:
         return
     raise InputError(
         "there is nothing new in this session: the calibration was made from it",
-        found=listed([f"{int(np.sum(seen & known))} configurations, all of them used"]),
+        found=f"{int(np.sum(seen & known))} configurations, all of them used",
         expected="photographs, or poses, that were taken after the calibration",
         next_step="Take three to five new photographs with their readings",
     )

@@ -1,34 +1,39 @@
-"""Whether a session is new to a calibration: its machine, and its photographs."""
+"""New data beside a calibration: are they the same machine's, what of them is new, and where it is.
+
+The calibrated machine, free within its drawing's tolerances, is the best guess of where to look in
+the photographs; only what was measured, and where poses and stations are, is kept of that.
+"""
 
 from __future__ import annotations
 
-from hashlib import blake2b
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Booleans
+from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
+from pkmcal.calibration.results import SavedCalibration, load
 from pkmcal.errors import InputError
-from pkmcal.session.load import Session
+from pkmcal.session.load import Session, digests, load_session
 from pkmcal.wording import listed
-
-if TYPE_CHECKING:
-    from pkmcal.calibration.results import SavedCalibration
 
 FAR = 10.0
 """Tolerances by which two drawings of one machine may differ: a corrected number, not another
 machine's."""
 
 
-def digests(session: Session) -> dict[str, list[str]]:
-    """Short digests of the photographs' files by configuration."""
-    out: dict[str, list[str]] = {}
-    for station in session.stations:
-        for photo in station.photographs:
-            name = session.configurations[photo.configuration]
-            digest = blake2b(photo.path.read_bytes(), digest_size=8).hexdigest()
-            out.setdefault(name, []).append(digest)
-    return out
+def read(
+    calibration: SavedCalibration | Path | str, session: Session | Path | str
+) -> tuple[SavedCalibration, Session]:
+    """Both, where they are not loaded. Raises InputError where the session is another machine's."""
+    saved = calibration if isinstance(calibration, SavedCalibration) else load(calibration)
+    if not isinstance(session, Session):
+        session = load_session(session)
+    _check_joints(saved, session)
+    _check_machine(saved, session)
+    return saved, session
 
 
 def known_rows(saved: SavedCalibration, session: Session) -> Booleans:
@@ -50,10 +55,23 @@ def known_rows(saved: SavedCalibration, session: Session) -> Booleans:
     )
 
 
-def check_machine(saved: SavedCalibration, session: Session) -> None:
+def look(
+    saved: SavedCalibration, session: Session, seed: int, told: Progress, share: float
+) -> Calibration:
+    """The session measured, and a first estimate of where everything is; see the module.
+
+    seed : of the search for the stations. told : gets the first ``share`` of the progress.
+    """
+    return calibrate(
+        replace(session, machine=saved.machine),
+        seed=seed,
+        progress=lambda text, part: told(text, share * part),
+    )
+
+
+def _check_machine(saved: SavedCalibration, session: Session) -> None:
     """Raise `InputError` where the session is another machine's."""
     machine, drawn = saved.machine, session.machine
-    _check_joints(saved, session)
     if machine.parameters.names != drawn.parameters.names:
         raise _another(
             f"{machine.name}, {machine.n_legs} legs, {len(machine.parameters)} parameters",
@@ -68,6 +86,16 @@ def check_machine(saved: SavedCalibration, session: Session) -> None:
             f"{table.names[k]} {saved.drawing[k]:.6g} in its drawing",
             f"{values[k]:.6g} in the session's, {off[0][k]:.0f} tolerances off",
         )
+
+
+def _another(calibrated: str, found: str) -> InputError:
+    return InputError(
+        "the calibration is of another machine than the session",
+        where="session.yaml, mechanism",
+        found=found,
+        expected=calibrated,
+        next_step="Give the calibration of this machine, or the session's own drawing",
+    )
 
 
 def _check_joints(saved: SavedCalibration, session: Session) -> None:
@@ -91,26 +119,3 @@ def _columns(document: Any) -> list[str]:
     joints = document.get("joints") if isinstance(document, dict) else None
     columns = joints.get("columns") if isinstance(joints, dict) else None
     return [str(name) for name in columns] if isinstance(columns, list) else []
-
-
-def _another(calibrated: str, found: str) -> InputError:
-    return InputError(
-        "the calibration is of another machine than the session",
-        where="session.yaml, mechanism",
-        found=found,
-        expected=calibrated,
-        next_step="Give the calibration of this machine, or the session's own drawing",
-    )
-
-
-def check_independent(known: Booleans, seen: Booleans) -> None:
-    """Raise `InputError` where nothing that was seen is new to the calibration."""
-    if np.any(seen & ~known):
-        return
-    raise InputError(
-        "the session is not independent: the calibration was made from these photographs",
-        found=f"{int(np.sum(seen & known))} configurations, all of them used",
-        expected="photographs that the calibration did not see",
-        next_step="Take new photographs, calibrate with --holdout N, or hold out regions of this"
-        " session with --regions N",
-    )
