@@ -12,10 +12,10 @@ import argparse
 import sys
 from pathlib import Path
 
+from pkmcal.calibration.results import load
 from pkmcal.control.loop import VisualServo
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.observe.images import decode
-from pkmcal.results import load
 from pkmcal.session.load import load_session
 
 

@@ -16,9 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pkmcal.calibration.results import SavedCalibration, load
 from pkmcal.control.loop import VisualServo
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.results import SavedCalibration, load
 
 
 def read_encoders(frame: int, saved: SavedCalibration) -> np.ndarray:

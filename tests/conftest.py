@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from pkmcal.cli import main
+from pkmcal.commands.cli import main
 from rendered import once
 
 

@@ -18,7 +18,7 @@ from pkmcal.calibration.recognise import (
     found_stations,
     read_photographs,
 )
-from pkmcal.check import Level, check_session
+from pkmcal.check.check import Level, check_session
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism

@@ -25,7 +25,8 @@ from pkmcal.boards.selection import positions
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
-from pkmcal.report.camera_page import camera_report_html
+from pkmcal.report.camera import outcome_of
+from pkmcal.report.page import page_html
 from test_boards import CAMERAS, render, view
 
 BOARD = chessboard((8, 6), 0.03)
@@ -306,13 +307,12 @@ def test_the_page(calibrated, tmp_path):
     found = calibrated["fisheye"]
     path = tmp_path / "p0.png"
     cv2.imwrite(str(path), np.full((768, 1024), 120, dtype=np.uint8))
-    html = camera_report_html(found, [path])
+    html = page_html(outcome_of(found, [path]))
     assert html.count('class="shot"') == 10
     assert html.count("data:image/jpeg;base64,") == 1
     assert html.count('class="seen"') == 480
     assert "http://" not in html
     assert "https://" not in html
-    assert "parameter-table" not in html
     assert "Usable" in html
 
 

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.check import (
+from pkmcal.check.check import (
+    JointCheck,
     Level,
     StationCheck,
     _kinematics,
     _station_findings,
     check_session,
+    joint_findings,
 )
-from pkmcal.check_joints import JointCheck, joint_findings
 from pkmcal.session.load import load_session
 
 GOOD = StationCheck("front", 15, True, 0.2, 0.04, 0.08, 5.5, 0.05, 0.01, 0.8)
@@ -173,7 +174,7 @@ def test_nearly_singular_configurations_are_named(demo, monkeypatch):
     session = load_session(demo.session)
     singularity = session.machine.forward_result(session.joints).singularity
     weakest = session.configurations[int(np.argmin(singularity))]
-    monkeypatch.setattr("pkmcal.check.NEAR_SINGULAR", singularity.min() + 1e-9)
+    monkeypatch.setattr("pkmcal.check.check.NEAR_SINGULAR", singularity.min() + 1e-9)
     (finding,) = _kinematics(session, np.random.default_rng(0)).findings
     assert finding.level is Level.DOUBTFUL
     assert finding.text.startswith(f"Near a singular pose in configuration {weakest}: ")

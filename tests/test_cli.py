@@ -16,11 +16,11 @@ import pytest
 
 import pkmcal
 from conftest import run
+from pkmcal.calibration.results import load
 from pkmcal.cameras import load_camera
-from pkmcal.cli import main
+from pkmcal.commands.cli import main
 from pkmcal.files import read_csv
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.results import load
 from pkmcal.session.starter import TO_FILL, template_files
 
 COMMANDS = (
@@ -50,7 +50,7 @@ def test_as_a_module():
 
 def test_help_imports_nothing_heavy():
     heavy = ("numpy", "scipy", "cv2", "pydantic", "yaml", "rich.progress")
-    code = f"import sys, pkmcal.cli; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, pkmcal.commands.cli; print([m for m in {heavy} if m in sys.modules])"
     assert python("-c", code).stdout == "[]\n"
 
 
@@ -84,7 +84,7 @@ def test_the_documentation_tells_of_all_commands_and_options():
 
 def test_a_reader_that_leaves_is_no_error():
     code = (
-        "import sys, os; from pkmcal.cli import main; r, w = os.pipe(); os.dup2(w, 1);"
+        "import sys, os; from pkmcal.commands.cli import main; r, w = os.pipe(); os.dup2(w, 1);"
         " os.close(w); os.close(r); sys.exit(main(['--help']))"
     )
     done = python("-c", code)

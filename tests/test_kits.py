@@ -10,7 +10,7 @@ import pytest
 from kit_sessions import Kit, board_kit, flatness, places, probe_kit, tool
 from pkmcal.geometry.rigid import apply, register
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.report.calibration import report_views
+from pkmcal.report.calibration import report_of
 
 KITS = ("delta", "linear-delta")
 
@@ -44,9 +44,7 @@ def test_a_board_and_a_webcam_calibrate_a_kit(by_board):
 def test_the_report_promises_what_is_kept(by_board):
     """The card about the platform's pose, by the poses and not by joints that nobody saw."""
     kit, found = by_board
-    cards = report_views(found.session, found.observation, found.estimate, found.findings)[
-        "headlines"
-    ]
+    cards = report_of(found.session, found.observation, found.estimate, found.verdict).figures
     questions = [card.question for card in cards]
     assert "How well are the joint centres known?" not in questions
     card = cards[questions.index("How well is the platform's pose known?")]

@@ -10,7 +10,8 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.check import Level
+from pkmcal.check.check import Level
+from pkmcal.check.repeats import _findings, _Look, _station_row
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
@@ -32,7 +33,6 @@ from pkmcal.observe.repeats import (
     same_edges,
 )
 from pkmcal.papers.axis_measurements import to_coordinates
-from pkmcal.repeatability import _findings, _Look, _station_row
 from pkmcal.session.load import load_session
 from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges, simulate_session
 from pkmcal.simulation.configurations import draw_configurations

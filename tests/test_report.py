@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal import wording
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.observe.predict import legs_in_camera
-from pkmcal.report import parameters, pictures, rejections, residuals, wording
-from pkmcal.report.calibration import report_views
+from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.charts import ticks_between
 from pkmcal.report.provenance import camera_position_covariance
 from pkmcal.report.scene import enlargement
@@ -177,11 +177,12 @@ def test_edges_are_drawn_where_the_camera_sees_them(tmp_path):
 
 def test_joints_are_drawn_where_the_camera_sees_them(case):
     session, estimate = case.session, case.estimate
-    shot = report_views(session, case.observation, estimate)["pictures"][0]
+    edges = case.observation.edges
+    base, platform = joint_centres(session.machine, estimate.machine, estimate.covariance)
+    shot = pictures.pictures(session, edges, estimate, np.zeros(len(edges)), (base, platform))[0]
     s = [station.name for station in session.stations].index(shot.station)
     k = session.configurations.index(shot.configuration)
     T_camera_base, pose = estimate.state.T_camera_base[s], estimate.state.T_base_platform[k]
-    base, platform = joint_centres(session.machine, estimate.machine, estimate.covariance)
     project = session.stations[s].camera.project
     assert len(shot.spots) == 12
     for spot in shot.spots:
@@ -214,7 +215,7 @@ def test_pictures_stand_for_all_stations_and_show_best_and_worst(case):
 
 
 def test_rejections_are_grouped_by_reason(case):
-    first, second = rejections.reasons(case.session, case.observation.rejected)
+    first, second = provenance.reasons(case.session, case.observation.rejected)
     assert (first.count, first.text) == (2, "seen over … mm only")
     assert first.cases[0] == ("front0 / c0", "leg 3 tube 2 right: seen over 3.5 mm only")
     assert second.cases == (("front1 / c3", "whole photograph"),)

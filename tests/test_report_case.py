@@ -13,6 +13,8 @@ from pkmcal.identify.problem import Estimate, State, Statistics
 from pkmcal.measurements import EdgeSet, Observation, Rejection
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera
+from pkmcal.report.calibration import report_of
+from pkmcal.report.page import page_html
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import Photograph
 
@@ -23,21 +25,15 @@ RADIUS = {0: 0.014, 1: 0.009}
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Stands in for identify.verdict.Verdict."""
-
-    usable: bool
-    headline: str
-    reasons: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class Case:
     session: Session
     observation: Observation
     estimate: Estimate
+
+
+def report_html(*found, **more) -> str:
+    """The report's page; as `report_of`."""
+    return page_html(report_of(*found, **more))
 
 
 def camera() -> Pinhole:

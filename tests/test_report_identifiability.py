@@ -10,10 +10,10 @@ import pytest
 
 from pkmcal.identify.words import explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.outcome import Verdict
 from pkmcal.papers.conditions import conditions
-from pkmcal.report.calibration import report_html
 from pkmcal.report.identifiability import STUB, section
-from test_report_case import Verdict, make_case
+from test_report_case import make_case, report_html
 from test_report_page import Found
 from test_words import heaved, make, told_of
 

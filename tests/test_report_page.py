@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pkmcal.measurements import Rejection
-from pkmcal.report.calibration import report_html
-from test_report_case import Case, Verdict, make_case
+from pkmcal.outcome import Verdict
+from test_report_case import Case, make_case, report_html
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
 CHROMIUM = next(
@@ -150,7 +150,7 @@ def test_page_runs_in_a_browser(page, tmp_path, width):
     assert root["data-overhang"] == "0"
     assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
     tags = Found(document).tags
-    assert any(a.get("id") == "plot" and a.get("data-drawn") == "yes" for _, a in tags)
+    assert any(a.get("id") == "plot-space" and a.get("data-drawn") == "yes" for _, a in tags)
     assert any(tag == "canvas" for tag, _ in tags)
     rows = [a for tag, a in tags if tag == "tr" and "data-values" in a]
     assert len(rows) == 54

@@ -9,13 +9,13 @@ import shutil
 import numpy as np
 import pytest
 
-from pkmcal import results
+from pkmcal.calibration import results
+from pkmcal.calibration.results import base_camera_covariance, check_output, document_of, load
 from pkmcal.errors import InputError
 from pkmcal.files import json_text
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.result_document import base_camera_covariance, document_of
-from pkmcal.results import check_output, load, save
+from pkmcal.report.calibration import save
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_twice_the_same_but_for_the_timings(folder, calibrated, tmp_path):
 def test_a_failed_save_leaves_the_old_result(folder, calibrated, monkeypatch):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
 
-    def fail(_calibration):
+    def fail(*_calibration):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(results, "document_of", fail)

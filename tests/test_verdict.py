@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
 from pkmcal.identify.bundle import bundle, what_data_tell
 from pkmcal.identify.verdict import LEFT_OPEN, judge
@@ -15,7 +16,6 @@ from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.papers.conditions import conditions
 from pkmcal.report.parameters import parameter_groups, unidentified
-from pkmcal.result_document import identifiability_of
 from test_words import heaved, make, moved
 
 

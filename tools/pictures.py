@@ -30,8 +30,9 @@ from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.measurements import Measurements
 from pkmcal.observe import legs
-from pkmcal.report import page, templating
-from pkmcal.results import save
+from pkmcal.report import page
+from pkmcal.report import page as templating
+from pkmcal.report.calibration import save
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
 from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera

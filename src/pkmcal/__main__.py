@@ -2,7 +2,7 @@
 
 import sys
 
-from pkmcal.cli import main
+from pkmcal.commands.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

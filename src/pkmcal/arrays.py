@@ -1,4 +1,4 @@
-"""The one array type of the project, so that signatures stay readable."""
+"""The one array type of the project, so that signatures stay readable; and its plain figure."""
 
 from __future__ import annotations
 
@@ -10,3 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 Integers = NDArray[np.integer[Any]]
 Booleans = NDArray[np.bool_]
+
+
+def rms(values: Array) -> float:
+    """Root mean square of all values; NaN of none."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")

@@ -13,7 +13,6 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.views import Boards, find_boards
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.files import listed
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import unrecognised
 from pkmcal.observe.images import decode, decode_all
@@ -21,6 +20,7 @@ from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import StationPose, View, find_station
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import label_of
+from pkmcal.wording import listed
 
 WORKERS = 2
 """Threads beside one another: decoding and array work release Python's lock."""

@@ -15,7 +15,6 @@ from pkmcal.errors import InputError
 from pkmcal.files import (
     Document,
     closest,
-    listed,
     parse_yaml,
     read_text,
     read_yaml,
@@ -24,6 +23,7 @@ from pkmcal.files import (
     write_text,
     yaml_text,
 )
+from pkmcal.wording import listed
 
 
 def load_camera(path: Path | str, label: str | None = None) -> Camera:
@@ -123,7 +123,12 @@ def read_camera(path: Path | str, camera: str | None = None) -> Camera:
 
 
 def write_camera(camera: Camera, path: Path | str, form: str) -> None:
-    """Write a camera for another program; it is read back and compared before it is written.
+    """Write a camera for another program, as :func:`foreign_text` has it."""
+    write_text(Path(path), foreign_text(camera, path, form))
+
+
+def foreign_text(camera: Camera, path: Path | str, form: str) -> str:
+    """The text of another program's camera file; it is read back and compared before.
 
     form : opencv (XML where the path ends so, else YAML), ros or kalibr.
     """
@@ -148,7 +153,7 @@ def write_camera(camera: Camera, path: Path | str, form: str) -> None:
         raise InputError(
             f"the format {form} does not keep this camera", where=path.name, found=again.model
         )
-    write_text(path, text)
+    return text
 
 
 def _from_opencv(text: str, label: str) -> Camera:

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from pkmcal.commands import console
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pkmcal.boards.camera import CameraCalibration
+from pkmcal.commands.finish import PAGE, finish
 
 ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"}
-WHAT = {
-    "camera.html": "open it in a browser",
+FILES = {
+    "camera.html": PAGE,
     "camera.yaml": "the camera, for a session's cameras/",
     "camera.json": "everything, with covariances",
 }
@@ -66,9 +62,12 @@ def camera(
     as_json: console.Json = False,
 ) -> int:
     """Calibrate a camera from photographs of a board."""
+    from dataclasses import replace
+
     from pkmcal.boards.board import load_board
     from pkmcal.boards.camera import calibrate_photographs
     from pkmcal.files import check_writable
+    from pkmcal.report.camera import outcome_of
 
     if len(images) == 1 and (images[0] / "session.yaml").is_file():
         paths, there = of_session(images[0])
@@ -76,22 +75,22 @@ def camera(
         paths, there = photographs(images), board or beside(images)
     described = load_board(board or there)
     check_writable(out)
+    others = [(OTHERS[form.value], form.value) for form in to or []]
     with console.progress(as_json) as told:
         told(f"Looking for the board in {len(paths)} photographs", 0.1)
         found = calibrate_photographs(paths, described, model.value)
         told("Writing the report", 0.9)
-        files = save(found, paths, out, [form.value for form in to or []])
-    if as_json:
-        console.print_json({**found.document(), "files": files})
-    else:
-        tell(console.out(), found, out, files)
-    return 0
+        outcome = outcome_of(found, paths, others)
+    files = {**FILES, **{name: "for that program" for name, _ in others}}
+    outcome = replace(outcome, summary={**outcome.document, "files": list(files)})
+    return finish(outcome, out, files, as_json=as_json)
 
 
 def of_session(folder: Path) -> tuple[list[Path], Path]:
     """A session's photographs of its board, all of one camera, and the board's file."""
     from pkmcal.errors import InputError
-    from pkmcal.files import listed, read_yaml
+    from pkmcal.files import read_yaml
+    from pkmcal.wording import listed
 
     session = read_yaml(folder / "session.yaml")
     stations: dict[str, Any] = session.data.get("stations") or {}
@@ -158,44 +157,3 @@ def beside(images: list[Path]) -> Path:
         where=str(first),
         expected="a file board.yaml here or above, or --board FILE",
     )
-
-
-def save(found: CameraCalibration, paths: list[Path], folder: Path, forms: list[str]) -> list[str]:
-    """Write camera.yaml, camera.json, camera.html and other programs' files; returns the names."""
-    from dataclasses import replace
-
-    from pkmcal.cameras.files import save_camera, write_camera
-    from pkmcal.files import json_text, staged_folder
-    from pkmcal.report.camera_page import camera_report_html
-
-    page = camera_report_html(found, paths)
-    with staged_folder(folder) as stage:
-        (stage / "camera.html").write_text(page, encoding="utf-8", newline="\n")
-        # with its covariance, so that `calibrate --refine-camera` knows how far to move it
-        measured = replace(found.camera, covariance=found.covariance)
-        save_camera(measured, stage / "camera.yaml")
-        (stage / "camera.json").write_text(json_text(found.document()), encoding="utf-8")
-        for form in forms:
-            write_camera(found.camera, stage / OTHERS[form], form)
-    return [*WHAT, *(OTHERS[form] for form in forms)]
-
-
-def tell(out: Console, found: CameraCalibration, folder: Path, files: list[str]) -> None:
-    """The result in a sentence, its numbers, what should be known, and the files."""
-    from pkmcal.report.camera_page import headline, parameter_rows
-
-    out.print(headline(found), style="bold")
-    table = console.plain_table()
-    for _ in range(3):
-        table.add_column()
-    for row in parameter_rows(found):
-        sigma = f"± {row.sigma}" if row.sigma else "not estimated"
-        table.add_row(row.name, f"{row.value} {row.unit}".strip(), sigma)
-    out.print(table)
-    points: list[tuple[str, str]] = [(console.MARKS["doubtful"], text) for text in found.warnings]
-    console.print_points(out, points)
-    notes: dict[str, Any] = {
-        **WHAT,
-        **{name: "for that program" for name in files if name not in WHAT},
-    }
-    console.print_files(out, [(str(folder / name), notes[name]) for name in files])

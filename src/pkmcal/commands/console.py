@@ -28,6 +28,8 @@ MARKS = {
 }
 STYLES = {"paper": "yellow", "prototype": "dim", "ours": ""}
 """Of a table's rows, by whose figures they are."""
+WIDEST_NAME = 32
+"""Letters of a row's name up to which it stays on one line."""
 
 
 def out() -> Console:
@@ -94,9 +96,10 @@ def print_table(console: Console, table: Table) -> None:
     shown = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
     if marked:
         shown.add_column()
+    short = max((len(row.name) for row in table.rows), default=0) <= WIDEST_NAME
     for place, heading in enumerate(columns):
         left = place == 0 or place in table.words
-        shown.add_column(heading, justify="left" if left else "right")
+        shown.add_column(heading, justify="left" if left else "right", no_wrap=not place and short)
     for row in table.rows:
         mark = [MARKS[row.mark] if row.mark else ""] if marked else []
         cells = (escaped(text) for text in (row.name, *row.cells)[: len(columns)])

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.calibrate import exit_code, summary, tell
+from pkmcal.commands.calibrate import FILES
+from pkmcal.commands.finish import tell, write
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,8 +39,11 @@ def demo(
     as_json: console.Json = False,
 ) -> int:
     """Simulate, calibrate, compare with the truth, open the report."""
+    from dataclasses import replace
+
+    from pkmcal.calibration.results import check_output
     from pkmcal.commands.comparison import compare
-    from pkmcal.results import check_output, save
+    from pkmcal.report.calibration import outcome_of
 
     session, result = out / SESSION, out / CALIBRATION
     _make_room(out)
@@ -48,25 +52,29 @@ def demo(
         _simulate(session, fast, told)
         calibration = _calibrate(session, told)
         told("Writing the report", 0.98)
-        save(calibration, result)
+        found = outcome_of(calibration)
+        write(found, result, FILES)
     # Only now, with everything written, is the truth looked at.
     comparison = compare(calibration, session)
-    if as_json:
-        whole = summary(calibration, result)
-        console.print_json({**whole, "session": session, "comparison": comparison.as_dict()})
-        return exit_code(calibration)
-    terminal = console.out()
     photographs = sum(len(station.photographs) for station in calibration.session.stations)
-    title = f"A {calibration.machine.name}, not built quite as drawn, in {photographs} simulated"
-    console.print_points(terminal, [("", f"{title} photographs: {session}")])
-    terminal.print()
-    tell(terminal, calibration, result)
-    _tell_comparison(terminal, comparison)
-    if not no_open and _can_show():
-        import webbrowser
+    found = replace(
+        found,
+        subject=f"A {calibration.machine.name}, not built quite as drawn, in {photographs}"
+        f" simulated photographs: {session}",
+        summary={
+            **(found.summary or {}),
+            "session": session,
+            "comparison": comparison.as_dict(),
+        },
+    )
+    code = tell(found, result, FILES, as_json=as_json)
+    if not as_json:
+        _tell_comparison(console.out(), comparison)
+        if not no_open and _can_show():
+            import webbrowser
 
-        webbrowser.open((result / "report.html").resolve().as_uri())
-    return exit_code(calibration)
+            webbrowser.open((result / "report.html").resolve().as_uri())
+    return code
 
 
 def _make_room(out: Path) -> None:
@@ -114,8 +122,10 @@ def _calibrate(session: Path, told: console.Progress) -> Calibration:
 
 def _tell_comparison(out: Console, found: Comparison) -> None:
     """Errors before and after, and whether the standard deviations were honest."""
+    from pkmcal.outcome import Row, Table
+
     before, after = found.drawing, found.calibrated
-    table = console.plain_table("", "Against the truth", "Drawing", "Calibrated", "")
+    rows: list[Row] = []
     for what, old, new, unit in (
         ("joint centres", before.centre * 1e3, after.centre * 1e3, " mm"),
         ("joint offsets", before.offset * 1e3, after.offset * 1e3, " mm"),
@@ -123,21 +133,15 @@ def _tell_comparison(out: Console, found: Comparison) -> None:
         ("platform's orientation", degrees(before.orientation), degrees(after.orientation), "°"),
     ):
         times = f"{old / new:.0f} times nearer" if new > 0 else ""
-        table.add_row("", what, f"{old:.2f}{unit}", f"[bold]{new:.3f}{unit}[/]", times)
+        rows.append(Row(what, (f"{old:.2f}{unit}", f"{new:.3f}{unit}", times)))
+    columns = ("Against the truth", "Drawing", "Calibrated", "")
+    console.print_table(out, Table("", columns, tuple(rows)))
     out.print()
-    out.print(table)
-    out.print()
-    share = found.within / found.count
-    console.print_points(
-        out,
-        [
-            (
-                "[cyan]→[/]",
-                f"{found.within} of {found.count} values ({share:.0%}) lie within two of their"
-                " standard deviations of the truth; 95 % should.",
-            )
-        ],
+    said = (
+        f"{found.within} of {found.count} values ({found.within / found.count:.0%}) lie within two"
+        " of their standard deviations of the truth; 95 % should."
     )
+    console.print_points(out, [("[cyan]→[/]", said)])
 
 
 def _can_show() -> bool:

@@ -34,18 +34,36 @@ def finish(
 
     quiet : say nothing of a result that may be used, and one sentence of another.
     """
-    from pkmcal.files import write_folder
-
     with console.progress(as_json or quiet) as told:
         told("Writing the report", 0.97)
-        write_folder(folder, contents(outcome, files))
+        write(outcome, folder, files)
+    return tell(outcome, folder, files, as_json=as_json, quiet=quiet)
+
+
+def write(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> None:
+    """Write the files, whole or not at all."""
+    from pkmcal.files import write_folder
+
+    write_folder(folder, contents(outcome, files))
+
+
+def tell(
+    outcome: Outcome,
+    folder: Path,
+    files: Mapping[str, str],
+    *,
+    as_json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Tell what was found and where it stands, and return the exit code."""
     if as_json:
         console.print_json(printed(outcome, folder, files))
     elif not quiet:
         out = console.out()
-        tell(out, outcome)
-        out.print()
-        console.print_files(out, [(str(folder / name), what) for name, what in files.items()])
+        tell_people(out, outcome)
+        if files:
+            out.print()
+            console.print_files(out, [(str(folder / name), what) for name, what in files.items()])
     elif not outcome.verdict.usable:
         verdict = outcome.verdict
         console.print_error(" ".join([verdict.headline, *verdict.reasons]))
@@ -69,12 +87,12 @@ def printed(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> dict[st
     """The one JSON object of a command."""
     return {
         "exit_code": outcome.exit_code,
-        "files": {name: str(folder / name) for name in files},
+        **({"files": {name: str(folder / name) for name in files}} if files else {}),
         **(outcome.document if outcome.summary is None else outcome.summary),
     }
 
 
-def tell(out: Console, outcome: Outcome) -> None:
+def tell_people(out: Console, outcome: Outcome) -> None:
     """What a command found, for people: the verdict, numbers, and what to look at."""
     verdict, findings = outcome.verdict, outcome.findings
     if outcome.subject:

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pkmcal.commands import console
+from pkmcal.commands.finish import NUMBERS, PAGE, finish
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from pkmcal.control.study import Plan
-    from pkmcal.outcome import Table
-    from pkmcal.report.servo_page import Servo
 
-WHAT = {
-    "servo.html": "open it in a browser",
-    "servo.json": "everything, for programs",
-}
+FILES = {"servo.html": PAGE, "servo.json": NUMBERS}
+MOST_SAMPLES = 5000
+"""Samples of a run; more take minutes and hundreds of megabytes."""
 
 
 def servo(
@@ -89,8 +85,9 @@ def servo(
 ) -> int:
     """Simulate control by the legs in the image."""
     from pkmcal.control.source import controlled, legs_of
+    from pkmcal.control.study import study
     from pkmcal.files import check_own_folder
-    from pkmcal.report.servo_page import servo_of
+    from pkmcal.report.servo import outcome_of
 
     plan = _plan(
         law=law, runs=runs, gain=gain, rate=rate, delay=delay, noise=noise,
@@ -98,20 +95,14 @@ def servo(
         hand=(hand_position, hand_rotation), ends=(start, goal),
     )  # fmt: skip
     folder = out or Path("servo")
-    check_own_folder(folder, WHAT, "a study of servoing", "an earlier study")
+    check_own_folder(folder, FILES, "a study of servoing", "an earlier study")
     numbers = None if legs is None else legs_of(legs)
     subject = controlled(
         machine, session=session, station=station, camera=camera, legs=numbers, seed=seed
     )
     with console.progress(as_json) as told:
-        found = servo_of(subject, plan, told)
-        told("Writing the report", 0.97)
-        save(found, folder)
-    if as_json:
-        console.print_json(summary(found, folder))
-    else:
-        tell(console.out(), found, folder)
-    return exit_code(found)
+        outcome = outcome_of(subject, study(subject.scene, plan, told))
+    return finish(outcome, folder, FILES, as_json=as_json)
 
 
 def _plan(
@@ -165,68 +156,9 @@ def _plan(
     return Plan(loop, runs, seed, hand[0], float(np.deg2rad(hand[1])), start, goal)
 
 
-MOST_SAMPLES = 5000
-"""Samples of a run; more take minutes and hundreds of megabytes."""
-
-
 def _positive(where: str, value: float, most: float) -> None:
     if not 0 < value <= most:
         raise InputError(
             "a loop cannot have this", where=where, found=f"{value:g}",
             expected=f"more than 0 and at most {most:g}",
         )  # fmt: skip
-
-
-def exit_code(found: Servo) -> int:
-    """1 where the control must not be used."""
-    return 0 if found.judgement.usable else 1
-
-
-def save(found: Servo, folder: Path) -> None:
-    """Write both files, whole or not at all."""
-    from pkmcal.files import json_text, write_folder
-    from pkmcal.report.servo_page import servo_html
-
-    texts = {"servo.html": servo_html(found), "servo.json": json_text(found.document())}
-    write_folder(folder, texts)
-
-
-def summary(found: Servo, folder: Path) -> dict[str, Any]:
-    """What the command says, for programs."""
-    document = found.document()
-    document.pop("curves")
-    files = {name: str(folder / name) for name in WHAT}
-    return {"exit_code": exit_code(found), **document, "files": files}
-
-
-def tell(out: Console, found: Servo, folder: Path) -> None:
-    """What the command says, for people."""
-    from pkmcal.report.servo_page import outcome_table
-
-    j = found.judgement
-    console.print_points(out, [("", found.subject.origin)])
-    out.print()
-    console.print_points(out, [(console.MARKS["good" if j.usable else "wrong"], j.headline)])
-    console.print_points(out, [("  [red]•[/]", reason) for reason in j.reasons])
-    out.print()
-    _table(out, outcome_table(found))
-    console.print_points(out, [("", found.stillness)])
-    points = [(console.MARKS["doubtful"], note) for note in found.warnings]
-    points += [("[cyan]→[/]", advice) for advice in j.advice]
-    if points:
-        out.print()
-        console.print_points(out, points)
-    out.print()
-    console.print_files(out, [(str(folder / name), what) for name, what in WHAT.items()])
-
-
-def _table(out: Console, table: Table) -> None:
-    from rich.table import Table as Rich
-
-    shown = Rich(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for place, heading in enumerate(table.columns):
-        right = "right" if place else "left"
-        shown.add_column(heading, justify=right, no_wrap=not place)
-    for row in table.rows:
-        shown.add_row(console.escaped(row.name), *row.cells)
-    out.print(shown)

@@ -68,8 +68,8 @@ def calibrated_station(
     Raises InputError where there is no such station or no camera file, ResultError for a
     calibration that was refused.
     """
+    from pkmcal.calibration.results import load
     from pkmcal.export.source import load_source
-    from pkmcal.results import load
 
     saved = load(folder)
     if not saved.verdict.usable:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.results import SavedCalibration, SavedStation, load
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.control.seen import seen_machine
 from pkmcal.control.study import Scene, Uncertainty
@@ -15,7 +16,6 @@ from pkmcal.errors import InputError
 from pkmcal.export.source import Source, load_source
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.results import SavedCalibration, SavedStation, load
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.stations import default_stations
 from pkmcal.simulation.truth import stream, true_machine

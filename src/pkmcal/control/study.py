@@ -186,7 +186,7 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Trials:
     """The runs with one estimate of the geometry.
 
     overshoot : (R,) largest part of its way by which a platform was beyond the goal. rise : (R,)
@@ -222,7 +222,7 @@ class Study:
     scene: Scene
     plan: Plan
     eye: Eye
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[Trials, ...]
     image: Stillness
     held: Stillness
     hidden: Array
@@ -235,7 +235,7 @@ class Study:
         wanted = set(self.eye.true.legs.tolist())
         return next(choice for choice in self.choices if set(choice.legs) == wanted)
 
-    def outcome(self, name: str) -> Outcome:
+    def outcome(self, name: str) -> Trials:
         """By the estimate's name."""
         return next(o for o in self.outcomes if o.estimate.name == name)
 
@@ -259,7 +259,7 @@ def study(
         eye.true, scene.drawing, scene.uncertainty, plan.runs, np.random.default_rng(seeds[2]),
         plan.hand_position, plan.hand_rotation,
     )  # fmt: skip
-    outcomes: list[Outcome] = []
+    outcomes: list[Trials] = []
     for k, belief in enumerate(beliefs):
         told = _told(progress, f"Servoing: {belief.title.lower()}", 0.05 + 0.2 * k)
         # the same noise for all, so that differences are the estimates'
@@ -299,13 +299,13 @@ def check_loop(loop: Loop) -> None:
     )
 
 
-def outcome(estimate: Estimate, runs: Runs) -> Outcome:
+def outcome(estimate: Estimate, runs: Runs) -> Trials:
     """The figures of an estimate's runs."""
     last = np.arange(len(runs.time)) <= runs.last[:, None]
     past = np.where(last, runs.past, 0.0)
     lowest = np.minimum.accumulate(runs.error, axis=1)
     first = np.maximum(runs.error[:, :1], 1e-300)
-    return Outcome(
+    return Trials(
         estimate,
         runs,
         overshoot=np.maximum(past.max(axis=1), 0.0),

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pkmcal.control.analysis import Subset
-from pkmcal.control.study import Outcome, Study
+from pkmcal.control.study import Study, Trials
+from pkmcal.outcome import Verdict
 
 ENOUGH = 0.9
 """Part of the runs with the identified geometry that must reach their goal."""
@@ -19,18 +18,7 @@ COARSE = 0.02
 """Noise at the goal, as a part of the usual way, that deserves a word."""
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """usable : may the control be used. headline, reasons against it, warnings, advice."""
-
-    usable: bool
-    headline: str
-    reasons: tuple[str, ...]
-    warnings: tuple[str, ...]
-    advice: tuple[str, ...]
-
-
-def judgement(found: Study) -> Judgement:
+def judgement(found: Study) -> Verdict:
     """The study in words."""
     own, good = found.own, found.outcome("identified")
     reasons = (*_blind(found), *_failures(good))
@@ -46,11 +34,11 @@ def judgement(found: Study) -> Judgement:
         headline = f"Control by the {law} of {legs} should not be used: " + _why(found, good)
     warnings = (*_fading(found), *_others(found), *_hidden(found), *_by_hand(found), *_noise(found))
     if usable:
-        return Judgement(usable, headline, (), (*reasons, *warnings), _advice(found))
-    return Judgement(usable, headline, reasons, warnings, _advice(found))
+        return Verdict(usable, headline, (), (*reasons, *warnings), _advice(found))
+    return Verdict(usable, headline, reasons, warnings, _advice(found))
 
 
-def _why(found: Study, good: Outcome) -> str:
+def _why(found: Study, good: Trials) -> str:
     if found.own.blind:
         return "these legs do not show every motion of the platform."
     return f"{good.reached} of {len(good.runs.end)} runs reach the goal."
@@ -73,7 +61,7 @@ def _blind(found: Study) -> tuple[str, ...]:
     )
 
 
-def _failures(outcome: Outcome) -> tuple[str, ...]:
+def _failures(outcome: Trials) -> tuple[str, ...]:
     """How runs failed, the most frequent first."""
     n = len(outcome.runs.end)
     return tuple(f"In {count} of {n} runs: {end.sentence}" for end, count in outcome.ends.items()

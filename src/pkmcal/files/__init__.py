@@ -5,7 +5,6 @@ from pkmcal.files.documents import (
     Keys,
     closest,
     json_text,
-    listed,
     parse_yaml,
     plain,
     read_json,
@@ -25,6 +24,7 @@ from pkmcal.files.writing import (
     write_folder,
     write_text,
 )
+from pkmcal.wording import listed
 
 __all__ = [
     "Document",

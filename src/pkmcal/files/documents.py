@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,15 +67,6 @@ def closest(name: str, known: Iterable[str]) -> str | None:
     # 0.6 is difflib's own threshold: one or two wrong letters in a short key.
     matches = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
     return by_lower[matches[0]] if matches else None
-
-
-def listed(names: Sequence[str], longest: int = 6) -> str:
-    """Join names for a sentence: "a, b and c", or "a, b, c and 12 more"."""
-    if len(names) <= 1:
-        return "".join(names)
-    if len(names) <= longest:
-        return f"{', '.join(names[:-1])} and {names[-1]}"
-    return f"{', '.join(names[: longest - 1])} and {len(names) - longest + 1} more"
 
 
 def shown(value: object) -> str:

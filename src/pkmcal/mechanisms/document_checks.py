@@ -13,7 +13,6 @@ from typing import TypeAlias
 import numpy as np
 
 from pkmcal.errors import InputError
-from pkmcal.files import listed
 from pkmcal.files.documents import field_path
 from pkmcal.mechanisms.carriers.contract import IN_PLANE, Site, base_carriers, platform_carriers
 from pkmcal.mechanisms.document import (
@@ -25,6 +24,7 @@ from pkmcal.mechanisms.document import (
 )
 from pkmcal.mechanisms.joints import equations
 from pkmcal.mechanisms.motors import bodies, motor_columns, sharing
+from pkmcal.wording import listed
 
 SAME = 1e-9
 """Metres, or parts of a direction, by which equal numbers of a file differ when written."""

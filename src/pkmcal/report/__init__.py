@@ -1,1 +1,1 @@
-"""What commands found, as pages that a person wants to read: :mod:`pkmcal.report.page` is the one page."""
+"""What commands found, as pages for people; :mod:`pkmcal.report.page` is the one of all of them."""

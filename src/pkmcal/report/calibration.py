@@ -1,18 +1,25 @@
-"""The page: every section's view, put into the templates."""
+"""What a calibration found, as an outcome: its verdict, main numbers, and the report's parts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from markupsafe import Markup
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.results import REPORT, check_output, texts_of, versions
+from pkmcal.files import write_folder
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.problem import Estimate
-from pkmcal.measurements import Observation
+from pkmcal.judge.holdouts import holdout_of
+from pkmcal.measurements import EdgeSet, Observation
+from pkmcal.outcome import Finding, Level, Outcome, Part, Plot, Verdict
 from pkmcal.report import (
-    figure,
+    charts,
     headline,
     identifiability,
     page,
@@ -20,21 +27,71 @@ from pkmcal.report import (
     pictures,
     poses,
     provenance,
-    rejections,
     residuals,
     scene,
-    toolpoint,
-    validation_page,
+    validation,
 )
+from pkmcal.report.toolpoint import ToolPoint, tool_point
 from pkmcal.session.load import Session
 
 if TYPE_CHECKING:
+    from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.words import Findings
-    from pkmcal.outcome import Verdict
-    from pkmcal.validate.holdouts import HoldOut
+    from pkmcal.judge.holdouts import HoldOut
+
+MODEL_ERROR = Markup(
+    "<strong>What σ means here.</strong> The standard deviations say how much the result would"
+    " scatter if the same photographs and readings were taken again. They know the noise of the"
+    " measurement and nothing of what the model leaves out: legs that bend, joints with play, a"
+    " lens that its file does not describe. Photographs that the calibration has not seen are the"
+    " test for those."
+)
+RESIDUALS = (
+    "Measured against predicted, in standard deviations. Bars hold the middle half of the values,"
+    " lines nine tenths; the grey band is where nine tenths belong if noise is all that is left."
+    " Longer lines mean that something other than the stated noise is at work; a box off zero,"
+    " that it always pulls the same way."
+)
 
 
-def report_html(
+def outcome_of(calibration: Calibration) -> Outcome:
+    """Everything that `pkmcal calibrate` tells and writes."""
+    c, held_out = calibration, holdout_of(calibration)
+    told = report_of(
+        c.session,
+        c.observation,
+        c.estimate,
+        c.verdict,
+        findings=c.findings,
+        timings=c.timings,
+        holdout=held_out,
+    )
+    groups = parameters.parameter_groups(c.session.machine, c.estimate)
+    open_ = parameters.unidentified(groups, c.estimate, c.findings)
+    numbers = held_out and held_out.document(c.session.configurations)
+    centres, tool = _uncertainty(c.session, c.estimate)
+    return replace(
+        told,
+        closing="" if c.verdict.usable else "Written all the same, to find out why:",
+        texts=texts_of(c, open_, numbers),
+        summary={
+            "verdict": asdict(c.verdict),
+            "figures": headline.numbers(c.observation, c.estimate, centres, tool),
+            "session_warnings": c.session.warnings,
+            "holdout": numbers,
+            "timings": c.timings,
+        },
+    )
+
+
+def save(calibration: Calibration, folder: Path | str) -> None:
+    """Write a calibration's three files into `folder`, whole or not at all."""
+    check_output(folder)
+    found = outcome_of(calibration)
+    write_folder(Path(folder), {REPORT: page.page_html(found), **found.texts})
+
+
+def report_of(
     session: Session,
     observation: Observation,
     estimate: Estimate,
@@ -43,71 +100,48 @@ def report_html(
     findings: Findings | None = None,
     timings: Mapping[str, float] | None = None,
     holdout: HoldOut | None = None,
-) -> str:
-    """One HTML page that needs nothing else: no network, no other file.
+) -> Outcome:
+    """The verdict, cards and parts.
 
-    verdict : usable, headline, reasons, warnings, advice. findings : what the data tell of the
-    machine; without them their section is left out. timings : seconds by step. holdout : what the
-    estimate predicts of configurations that it did not see.
+    findings : what the data tell of the machine; without them their section is left out.
+    timings : seconds by step. holdout : what the estimate predicts of configurations that it did
+    not see.
     """
-    views = report_views(session, observation, estimate, findings)
-    return page.render(
-        "report.html.j2",
-        **views,
+    edges = observation.edges
+    camera = residuals.camera_numbers(session)
+    shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
+    centres, tool = _uncertainty(session, estimate)
+    measured = poses.section(session, observation, estimate)
+    # boards and trackers alone have no edges to show; legs without any do have a question
+    photographed = len(edges) > 0 or not len(observation.poses)
+    parts = (
+        _geometry(session, observation, estimate, centres),
+        _parameters(session, estimate),
+        findings and _identifiability(findings, estimate),
+        _photographs(session, edges, estimate, shifts, centres) if photographed else None,
+        measured and measured.part,
+        holdout and validation.held_out(holdout, session),
+        _residuals(session, edges, estimate, shifts, measured and measured.axes),
+        _left_out(session, observation, estimate, findings),
+        _stations(session, estimate, camera),
+        _how(session, estimate, timings or {}),
+    )
+    return Outcome(
+        command="calibrate",
+        title=f"Calibration of {session.machine.name}",
         verdict=verdict,
-        timings=provenance.durations(timings),
-        holdout=validation_page.holdout_views(holdout, session),
-        plotly=page.plotly_script(),
+        kicker=f"session {session.folder.name}",
+        figures=headline.cards(session, observation, estimate, centres, tool),
+        parts=tuple(part for part in parts if part),
+        findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
     )
 
 
-def report_views(
-    session: Session,
-    observation: Observation,
-    estimate: Estimate,
-    findings: Findings | None = None,
-) -> dict[str, Any]:
-    """Everything that the templates show besides the verdict, by its name there."""
-    edges, machine = observation.edges, estimate.machine
-    camera = residuals.camera_numbers(session)
+def _uncertainty(session: Session, estimate: Estimate) -> tuple[tuple[Centres, ...], ToolPoint]:
+    """Joint centres, and poses of the configurations in use, free of the choice of frames."""
     covariance = free_of_gauge(estimate)
-    centres = joint_centres(session.machine, machine, covariance)
-    tool = _tool_point(session, estimate, covariance, centres)
-    shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
-    groups = parameters.parameter_groups(session.machine, estimate)
-    drawn = scene.scene_of(session, estimate, centres)
-    seen = poses.places(observation, estimate)
-    # boards and trackers alone have no edges to show; legs without any do have a question
-    photographed = len(edges) > 0 or not len(observation.poses)
-    return {
-        "session": session,
-        "estimate": estimate,
-        "headlines": headline.headlines(session, observation, estimate, centres, tool),
-        "scene": drawn,
-        "views": scene.views(drawn),
-        "figure": figure.figure_of(drawn, seen, session.configurations),
-        "groups": groups,
-        "unidentified": parameters.bound_together(estimate)
-        if findings
-        else parameters.unidentified(groups, estimate),
-        "told": findings and identifiability.section(findings, machine.parameters),
-        "edges": photographed,
-        "pictures": pictures.pictures(session, edges, estimate, shifts, centres)
-        if photographed
-        else (),
-        "poses": poses.section(session, observation, estimate),
-        "residuals": residuals.residual_charts(session, edges, estimate, shifts),
-        "reasons": rejections.reasons(session, observation.rejected),
-        "stations": provenance.station_rows(session, estimate, camera),
-        "settings": provenance.settings(session, estimate),
-        "versions": provenance.versions(),
-    }
-
-
-def _tool_point(
-    session: Session, estimate: Estimate, covariance: Array, centres: tuple[Centres, ...]
-) -> toolpoint.ToolPoint:
-    return toolpoint.tool_point(
+    centres = joint_centres(session.machine, estimate.machine, covariance)
+    tool = tool_point(
         session.machine,
         estimate.machine,
         covariance,
@@ -117,3 +151,110 @@ def _tool_point(
         centres,
         legs_seen=estimate.edge_weights.size > 0,
     )
+    return centres, tool
+
+
+def _geometry(
+    session: Session, observation: Observation, estimate: Estimate, centres: tuple[Centres, ...]
+) -> Part:
+    drawn = scene.scene_of(session, estimate, centres)
+    seen = poses.places(observation, estimate)
+    return Part(
+        "geometry",
+        "Geometry before and after",
+        (page.render("geometry.html.j2", scene=drawn),),
+        plots=(
+            Plot(
+                "space",
+                "In space",
+                "Drag to turn, wheel or pinch to come nearer.",
+                "The machine in three dimensions: joint centres by the drawing and as calibrated."
+                " The two plane views show the same.",
+                scene.figure_of(drawn, seen, session.configurations),
+                height=420,
+            ),
+        ),
+        html=page.render("views.html.j2", views=scene.views(drawn)),
+        menu="Geometry",
+    )
+
+
+def _parameters(session: Session, estimate: Estimate) -> Part:
+    groups = parameters.parameter_groups(session.machine, estimate)
+    html = page.render("parameters.html.j2", groups=groups, gauge=estimate.gauge)
+    return Part("parameters", "Parameters", html=html)
+
+
+def _identifiability(findings: Findings, estimate: Estimate) -> Part:
+    told = identifiability.section(findings, estimate.machine.parameters)
+    html = page.render("identifiability.html.j2", told=told)
+    return Part("identifiability", "What the data can tell", html=html, menu="What the data tell")
+
+
+def _photographs(
+    session: Session,
+    edges: EdgeSet,
+    estimate: Estimate,
+    shifts: Array,
+    centres: tuple[Centres, ...],
+) -> Part:
+    html = page.render(
+        "photographs.html.j2",
+        n_legs=session.machine.n_legs,
+        pictures=pictures.pictures(session, edges, estimate, shifts, centres),
+    )
+    return Part("photographs", "Photographs", html=html)
+
+
+def _residuals(
+    session: Session,
+    edges: EdgeSet,
+    estimate: Estimate,
+    shifts: Array,
+    axes: charts.RowChart | None,
+) -> Part:
+    found = residuals.residual_charts(session, edges, estimate, shifts)
+    shown = charts.panels(
+        found.by_leg,
+        found.by_station,
+        found.joints,
+        axes,
+        found.histogram,
+        found.by_configuration,
+        found.outward,
+        remarks=found.remarks,
+    )
+    return Part("residuals", "Residuals", (RESIDUALS,), html=shown)
+
+
+def _left_out(
+    session: Session, observation: Observation, estimate: Estimate, findings: Findings | None
+) -> Part:
+    groups = parameters.parameter_groups(session.machine, estimate)
+    html = page.render(
+        "rejected.html.j2",
+        reasons=provenance.reasons(session, observation.rejected),
+        told=bool(findings),
+        unidentified=parameters.bound_together(estimate)
+        if findings
+        else parameters.unidentified(groups, estimate),
+    )
+    return Part("rejected", "What was left out, and what stays open", html=html, menu="Left out")
+
+
+def _stations(session: Session, estimate: Estimate, camera: Integers) -> Part:
+    table = provenance.stations_table(session, estimate, camera)
+    return Part("stations", "Where the cameras stood", tables=(table,), menu="Cameras")
+
+
+def _how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> Part:
+    html = page.render(
+        "how.html.j2",
+        model_error=MODEL_ERROR,
+        lists=(
+            ("Settings and solver", provenance.settings(session, estimate)),
+            ("Time", [(name, f"{seconds:.2f} s") for name, seconds in timings.items()]),
+            ("Versions", versions().items()),
+        ),
+    )
+    return Part("how", "How it was computed", html=html)

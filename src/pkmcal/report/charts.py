@@ -198,7 +198,7 @@ def bar_chart(
     return BarChart(title, unit, alt, tuple(bars), high, ticks, labels, curve, note=note)
 
 
-def panels(*charts: BarChart | RowChart | None) -> Markup | str:
-    """Charts beside each other, as HTML for a part of the page; nothing without any."""
+def panels(*charts: BarChart | RowChart | None, remarks: tuple[str, ...] = ()) -> Markup | str:
+    """Charts beside each other, under what is remarkable in them; nothing without any."""
     there = [chart for chart in charts if chart]
-    return page.render("panels.html.j2", charts=there) if there else ""
+    return page.render("panels.html.j2", charts=there, remarks=remarks) if there else ""

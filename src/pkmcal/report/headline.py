@@ -1,10 +1,12 @@
-"""The numbers at the top of the page."""
+"""The numbers that answer a reader's questions: cards for people, the same for programs."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from pkmcal.arrays import Integers
+from pkmcal.arrays import Array, Integers
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.problem import Estimate
 from pkmcal.measurements import Observation
@@ -18,7 +20,7 @@ NO_TURN = 1e-9
 """rad; what rounding leaves."""
 
 
-def headlines(
+def cards(
     session: Session,
     observation: Observation,
     estimate: Estimate,
@@ -26,7 +28,7 @@ def headlines(
     tool: ToolPoint,
 ) -> tuple[Figure, ...]:
     """The cards in their order; those that have nothing to tell are left out."""
-    cards = (
+    found = (
         _joint_sigma(centres) if len(observation.edges) else None,
         _tool_sigma(session, tool),
         _change(centres),
@@ -34,7 +36,36 @@ def headlines(
         _data(session, observation, estimate),
         _fit(estimate),
     )
-    return tuple(card for card in cards if card)
+    return tuple(card for card in found if card)
+
+
+def numbers(
+    observation: Observation, estimate: Estimate, centres: tuple[Centres, ...], tool: ToolPoint
+) -> dict[str, Any]:
+    """In m and rad; means over joint centres and configurations, sigma of one coordinate."""
+    statistics, table = estimate.statistics, estimate.machine.parameters
+    offsets = np.sqrt(np.diag(estimate.covariance)[table.of_kind("offset")])
+    sigma = np.concatenate([side.sigma for side in centres])
+    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres])
+    return {
+        "joint_centre_sigma": float(np.median(sigma)),
+        "joint_offset_sigma": float(np.median(offsets)) if offsets.size else None,
+        "joint_centre_change": float(change.mean()),
+        "platform_position_sigma": _mean(tool.position),
+        "platform_orientation_sigma": _mean(tool.orientation),
+        "platform_position_change": _mean(tool.off_position),
+        "platform_orientation_change": _mean(tool.off_orientation),
+        "edges": len(observation.edges),
+        "rejected": len(observation.rejected),
+        "chi2_per_freedom": statistics.chi2 / statistics.dof if statistics.dof > 0 else None,
+        "edge_noise_scale": statistics.noise_scale,
+    }
+
+
+def _mean(values: Array) -> float | None:
+    """Of the finite ones."""
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if values.size else None
 
 
 def _joint_sigma(centres: tuple[Centres, ...]) -> Figure:

@@ -20,14 +20,12 @@ N_COLOURS = 8
 def page_html(outcome: Outcome) -> str:
     """The page: verdict, what to look at, cards, then the parts, each with its navigation."""
     plots = [plot for part in outcome.parts for plot in part.plots]
-    return render(
-        "page.html.j2",
+    warnings = [finding.text for finding in outcome.findings if finding.level != "note"]
+    template = environment().get_template("page.html.j2")
+    return template.render(
         o=outcome,
         verdict=outcome.verdict,
-        warnings=(
-            *outcome.verdict.warnings,
-            *(finding.text for finding in outcome.findings if finding.level != "note"),
-        ),
+        warnings=(*outcome.verdict.warnings, *warnings),
         remarks=[finding.text for finding in outcome.findings if finding.level == "note"],
         plots=plots,
         plotly=plotly_script() if plots else "",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.identify.decided import EXACT, Decider, decided_by
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.words import Findings
 from pkmcal.identify.words_names import named
@@ -23,10 +24,6 @@ from pkmcal.wording import (
     split_name,
 )
 
-DECIDES = 0.5
-"""Share of what is known that has to come from the data for the value to be theirs."""
-EXACT = 1e-9
-"""Standard deviations (m or rad) below this are zero but for rounding: a nanometre."""
 TIGHT = 0.95
 """Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""
 MOST_PAIRS = 6
@@ -82,12 +79,13 @@ def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[Group, ...]:
     """All parameters, grouped by leg in the order of the file."""
     table = estimate.machine.parameters
     before = drawing.values
-    rows = [_row(table, k, float(before[k]), estimate) for k in range(len(table))]
+    source = decided_by(table, estimate.covariance, estimate.data_share)
+    rows = [_row(table, k, float(before[k]), estimate, source[k]) for k in range(len(table))]
     legs = list(dict.fromkeys(row.leg for row in rows))
     return tuple(Group(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
 
 
-def _row(table: ParameterTable, k: int, before: float, estimate: Estimate) -> Row:
+def _row(table: ParameterTable, k: int, before: float, estimate: Estimate, source: Decider) -> Row:
     factor, unit = SCALES.get(table.units[k], (1.0, table.units[k].replace("1", "")))
     after = float(estimate.machine.values[k])
     variance = float(estimate.covariance[k, k])
@@ -96,7 +94,6 @@ def _row(table: ParameterTable, k: int, before: float, estimate: Estimate) -> Ro
     places = decimals(numbers[3])
     name = table.names[k]
     leg, path = split_name(name)
-    source = _source(table, name, sigma, float(estimate.data_share[k]))
     return Row(
         name=name,
         leg=leg,
@@ -111,15 +108,6 @@ def _row(table: ParameterTable, k: int, before: float, estimate: Estimate) -> Ro
         share=float(estimate.data_share[k]) if sigma else float("nan"),
         note=_tie(table, name),
     )
-
-
-def _source(table: ParameterTable, name: str, sigma: float, share: float) -> str:
-    """What decides a value."""
-    if name in table.fixed:
-        return "fixed"
-    if sigma == 0:
-        return "frame"
-    return "data" if share >= DECIDES else "drawing"
 
 
 def _tie(table: ParameterTable, name: str) -> str:

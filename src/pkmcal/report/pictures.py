@@ -5,11 +5,12 @@ from __future__ import annotations
 import base64
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot, inverse
 from pkmcal.identify.centres import Centres
@@ -101,7 +102,8 @@ def pictures(
     """At most ``MOST`` photographs that stand for the rest. shifts : (N,) px, for tooltips."""
     chosen = choose(session, edges, estimate.edge_residuals, estimate.configurations)
     with ThreadPoolExecutor(THREADS) as pool:
-        shots = pool.map(lambda item: _jpeg(item[1], session.stations[item[0]].camera), chosen)
+        sizes = (session.stations[s].camera.image_size for s, _, _ in chosen)
+        shots = pool.map(jpeg, (photo.path for _, photo, _ in chosen), sizes)
         return tuple(
             _picture(session, edges, estimate, shifts, centres, item, jpeg)
             for item, jpeg in zip(chosen, shots, strict=True)
@@ -150,16 +152,18 @@ def _queue(session: Session, edges: EdgeSet, white: Array, posed: Booleans, s: i
     return [(s, first[k], names.get(k, "")) for k in order]
 
 
-def _jpeg(photo: Photograph, camera: Camera) -> str:
-    """The photograph in grey, small, as base64; empty where it is not there any more."""
+def jpeg(path: Path | None, size: tuple[int, int]) -> str:
+    """A photograph in grey, small, as base64; empty where it is not there any more."""
     import cv2
 
+    if path is None:
+        return ""
     try:
-        image = decode(photo.path, camera.image_size, photo.path.name)
+        image: Any = decode(path, size, path.name)
     except InputError:
         return ""
-    if image.shape[1] > LARGEST_WIDTH:
-        height = max(1, round(image.shape[0] * LARGEST_WIDTH / image.shape[1]))
+    if size[0] > LARGEST_WIDTH:
+        height = max(1, round(size[1] * LARGEST_WIDTH / size[0]))
         image = cv2.resize(image, (LARGEST_WIDTH, height), interpolation=cv2.INTER_AREA)
     packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
     return base64.b64encode(packed.tobytes()).decode("ascii")

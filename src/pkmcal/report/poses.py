@@ -11,6 +11,7 @@ from pkmcal.calibration.doubts import turning
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.problem import Estimate
 from pkmcal.measurements import Observation, PoseSet
+from pkmcal.outcome import Part, Row, Table
 from pkmcal.report.charts import (
     NORMAL_90,
     Bar,
@@ -18,6 +19,7 @@ from pkmcal.report.charts import (
     RowChart,
     bar_chart,
     box,
+    panels,
     row_chart,
 )
 from pkmcal.report.residuals import KEPT, SIGMAS, expected_rms
@@ -28,43 +30,18 @@ OPEN = 0.3
 """m or rad; a place that is known no better is not told by the data."""
 MOST = 12
 """Poses in the list of the worst."""
-
-
-@dataclass(frozen=True)
-class MountRow:
-    """Where a target sits. position : three texts (mm), turn : three (degrees), each with its
-    deviation, or ``open`` where the data do not tell it.
-    """
-
-    name: str
-    frame: str
-    position: tuple[tuple[str, str], ...]
-    turn: tuple[tuple[str, str], ...]
-
-
-@dataclass(frozen=True)
-class PoseRow:
-    """One measured pose: off by so much, in mm and degrees, and in standard deviations."""
-
-    station: str
-    configuration: str
-    position: str
-    turn: str
-    sigmas: str
-    aside: bool
+JUMPS = (
+    "Bars by configuration: a jump that stays says that something was moved, a single tall bar"
+    " that this one photograph, or its readings, are wrong."
+)
 
 
 @dataclass(frozen=True)
 class Poses:
-    """The section's content. scale : factor on the stated noise. summary : sentences."""
+    """The section, and for the one on residuals a chart of the poses' six numbers."""
 
-    summary: tuple[str, ...]
-    mounts: tuple[MountRow, ...]
-    sigmas: BarChart | None
-    position: BarChart | None
-    turn: BarChart | None
+    part: Part
     axes: RowChart | None
-    worst: tuple[PoseRow, ...]
 
 
 def section(session: Session, observation: Observation, estimate: Estimate) -> Poses | None:
@@ -73,16 +50,19 @@ def section(session: Session, observation: Observation, estimate: Estimate) -> P
     if not len(poses):
         return None
     error = errors(poses, estimate)
-    return Poses(
-        summary=_summary(poses, estimate, error)
-        + tuple(text for _, text in turning(session, poses, estimate.state.on_platform)),
-        mounts=tuple(_mount(session, estimate, m) for m in range(len(estimate.state.T_mount))),
-        sigmas=_by_configuration(session, poses, estimate),
-        position=_bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off, mm"),
-        turn=_bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned, degrees"),
-        axes=_axes(poses, estimate),
-        worst=_worst(session, poses, estimate, error),
+    turns = (text for _, text in turning(session, poses, estimate.state.on_platform))
+    part = Part(
+        "poses",
+        "Board" if session.board else "Measured poses",
+        (f"{' '.join([*_summary(poses, estimate, error), *turns])} {JUMPS}",),
+        html=panels(
+            _by_configuration(session, poses, estimate),
+            _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off, mm"),
+            _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned, degrees"),
+        ),
+        tables=(_mounts(session, estimate), _worst(session, poses, estimate, error)),
     )
+    return Poses(part, _axes(poses, estimate))
 
 
 def errors(poses: PoseSet, estimate: Estimate) -> Array:
@@ -98,7 +78,7 @@ def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...
     s = estimate.statistics
     aside = "" if kept.all() else f", {int(np.sum(~kept))} put aside"
     seen = count(len(np.unique(poses.configuration)), "configuration")
-    sizes = [_rms(error[kept, 3:]) * 1e3, float(np.rad2deg(_rms(error[kept, :3])))]
+    sizes = [_length(error[kept, 3:]) * 1e3, float(np.rad2deg(_length(error[kept, :3])))]
     told = [f"{brief(x)}{u}" for x, u in zip(sizes, (" mm", "°"), strict=True) if np.isfinite(x)]
     # the factor itself is never below one
     times = s.pose_scale if s.pose_scale > 1 else np.sqrt(s.chi2_poses / max(s.dof_poses, 1))
@@ -109,7 +89,7 @@ def _summary(poses: PoseSet, estimate: Estimate, error: Array) -> tuple[str, ...
     )
 
 
-def _rms(values: Array) -> float:
+def _length(values: Array) -> float:
     """Root mean square length of vectors (n, 3), what was not measured left out."""
     known = np.isfinite(values)
     if not known.any():
@@ -117,16 +97,22 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.nansum(values**2, axis=-1))))
 
 
-def _mount(session: Session, estimate: Estimate, m: int) -> MountRow:
-    state, covariance = estimate.state, estimate.mount_covariance
-    T, on_platform = state.T_mount[m], bool(state.on_platform[m])
-    sigma = np.sqrt(np.maximum(np.diag(covariance[m]), 0.0))
-    names = mount_names(session, len(state.T_mount))
-    return MountRow(
-        name=names[m],
-        frame="platform" if on_platform else "base",
-        position=_texts(T[:3, 3], sigma[3:], 1e3),
-        turn=_texts(rotation_vector(T[:3, :3]), sigma[:3], 180 / np.pi),
+def _mounts(session: Session, estimate: Estimate) -> Table:
+    """Where the targets sit, a row each."""
+    state, rows = estimate.state, list[Row]()
+    for m, name in enumerate(mount_names(session, len(state.T_mount))):
+        T, sigma = state.T_mount[m], np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0))
+        place = _texts(T[:3, 3], sigma[3:], 1e3)
+        turn = _texts(rotation_vector(T[:3, :3]), sigma[:3], 180 / np.pi)
+        rows.append(Row(name, ("platform" if state.on_platform[m] else "base", *place, *turn)))
+    return Table(
+        "Where it sits",
+        ("Target", "Frame", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"),
+        tuple(rows),
+        "Place and rotation vector of the target's own axes in the body's frame, ± σ. Open: these"
+        " measurements do not tell it, and nothing that they predict depends on it.",
+        brief=False,
+        words=(1,),
     )
 
 
@@ -136,15 +122,14 @@ def mount_names(session: Session, n: int) -> list[str]:
     return ["board"] * (n - len(trackers)) + trackers
 
 
-def _texts(values: Array, sigma: Array, factor: float) -> tuple[tuple[str, str], ...]:
-    out: list[tuple[str, str]] = []
+def _texts(values: Array, sigma: Array, factor: float) -> list[str]:
+    """Numbers with their deviations, ``open`` where the data do not tell them."""
+    out: list[str] = []
     for value, spread in zip(values.tolist(), sigma.tolist(), strict=True):
-        if spread > OPEN:
-            out.append(("open", ""))
-        else:
-            text = number(value * factor, decimals(spread * factor))
-            out.append((text, brief(spread * factor) if spread else ""))
-    return tuple(out)
+        text = number(value * factor, decimals(spread * factor))
+        known = f"{text} ± {brief(spread * factor)}" if spread else text
+        out.append("open" if spread > OPEN else known)
+    return out
 
 
 def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> BarChart | None:
@@ -193,29 +178,27 @@ def _axes(poses: PoseSet, estimate: Estimate) -> RowChart | None:
     ]
     alt = "Boxes of the poses' residuals by their six numbers"
     title = "Poses, by the six numbers"
-    return row_chart(title, SIGMAS, [b for b in boxes if b], NORMAL_90, alt)
+    note = "about and along the station's x, y and z"
+    return row_chart(title, SIGMAS, [b for b in boxes if b], NORMAL_90, alt, note)
 
 
-def _worst(
-    session: Session, poses: PoseSet, estimate: Estimate, error: Array
-) -> tuple[PoseRow, ...]:
+def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -> Table:
+    """The poses that are farthest off, in standard deviations."""
     level = np.sqrt(np.sum(estimate.pose_residuals**2, axis=1) / np.maximum(poses.rows, 1))
-    order = np.argsort(-level, kind="stable")[:MOST]
-    return tuple(_row(session, poses, estimate, error, level, int(k)) for k in order)
-
-
-def _row(
-    session: Session, poses: PoseSet, estimate: Estimate, error: Array, level: Array, k: int
-) -> PoseRow:
-    turn = float(np.rad2deg(np.linalg.norm(error[k, :3])))
-    return PoseRow(
-        station=session.station_names[poses.station[k]],
-        configuration=session.configurations[poses.configuration[k]],
-        position=brief(_rms(error[k : k + 1, 3:]) * 1e3),
-        turn=brief(turn) if np.isfinite(turn) else "",
-        sigmas=number(float(level[k]), 1),
-        aside=bool(estimate.pose_weights[k] < KEPT),
-    )
+    rows: list[Row] = []
+    for k in np.argsort(-level, kind="stable")[:MOST].tolist():
+        turn = float(np.rad2deg(np.linalg.norm(error[k, :3])))
+        cells = (
+            session.configurations[poses.configuration[k]],
+            brief(_length(error[k : k + 1, 3:]) * 1e3),
+            brief(turn),
+            number(float(level[k]), 1),
+            "put aside" if estimate.pose_weights[k] < KEPT else "used",
+        )
+        rows.append(Row(session.station_names[poses.station[k]], cells))
+    columns = ("Station", "Configuration", "Off, mm", "Turned, °", "In σ", "Use")
+    title = "The poses that fit worst"
+    return Table(title, columns, tuple(rows), brief=False, words=(1, 5))
 
 
 def places(observation: Observation, estimate: Estimate) -> tuple[Array, Integers]:

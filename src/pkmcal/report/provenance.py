@@ -1,71 +1,63 @@
-"""How the result was made: settings, solver, versions, times, and where the cameras stood."""
+"""How the result was made: where the cameras stood, settings, solver; and what was left out."""
 
 from __future__ import annotations
 
-import platform
-from collections.abc import Mapping
+import re
 from dataclasses import dataclass
-from importlib import metadata
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, pose_difference, skew
 from pkmcal.identify.problem import Estimate
+from pkmcal.measurements import Rejection
+from pkmcal.outcome import Row, Table
+from pkmcal.report.residuals import SIDES
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
 OPEN = 1e3
 """mm; a place that is known no better is not told by the data."""
-PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
+MOST_CASES = 400
+"""Cases listed for one reason; calibration.json has all of them."""
 
 
-@dataclass(frozen=True)
-class StationRow:
-    """A camera's pose. position, sigma : three texts each (mm, base frame). turn_sigma : degrees.
-
-    moved : distance and angle from the pose that was given by hand, empty without one.
-    edge_shift : px outward with its standard deviation.
-    """
-
-    name: str
-    camera_file: str
-    model: str
-    photographs: int
-    position: tuple[str, str, str]
-    sigma: tuple[str, str, str]
-    turn_sigma: str
-    moved: str
-    edge_shift: str
-
-
-def station_rows(session: Session, estimate: Estimate, camera: Integers) -> tuple[StationRow, ...]:
+def stations_table(session: Session, estimate: Estimate, camera: Integers) -> Table:
     """One row a station; camera (S,) is the number of its camera file."""
-    cameras = [_station(session, estimate, s, int(camera[s])) for s in range(len(session.stations))]
-    first = len(cameras)
-    trackers = [_tracker(session, estimate, first + t) for t in range(len(session.trackers))]
-    return tuple(cameras + trackers)
+    edges = len(estimate.edge_weights) > 0
+    rows: list[Row] = []
+    for s, station in enumerate(session.stations):
+        shift = estimate.state.edge_shift[camera[s]]
+        sigma = estimate.edge_shift_sigma[camera[s]]
+        places = decimals(float(sigma))
+        cells = (
+            *_place(estimate, s),
+            *([f"{number(shift, places, signed=True)} ± {number(sigma, places)}"] if edges else []),
+            _moved(station.T_camera_base, estimate.state.T_camera_base[s]),
+            f"{station.camera_file}, {station.camera.model},"
+            f" {count(len(station.photographs), 'photograph')}",
+        )
+        rows.append(Row(station.name, cells))
+    for s, table in enumerate(session.trackers, start=len(session.stations)):
+        what = f"{table.label}, tracker, {table.kind}, {count(len(table.configuration), 'row')}"
+        rows.append(Row(table.name, (*_place(estimate, s), *(["–"] if edges else []), "–", what)))
+    columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of its turn")
+    columns += ("Edge shift, px",) if edges else ()
+    columns += ("Away from the pose by hand", "Camera")
+    return Table("", columns, tuple(rows), brief=False, words=(len(columns) - 1,))
 
 
-def _tracker(session: Session, estimate: Estimate, s: int) -> StationRow:
-    table = session.trackers[s - len(session.stations)]
-    position, sigma, turn = _place(estimate, s)
-    rows = len(table.configuration)
-    return StationRow(
-        table.name, table.label, f"tracker, {table.kind}", rows, position, sigma, turn, "", "–"
-    )
-
-
-def _place(estimate: Estimate, s: int) -> tuple[tuple[str, str, str], tuple[str, str, str], str]:
-    """A station's place and deviations (mm), and the deviation of its turn (degrees)."""
+def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
+    """A station's place with its deviations (mm), and the deviation of its turn (degrees)."""
     found, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
     place = inverse(found)[:3, 3] * 1e3
     sigma = np.sqrt(np.diag(camera_position_covariance(found, covariance))) * 1e3
-    turn = np.rad2deg(np.sqrt(np.trace(covariance[:3, :3]) / 3))
-    known = sigma < OPEN
-    x, y, z = (number(v, decimals(float(d))) for v, d in zip(place, sigma, strict=True))
-    sx, sy, sz = (brief(float(d)) if k else "open" for d, k in zip(sigma, known, strict=True))
-    return (x, y, z), (sx, sy, sz), brief(float(turn)) if turn < 90 else "open"
+    turn = float(np.rad2deg(np.sqrt(np.trace(covariance[:3, :3]) / 3)))
+    x, y, z = (
+        f"{number(v, decimals(d))} ± {brief(d) if d < OPEN else 'open'}"
+        for v, d in zip(place.tolist(), sigma.tolist(), strict=True)
+    )
+    return x, y, z, f"{brief(turn)}°" if turn < 90 else "open"
 
 
 def camera_position_covariance(T_camera_base: Array, covariance: Array) -> Array:
@@ -79,28 +71,9 @@ def camera_position_covariance(T_camera_base: Array, covariance: Array) -> Array
     return jacobian @ covariance @ jacobian.T
 
 
-def _station(session: Session, estimate: Estimate, s: int, camera: int) -> StationRow:
-    station = session.stations[s]
-    found = estimate.state.T_camera_base[s]
-    position, sigma, turn = _place(estimate, s)
-    shift, shift_sigma = estimate.state.edge_shift[camera], estimate.edge_shift_sigma[camera]
-    places = decimals(float(shift_sigma))
-    return StationRow(
-        name=station.name,
-        camera_file=station.camera_file,
-        model=station.camera.model,
-        photographs=len(station.photographs),
-        position=position,
-        sigma=sigma,
-        turn_sigma=turn,
-        moved=_moved(station.T_camera_base, found),
-        edge_shift=f"{number(shift, places, signed=True)} ± {number(shift_sigma, places)}",
-    )
-
-
 def _moved(rough: Array | None, found: Array) -> str:
     if rough is None:
-        return ""
+        return "–"
     turn = np.rad2deg(np.linalg.norm(pose_difference(found, rough)[:3]))
     way = np.linalg.norm(inverse(found)[:3, 3] - inverse(rough)[:3, 3]) * 1e3
     return f"{number(float(way), 0)} mm, {number(float(turn), 1)}°"
@@ -147,19 +120,59 @@ def _left(freedom: float) -> str:
     return f", {number(freedom, 0)} degrees of freedom" if freedom >= 0.5 else ""
 
 
-def versions() -> tuple[tuple[str, str], ...]:
-    """(package, version); a package that is there without metadata has none."""
-    from pkmcal import __version__
+@dataclass(frozen=True)
+class Reason:
+    """One reason. cases : (photograph, what) for the first of ``count`` findings."""
 
-    found = [("pkmcal", __version__), ("Python", platform.python_version())]
-    for name in PACKAGES:
-        try:
-            found.append((name, metadata.version(name)))
-        except metadata.PackageNotFoundError:
-            continue
-    return tuple(found)
+    text: str
+    count: int
+    photographs: int
+    cases: tuple[tuple[str, str], ...]
+
+    @property
+    def unlisted(self) -> int:
+        """Findings that the list leaves out."""
+        return self.count - len(self.cases)
 
 
-def durations(timings: Mapping[str, float] | None) -> tuple[tuple[str, str], ...]:
-    """(step, seconds) in the given order."""
-    return tuple((name, f"{value:.2f} s") for name, value in (timings or {}).items())
+def reasons(session: Session, rejected: tuple[Rejection, ...]) -> tuple[Reason, ...]:
+    """Grouped by reason, the most frequent first; numbers in a reason do not part groups."""
+    groups: dict[str, list[Rejection]] = {}
+    for item in rejected:
+        groups.setdefault(_kind(item.reason), []).append(item)
+    ordered = sorted(groups.items(), key=lambda pair: -len(pair[1]))
+    return tuple(_reason(session, text, items) for text, items in ordered)
+
+
+def _kind(reason: str) -> str:
+    """The reason without its measured numbers, which differ from case to case."""
+    return re.sub(r"[-+−]?\d+(\.\d+)?([eE][-+]?\d+)?", "…", reason)
+
+
+def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
+    same = len({item.reason for item in items}) == 1
+    return Reason(
+        text=items[0].reason if same else text,
+        count=len(items),
+        photographs=len({(i.station, i.configuration) for i in items}),
+        cases=tuple(
+            (_photograph(session, i), _what(i) if same else f"{_what(i)}: {i.reason}")
+            for i in items[:MOST_CASES]
+        ),
+    )
+
+
+def _photograph(session: Session, item: Rejection) -> str:
+    return f"{session.station_names[item.station]} / {session.configurations[item.configuration]}"
+
+
+def _what(item: Rejection) -> str:
+    """The rejected thing in words; -1 stands for all of them."""
+    if item.leg < 0:
+        return "board" if item.reason.startswith("the board") else "whole photograph"
+    words = [f"leg {item.leg + 1}"]
+    if item.tube >= 0:
+        words.append(f"tube {item.tube + 1}")
+    if item.side >= 0:
+        words.append(SIDES[item.side])
+    return " ".join(words)

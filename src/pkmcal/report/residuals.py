@@ -187,7 +187,8 @@ def _outward(edges: EdgeSet, shifts: Array) -> RowChart | None:
         boxes.append(box(name, values, "px", 3, leg + 1))
     alt = "Boxes of the outward shift in pixels by leg, tube and side"
     title = "Edges too far out (+) or in (−), by leg, tube and side"
-    return row_chart(title, "pixels", [b for b in boxes if b], None, alt)
+    note = "looking along the leg from base to platform"
+    return row_chart(title, "pixels", [b for b in boxes if b], None, alt, note)
 
 
 def _edge_kinds(edges: EdgeSet) -> list[tuple[int, int, int]]:

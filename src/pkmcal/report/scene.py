@@ -1,14 +1,20 @@
-"""The geometry before and after, [B] Fig. 7: joint centres at home, errors drawn enlarged."""
+"""The geometry before and after, [B] Fig. 7: joint centres at home, errors drawn enlarged.
+
+Two plane views as SVG, and one in space as a Plotly figure: plain data, drawn by the page's
+script. Its colours are names of the page's CSS variables; the script puts in the values of the
+light or the dark theme. Lengths in it are millimetres.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
@@ -24,6 +30,15 @@ SHARE = 0.22
 MARGIN = 30.0
 NEAR = 9.0
 """SVG units within which two labels are written as one."""
+RING = 25
+"""Points of an ellipsoid's ring."""
+LOOKS = {
+    "paper_bgcolor": "--card",
+    "plot_bgcolor": "rgba(0,0,0,0)",
+    "font": {"color": "--ink", "family": "system-ui, sans-serif", "size": 12},
+    "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
+}
+AXIS = {"color": "--muted", "gridcolor": "--rule", "zerolinecolor": "--rule", "linecolor": "--rule"}
 
 
 @dataclass(frozen=True)
@@ -225,4 +240,145 @@ def _labels(
             placed.append((x, y, [mark.leg]))
     return tuple(
         (round(x, 1), round(y + 4, 1), " ".join(str(n) for n in legs)) for x, y, legs in placed
+    )
+
+
+# ------------------------------------------------------------------ in space
+
+
+def figure_of(
+    scene: Scene, places: tuple[Array, Integers] | None = None, names: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Traces, layout and configuration for ``Plotly.newPlot``.
+
+    places : of measured targets (N, 3), base frame, and their configurations, by their names.
+    """
+    base, platform = scene.of_side("base"), scene.of_side("platform")
+    legs = list(zip(base, platform, strict=True))
+    data = [
+        line("Drawing", "--drawing", 4, [np.stack([a.drawing, b.drawing]) for a, b in legs]),
+        line(
+            f"Calibrated, × {scene.factor:g}",
+            "--calibrated",
+            4,
+            [np.stack([a.shown, b.shown]) for a, b in legs],
+        ),
+        *(
+            line(
+                f"{side[0].side} outline",
+                "--quiet",
+                2,
+                [ring(np.array([joint.drawing for joint in side]))],
+                showlegend=False,
+            )
+            for side in (base, platform)
+        ),
+        line("Change", "--ink", 6, [np.stack([j.drawing, j.shown]) for j in scene.joints]),
+        _ellipsoids(scene),
+        _centres(base, platform),
+    ]
+    if places is not None and len(places[0]):
+        points, configuration = places
+        hover = [f"configuration {names[k]}" for k in configuration]
+        look = {"size": 2.5, "color": "--quiet", "symbol": "diamond"}
+        data.append(markers("Measured poses", points, look, hovertext=hover, hoverinfo="text"))
+    layout = space_layout({"x": 1.45, "y": -1.45, "z": 0.8})
+    layout["scene"]["camera"]["center"] = {"x": 0, "y": 0, "z": -0.14}
+    layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
+    return {"data": data, "layout": layout, "config": {"scrollZoom": True}}
+
+
+def line(
+    name: str, colour: str, width: float, segments: Sequence[Array], **more: Any
+) -> dict[str, Any]:
+    """A trace of lines in space, each (n, 3), m."""
+    return {
+        "type": "scatter3d",
+        "mode": "lines",
+        "name": name,
+        "line": {"color": colour, "width": width},
+        "hoverinfo": "skip",
+        "connectgaps": False,
+        **coordinates(segments),
+        **more,
+    }
+
+
+def coordinates(segments: Sequence[Array]) -> dict[str, list[float | None]]:
+    """Coordinates (mm) of lines (n, 3), a gap after each."""
+    out: dict[str, list[float | None]] = {"x": [], "y": [], "z": []}
+    for points in segments:
+        for axis, name in enumerate("xyz"):
+            out[name] += [*np.round(points[:, axis] * 1e3, 2).tolist(), None]
+    return out
+
+
+def markers(name: str, points: Array, marker: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """A trace of marks at points (n, 3), m."""
+    at = np.round(points * 1e3, 2)
+    return {
+        "type": "scatter3d",
+        "mode": "markers",
+        "name": name,
+        "marker": marker,
+        **{axis: at[:, k].tolist() for k, axis in enumerate("xyz")},
+        **more,
+    }
+
+
+def ring(points: Array) -> Array:
+    """A body's joints (L, 3) in the order that goes around their middle, closed (L + 1, 3)."""
+    centred = points - points.mean(axis=0)
+    across = np.linalg.svd(centred, full_matrices=False)[2][:2]
+    around = np.argsort(np.arctan2(*(centred @ across.T).T))
+    return points[[*around, around[0]]]
+
+
+def space_layout(eye: dict[str, float]) -> dict[str, Any]:
+    """The layout of a figure in space, seen from ``eye``."""
+    axis = {**AXIS, "showbackground": False, "tickfont": {"size": 10}, "nticks": 6}
+    return {
+        **LOOKS,
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "uirevision": "keep",
+        "scene": {
+            "aspectmode": "data",
+            "dragmode": "turntable",
+            "camera": {"eye": eye},
+            **{f"{name}axis": {**axis, "title": {"text": f"{name} (mm)"}} for name in "xyz"},
+        },
+    }
+
+
+def _ellipsoids(scene: Scene) -> dict[str, Any]:
+    """Three rings of every centre's ellipsoid, along its principal planes."""
+    angle = np.linspace(0, 2 * np.pi, RING)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    segments: list[Array] = []
+    for joint in scene.joints:
+        values, axes = np.linalg.eigh(joint.spread)
+        half = axes * (ELLIPSE * np.sqrt(np.maximum(values, 0)))
+        segments += [joint.shown + circle @ half[:, list(p)].T for p in ((0, 1), (0, 2), (1, 2))]
+    return line(f"{ELLIPSE:g}σ, × {scene.spread_factor:g}", "--calibrated", 2, segments)
+
+
+def _centres(base: tuple[Joint, ...], platform: tuple[Joint, ...]) -> dict[str, Any]:
+    """Markers of the drawing's centres with leg numbers and tooltips."""
+    joints = (*base, *platform)
+    look = {
+        "size": 5,
+        "color": "--drawing",
+        "symbol": ["square"] * len(base) + ["circle"] * len(platform),
+    }
+    return markers(
+        "Joint centres, drawing",
+        np.array([joint.drawing for joint in joints]),
+        look,
+        mode="markers+text",
+        showlegend=False,
+        text=[str(joint.leg) for joint in joints],
+        textposition="top center",
+        textfont={"color": "--ink", "size": 13},
+        hovertext=[joint.tip.replace("; ", "<br>") for joint in joints],
+        hoverinfo="text",
     )

@@ -15,7 +15,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.files import csv_text, listed, staged_folder, yaml_text
+from pkmcal.files import csv_text, staged_folder, yaml_text
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.simulation.board import board_part, holder_part
@@ -24,6 +24,7 @@ from pkmcal.simulation.render import Sensor, View, photograph, render
 from pkmcal.simulation.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
 from pkmcal.simulation.surfaces import SmoothNoise
 from pkmcal.simulation.truth import FILE, Settings, Truth, draw_truth, stream, truth_document
+from pkmcal.wording import listed
 
 Progress = Callable[[int, int], None]
 

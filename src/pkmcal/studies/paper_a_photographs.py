@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from pkmcal.check.repeats import LegScatter, study_repeats
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.papers.axis_measurements import AxisNoise
-from pkmcal.repeatability import LegScatter, study_repeats
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import MECHANISM, camera_of_size
 

@@ -17,6 +17,7 @@ from pkmcal.files import Schema
 from pkmcal.geometry.batches import turned
 from pkmcal.geometry.rigid import cross, dot, rotation, skew
 from pkmcal.mechanisms.carriers.contract import (
+    Chain,
     Direction,
     PlatformCarrier,
     Site,
@@ -126,6 +127,12 @@ class Bar(PlatformCarrier):
         """Turns."""
         del parameters
         return turned_blocks(6, (0, e), (3, f))
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """From the hinge's place on the platform along the base frame's axes."""
+        center, hinge = parameters[..., :3], parameters[..., 3:]
+        return Chain("float", hinge, np.zeros_like(center), center)
 
 
 @final
@@ -273,6 +280,13 @@ class HingedBar(PlatformCarrier):
         out[..., :3, 0], out[..., 3:6, 0] = -w, w
         out[..., :3, 1] = cross(w, parameters[..., :3])
         return out
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """About w, through the hinge's place on the platform."""
+        axis = parameters[..., 6:]
+        w = axis / np.sqrt(dot(axis, axis))[..., None]
+        return Chain("turn", parameters[..., 3:6], w, parameters[..., :3])
 
 
 def _cos_sin(internal: Array | None) -> tuple[Array, Array]:

@@ -98,6 +98,24 @@ class Site(NamedTuple):
     where: Callable[..., str]
 
 
+class Chain(NamedTuple):
+    """The one elementary joint that carries a limb's end, for programs of bodies and joints.
+
+    motion : what the arm does by the reading (base side) or by the platform (platform side):
+        ``fixed`` it stands on its body, ``slide`` it goes along the axis, ``turn`` it turns about
+        it, by the right-hand rule, ``float`` it keeps its direction where the platform turns.
+    point : (..., 3) m, where the arm stands: on the axis, if there is one; in the body's frame.
+    axis : (..., 3) unit, in the body's frame; zeros where the motion has none.
+    arm : (..., 3) m, from the point to the limb's end at reading or internal coordinate zero; in
+        the body's frame, of a floating one along the base frame's axes.
+    """
+
+    motion: Literal["fixed", "slide", "turn", "float"]
+    point: Array
+    axis: Array
+    arm: Array
+
+
 class Carrier(ABC):
     """What both sides share: words in files, schema, parameters, and changes of the frames.
 
@@ -151,6 +169,14 @@ class Carrier(ABC):
     @abstractmethod
     def carried(parameters: Array, e: Array, f: Array) -> Array:
         """Derivative (..., n, n) of :meth:`moved` by the parameters."""
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain | None:
+        """The same end as an elementary joint, for parameters (..., n), which exports build from;
+        None where it is none, and then C, MuJoCo and the firmwares refuse the machine.
+        """
+        del parameters
+        return None
 
 
 class BaseCarrier(Carrier):

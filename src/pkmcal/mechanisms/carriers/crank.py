@@ -13,6 +13,7 @@ from pkmcal.files import Schema
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
+    Chain,
     Direction,
     Interval,
     ParameterKind,
@@ -207,6 +208,15 @@ class Crank(BaseCarrier):
         out[..., :3, 3:6] = _by_axis(lag, before.v, parameters)
         out[..., :3, 9] = moved_direction(before.e0, e) - after.e0
         return out
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """The arm as at reading zero, about v; its foot is ``center + along v + radial e0``."""
+        frame = _frame(parameters)
+        arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
+        out, _ = _turned(frame, parameters, np.zeros(parameters.shape[:-1]))
+        foot = parameters[..., :3] + along * frame.v + radial * frame.e0
+        return Chain("turn", foot, frame.v, arm * out)
 
 
 def _frame(parameters: Array) -> _Frame:

@@ -9,6 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
+    Chain,
     Site,
     moved_point,
     point_by_frame,
@@ -64,3 +65,9 @@ class FixedPoint(BaseCarrier):
         """A turn."""
         del parameters, f
         return turned_blocks(3, (0, e))
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """The centre, without a joint."""
+        none = np.zeros_like(parameters)
+        return Chain("fixed", parameters, none, none)

@@ -9,6 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.batches import turned
 from pkmcal.mechanisms.carriers.contract import (
+    Chain,
     PlatformCarrier,
     Site,
     moved_point,
@@ -69,3 +70,9 @@ class RigidPlatform(PlatformCarrier):
         """A turn."""
         del parameters, e
         return turned_blocks(3, (0, f))
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """The centre, without a joint."""
+        none = np.zeros_like(parameters)
+        return Chain("fixed", parameters, none, none)

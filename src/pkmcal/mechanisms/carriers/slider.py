@@ -14,6 +14,7 @@ from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import (
     IN_PLANE,
     BaseCarrier,
+    Chain,
     Direction,
     Interval,
     Site,
@@ -112,3 +113,11 @@ class Slider(BaseCarrier):
         """Turns."""
         del parameters, f
         return turned_blocks(6, (0, e), (3, e))
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """A slide from the centre along v."""
+        center, axis = parameters[..., :3], parameters[..., 3:]
+        return Chain(
+            "slide", center, axis / np.sqrt(dot(axis, axis))[..., None], np.zeros_like(center)
+        )

@@ -1,0 +1,577 @@
+"""What a calibration leaves on disk: mechanism.yaml and calibration.json, written and read back.
+
+calibration.json holds everything that a calibration found, in SI units, in the frames that
+``gauge`` names; without dates, so that the same session gives the same file but for its timings.
+"""
+
+from __future__ import annotations
+
+import platform
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from pydantic import ConfigDict, Field
+
+from pkmcal import __version__
+from pkmcal.arrays import Array, Booleans
+from pkmcal.errors import InputError
+from pkmcal.files import (
+    Document,
+    Schema,
+    check_writable,
+    json_text,
+    plain,
+    read_json,
+    validate,
+)
+from pkmcal.geometry.rigid import inverse, skew
+from pkmcal.identify.decided import decided_by
+from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document, mechanism_text
+from pkmcal.outcome import Verdict
+from pkmcal.session.load import digests
+from pkmcal.wording import listed
+
+if TYPE_CHECKING:
+    from pkmcal.calibration.calibrate import Calibration
+    from pkmcal.identify.words import Findings
+
+MECHANISM, EVERYTHING, REPORT = "mechanism.yaml", "calibration.json", "report.html"
+FILES = (REPORT, MECHANISM, EVERYTHING)
+CAMERA_FILE = re.compile(r"camera-.+\.yaml")
+"""Cameras as refined with the machine, where that was asked for."""
+EXACT = 1e-9
+"""Relative difference below which two numbers of a file are the same: rounding leaves 1e-15, a
+change by hand a millionth."""
+FORMAT_KEY, FORMAT = "pkmcal_calibration", 1
+PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
+CONVENTIONS = (
+    "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = reading + offset. Legs,"
+    " tubes and sides count from 1. sigma is a standard deviation: of sampling, not of what the"
+    " model leaves out. Rotations of a pose are perturbed from the left, about the axes of its"
+    " outer frame."
+)
+EDGE_COLUMNS = ("station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt")
+"""Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations."""
+POSE_COLUMNS = (
+    "station", "configuration", "target", "weight", "turn1", "turn2", "turn3", "x", "y", "z",
+)  # fmt: skip
+"""Of a row in residuals.poses, the last six whitened together, in standard deviations."""
+OPEN = 1.0
+"""m or rad; a target's place that is known no better is not told by the data."""
+
+Row3 = tuple[float, float, float]
+Row4 = tuple[float, float, float, float]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+
+
+def check_output(folder: Path | str) -> None:
+    """Raise `InputError` where a result cannot go into `folder`; call it before the work.
+
+    Only a new or empty folder, or an earlier result, is written to: a session's own
+    mechanism.yaml must not be lost to its calibrated one.
+    """
+    folder = Path(folder)
+    check_writable(folder)
+    if not folder.is_dir():
+        return
+    entries = sorted(entry.name for entry in folder.iterdir())
+    foreign = [name for name in entries if name not in FILES and not CAMERA_FILE.fullmatch(name)]
+    # A mechanism.yaml without the rest is somebody's drawing.
+    if foreign or (entries and EVERYTHING not in entries):
+        raise InputError(
+            "the output folder holds something other than a calibration",
+            where=str(folder),
+            found=listed(foreign or entries, 4),
+            expected="a new or empty folder, or an earlier calibration to replace",
+            next_step="Name another folder with -o, or move these files away",
+        )
+
+
+def texts_of(
+    calibration: Calibration,
+    not_identified: Sequence[str] = (),
+    holdout: dict[str, Any] | None = None,
+) -> dict[str, str]:
+    """What a calibration leaves on disk besides its page: texts by their files' names.
+
+    not_identified, holdout : as for :func:`document_of`.
+    """
+    return {
+        MECHANISM: calibrated_mechanism_text(calibration),
+        EVERYTHING: json_text(document_of(calibration, not_identified, holdout)),
+        **_refined_cameras(calibration),
+    }
+
+
+def _refined_cameras(calibration: Calibration) -> dict[str, str]:
+    """Camera files as refined with the machine, by their place in the folder."""
+    from pkmcal.cameras.files import camera_text
+
+    cameras = calibration.cameras
+    if not cameras.active:
+        return {}
+    return {
+        f"camera-{Path(file).stem}.yaml": camera_text(cameras.result(calibration.estimate, file))
+        for file in cameras.files
+    }
+
+
+def calibrated_mechanism_text(calibration: Calibration) -> str:
+    """The calibrated machine as a mechanism file, with what it is on top."""
+    verdict = calibration.verdict
+    name = calibration.session.folder.resolve().name
+    lines = [
+        f"Calibrated by pkmcal {__version__} from the session {name}"
+        f" (method {calibration.method}, seed {calibration.seed}).",
+        verdict.headline if verdict.usable else "NOT TO BE USED: " + " ".join(verdict.reasons),
+        f"Frames: {calibration.estimate.gauge}. Lengths in metres.",
+        f"Standard deviations, covariance and all else: {EVERYTHING}; for people: {REPORT}.",
+    ]
+    # A session's name may hold a line break; what follows it must stay a comment.
+    comment = "".join(f"# {' '.join(line.split())}\n" for line in lines)
+    return comment + mechanism_text(calibration.machine)
+
+
+def document_of(
+    calibration: Calibration,
+    not_identified: Sequence[str] = (),
+    holdout: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The content of calibration.json, plain data without NaN and dates.
+
+    not_identified : sentences about what the data could not decide, as the report tells them.
+    holdout : residuals on configurations that were held out, beside those in use.
+    """
+    session, estimate = calibration.session, calibration.estimate
+    document = {
+        FORMAT_KEY: FORMAT,
+        "conventions": CONVENTIONS,
+        "verdict": asdict(calibration.verdict),
+        "method": calibration.method,
+        "model": calibration.session.model,
+        "seed": calibration.seed,
+        "gauge": estimate.gauge,
+        "parameters": _parameters(calibration),
+        "covariance": estimate.covariance,
+        "not_identified": not_identified,
+        "identifiability": identifiability_of(calibration.findings),
+        "stations": _stations(calibration),
+        "targets": _targets(calibration),
+        "cameras": _cameras(calibration),
+        "configurations": _configurations(calibration),
+        "statistics": asdict(estimate.statistics),
+        "holdout": holdout,
+        "residuals": _residuals(calibration),
+        "rejected": _rejected(calibration),
+        "mechanism": estimate.machine.to_document(),
+        "session": {"folder": session.folder.resolve().name, **session.document},
+        "warnings": session.warnings,
+        "versions": versions(),
+        "timings": {name: round(value, 3) for name, value in calibration.timings.items()},
+    }
+    return plain(document)
+
+
+def versions() -> dict[str, str]:
+    """Versions of pkmcal, Python and the packages that numbers depend on."""
+    found = {"pkmcal": __version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _parameters(calibration: Calibration) -> list[dict[str, Any]]:
+    """One entry a parameter; decided_by : data, drawing, frame (of the result) or fixed."""
+    estimate = calibration.estimate
+    table = estimate.machine.parameters
+    source = decided_by(table, estimate.covariance, estimate.data_share)
+    sigma = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
+    return [
+        {
+            "name": name,
+            "unit": table.units[k],
+            "drawing": calibration.session.machine.values[k],
+            "value": estimate.machine.values[k],
+            "sigma": sigma[k],
+            "data_share": estimate.data_share[k],
+            "decided_by": source[k],
+        }
+        for k, name in enumerate(table.names)
+    ]
+
+
+def identifiability_of(findings: Findings | None) -> dict[str, Any] | None:
+    """The rank, what is open in words, and the paper's conditions; null where not looked at.
+
+    moves_platform : m, root mean square over the platform's joints and poses.
+    """
+    if findings is None:
+        return None
+    told = findings.told
+    return {
+        "rank": told.rank,
+        "n_parameters": told.n_parameters,
+        "n_frames": told.n_frames,
+        "singular_values": told.singular_values,
+        "moves_platform_by_drawing": findings.by_drawing,
+        "unidentified": [asdict(sentence) for sentence in findings.unidentified],
+        "weak": [asdict(sentence) for sentence in findings.weak],
+        "conditions": [asdict(condition) for condition in findings.conditions],
+    }
+
+
+def _stations(calibration: Calibration) -> list[dict[str, Any]]:
+    estimate = calibration.estimate
+    out: list[dict[str, Any]] = []
+    session = calibration.session
+    sources = [(x.name, x.camera_file, len(x.photographs)) for x in session.stations]
+    sources += [(table.name, table.label, len(table.configuration)) for table in session.trackers]
+    for s, (name, file, number) in enumerate(sources):
+        T_camera_base = estimate.state.T_camera_base[s]
+        covariance = base_camera_covariance(T_camera_base, estimate.station_covariance[s])
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        out.append(
+            {
+                "name": name,
+                "camera": file,
+                "T_base_camera": inverse(T_camera_base),
+                "sigma_rotation": sigma[:3],
+                "sigma_translation": sigma[3:],
+                "photographs": number,
+            }
+        )
+    return out
+
+
+def _targets(calibration: Calibration) -> list[dict[str, Any]]:
+    """Boards, and what trackers measured, on their body; sigma null where nothing tells it."""
+    estimate, names = calibration.estimate, [m.name for m in calibration.measurements.mounts]
+    out: list[dict[str, Any]] = []
+    for m, name in enumerate(names):
+        body = "platform" if estimate.state.on_platform[m] else "base"
+        sigma = np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0.0))
+        known = [float(x) if x < OPEN else None for x in sigma]
+        out.append(
+            {
+                "name": name,
+                "fixed_to": body,
+                f"T_{body}_target": estimate.state.T_mount[m],
+                "sigma_rotation": known[:3],
+                "sigma_translation": known[3:],
+            }
+        )
+    return out
+
+
+def base_camera_covariance(T_camera_base: Array, covariance: Array) -> Array:
+    """Covariance (6, 6) of (omega, tau) of T_base_camera from that of T_camera_base, m and rad.
+
+    With R, t of T_camera_base: omega' = -R^T omega, tau' = -R^T ([t]x omega + tau).
+    """
+    rot_t, t = T_camera_base[:3, :3].T, T_camera_base[:3, 3]
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = jacobian[3:, 3:] = -rot_t
+    jacobian[3:, :3] = -rot_t @ skew(t)
+    return jacobian @ covariance @ jacobian.T
+
+
+def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
+    """Each camera file once, with its edge shift, px outward."""
+    estimate, numbers = calibration.estimate, calibration.measurements.camera_of_station.tolist()
+    stations = calibration.session.stations
+    # trackers, whose number means nothing, come last
+    files = {c: station.camera_file for c, station in zip(numbers, stations, strict=False)}
+    return [
+        {
+            "file": files[c],
+            "edge_shift": estimate.state.edge_shift[c],
+            "sigma": estimate.edge_shift_sigma[c],
+            **_refined(calibration, files[c]),
+        }
+        for c in sorted(files)
+    ]
+
+
+def _refined(calibration: Calibration, file: str) -> dict[str, Any]:
+    """The intrinsics where they were refined with the machine, with their deviations."""
+    if not calibration.cameras.active:
+        return {}
+    camera = calibration.cameras.result(calibration.estimate, file)
+    n = len(camera.parameters)
+    covariance = np.zeros((n, n)) if camera.covariance is None else camera.covariance
+    return {
+        "parameters": list(camera.parameter_names),
+        "values": camera.parameters,
+        "deviations": np.sqrt(np.diag(covariance)),
+    }
+
+
+def _configurations(calibration: Calibration) -> list[dict[str, Any]]:
+    """Poses of all configurations; those not used have theirs from the readings alone."""
+    session, estimate = calibration.session, calibration.estimate
+    seen = digests(session)
+    return [
+        {
+            "name": name,
+            "photographs": seen.get(name, []),
+            "used": bool(estimate.configurations[k]),
+            "joints": session.joints[k],
+            "joint_residuals": np.round(estimate.joint_residuals[k], 4),
+            "T_base_platform": estimate.state.T_base_platform[k],
+        }
+        for k, name in enumerate(session.configurations)
+    ]
+
+
+def _residuals(calibration: Calibration) -> dict[str, Any]:
+    """One row an edge, and one a pose, whitened."""
+    edges, estimate = calibration.observation.edges, calibration.estimate
+    whole = [edges.station, edges.configuration, edges.leg, edges.tube, edges.side]
+    reals = np.column_stack([estimate.edge_weights, estimate.edge_residuals])
+    numbers = np.column_stack(whole) + 1
+    rows = [
+        [*place, *values]
+        for place, values in zip(numbers.tolist(), np.round(reals, 3).tolist(), strict=True)
+    ]
+    found = calibration.measurements.poses
+    reals = np.column_stack([estimate.pose_weights, estimate.pose_residuals])
+    numbers = np.column_stack([found.station, found.configuration, found.mount]) + 1
+    poses = [
+        [*place, *values]
+        for place, values in zip(numbers.tolist(), np.round(reals, 3).tolist(), strict=True)
+    ]
+    return {"columns": EDGE_COLUMNS, "edges": rows, "pose_columns": POSE_COLUMNS, "poses": poses}
+
+
+def _rejected(calibration: Calibration) -> list[dict[str, Any]]:
+    """What was left out, by reason; leg, tube and side from 1, 0 where all of them are meant."""
+    session = calibration.session
+    groups: dict[str, list[list[Any]]] = {}
+    for item in calibration.observation.rejected:
+        groups.setdefault(item.reason, []).append(
+            [
+                session.station_names[item.station],
+                session.configurations[item.configuration],
+                item.leg + 1,
+                item.tube + 1,
+                item.side + 1,
+            ]
+        )
+    return [
+        {"reason": reason, "count": len(cases), "cases": cases}
+        for reason, cases in sorted(groups.items(), key=lambda group: -len(group[1]))
+    ]
+
+
+# ------------------------------------------------------------------ read back
+
+
+@dataclass(frozen=True)
+class SavedStation:
+    """One camera's pose as found: T_base_camera (4, 4), m.
+
+    sigma_rotation, sigma_translation : (3,) standard deviations, rad and m, base axes.
+    """
+
+    name: str
+    camera: str
+    T_base_camera: Array
+    sigma_rotation: Array
+    sigma_translation: Array
+
+
+@dataclass(frozen=True)
+class SavedCalibration:
+    """A calibration read back, in the frames that `gauge` names.
+
+    machine : with the calibrated values. drawing : (P,) values before. covariance : (P, P).
+    data_share : (P,), NaN where it means nothing.
+    configurations : K names. used : (K,). joints : (K, m). T_base_platform : (K, 4, 4).
+    document : the whole file.
+    """
+
+    path: Path
+    machine: Machine
+    drawing: Array
+    covariance: Array
+    data_share: Array
+    gauge: str
+    method: str
+    seed: int
+    verdict: Verdict
+    stations: tuple[SavedStation, ...]
+    configurations: tuple[str, ...]
+    used: Booleans
+    joints: Array
+    T_base_platform: Array
+    document: dict[str, Any]
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (P,) of the machine's parameters, m or rad."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+class _Part(Schema):
+    """Fields that are needed here; a newer pkmcal may write more."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class _Verdict(_Part):
+    usable: bool
+    headline: str
+    reasons: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+
+
+class _Parameter(_Part):
+    name: str
+    drawing: float
+    value: float
+    data_share: float | None
+
+
+class _Station(_Part):
+    name: str
+    camera: str
+    T_base_camera: Matrix4
+    sigma_rotation: Row3
+    sigma_translation: Row3
+
+
+class _Configuration(_Part):
+    name: str
+    used: bool
+    joints: tuple[float, ...]
+    T_base_platform: Matrix4
+
+
+class _Saved(_Part):
+    pkmcal_calibration: Literal[1] = Field(description="the file's version, 1")
+    verdict: _Verdict
+    method: str
+    seed: int
+    gauge: str
+    parameters: tuple[_Parameter, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    stations: tuple[_Station, ...]
+    configurations: tuple[_Configuration, ...]
+    mechanism: MechanismDocument
+
+
+def load(source: Path | str) -> SavedCalibration:
+    """Read a calibration from its folder or its calibration.json, and check that it is whole."""
+    document = _read(Path(source))
+    saved = validate(document, _Saved)
+    machine = machine_from_document(saved.mechanism)
+    _check_parameters(document, saved, machine)
+    covariance = _covariance(document, saved)
+    for group in ("stations", "configurations"):
+        _check_poses(document, group, getattr(saved, group))
+    return SavedCalibration(
+        path=document.path,
+        machine=machine,
+        drawing=np.array([p.drawing for p in saved.parameters]),
+        covariance=covariance,
+        data_share=np.array([p.data_share for p in saved.parameters], dtype=float),
+        gauge=saved.gauge,
+        method=saved.method,
+        seed=saved.seed,
+        verdict=Verdict(**saved.verdict.model_dump()),
+        stations=tuple(_station(station) for station in saved.stations),
+        configurations=tuple(c.name for c in saved.configurations),
+        used=np.array([c.used for c in saved.configurations], dtype=bool),
+        joints=np.array([c.joints for c in saved.configurations]).reshape(-1, machine.n_joints),
+        T_base_platform=np.array([c.T_base_platform for c in saved.configurations]),
+        document=document.data,
+    )
+
+
+def _read(source: Path) -> Document:
+    path = source / EVERYTHING if source.is_dir() else source
+    if not path.is_file():
+        raise InputError(
+            "there is no calibration here",
+            where=str(source),
+            expected=f"a folder that pkmcal calibrate wrote, or its {EVERYTHING}",
+        )
+    document = read_json(path, label=str(path))
+    found = document.data.get(FORMAT_KEY)
+    if found != FORMAT:
+        raise InputError(
+            "this is not a calibration of a version that is known" if found else
+            "this is not a calibration",
+            where=f"{path}, {FORMAT_KEY}",
+            found=found,
+            expected=str(FORMAT),
+        )  # fmt: skip
+    return document
+
+
+def _check_parameters(document: Document, saved: _Saved, machine: Machine) -> None:
+    names = tuple(p.name for p in saved.parameters)
+    if names != machine.parameters.names:
+        raise _edited(document, "parameters", "the names of the mechanism's parameters")
+    values = np.array([p.value for p in saved.parameters])
+    if not np.allclose(values, machine.values, rtol=EXACT, atol=EXACT**2):
+        k = int(np.argmax(np.abs(values - machine.values)))
+        raise _edited(document, f"parameters[{k + 1}].value", f"the value of {names[k]}")
+
+
+def _covariance(document: Document, saved: _Saved) -> Array:
+    count = len(saved.parameters)
+    if {len(row) for row in saved.covariance} != {count} or len(saved.covariance) != count:
+        raise InputError(
+            "the covariance has another size than the list of parameters",
+            where=document.where("covariance"),
+            expected=f"{count} rows of {count} numbers",
+        )
+    matrix = np.array(saved.covariance)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    off = np.abs(matrix - matrix.T) > EXACT * scale[:, None] * scale
+    if off.any() or np.any(np.diag(matrix) < 0):
+        raise InputError(
+            "the covariance is not that of any numbers: not symmetric, or negative on its diagonal",
+            where=document.where("covariance"),
+            next_step="Calibrate again; this file was changed after it was written",
+        )
+    return matrix
+
+
+def _check_poses(document: Document, group: str, items: tuple[Any, ...]) -> None:
+    key = "T_base_camera" if group == "stations" else "T_base_platform"
+    for k, item in enumerate(items):
+        matrix = np.array(getattr(item, key))
+        rot = matrix[:3, :3]
+        rigid = np.allclose(rot @ rot.T, np.eye(3), atol=1e-6) and np.linalg.det(rot) > 0
+        if not rigid or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+            raise _edited(document, f"{group}[{k + 1}].{key}", "a rotation and a translation")
+
+
+def _edited(document: Document, field: str, expected: str) -> InputError:
+    return InputError(
+        "the calibration does not agree with itself",
+        where=f"{document.label}, {field}",
+        expected=expected,
+        next_step="Calibrate again; this file was changed after it was written",
+    )
+
+
+def _station(saved: _Station) -> SavedStation:
+    return SavedStation(
+        saved.name,
+        saved.camera,
+        np.array(saved.T_base_camera),
+        np.array(saved.sigma_rotation),
+        np.array(saved.sigma_translation),
+    )

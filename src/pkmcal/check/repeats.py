@@ -1,0 +1,425 @@
+"""Measurement accuracy by experiment, [A] 4.2 and Table 1: how repeated photographs scatter.
+
+The session is calibrated, so that every leg is looked for where it is; then each photograph is
+measured by itself. What differs between photographs of one configuration from one station is the
+noise of a measurement: of the direction and position of each leg's axis, and of its edges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
+from pkmcal.calibration.recognise import read_photographs
+from pkmcal.errors import InputError
+from pkmcal.files import plain
+from pkmcal.measurements import EdgeSet
+from pkmcal.observe import legs
+from pkmcal.observe.predict import legs_in_camera
+from pkmcal.observe.repeats import (
+    Cylinders,
+    Groups,
+    axis_coordinates,
+    by_camera,
+    by_ends,
+    by_platform,
+    deviations,
+    fit_motions,
+    groups_of,
+    half_angles,
+    odd_ones,
+    pixel_units,
+    same_edges,
+)
+from pkmcal.outcome import Finding, Level, Part, Row, Table
+from pkmcal.papers.axis_measurements import AxisNoise
+from pkmcal.session.load import Session, Station, load_session
+
+SHARED = 0.3
+"""Share of the scatter, above what chance explains, from which its cause is told."""
+BETTER = 0.1
+"""Share by which each leg's own motion must explain more than one of the whole to be the cause."""
+TELLING = 0.9
+"""Share that chance explains from which nothing can be told of a motion: too few edges show it."""
+MOSTLY_COMMON = 0.5
+"""Scatter, in what photographs promise, below which averaging repeats gains under an eighth."""
+SHUFFLES = 16
+"""Exchanges of the repeats that tell what chance explains, to a few hundredths."""
+PAPER = AxisNoise(images=1)
+"""[A] Table 1, upper bounds, in degrees where the paper prints rad (errata)."""
+LEGEND = (
+    "Standard deviations of one photograph, pooled over the configurations.",
+    "ψ: of the leg's direction in the image. θ: towards the camera. x, z: of its",
+    "point with y = 0, camera frame; – for a leg level in the image, without one.",
+    "θ and z come from the leg's width in the image, so they scatter most.",
+    "Shift, tilt: of its edges, as a whole and at their ends.",
+)
+
+
+@dataclass(frozen=True)
+class LegScatter:
+    """Standard deviations of one photograph of a leg (from 1), pooled over configurations.
+
+    psi, theta (rad), x, z (m) : of the axis, [A] Table 1, camera frame; NaN where there are none.
+    shift, tilt : of an edge, px, as a whole and at its ends. promised : the edges' scatter over
+    what their own photographs promise. photographs, freedom : that saw the leg, and how many of
+    them are repeats.
+    """
+
+    station: str
+    leg: int
+    psi: float
+    theta: float
+    x: float
+    z: float
+    shift: float
+    tilt: float
+    promised: float
+    photographs: int
+    freedom: int
+
+
+@dataclass(frozen=True)
+class StationScatter:
+    """Why the repeats at a station differ.
+
+    shift : px, and promised : as for a leg, over all of them. camera, platform, legs : share of
+    the squared scatter that a motion of the camera, of the platform, or of each leg by itself
+    explains, above chance. photographs, configurations : with repeats. dropped : repeats of
+    edges that lay far from the others.
+    """
+
+    station: str
+    photographs: int
+    configurations: int
+    shift: float
+    promised: float
+    camera: float
+    platform: float
+    legs: float
+    dropped: int
+
+    @property
+    def cause(self) -> str:
+        """What moves: ``camera``, ``platform``, ``legs`` or, where nothing does, ``noise``.
+
+        Legs that move by themselves imitate a motion of the whole in part, and explain more.
+        """
+        best = "camera" if self.camera >= self.platform else "platform"
+        whole = max(self.camera, self.platform)
+        if self.legs > max(SHARED, whole + BETTER):
+            return "legs"
+        return best if whole > SHARED else "noise"
+
+
+@dataclass(frozen=True)
+class RepeatStudy:
+    """Table 1 of a session.
+
+    legs : by station and leg. middle, bound : median and largest of each column (leg 0).
+    """
+
+    legs: tuple[LegScatter, ...]
+    stations: tuple[StationScatter, ...]
+    middle: LegScatter
+    bound: LegScatter
+    findings: tuple[Finding, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything under its name, for ``--json``."""
+        causes = [{**asdict(s), "cause": s.cause} for s in self.stations]
+        paper = {name: getattr(PAPER, name) for name in ("psi", "theta", "x", "z")}
+        return plain({**asdict(self), "stations": causes, "paper": paper})
+
+
+def study_repeats(
+    session: Session | Path | str, *, seed: int = 0, progress: Progress | None = None
+) -> RepeatStudy:
+    """How photographs of the same configurations scatter, by station and leg.
+
+    Raises InputError where the session has no repeats, and what `calibrate` raises.
+    """
+    if not isinstance(session, Session):
+        session = load_session(session)
+    require_repeats(session)
+    calibration = calibrate(session, seed=seed, progress=progress)
+    observed = [p for p in read_photographs(session) if _sees_legs(session.stations[p.station])]
+    looks = [_Look.of(calibration, photographs) for photographs in observed]
+    looks = [look for look in looks if np.any(look.same.count > 1)]
+    names = [station.name for station in session.stations]
+    legs = tuple(row for look in looks for row in _leg_rows(look, names[look.station]))
+    stations = tuple(_station_row(look, names[look.station]) for look in looks)
+    middle, bound = _over_legs(legs, 0.5), _over_legs(legs, 1.0)
+    return RepeatStudy(legs, stations, middle, bound, _findings(stations))
+
+
+def require_repeats(session: Session) -> None:
+    """An InputError, with what to write, where no station that observes legs has repeats."""
+    for station in session.stations:
+        rows = [photo.configuration for photo in station.photographs]
+        if _sees_legs(station) and len(set(rows)) < len(rows):
+            return
+    name = session.stations[0].name
+    raise InputError(
+        "the session has no repeated photographs",
+        where=f"session.yaml, stations.{name}.images",
+        found=f"{session.document['stations'][name]['images']}, one photograph a configuration",
+        expected=f"a pattern such as images/{name}/{{configuration}}_{{repeat}}.png",
+        next_step="Photograph some configurations several times, moving nothing in between, and"
+        f" name the photographs images/{name}/0001_1.png, images/{name}/0001_2.png and so on",
+    )
+
+
+def _sees_legs(station: Station) -> bool:
+    return "legs" in station.observe
+
+
+@dataclass(frozen=True)
+class _Look:
+    """One station's edges, each photograph's by itself, without those that fell far off.
+
+    photo : (N,) number of the photograph. same : the repeats of each edge. turn : (N, 2) of each
+    from their mean, rad, in the bases (N, 3, 2) of ``basis``.
+    """
+
+    station: int
+    edges: EdgeSet
+    photo: Integers
+    cylinders: Cylinders
+    same: Groups
+    turn: Array
+    basis: Array
+    dropped: int
+
+    @classmethod
+    def of(cls, calibration: Calibration, photographs: legs.Photographs) -> _Look:
+        """Measure a station's photographs where the calibration says that the legs are."""
+        state, machine = calibration.estimate.state, calibration.machine
+        s, rows = photographs.station, photographs.configuration
+        camera = calibration.cameras.camera(calibration.session.stations[s].camera_file)
+        numbered = replace(photographs, camera=camera, configuration=np.arange(len(rows)))
+        poses, T_camera_base = state.T_base_platform[rows], state.T_camera_base[s]
+        edges = legs.measure(numbered, machine, T_camera_base, poses).edges
+        photo = edges.configuration
+        edges = replace(edges, configuration=rows[photo])
+        odd = odd_ones(edges, same_edges(edges))
+        keep = ~odd.any
+        edges, photo = edges.select(keep), photo[keep]
+        same = same_edges(edges)
+        turn = deviations(edges, same)
+        ends = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
+        radii = machine.radii()
+        radius = np.array([radii[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)])
+        return cls(
+            station=s,
+            edges=edges,
+            photo=photo,
+            cylinders=Cylinders(ends.a[photo, edges.leg], ends.b[photo, edges.leg], radius),
+            same=same,
+            turn=turn - same.mean(turn)[same.member],
+            basis=edges.basis[same.first[same.member]],
+            dropped=int(np.sum(~keep)),
+        )
+
+
+def _leg_rows(look: _Look, station: str) -> list[LegScatter]:
+    """Table 1 of one station: a row for each leg that has repeats."""
+    edges = look.edges
+    pixel = pixel_units(edges)[:, 0]
+    tilt = look.turn[:, 1] * half_angles(edges, look.cylinders)
+    pixels = _pooled(np.stack([look.turn[:, 0], tilt], axis=1) / pixel[:, None], look.same)
+    promised = _pooled(look.turn / _stated(look), look.same)
+    rows, axes = _axis_scatter(look)
+    leg = edges.leg[look.same.first]
+    out: list[LegScatter] = []
+    for j in np.unique(leg[look.same.count > 1]):
+        mine = leg == j
+        psi, theta, x, z = (float(v) for v in _deviation(axes, rows == j))
+        shift, tilts = (float(v) for v in _deviation(pixels, mine))
+        ratio = float(np.sqrt(np.mean(_deviation(promised, mine) ** 2)))
+        count = len(np.unique(look.photo[edges.leg == j]))
+        freedom = count - len(np.unique(edges.configuration[edges.leg == j]))
+        row = (station, int(j) + 1, psi, theta, x, z, shift, tilts, ratio, count, freedom)
+        out.append(LegScatter(*row))
+    return out
+
+
+@dataclass(frozen=True)
+class _Pooled:
+    """Sums of squares (G, n) of deviations from each group's mean, and their freedoms (G,)."""
+
+    squares: Array
+    freedom: Array
+
+
+def _pooled(values: Array, groups: Groups) -> _Pooled:
+    away = values - groups.mean(values)[groups.member]
+    return _Pooled(groups.total(away**2), groups.count - 1.0)
+
+
+def _deviation(pooled: _Pooled, mine: Booleans) -> Array:
+    """Standard deviations (n,) over some groups; NaN where nothing repeats."""
+    freedom = pooled.freedom[mine].sum()
+    return np.sqrt(pooled.squares[mine].sum(axis=0) / (freedom if freedom else np.nan))
+
+
+def _stated(look: _Look) -> Array:
+    """Standard deviations (N, 2) that each edge's own photograph promises, mean over repeats."""
+    mean = look.same.mean(look.edges.covariance[:, [0, 1], [0, 1]])
+    return np.sqrt(mean)[look.same.member]
+
+
+def _whiten(look: _Look) -> Array:
+    """Inverse roots (N, 2, 2) of the edges' stated covariances, the same for all repeats of one."""
+    stated = look.same.mean(look.edges.covariance)[look.same.member]
+    return np.linalg.inv(np.linalg.cholesky(stated))
+
+
+def _axis_scatter(look: _Look) -> tuple[Integers, _Pooled]:
+    """The axes' psi, theta, x, z in every photograph: the leg of each configuration, and sums.
+
+    An axis is fitted to all edges of the leg, of all of its tubes, weighted as the calibration
+    weights them; one that shows a single side has none.
+    """
+    edges, legs = look.edges, look.cylinders
+    seen = groups_of(look.photo, edges.leg)
+    fit = fit_motions(look.turn, by_ends(edges, look.basis, legs), _whiten(look), seen)
+    change = axis_coordinates(fit.motion, legs.a[seen.first], legs.b[seen.first])
+    sides = seen.total(edges.side[:, None] == np.array([0, 1]))
+    whole = np.flatnonzero((sides > 0).all(axis=1))
+    first = seen.first[whole]
+    repeats = groups_of(edges.configuration[first], edges.leg[first])
+    return edges.leg[first][repeats.first], _pooled(change[whole], repeats)
+
+
+def _station_row(look: _Look, station: str) -> StationScatter:
+    """Scatter over all legs of a station, and what motion explains it."""
+    edges, same, legs = look.edges, look.same, look.cylinders
+    every = np.ones(len(same.first), dtype=bool)
+    shift = _deviation(_pooled(look.turn[:, :1] / pixel_units(edges)[:, :1], same), every)
+    promised = _deviation(_pooled(look.turn / _stated(look), same), every)
+    ends = by_ends(edges, look.basis, legs)
+    photo = groups_of(look.photo)
+    return StationScatter(
+        station=station,
+        photographs=len(photo.first),
+        configurations=len(np.unique(edges.configuration[same.first[same.count > 1]])),
+        shift=float(shift[0]),
+        promised=float(np.sqrt(np.mean(promised**2))),
+        camera=_explained(look, by_camera(ends, legs), photo),
+        platform=_explained(look, by_platform(ends, legs), photo),
+        legs=_explained(look, ends, groups_of(look.photo, edges.leg)),
+        dropped=look.dropped,
+    )
+
+
+def _explained(look: _Look, rows: Array, groups: Groups) -> float:
+    """Share of the squared scatter that motions of groups explain: 0 as by chance, 1 all.
+
+    rows : (N, 2, p) turn of the edges by a group's motion. What chance explains is found by
+    exchanging the repeats of every edge by itself, which leaves its scatter and parts it from
+    the other edges'. Two edges of a leg look like a motion of it however they scatter.
+    """
+    whiten, rng = _whiten(look), np.random.default_rng(0)
+
+    def share(turn: Array) -> float:
+        fit = fit_motions(turn, rows, whiten, groups)
+        return float(fit.explained.sum() / max(fit.total.sum(), 1e-300))
+
+    shuffled = [share(look.turn[look.same.exchanged(rng)]) for _ in range(SHUFFLES)]
+    chance = float(np.mean(shuffled))
+    return (share(look.turn) - chance) / (1 - chance) if chance < TELLING else 0.0
+
+
+def _over_legs(rows: tuple[LegScatter, ...], share: float) -> LegScatter:
+    """A quantile of each column over all legs; at share 1 the largest, as [A] Table 1 has them."""
+
+    def quantile(name: str) -> float:
+        column = np.array([getattr(row, name) for row in rows])
+        known = column[np.isfinite(column)]
+        return float(np.quantile(known, share)) if known.size else float("nan")
+
+    return LegScatter(
+        station="",
+        leg=0,
+        psi=quantile("psi"),
+        theta=quantile("theta"),
+        x=quantile("x"),
+        z=quantile("z"),
+        shift=quantile("shift"),
+        tilt=quantile("tilt"),
+        promised=quantile("promised"),
+        photographs=sum(row.photographs for row in rows),
+        freedom=sum(row.freedom for row in rows),
+    )
+
+
+def part_of(study: RepeatStudy) -> Part:
+    """The scatter as a table, beside the paper's."""
+    rows = [Row(leg.station, (str(leg.leg), *_cells(leg))) for leg in study.legs]
+    rows.append(Row("median", ("", *_cells(study.middle))))
+    rows.append(Row("upper bound", ("", *_cells(study.bound))))
+    paper = (_degrees(PAPER.psi), _degrees(PAPER.theta), _mm(PAPER.x), _mm(PAPER.z))
+    rows.append(Row("[A] Table 1", ("", "", *paper, "", ""), "paper"))
+    columns = ("Station", "Leg", "Photos", "ψ", "θ", "x", "z", "Shift", "Tilt")
+    table = Table("Scatter of repeated photographs", columns, tuple(rows), legend=LEGEND)
+    return Part("repeats", "Repeats", tables=(table,))
+
+
+def _cells(row: LegScatter) -> tuple[str, ...]:
+    axis = (_degrees(row.psi), _degrees(row.theta), _mm(row.x), _mm(row.z))
+    edges = (f"{v:.3f} px" if math.isfinite(v) else "–" for v in (row.shift, row.tilt))
+    return str(row.photographs), *axis, *edges
+
+
+def _degrees(value: float) -> str:
+    return f"{math.degrees(value):.2g}°" if math.isfinite(value) else "–"
+
+
+def _mm(value: float) -> str:
+    return f"{value * 1e3:.2g} mm" if math.isfinite(value) else "–"
+
+
+_CAUSES = {
+    "camera": "{share:.0%} of it is common to all legs as if the camera moved: fix the camera, and"
+    " release the shutter without touching it.",
+    "platform": "{share:.0%} of it is common to all legs as if the platform moved, and not the"
+    " camera: wait until the machine stands still, with its brakes or drives holding it.",
+    "legs": "{share:.0%} of it is as if each leg moved by itself: they vibrate, or turn in their"
+    " joints between photographs.",
+    "noise": "It is each edge's own, so neither the camera nor the machine moves: sensor noise.",
+}
+
+
+def _findings(stations: tuple[StationScatter, ...]) -> tuple[Finding, ...]:
+    """What each station's repeats say, and what more of them would bring."""
+    nothing = "No edge shows in two photographs of one configuration: nothing tells the scatter."
+    found = [_finding(s) for s in stations] or [Finding(Level.DOUBTFUL, nothing)]
+    if stations and all(station.promised < MOSTLY_COMMON for station in stations):
+        text = (
+            "What the repeats have in common, such as shading, is most of an edge's error: more"
+            " repeats will hardly help, more configurations will."
+        )
+        found.append(Finding(Level.NOTE, text))
+    return tuple(found)
+
+
+def _finding(station: StationScatter) -> Finding:
+    """How large the scatter of a station is and where it comes from, in words."""
+    cause = station.cause
+    share = {"camera": station.camera, "platform": station.platform, "legs": station.legs}
+    text = (
+        f"{station.station}: repeats scatter by {station.shift:.3f} px,"
+        f" {station.promised:.2g} times what each photograph promises."
+        f" {_CAUSES[cause].format(share=share.get(cause, 0.0))}"
+    )
+    if station.promised > 1:
+        text += " The calibration takes the repeats' scatter for the edges' noise."
+        return Finding(Level.DOUBTFUL, text, station.station)
+    return Finding(Level.NOTE, text, station.station)

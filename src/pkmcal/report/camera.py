@@ -1,0 +1,325 @@
+"""What a camera's calibration found, as an outcome: intrinsics, corners over photographs, field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
+from pkmcal.cameras.files import camera_text, foreign_text
+from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
+from pkmcal.report import charts, page
+from pkmcal.report.pictures import THREADS, jpeg
+from pkmcal.wording import brief, count, decimals, number
+
+ARROW = 0.05
+"""Length of a large residual's arrow as a share of the picture's width."""
+FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000)
+ANGLE_STEP = 5.0
+"""degrees of the angle from the axis that one bar of the histogram holds."""
+FIELD_CELLS = (16, 12)
+UNITS = {"focal": "px", "center": "px"}
+WORDS = {
+    "focal.x": "focal length x",
+    "focal.y": "focal length y",
+    "center.x": "centre x",
+    "center.y": "centre y",
+}
+COMPARED = (
+    "Every model with more and more distortion terms. What counts is the error on views left out of"
+    " the fit; a term is taken only where they gain from it, and the model with the fewest"
+    " parameters among equals."
+)
+SIGMA = (
+    "The standard deviations say how much the intrinsics would scatter if other photographs of this"
+    " kind were taken. They hold the noise of the corners and the views' disagreement beyond it."
+    " They know nothing of what all photographs share: a board whose squares are not as long as its"
+    " file says leaves the intrinsics alone and scales every distance; a focus that moves"
+    " afterwards makes it another camera."
+)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph; corners are (x, y, dx, dy, in use, tip), residuals already enlarged."""
+
+    name: str
+    width: int
+    height: int
+    jpeg: str
+    corners: tuple[tuple[float, float, float, float, bool, str], ...]
+    caption: str
+
+
+@dataclass(frozen=True)
+class Field:
+    """The picture in cells: (x, y, width, height, corners, share of the most) and mean residuals
+    (x, y, dx, dy), enlarged by `factor`, which is larger than that of single corners.
+    """
+
+    width: int
+    height: int
+    cells: tuple[tuple[float, float, float, float, int, float], ...]
+    arrows: tuple[tuple[float, float, float, float], ...]
+    factor: int
+
+
+def outcome_of(
+    calibration: CameraCalibration,
+    paths: Sequence[Path | str] = (),
+    others: Sequence[tuple[str, str]] = (),
+) -> Outcome:
+    """Everything that `pkmcal camera` tells and writes.
+
+    paths : the photographs, to show them; by name. others : other programs' camera files, names
+    and forms.
+    """
+    c = calibration
+    factor = _factor(c.residuals[c.kept], c.camera.image_size[0])
+    # with its covariance, so that `calibrate --refine-camera` knows how far to move it
+    measured = replace(c.camera, covariance=c.covariance)
+    return Outcome(
+        command="camera",
+        title=f"Calibration of a {c.camera.model} camera",
+        verdict=Verdict(True, headline(c), warnings=c.warnings),
+        figures=_cards(c),
+        parts=(
+            Part("intrinsics", "Intrinsics", tables=(_intrinsics(c),), notes=_correlations(c)),
+            Part("models", "Models compared", (COMPARED,), tables=(_compared(c),), menu="Models"),
+            Part(
+                "field",
+                "Field",
+                html=page.render("field.html.j2", field=_field(c))
+                + charts.panels(_angles_chart(c), _views_chart(c)),
+            ),
+            Part(
+                "photographs",
+                "Photographs",
+                html=page.render(
+                    "corners.html.j2",
+                    shots=_shots(c, [Path(path) for path in paths], factor),
+                    factor=factor,
+                    missed=[d for d in c.detections if not d.found],
+                ),
+            ),
+            Part("how", "What σ means", (SIGMA,)),
+        ),
+        document=c.document(),
+        texts={
+            "camera.yaml": camera_text(measured),
+            **{name: foreign_text(c.camera, name, form) for name, form in others},
+        },
+    )
+
+
+def headline(c: CameraCalibration) -> str:
+    """The result in one sentence."""
+    focal, sigma = c.camera.parameters[:2].mean(), c.sigma[:2].mean()
+    kind = {"unified": "unified (mirror or wide-lens)"}.get(c.camera.model, c.camera.model)
+    return (
+        f"A {kind} camera, focal length {number(focal, decimals(sigma))} ± {brief(sigma)} px;"
+        f" photographs outside the fit are predicted to {brief(c.held_out.rms)} px."
+    )
+
+
+def _intrinsics(c: CameraCalibration) -> Table:
+    """The intrinsics with two digits of their sigma."""
+    rows: list[Row] = []
+    values = zip(
+        c.camera.parameter_names, c.camera.parameters.tolist(), c.sigma.tolist(), strict=True
+    )
+    for name, value, sigma in values:
+        unit = UNITS.get(name.partition(".")[0], "")
+        places = decimals(sigma)
+        shown = (
+            (number(value, places), number(sigma, places))
+            if sigma > 0
+            else (f"{value:g}", "not estimated")
+        )
+        rows.append(Row(WORDS.get(name, name), (*shown, unit)))
+    return Table("", ("Parameter", "Value", "σ", "Unit"), tuple(rows), words=(3,))
+
+
+def _correlations(c: CameraCalibration) -> tuple[str, ...]:
+    pairs = [f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations]
+    if not pairs:
+        return ()
+    return (f"Hardly told apart, and so to be used together only: {'; '.join(pairs)}.",)
+
+
+def _compared(c: CameraCalibration) -> Table:
+    rows = [
+        Row(
+            one.model,
+            (
+                " ".join(one.terms) or "none",
+                number(one.rms, decimals(one.rms) + 1),
+                number(one.left_out, decimals(one.left_out) + 1),
+            ),
+            mark="good" if (one.model, one.terms) == (c.camera.model, c.terms) else None,
+        )
+        for one in c.compared
+    ]
+    columns = ("Model", "Distortion", "Fitted, px", "Left out, px")
+    note = "✓: chosen."
+    return Table("", columns, tuple(rows), note, brief=False, words=(1,))
+
+
+def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
+    focal, sigma = c.camera.parameters[:2], c.sigma[:2]
+    share = float(np.max(sigma / focal)) * 100
+    return (
+        Figure(
+            "How sure is the focal length?",
+            ((brief(share), "%"),),
+            f"1σ, from {count(len(c.views), 'photograph')}; "
+            + (
+                f"the views disagree by {c.spread:.1f} times the corners' noise, which is in it"
+                if c.spread > 1
+                else "the views agree as far as the corners' noise lets them"
+            ),
+        ),
+        Figure(
+            "How well does it predict other photographs?",
+            ((brief(c.held_out.rms), "px"),),
+            f"length of a residual, root mean square, camera fitted to the other views;"
+            f" {brief(c.rms)} px on the views that it was fitted to",
+        ),
+        Figure(
+            "Are straight lines straight?",
+            ((brief(c.held_out.straightness), "px"),),
+            "distance of corners from their board line's great circle, on held-out views; no pose"
+            " takes part in this",
+        ),
+        *_data_cards(c),
+    )
+
+
+def _data_cards(c: CameraCalibration) -> tuple[Figure, ...]:
+    tilt = tilts(c.T_camera_board, c.board.points)
+    covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
+    seen = int(np.isfinite(c.residuals).all(axis=-1).sum())
+    return (
+        Figure(
+            "What is it based on?",
+            ((f"{len(c.views)} of {len(c.detections)}", "photographs"),),
+            f"{count(seen, 'corner')}, {seen - int(c.kept.sum())} of them put aside",
+        ),
+        Figure(
+            "How different are the views?",
+            ((f"{tilt.min():.0f} to {tilt.max():.0f}", "°"),),
+            "tilt of the board from facing the camera; 20 to 45° to all sides tell most",
+        ),
+        Figure(
+            "How much of the picture was tested?",
+            ((f"{covered:.0f}", "%"),),
+            f"of {CELLS[0]}×{CELLS[1]} cells hold corners; elsewhere the lens is extrapolated",
+        ),
+    )
+
+
+def _factor(residuals: Array, width: int) -> int:
+    """Enlargement by which a large residual's arrow becomes visible and no longer than that."""
+    large = float(np.quantile(np.linalg.norm(residuals, axis=-1), 0.95)) if len(residuals) else 1.0
+    wanted = ARROW * width / max(large, 1e-9)
+    return max((f for f in FACTORS if f <= wanted), default=1)
+
+
+def _shots(c: CameraCalibration, paths: list[Path], factor: int) -> tuple[Shot, ...]:
+    by_name = {path.name: path for path in paths}
+    size = c.camera.image_size
+    with ThreadPoolExecutor(THREADS) as pool:
+        jpegs = pool.map(lambda name: jpeg(by_name.get(name), size), c.views)
+        return tuple(_shot(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
+
+
+def _shot(c: CameraCalibration, v: int, jpeg: str, factor: int) -> Shot:
+    seen = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
+    corners: list[tuple[float, float, float, float, bool, str]] = []
+    for i in seen.tolist():
+        (x, y), off = c.pixels[v, i].tolist(), c.residuals[v, i]
+        places = decimals(max(c.rms, 1e-6)) + 1
+        tip = (
+            f"Corner {i}: {number(off[0], places, signed=True)},"
+            f" {number(off[1], places, signed=True)} px; weight {c.weight[v, i]:.2f}"
+        )
+        dx, dy = (off * factor).tolist()
+        corners.append((x, y, dx, dy, bool(c.kept[v, i]), tip))
+    aside = int(np.sum([not corner[4] for corner in corners]))
+    caption = f"{count(len(seen), 'corner')}" + (f", {aside} put aside" if aside else "")
+    caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
+    width, height = c.camera.image_size
+    return Shot(c.views[v], width, height, jpeg, tuple(corners), caption)
+
+
+def _field(c: CameraCalibration) -> Field:
+    """Corners a cell, and the mean residual of cells with three or more."""
+    width, height = c.camera.image_size
+    columns, rows = FIELD_CELLS
+    pixels, off = c.pixels[c.kept], c.residuals[c.kept]
+    dx, dy = width / columns, height / rows
+    column = np.clip(((pixels[:, 0] + 0.5) / dx).astype(int), 0, columns - 1)
+    row = np.clip(((pixels[:, 1] + 0.5) / dy).astype(int), 0, rows - 1)
+    flat = row * columns + column
+    counts = np.bincount(flat, minlength=rows * columns)
+    most = max(int(counts.max()), 1)
+    cells = [
+        (k % columns * dx - 0.5, k // columns * dy - 0.5, dx, dy, int(n), float(n) / most)
+        for k, n in enumerate(counts.tolist())
+        if n
+    ]
+    full = np.flatnonzero(counts >= 3)
+    roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
+    means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
+    factor = _factor(means, width)
+    arrows = np.concatenate([roots, means * factor], axis=1).tolist()
+    return Field(width, height, tuple(cells), tuple((x, y, u, v) for x, y, u, v in arrows), factor)
+
+
+def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
+    """Held-out error a view; the fit's own beside it in the tooltip."""
+    squares = np.where(c.kept, np.sum(np.nan_to_num(c.residuals) ** 2, axis=-1), 0.0)
+    fitted = np.sqrt(squares.sum(axis=1) / np.maximum(c.kept.sum(axis=1), 1))
+    middle = float(np.median(c.held_out.by_view))
+    bars = [
+        charts.Bar(
+            name,
+            f"{name}: {brief(float(out))} px held out, {brief(float(own))} px when fitted",
+            float(out),
+            quiet=bool(out < 2 * middle),
+        )
+        for name, out, own in zip(c.views, c.held_out.by_view, fitted, strict=True)
+    ]
+    return charts.bar_chart(
+        "Held-out error of each photograph", "photographs; root mean square, px", bars, (),
+        f"Bars of {len(bars)} photographs, the middle one {brief(middle)} px",
+    )  # fmt: skip
+
+
+def _angles_chart(c: CameraCalibration) -> charts.BarChart | None:
+    """How far from the axis the corners lie."""
+    rays = c.camera.ray(c.pixels[c.kept])
+    angle = np.rad2deg(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
+    angle = angle[np.isfinite(angle)]
+    last = int(np.ceil((angle.max() if angle.size else 1.0) / ANGLE_STEP)) + 1
+    counts = np.bincount((angle / ANGLE_STEP).astype(int), minlength=last)
+    bars = [
+        charts.Bar(
+            f"{k * ANGLE_STEP:.0f}",
+            f"{k * ANGLE_STEP:.0f} to {(k + 1) * ANGLE_STEP:.0f}°: {count(n, 'corner')}",
+            float(n),
+            quiet=True,
+        )
+        for k, n in enumerate(counts.tolist())
+    ]
+    every = max(1, len(bars) // 8)
+    labels = tuple((float(k), f"{k * ANGLE_STEP:.0f}") for k in range(0, len(bars) + 1, every))
+    return charts.bar_chart(
+        "Corners by their angle from the axis", "degrees", bars, labels,
+        f"Corners from {angle.min(initial=180):.0f} to {angle.max(initial=0):.0f} degrees",
+    )  # fmt: skip

@@ -1,0 +1,669 @@
+"""What a study of servoing found, as an outcome, [B] Fig. 10: curves, an animation, the image.
+
+Plotly's colours are names of the page's CSS variables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers, rms
+from pkmcal.control.source import Controlled
+from pkmcal.control.study import Study, Trials
+from pkmcal.control.words import judgement, named
+from pkmcal.geometry.rigid import inverse
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.mechanisms.kinematics import inverse_result
+from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Plot, Row, Table, Verdict
+from pkmcal.report.scene import AXIS, LOOKS, coordinates, line, markers, ring, space_layout
+from pkmcal.wording import brief, number
+
+MOST_CHOICES = 2
+"""Choices of legs told of each number of them."""
+SLIGHT = 0.01
+"""Part of the way by which noise may bring a platform beyond its goal."""
+LONG = 100.0
+"""m of a way that count as much as passing the goal by all of it."""
+COLOURS = {"true": "--quiet", "identified": "--drawing", "cad": "--good", "hand": "--calibrated"}
+SHADES = {"identified": "rgba(0,104,168,.16)", "hand": "rgba(194,72,12,.16)"}
+FRAMES = 60
+"""Pictures of the animation; more only make the page heavy."""
+POINTS = 300
+"""Points of a curve."""
+LEAST = 1e-5
+"""Part of the error's start below which a curve tells nothing."""
+ALONG = 17
+"""Places along an edge that is drawn; edges are curves in a mirror."""
+HOW = (
+    "The camera measures the edges of one tube of each seen leg. The error is the cross product of"
+    " what is seen and what was seen when the goal was taught: of the edges' normals, or of the"
+    " legs' directions. The drives' rates are −gain · D N⁺ e, with the interaction matrix N and the"
+    " inverse Jacobian D by the measured directions, the readings, and the base centres that the"
+    " controller believes. The goal is taught by the true machine without noise, so a wrong"
+    " geometry changes the way and not the end.",
+    "The true machine follows its drives by forward kinematics. A run ends early where a drive"
+    " leaves its range, the platform comes near a singular pose, or a leg leaves the image. A leg"
+    " behind another one is measured all the same.",
+)
+
+
+def outcome_of(subject: Controlled, found: Study) -> Outcome:
+    """Everything that `pkmcal servo` tells and writes."""
+    verdict, run = judgement(found), shown_run(found)
+    document = document_of(subject, found, verdict)
+    ends = ends_table(found)
+    return Outcome(
+        command="servo",
+        title=f"Control by the legs of {subject.name}",
+        verdict=verdict,
+        kicker="visual servoing, simulated",
+        subject=subject.origin,
+        stamp="It works in simulation" if verdict.usable else "Not to be used",
+        figures=cards(found),
+        parts=(
+            Part(
+                "curves",
+                "Error curves",
+                said=(stillness(found),),
+                plots=(
+                    Plot(
+                        "curves",
+                        f"Error of the {found.plan.loop.law}, as a part of its start's",
+                        "Lines: the median; shaded: from the least to the largest; of runs that"
+                        " reach the goal. Logarithmic, so that an exponential is a straight line;"
+                        " [B] Fig. 10 for one run.",
+                        "Norm of the error against time for four estimates of the geometry",
+                        curves(found),
+                        height=420,
+                    ),
+                    Plot(
+                        "tail",
+                        "The end of the ways, platform's joints from the goal",
+                        "Distance of the platform's joints from the goal, as a part of the way,"
+                        " median of runs that reach it.",
+                        "Distance from the goal against time, enlarged near zero",
+                        tail(found),
+                        height=320,
+                    ),
+                ),
+                tables=(outcome_table(found), *([ends] if ends else [])),
+            ),
+            Part(
+                "run",
+                "One run",
+                plots=(
+                    Plot(
+                        "space",
+                        f"Run {run + 1} in space",
+                        "The true machine, led by the identified geometry; dashed: the goal; grey:"
+                        " the way of the platform's middle with the identified geometry, orange"
+                        " with the one by hand.",
+                        "The machine in three dimensions on its way to the goal",
+                        space(found, run),
+                        height=560,
+                        frames=frames(found, run),
+                    ),
+                    Plot(
+                        "image",
+                        f"Run {run + 1} in the image",
+                        "Edges of the seen legs at the start (thin) and at the goal (thick), and"
+                        " the way of their ends between; the frame is the image's.",
+                        "The legs' edges in the camera's image and their ways from start to goal",
+                        image(found, run),
+                        height=520,
+                    ),
+                ),
+            ),
+            Part("legs", "Legs", tables=(choices_table(found),)),
+            Part("how", "How it was computed", HOW, tables=(settings_table(found),)),
+        ),
+        findings=tuple(Finding(Level.DOUBTFUL, text) for text in subject.warnings),
+        document=document,
+        summary={name: value for name, value in document.items() if name != "curves"},
+    )
+
+
+def stillness(s: Study) -> str:
+    """How still the platform is held, in a sentence."""
+    position, turn = rms(s.held.position), rms(s.held.turn)
+    one, one_turn = rms(s.image.position), rms(s.image.turn)
+    if not position > 0:
+        return "The edges are without noise."
+    return (
+        f"Held at its goal, noise of {s.plan.loop.noise.shift:g} px moves the platform by"
+        f" {brief(1e3 * position)} mm and {brief(np.rad2deg(turn))}° (root mean square);"
+        f" one image alone is good to {brief(1e3 * one)} mm and"
+        f" {brief(np.rad2deg(one_turn))}°."
+    )
+
+
+def document_of(subject: Controlled, found: Study, verdict: Verdict) -> dict[str, Any]:
+    """Plain data for JSON: m, rad, s; legs count from 1."""
+    s, j = found, verdict
+    return {
+        "machine": subject.name,
+        "origin": subject.origin,
+        "station": subject.station,
+        "usable": j.usable,
+        "headline": j.headline,
+        "reasons": j.reasons,
+        "warnings": (*subject.warnings, *j.warnings),
+        "advice": j.advice,
+        "settings": _settings(s),
+        "estimates": {o.estimate.name: _outcome_document(o) for o in s.outcomes},
+        "stillness": {
+            "position": rms(s.held.position),
+            "turn": rms(s.held.turn),
+            "one_image_position": rms(s.image.position),
+            "one_image_turn": rms(s.image.turn),
+        },
+        "hidden": dict(zip([str(j + 1) for j in s.eye.true.legs], s.hidden, strict=True)),
+        "visibility": {
+            "legs": [
+                {"legs": [j + 1 for j in c.legs], "worst": c.worst, "usual": c.usual}
+                for c in s.choices
+            ],
+        },
+        "equilibria": _equilibria(s),
+        "curves": {
+            "time": s.outcomes[0].runs.time,
+            **{o.estimate.name: np.median(shares(o), axis=0) for o in s.outcomes},
+        },
+    }
+
+
+def shown_run(found: Study) -> int:
+    """The run that is drawn: the one whose estimate by hand passes its goal farthest, of those that
+    all estimates bring there.
+    """
+    everywhere = np.all([o.runs.reached for o in found.outcomes], axis=0)
+    hand = found.outcome("hand")
+    # where nobody passes the goal, the longest way shows most
+    passed = np.where(hand.overshoot > SLIGHT, hand.overshoot, 0.0)
+    marks = passed + hand.runs.way[:, 0] / LONG
+    return int(np.argmax(np.where(everywhere, marks, -1.0)))
+
+
+def cards(found: Study) -> tuple[Figure, ...]:
+    """The main numbers."""
+    s = found
+    good, hand = s.outcome("identified"), s.outcome("hand")
+    n = s.plan.runs
+    return (
+        Figure(
+            "How many runs reach their goal?",
+            ((f"{good.reached}", f"of {n}"),),
+            f"with the identified geometry; by hand {hand.reached}",
+        ),
+        Figure(
+            "How fast?",
+            ((_seconds(good), "s"),),
+            f"until the platform stays within 2 % of its way, median; by hand {_seconds(hand)} s,"
+            f" an exponential {np.log(50) / s.plan.loop.gain:.1f} s",
+        ),
+        Figure(
+            "Does it pass its goal?",
+            ((_percent(good.overshoot, good), "%"),),
+            f"of the way, the farthest of all runs; by hand {_percent(hand.overshoot, hand)} %",
+        ),
+        Figure(
+            "How still is it held?",
+            (
+                (_magnitude(1e3 * rms(s.held.position)), "mm"),
+                (_magnitude(float(np.rad2deg(rms(s.held.turn)))), "°"),
+            ),
+            f"root mean square, noise of {s.plan.loop.noise.shift:g} px an edge",
+        ),
+    )
+
+
+def outcome_table(found: Study) -> Table:
+    """One row an estimate."""
+    rows = [
+        Row(
+            o.estimate.title,
+            (
+                f"{o.reached} of {len(o.runs.end)}",
+                _percent(o.overshoot, o, np.median),
+                _percent(o.overshoot, o),
+                _percent(o.rise, o),
+                _seconds(o),
+                _last(o),
+            ),
+        )
+        for o in found.outcomes
+    ]
+    return Table(
+        "Estimates of the geometry",
+        (
+            "Geometry",
+            "Reached",
+            "Passed goal, %",
+            "at most",
+            "Error rose, %",
+            "Settled, s",
+            "Left, mm",
+        ),
+        tuple(rows),
+        "Passed goal: part of its way by which the platform was beyond the goal, median and"
+        " largest. Error rose: the largest rise of the error's norm above an earlier value."
+        " Settled: within 2 % of the way for good, median. Left: distance of the platform's joints"
+        " at the end, median. All of runs that reached the goal.",
+    )
+
+
+def ends_table(found: Study) -> Table | None:
+    """How runs ended that failed; None where none did."""
+    kinds = {end for o in found.outcomes for end in o.ends if not end.good}
+    if not kinds:
+        return None
+    rows = [
+        Row(end.sentence, tuple(str(o.ends.get(end, 0)) for o in found.outcomes))
+        for end in sorted(kinds, key=lambda end: end.word)
+    ]
+    columns = ("How the others ended", *(o.estimate.title for o in found.outcomes))
+    return Table("Runs that did not reach their goal", columns, tuple(rows), brief=False)
+
+
+def choices_table(found: Study) -> Table:
+    """Which legs must be seen."""
+    s = found
+    useful = [c for c in s.choices if not c.blind]
+    sizes = sorted({len(c.legs) for c in useful})
+    shown = [c for n in sizes for c in [c for c in useful if len(c.legs) == n][:MOST_CHOICES]]
+    if s.own not in shown:
+        shown = [s.own, *shown]
+    rows = [
+        Row(
+            named(c, s) + (", as seen" if c == s.own else ""),
+            (number(c.worst, 5), number(c.usual, 5), "no" if c.blind else "hardly, at some poses"
+             if c.fading else "yes"),
+        )
+        for c in shown
+    ]  # fmt: skip
+    return Table(
+        f"Which legs must be seen, by their {s.plan.loop.law}",
+        ("Legs", "Visibility, worst pose", "usual", "Every motion seen"),
+        tuple(rows),
+        "Visibility: the smallest singular value of the interaction matrix as a part of its"
+        " largest, at poses all over the workspace; the two best choices of each number. Fewer legs"
+        " do not show every motion.",
+        brief=False,
+    )
+
+
+def settings_table(found: Study) -> Table:
+    """What was simulated."""
+    s = _settings(found)
+    names = {
+        "law": "Control by",
+        "legs": "Legs seen",
+        "gain": "Gain, 1/s",
+        "rate": "Images a second",
+        "delay": "Delay, images",
+        "noise": "Noise of an edge, px",
+        "joint_noise": "Noise of a reading, m or rad",
+        "speed": "Fastest drive, m/s or rad/s",
+        "duration": "Time of a run, s",
+        "hand_position": "Camera's place by hand, off by m",
+        "hand_rotation": "and by rad",
+        "runs": "Runs of every estimate",
+        "seed": "Seed",
+    }
+    rows = [Row(name, (_told(s[key]),)) for key, name in names.items()]
+    return Table("What was simulated", ("Setting", "Value"), tuple(rows), brief=False)
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(str(item) for item in value)
+    return (
+        "no limit" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+    )
+
+
+def _settings(s: Study) -> dict[str, Any]:
+    loop, plan = s.plan.loop, s.plan
+    return {
+        "law": loop.law,
+        "legs": [int(j) + 1 for j in s.eye.true.legs],
+        "gain": loop.gain,
+        "rate": loop.rate,
+        "delay": loop.delay,
+        "noise": loop.noise.shift,
+        "joint_noise": loop.joint_noise,
+        "speed": None if loop.speed is None else float(loop.speed[0]),
+        "duration": loop.duration,
+        "hand_position": plan.hand_position,
+        "hand_rotation": plan.hand_rotation,
+        "runs": plan.runs,
+        "seed": plan.seed,
+    }
+
+
+def _equilibria(s: Study) -> dict[str, Any]:
+    found = s.equilibria
+    return {
+        "reached": found.reached,
+        "alike": found.alike,
+        "cancelled": found.cancelled,
+        "outside": found.out,
+        "distance": found.distance,
+        "looks_alike": found.looks_alike,
+        "T_base_platform": found.T_base_platform,
+    }
+
+
+def _outcome_document(o: Trials) -> dict[str, Any]:
+    return {
+        "title": o.estimate.title,
+        "reached": o.reached,
+        "ends": {end.word: n for end, n in o.ends.items()},
+        "overshoot_median": _over(o.overshoot, o, np.median),
+        "overshoot_largest": _over(o.overshoot, o, np.max),
+        "error_rise_largest": _over(o.rise, o, np.max),
+        "settling_median": float(np.nanmedian(o.settling)) if o.reached else None,
+        "runs": [
+            {"end": end.word, "way": way, "overshoot": over, "settling": settling}
+            for end, way, over, settling in zip(
+                o.runs.end, o.runs.way[:, 0], o.overshoot, o.settling, strict=True
+            )
+        ],
+    }
+
+
+def _over(values: Any, o: Trials, of: Callable[[Any], Any]) -> float | None:
+    """A figure over the runs that reached the goal."""
+    good = values[o.runs.reached]
+    return float(of(good)) if good.size else None
+
+
+def _percent(values: Any, o: Trials, of: Callable[[Any], Any] = np.max) -> str:
+    value = _over(values, o, of)
+    return "–" if value is None else brief(100 * value) if value > 5e-4 else "0"
+
+
+def _seconds(o: Trials) -> str:
+    known = o.settling[np.isfinite(o.settling)]
+    return f"{np.median(known):.1f}" if known.size else "–"
+
+
+def _last(o: Trials) -> str:
+    way = o.runs.way[o.runs.reached][:, -max(1, o.runs.way.shape[1] // 10) :]
+    return brief(1e3 * float(np.median(way.mean(axis=1)))) if len(way) else "–"
+
+
+def _magnitude(value: float) -> str:
+    return brief(value) if value > 0 else "0"
+
+
+# ------------------------------------------------------------------ against time
+
+
+def shares(o: Trials) -> Array:
+    """Norms of the error (R, K) as parts of the start's, of the runs that reached the goal; of all
+    where none did.
+    """
+    return _parts(o, o.runs.error)
+
+
+def _parts(o: Trials, values: Array) -> Array:
+    rows = o.runs.reached if o.reached else np.ones(len(values), dtype=bool)
+    return values[rows] / np.maximum(values[rows, :1], 1e-300)
+
+
+def _every(samples: int, most: int) -> Integers:
+    return np.unique(np.linspace(0, samples - 1, min(samples, most)).round().astype(int))
+
+
+def _rounded(values: Array, digits: int = 4) -> list[float]:
+    return [float(f"{v:.{digits}g}") for v in values]
+
+
+def curves(s: Study) -> dict[str, Any]:
+    """Norm of the error against time, a line and a band for each estimate."""
+    data: list[dict[str, Any]] = []
+    time = s.outcomes[0].runs.time
+    rows = _every(len(time), POINTS)
+    for o in s.outcomes:
+        values = np.maximum(shares(o)[:, rows], LEAST)
+        name = o.estimate.name
+        if name in SHADES:
+            data.append(_band(time[rows], values, SHADES[name], name))
+    for o in s.outcomes:
+        values = np.maximum(np.median(shares(o)[:, rows], axis=0), LEAST)
+        data.append(_curve(o, time[rows], values, "%{y:.2g} after %{x:.2f} s"))
+    layout = _plane("time, s", "error / error at the start")
+    layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
+    return {"data": data, "layout": layout, "config": {}}
+
+
+def tail(s: Study) -> dict[str, Any]:
+    """Distance from the goal, as a part of the way, enlarged near zero."""
+    data: list[dict[str, Any]] = []
+    time = s.outcomes[0].runs.time
+    rows = _every(len(time), POINTS)
+    for o in s.outcomes:
+        values = 100 * np.median(_parts(o, o.runs.way)[:, rows], axis=0)
+        data.append(_curve(o, time[rows], values, "%{y:.2f} % after %{x:.2f} s"))
+    layout = _plane("time, s", "% of the way")
+    layout["yaxis"] |= {"range": [0, 10]}
+    return {"data": data, "layout": layout, "config": {}}
+
+
+def _curve(o: Trials, time: Array, values: Array, hover: str) -> dict[str, Any]:
+    dash = {"true": "dot", "cad": "dash"}.get(o.estimate.name, "solid")
+    look = {"color": COLOURS[o.estimate.name], "width": 2.5, "dash": dash}
+    told = {"hoverinfo": "all", "hovertemplate": hover}
+    return _flat(o.estimate.title, _rounded(time), _rounded(values), look, **told)
+
+
+def _flat(name: str, x: Any, y: Any, look: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """A trace of a line in the plane."""
+    plain = {"type": "scatter", "mode": "lines", "name": name, "x": x, "y": y}
+    return {**plain, "line": look, "hoverinfo": "skip", **more}
+
+
+def _band(time: Array, values: Array, colour: str, name: str) -> dict[str, Any]:
+    both = np.concatenate([time, time[::-1]])
+    edge = np.concatenate([values.max(axis=0), values.min(axis=0)[::-1]])
+    fill = {"fill": "toself", "fillcolor": colour, "showlegend": False}
+    return _flat(f"{name}, all runs", _rounded(both), _rounded(edge), {"width": 0}, **fill)
+
+
+def _plane(x: str, y: str) -> dict[str, Any]:
+    return {
+        **LOOKS,
+        "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
+        "legend": {"orientation": "h", "y": 1.12, "x": 0, "bgcolor": "rgba(0,0,0,0)"},
+        "xaxis": {**AXIS, "title": {"text": x}},
+        "yaxis": {**AXIS, "title": {"text": y}},
+    }
+
+
+# ------------------------------------------------------------------ in space
+
+
+def _limbs(s: Study, poses: Array) -> tuple[Array, Array]:
+    """Ends A and B (n, L, 3) of the true limbs at poses (n, 4, 4), m."""
+    machine = s.eye.true.machine
+    layout, theta = machine.layout, machine.values
+    readings, internal = inverse_result(layout, theta, poses)
+    ends = limb_ends(layout, theta, np.nan_to_num(readings), poses, internal)
+    return np.broadcast_to(ends.a, ends.b.shape), ends.b
+
+
+def _moving(s: Study, pose: Array) -> list[dict[str, Any]]:
+    """Coordinates of what moves, one a trace: each leg, then the platform."""
+    a, b = (v[0] for v in _limbs(s, pose[None]))
+    legs = (coordinates([np.stack(ends)]) for ends in zip(a, b, strict=True))
+    return [dict(leg) for leg in legs] + [dict(coordinates([ring(b)]))]
+
+
+def space(s: Study, run: int) -> dict[str, Any]:
+    """The machine on its way; what moves comes first, so that frames name it by its place."""
+    shown = s.outcome("identified").runs
+    start, goal = shown.T_base_platform[run, 0], shown.goals[run]
+    seen = set(s.eye.true.legs.tolist())
+    *legs, platform = _moving(s, start)
+    data = [
+        line(
+            f"leg {j + 1}" + ("" if j in seen else ", not seen"),
+            f"--leg{j % 8 + 1}" if j in seen else "--quiet",
+            8 if j in seen else 4,
+            (),
+            **leg,
+        )
+        for j, leg in enumerate(legs)
+    ]
+    data.append(line("platform", "--ink", 6, (), **platform))
+    a, b = (v[0] for v in _limbs(s, goal[None]))
+    data.append(line("base", "--muted", 3, [ring(a)], showlegend=False))
+    dashed = line("goal", "--ink", 2, [ring(b)])
+    dashed["line"]["dash"] = "dash"
+    data.append(dashed)
+    for name, colour in (("identified", "--muted"), ("hand", "--calibrated")):
+        o = s.outcome(name)
+        poses = o.runs.T_base_platform[run][_every(len(o.runs.time), FRAMES)]
+        middle = _limbs(s, poses)[1].mean(axis=1)
+        data.append(line(f"way, {o.estimate.title.lower()}", colour, 5, [middle]))
+    camera = markers(
+        "camera",
+        inverse(s.eye.true.T_camera_base)[None, :3, 3],
+        {"size": 5, "color": "--ink", "symbol": "square"},
+        mode="markers+text",
+        text=["camera"],
+        textposition="top center",
+        textfont={"color": "--ink", "size": 12},
+        hoverinfo="skip",
+        showlegend=False,
+    )
+    layout = space_layout({"x": 1.3, "y": -1.3, "z": 0.7}) | {
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 70},
+        "legend": {"orientation": "v", "y": 1, "x": 0, "bgcolor": "rgba(0,0,0,0)"},
+        "updatemenus": [_player()],
+    }
+    return {"data": [*data, camera], "layout": layout, "config": {"scrollZoom": True}}
+
+
+def frames(s: Study, run: int) -> tuple[dict[str, Any], ...]:
+    """The pictures of :func:`space`'s animation."""
+    runs = s.outcome("identified").runs
+    out: list[dict[str, Any]] = []
+    for row in _every(int(runs.last[run]) + 1, FRAMES):
+        moving = _moving(s, runs.T_base_platform[run, row])
+        out.append(
+            {
+                "name": f"{runs.time[row]:.2f} s",
+                "data": [{"type": "scatter3d", **trace} for trace in moving],
+                "traces": list(range(len(moving))),
+            }
+        )
+    return tuple(out)
+
+
+def _player() -> dict[str, Any]:
+    """The buttons that play the animation."""
+    still = {"transition": {"duration": 0}}
+    play = {"frame": {"duration": 60, "redraw": True}, "fromcurrent": True, **still}
+    pause = {"frame": {"duration": 0, "redraw": False}, "mode": "immediate", **still}
+    return {
+        "type": "buttons",
+        "direction": "left",
+        "x": 0,
+        "y": 0,
+        "xanchor": "left",
+        "yanchor": "top",
+        "pad": {"t": 14},
+        "showactive": False,
+        "bgcolor": "--card",
+        "bordercolor": "--quiet",
+        "buttons": [
+            {"label": "▶ Play", "method": "animate", "args": [None, play]},
+            {"label": "❚❚ Pause", "method": "animate", "args": [[None], pause]},
+        ],
+    }
+
+
+# ------------------------------------------------------------------ in the image
+
+
+def image(s: Study, run: int) -> dict[str, Any]:
+    """Edges at start and goal, the ways of their ends, and the image's frame."""
+    width, height = s.eye.camera.image_size
+    data = [_frame(width, height)]
+    runs = s.outcome("identified").runs
+    first, goal = runs.T_base_platform[run, :1], runs.goals[run : run + 1]
+    data += _edges(s, first, 1.2, "at the start", "dot")
+    data += _edges(s, goal, 2.6, "at the goal", "solid")
+    data += _ways(s, run, "identified", "solid")
+    data += _ways(s, run, "hand", "dash")
+    layout = {
+        **LOOKS,
+        "margin": {"l": 48, "r": 12, "t": 8, "b": 40},
+        "legend": {"orientation": "h", "y": 1.1, "x": 0, "bgcolor": "rgba(0,0,0,0)"},
+        "xaxis": {**AXIS, "title": {"text": "pixels"}, "range": [-0.04 * width, 1.04 * width]},
+        "yaxis": {
+            **AXIS,
+            "range": [1.04 * height, -0.04 * height],
+            "scaleanchor": "x",
+            "scaleratio": 1,
+        },
+    }
+    return {"data": data, "layout": layout, "config": {}}
+
+
+def _frame(width: int, height: int) -> dict[str, Any]:
+    right, bottom = width - 0.5, height - 0.5
+    look = {"color": "--muted", "width": 1.5}
+    x, y = [-0.5, right, right, -0.5, -0.5], [-0.5, -0.5, bottom, bottom, -0.5]
+    return _flat("image", x, y, look, showlegend=False)
+
+
+def _pixels(s: Study, poses: Array, places: int) -> Array:
+    """Pixels (n, E, places, 2) along the edges of the seen legs."""
+    machine = s.eye.true.machine
+    return s.eye.points(poses, np.nan_to_num(machine.inverse(poses)), places).pixel
+
+
+def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[dict[str, Any]]:
+    pixels = _pixels(s, pose, ALONG)[0]
+    return [
+        _flat(
+            f"edges {name}",
+            _pixel_list(pixels[e, :, 0]),
+            _pixel_list(pixels[e, :, 1]),
+            {"color": f"--leg{int(leg) % 8 + 1}", "width": width, "dash": dash},
+            legendgroup=name,
+            showlegend=e == 0,
+        )
+        for e, leg in enumerate(s.eye.tubes.leg)
+    ]
+
+
+def _ways(s: Study, run: int, name: str, dash: str) -> list[dict[str, Any]]:
+    """Ways of both ends of each leg's first edge."""
+    o = s.outcome(name)
+    poses = o.runs.T_base_platform[run][_every(len(o.runs.time), FRAMES)]
+    pixels, gap = _pixels(s, poses, 3), np.full((1, 2), np.nan)
+    data: list[dict[str, Any]] = []
+    for e in range(0, len(s.eye.tubes.leg), 2):
+        ways = np.concatenate([pixels[:, e, 0], gap, pixels[:, e, -1]])
+        data.append(
+            _flat(
+                f"way, {o.estimate.title.lower()}",
+                _pixel_list(ways[:, 0]),
+                _pixel_list(ways[:, 1]),
+                {"color": COLOURS[name], "width": 1.6, "dash": dash},
+                legendgroup=f"way {name}",
+                showlegend=e == 0,
+            )
+        )
+    return data
+
+
+def _pixel_list(values: Array) -> list[float | None]:
+    return [round(float(v), 1) if np.isfinite(v) else None for v in values]
