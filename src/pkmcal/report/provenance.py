@@ -27,9 +27,9 @@ def stations_table(session: Session, estimate: Estimate, camera: Integers) -> Ta
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
     for s, station in enumerate(session.stations):
-        shift = estimate.state.edge_shift[camera[s]]
-        sigma = estimate.edge_shift_sigma[camera[s]]
-        places = decimals(float(sigma))
+        shift = float(estimate.state.edge_shift[camera[s]])
+        sigma = float(estimate.edge_shift_sigma[camera[s]])
+        places = decimals(sigma)
         cells = (
             *_place(estimate, s),
             *([f"{number(shift, places, signed=True)} ± {number(sigma, places)}"] if edges else []),
