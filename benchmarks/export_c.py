@@ -15,12 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pkmcal.export.c_header import HEADER, SOURCE, header_text
-from pkmcal.export.c_source import source_text
-from pkmcal.export.c_tables import tables_of
-from pkmcal.export.samples import samples
-from pkmcal.export.source import load_source
-from pkmcal.export.text import c_array
+from pkmcal.export.c import SOURCE, CSource, c_array
+from pkmcal.export.source import load_source, samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue
 
@@ -97,18 +93,18 @@ def main() -> None:
 def timed(name: str, folder: Path) -> str:
     """The compiled program's line for one machine."""
     source = load_source(name)
-    machine, tables = source.machine, tables_of(source.machine)
+    machine = source.machine
     poses, readings = samples(machine, PAIRS)
     motion = machine.layout.motion
     sign = np.random.default_rng(1).choice([-1, 1], (PAIRS, 6))
     away = np.repeat([1e-3, 2e-4], 3) * sign @ motion @ motion.T
     arrays = {
-        "readings": c_array("double", "READINGS", "[PAIRS][PKMCAL_JOINTS]", readings),
-        "poses": c_array("double", "POSES", "[PAIRS][12]", flat(poses)),
-        "starts": c_array("double", "STARTS", "[PAIRS][12]", flat(perturb(poses, away))),
+        "readings": c_array("READINGS", "[PAIRS][PKMCAL_JOINTS]", readings),
+        "poses": c_array("POSES", "[PAIRS][12]", flat(poses)),
+        "starts": c_array("STARTS", "[PAIRS][12]", flat(perturb(poses, away))),
     }
-    (folder / HEADER).write_text(header_text(source, tables))
-    (folder / SOURCE).write_text(source_text(source, tables))
+    for file, text in CSource().files(source).items():
+        (folder / file).write_text(text)
     (folder / "main.c").write_text(MAIN % {**arrays, "pairs": PAIRS, "rounds": ROUNDS})
     compiler = os.environ.get("CC", "cc")
     build = [compiler, "-std=c99", "-O2", "main.c", SOURCE, "-lm", "-o", "timed"]

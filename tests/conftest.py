@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from pkmcal.commands.cli import main
+from rendered import once
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,18 @@ class Demo:
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory) -> Demo:
-    folder = tmp_path_factory.mktemp("demo") / "out"
-    return Demo(folder, run("demo", "-o", folder, "--fast", "--no-open", "--json"))
+    """One demonstration a run of the tests: all workers share the first one's."""
+    root = tmp_path_factory.getbasetemp()
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+
+    def make(part: Path) -> None:
+        # where it will stand is what it says of itself
+        done = run("demo", "-o", root / "demo" / "out", "--fast", "--no-open", "--json")
+        part.mkdir()
+        (part / "run.json").write_text(json.dumps(vars(done)))
+
+    said = once(root / "demo" / "said", make)
+    return Demo(root / "demo" / "out", Run(**json.loads((said / "run.json").read_text())))
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from pkmcal.calibration.calibrate import calibrate
 from pkmcal.calibration.recognise import boards_of, read_photographs
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.hand_eye import solve_pairs
+from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
 

@@ -14,10 +14,8 @@ from pkmcal.cameras.files import read_camera
 from pkmcal.cameras.unified import Unified
 from pkmcal.errors import InputError, ResultError
 from pkmcal.export import ros
-from pkmcal.export.contract import Difference, exporters
-from pkmcal.export.samples import samples
-from pkmcal.export.source import load_source
-from pkmcal.export.writing import export
+from pkmcal.export.contract import Difference, export, exporters, quaternion
+from pkmcal.export.source import load_source, samples
 from pkmcal.mechanisms import catalogue, load_mechanism
 
 OURS = ("c", "json", "klipper", "linuxcnc", "reprap", "ros", "yaml")
@@ -67,7 +65,7 @@ def test_a_format_expresses_a_machine_or_says_that_it_does_not(name):
 @pytest.mark.parametrize(
     ("name", "old", "new"),
     [
-        ("c", "LENGTH[PKMCAL_RODS] = {\n    0.0", "LENGTH[PKMCAL_RODS] = {\n    0.00001"),
+        ("c", ".length = 0.0", ".length = 0.00001"),
         ("c", "{{0.9", "{{0.8"),
         ("json", '"value": 0.2693,', '"value": 0.2694,'),
         ("yaml", "center: [0.2693", "center: [0.26930001"),
@@ -252,7 +250,7 @@ def test_ros_gets_cameras_and_where_they_stand(tmp_path):
 def test_a_quaternion_of_half_a_turn():
     for axis in np.eye(3):
         rot = 2 * np.outer(axis, axis) - np.eye(3)
-        np.testing.assert_allclose(np.abs(ros.quaternion(rot)), [*axis, 0.0], atol=1e-15)
+        np.testing.assert_allclose(np.abs(quaternion(rot)), [*axis, 0.0], atol=1e-15)
 
 
 def test_a_tampered_transform_is_found(tmp_path):

@@ -14,8 +14,8 @@ import pytest
 from export_sources import built, source_of
 from pkmcal.errors import InputError
 from pkmcal.export.c import CSource
-from pkmcal.export.samples import samples
-from pkmcal.export.writing import export
+from pkmcal.export.contract import export
+from pkmcal.export.source import samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
 

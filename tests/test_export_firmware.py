@@ -10,12 +10,10 @@ import pytest
 from export_sources import built, source_of
 from pkmcal.errors import InputError
 from pkmcal.export import klipper, linuxcnc, reprap
-from pkmcal.export.contract import exporters
-from pkmcal.export.delta import DEGREE, MM, delta_of, reach
-from pkmcal.export.delta_fit import Freedoms, fitted
-from pkmcal.export.linuxcnc_delta import linear_joints, rotary_joints
-from pkmcal.export.samples import samples
-from pkmcal.export.writing import export
+from pkmcal.export.contract import export, exporters
+from pkmcal.export.delta import DEGREE, MM, Freedoms, delta_of, fitted, reach
+from pkmcal.export.linuxcnc import linear_joints, rotary_joints
+from pkmcal.export.source import samples
 from pkmcal.geometry.rigid import perturb, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Level

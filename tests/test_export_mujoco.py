@@ -13,12 +13,13 @@ import pytest
 from mujoco_machines import ALL, CATALOGUE, MADE, TURNED, machine_of, made
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.export.contract import exporters
-from pkmcal.export.mujoco_home import home_state
-from pkmcal.export.mujoco_read import closed, constraints, moved, read
-from pkmcal.export.samples import samples
-from pkmcal.export.source import Source
+from pkmcal.export.mujoco_model import home_state
+from pkmcal.export.mujoco_read import read
+from pkmcal.export.source import Source, samples
 from pkmcal.geometry.rigid import pose, pose_difference
 from pkmcal.mechanisms import catalogue
+from pkmcal.mechanisms.carriers.crank import Crank
+from pkmcal.mechanisms.carriers.rigid import RigidPlatform
 from pkmcal.mechanisms.kinematics import forward
 
 LOUD = "NO MUJOCO: exported models were not loaded in it (pip install mujoco)"
@@ -235,20 +236,14 @@ def test_joints_that_move_another_way_are_found(name, old, new):
 
 
 @pytest.mark.parametrize("name", ["3-upu", "h4", "h4-rods", "3-spr", "rpr-and-spu"])
-def test_derivatives_of_what_is_read_again(name):
+def test_what_is_read_again_closes_from_beside(name):
     model = read(exported(machine_of(name))[1])
     rng = np.random.default_rng(0)
-    away = moved(model, model.key, 0.1 * rng.normal(size=model.n_dofs))
-    assert np.abs(constraints(model, away)[0]).max() > 1e-3
-    for state in (model.key, closed(model, away, np.zeros(model.n_dofs, dtype=bool))):
-        value, by = constraints(model, state)
-        assert np.abs(value).max() < 1e-13
-        step = 1e-6 * np.eye(model.n_dofs)
-        ahead, behind = (
-            np.array([constraints(model, moved(model, state, sign * d))[0] for d in step]).T
-            for sign in (1, -1)
-        )
-        assert np.abs((ahead - behind) / 2e-6 - by).max() < 1e-8
+    away = model.key + 0.1 * rng.normal(size=(3, model.key.size))
+    assert np.abs(model.gaps(away)).max(axis=1).min() > 1e-3
+    found = model.closed(away, np.zeros(model.key.size, dtype=bool))
+    assert np.abs(model.gaps(found)).max() < 1e-13
+    assert np.abs(found - away).max() > 1e-3
 
 
 # ------------------------------------------------------------------ words and refusals
@@ -322,12 +317,9 @@ def test_a_machine_that_does_not_close_is_refused():
         exported(replace(machine, document=document))
 
 
-def test_joints_of_a_new_carrier_are_refused():
-    machine = machine_of("delta")
-    for side in ("base", "platform"):
-        leg = machine.document.legs[0]
-        node = getattr(leg, side).model_copy(update={"joint": "cam"})
-        legs = (leg.model_copy(update={side: node}), *machine.document.legs[1:])
-        document = machine.document.model_copy(update={"legs": legs})
-        with pytest.raises(InputError, match="MuJoCo export has no body for; found cam"):
-            exported(replace(machine, document=document))
+@pytest.mark.parametrize(("carrier", "side"), [(Crank, "base"), (RigidPlatform, "platform")])
+def test_joints_that_are_not_elementary_are_refused(carrier, side, monkeypatch):
+    monkeypatch.setattr(carrier, "chain", lambda parameters: None)
+    told = f"leg 1 of mechanism 'delta' is carried on its {side} side by no joint that an export"
+    with pytest.raises(InputError, match=told):
+        exported(machine_of("delta"))

@@ -14,13 +14,13 @@ from pkmcal.files import (
     Schema,
     closest,
     field_path,
-    listed,
     parse_yaml,
     read_yaml,
     shown,
     validate,
     yaml_text,
 )
+from pkmcal.wording import listed
 
 
 def write(tmp_path, content, name="a.yaml"):

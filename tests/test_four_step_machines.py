@@ -14,9 +14,7 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
-from pkmcal.identify import paper_methods
 from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import centre_index, default_gauge
 from pkmcal.identify.problem import State
@@ -29,6 +27,8 @@ from pkmcal.mechanisms import (
     mechanism_text,
 )
 from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.papers import methods
+from pkmcal.papers.four_step import four_step
 
 MACHINES = ("gough-stewart", "3-rpr", "3-rps", "3-upu", "6-spu-passive", "constant-legs")
 NOISE = 1e-4
@@ -390,7 +390,7 @@ def test_the_bundle_starts_from_the_steps(name):
 @pytest.mark.parametrize("name", ["3-rpr", "3-rps", "6-spu-passive"])
 def test_the_method_as_a_result_of_its_own(name, monkeypatch, tmp_path):
     """``--method four-step``: deviations by repetition, residuals, a mechanism that can be read."""
-    monkeypatch.setattr(paper_methods, "REPETITIONS", 20)
+    monkeypatch.setattr(methods, "REPETITIONS", 20)
     rng = np.random.default_rng(14)
     scene = make_scene(name, rng, 24)
     board = perturb(np.eye(4), rng.normal(size=(1, 6)))
@@ -398,7 +398,7 @@ def test_the_method_as_a_result_of_its_own(name, monkeypatch, tmp_path):
     measurements = noisy(measurements, rng)
     known = start_state(scene.drawing, measurements, scene.truth.T_camera_base)
     joint = bundle(scene.drawing, measurements, known)
-    found = paper_methods.by_paper("four-step", scene.drawing, measurements, joint)
+    found = methods.by_paper("four-step", scene.drawing, measurements, joint)
     sigma = np.sqrt(np.diag(found.covariance))
     free = sigma > 1e-9
     ratio = ((found.state.theta - scene.truth.theta)[free] / sigma[free]) ** 2

@@ -9,12 +9,12 @@ import pytest
 
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
-from pkmcal.identify import four_step_checks as checks
-from pkmcal.identify.conditions import Condition, conditions
-from pkmcal.identify.four_step import four_step
-from pkmcal.identify.four_step_model import legs_of
 from pkmcal.mechanisms import load_mechanism, machine_from_document
 from pkmcal.mechanisms.document import MechanismDocument
+from pkmcal.papers import four_step_checks as checks
+from pkmcal.papers.conditions import Condition, conditions
+from pkmcal.papers.four_step import four_step
+from pkmcal.papers.legs import legs_of
 from test_four_step_machines import (
     THREE_BY_THREE,
     THREE_BY_TWO,
@@ -163,7 +163,7 @@ def test_lengths_that_the_distances_do_not_tell():
     rng = np.random.default_rng(7)
     u = np.array([0.0, 0, 1]) + 0.3 * rng.normal(size=(12, 3))
     u = u / np.linalg.norm(u, axis=-1, keepdims=True)
-    from pkmcal.identify.four_step_axes import Axes
+    from pkmcal.papers.leg_axes import Axes
 
     k = np.arange(12)
     u = np.broadcast_to(u[None, :, None], (1, 12, 6, 3)).copy()
@@ -184,8 +184,8 @@ def test_a_length_that_collapsed_is_told():
     legs = legs_of(drawing)
     q0 = np.where(np.arange(6) == 2, 0.001, legs.rod)[None]
     with pytest.raises(ResultError, match="leg 3 of constant length shrank"):
-        checks._not_collapsed(legs, q0[0])
-    checks._not_collapsed(legs, legs.rod)
+        checks.not_collapsed(legs, q0[0])
+    checks.not_collapsed(legs, legs.rod)
 
 
 # the paper's counts ------------------------------------------------------------------------

@@ -9,10 +9,10 @@ import pytest
 
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
-from pkmcal.identify.hand_eye import matrix, quaternion, size_of, solve_pairs, start_from_poses
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate_poses
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.kinematics import on_manifold
+from pkmcal.papers.hand_eye import matrix, quaternion, size_of, solve_pairs, start_from_poses
 
 NOISE = np.repeat([np.radians(0.03), 2e-4], 3)
 BOARD = (Mount("board", "platform"),)

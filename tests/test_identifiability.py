@@ -16,13 +16,13 @@ from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle, start_state, what_data_tell
 from pkmcal.identify.covariance import identifiability
-from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import apply, default_gauge, freedoms, generators
 from pkmcal.identify.problem import State
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.papers.four_step import four_step
 from pkmcal.simulation import EdgeNoise, Settings, simulate_edges, true_machine
 from pkmcal.simulation.stations import default_stations
 from test_joint_machines import JOINT_NOISE, Session, camera

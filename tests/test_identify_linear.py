@@ -10,10 +10,10 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply, perturb
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import ThreeCentres, centre_index
 from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.linear import centres, procrustes_scale, scale_ratio
+from pkmcal.papers.four_step import four_step
+from pkmcal.papers.linear import centres, procrustes_scale, scale_ratio
 from test_identify_scene import guess, make_scene
 
 METHODS = ["plain", "huber", "tukey", "least-median", "robust", "errors-in-variables"]

@@ -14,12 +14,9 @@ from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.residuals import BatchState
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.reproduce.paper_a_simulation import (
-    Settings,
-    joint_problem,
-    simulate,
-    study_machine,
-)
+from pkmcal.studies.engine import Batch
+from pkmcal.studies.paper_a import HexapodByAxes
+from pkmcal.studies.simulated import joint_problem
 from test_identify_scene import FOCAL, make_scene
 
 
@@ -115,13 +112,11 @@ def test_jacobian_with_fixed_and_tied_parameters():
 
 def test_jacobian_of_edges_that_are_whitened_in_pairs():
     rng = np.random.default_rng(4)
-    machine = study_machine()
-    settings = Settings(poses=3)
-    truth = simulate(machine, settings, 2, rng)
-    problem = joint_problem(machine, settings, truth)
-    z = (truth.theta - problem.drawing) @ np.linalg.pinv(problem.free).T
-    T = np.broadcast_to(truth.T_camera_base, (2, 3, 4, 4))
-    check(problem, BatchState(z, T, truth.T_base_platform, np.zeros((2, 1, 1))), rng)
+    data = HexapodByAxes(poses=3).draw(Batch("hexapod", 2, np.random.SeedSequence(4)))
+    problem = joint_problem(data.machine, data, ThreeCentres())
+    z = (data.theta - problem.drawing) @ np.linalg.pinv(problem.free).T
+    T = np.broadcast_to(data.view.T_camera_base, (2, 3, 4, 4))
+    check(problem, BatchState(z, T, data.T_base_platform, np.zeros((2, 1, 1))), rng)
 
 
 def test_true_values_leave_no_residual():

@@ -10,24 +10,26 @@ import pytest
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.hand_eye import start_from_poses
-from pkmcal.identify.inverse_kinematic import (
+from pkmcal.measurements import Mount, PoseSet
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms.document import MOTIONS
+from pkmcal.papers.hand_eye import start_from_poses
+from pkmcal.papers.inverse_kinematic import (
     fit_session,
     inverse_kinematic,
     pose_problem,
     turn_between,
     unknown_names,
 )
-from pkmcal.identify.measured_platform import seen_platform, taken
-from pkmcal.identify.rotation_axis import facing, rotation_axis
-from pkmcal.measurements import Mount, PoseSet
-from pkmcal.mechanisms import load_mechanism
-from pkmcal.mechanisms.document import MOTIONS
-from pkmcal.reproduce.paper_c_simulation import Settings, measurements, model, simulate
+from pkmcal.papers.measured_platform import seen_platform, taken
+from pkmcal.papers.rotation_axis import facing, rotation_axis
+from pkmcal.studies.paper_c import H4ByBoard
+from pkmcal.studies.paper_c_machine import Deviations, model
+from pkmcal.studies.simulated import measurements
 from test_hand_eye import anywhere, measured, platform_poses, seen_from, true_machine
 
 H = 1e-6
-QUIET = Settings(turn=1e-9, shift=1e-9, joint_noise=1e-9)
+QUIET = H4ByBoard(turn=1e-9, shift=1e-9, joint_noise=1e-9)
 
 
 # ------------------------------------------------------------------ the pose from the board
@@ -141,21 +143,20 @@ def test_jacobians(name, form):
 
 def test_whitened_rows_have_unit_variance():
     """Rows at the truth, divided by what the noise makes of them."""
-    settings = Settings()
-    truth = simulate("calibration", settings, 30, np.random.default_rng(0))
-    machine, n = truth.machine, truth.n_calibration
+    truth = H4ByBoard().simulated("calibration", 30, np.random.default_rng(0))
+    machine, n = truth.machine, truth.count
     problem, state = pose_problem(
         machine,
-        measurements(truth, settings),
-        truth.seen[:, :n],
+        measurements(truth),
+        truth.T_camera_board[:, :n],
         truth.joints[:, :n],
         replace_start(machine, truth),
         "implicit",
     )
     z = (truth.theta - machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
     state = state._replace(z=z)
-    noise = np.broadcast_to(np.diag(settings.sigma**2), (n, 6, 6))
-    whitened = replace(problem, weigh=problem.whitening(state, noise, settings.joint_noise))
+    noise = np.broadcast_to(np.diag(truth.noise.pose**2), (n, 6, 6))
+    whitened = replace(problem, weigh=problem.whitening(state, noise, truth.noise.reading))
     rows = whitened.residuals(state).value.reshape(-1, 6)
     covariance = rows.T @ rows / len(rows)
     assert np.abs(covariance - np.eye(6)).max() < 5 * np.sqrt(2 / len(rows))
@@ -167,10 +168,10 @@ def replace_start(machine, truth):
 
     return State(
         machine.parameters.drawing,
-        truth.T_camera_base[None],
+        truth.view.T_camera_base,
         np.zeros((0, 4, 4)),
         np.zeros(1),
-        T_mount=truth.T_platform_board[None],
+        T_mount=truth.view.T_platform_board[None],
         on_platform=np.ones(1, dtype=bool),
     )
 
@@ -183,16 +184,16 @@ def replace_start(machine, truth):
 @pytest.mark.parametrize("kind", ["design", "calibration"])
 def test_without_noise_every_form_finds_the_machine(kind, form, whitened):
     """And the unknowns that nothing tells are those of the errata."""
-    truth = simulate(kind, QUIET, 1, np.random.default_rng(2))
-    machine, data = model(kind), measurements(truth, QUIET)
+    truth = QUIET.simulated(kind, 1, np.random.default_rng(2))
+    machine, data = model(kind), measurements(truth)
     start = start_from_poses(machine, data)
     fit = fit_session(machine, data, start, form, whitened, use_drawing=False)
     state = fit.solution.state
     solved = machine.with_values(fit.problem.theta(state)[0])
-    control = truth.n_calibration
+    control = truth.count
     poses = solved.forward(truth.joints[0, control:])
     predicted = state.T_camera_base[0, 0] @ poses @ state.T_mount[0, 0]
-    off = pose_difference(predicted, truth.seen[0, control:])
+    off = pose_difference(predicted, truth.T_camera_board[0, control:])
     # as printed the axis was found beforehand, exactly here
     assert np.abs(off).max() < 1e-6
     wanted = {"design": (21, 23), "calibration": (38, 40)}[kind][whitened]
@@ -203,13 +204,12 @@ def test_without_noise_every_form_finds_the_machine(kind, form, whitened):
 
 def test_whitened_is_the_joint_estimate():
     """The two differ by far less than either errs."""
-    settings = Settings()
-    truth = simulate("calibration", settings, 1, np.random.default_rng(4))
-    machine, data = model("calibration"), measurements(truth, settings)
+    truth = H4ByBoard().simulated("calibration", 1, np.random.default_rng(4))
+    machine, data = model("calibration"), measurements(truth)
     start = start_from_poses(machine, data)
     one = inverse_kinematic(machine, data, start)
     other = bundle(machine, data, start, robust=False, scale_noise=False)
-    readings = truth.joints[0, truth.n_calibration :]
+    readings = truth.joints[0, truth.count :]
 
     def board(theta, state):
         poses = machine.with_values(theta).forward(readings)
@@ -245,15 +245,16 @@ def test_any_machine_with_a_board(name):
 
 
 def test_rods_by_the_implicit_form_alone():
-    truth = simulate("rods", Settings(), 1, np.random.default_rng(1))
-    machine, data = model("rods"), measurements(truth, Settings())
+    truth = H4ByBoard().simulated("rods", 1, np.random.default_rng(1))
+    machine, data = model("rods"), measurements(truth)
     with pytest.raises(InputError, match="several rods on a motor"):
         inverse_kinematic(machine, data, form="joint")
     state = inverse_kinematic(machine, data)
-    readings = truth.joints[0, truth.n_calibration :]
+    readings = truth.joints[0, truth.count :]
     poses = machine.with_values(state.theta).forward(readings)
     predicted = state.T_camera_base[0] @ poses @ state.T_mount[0]
-    exact = truth.T_camera_base @ truth.poses[0, truth.n_calibration :] @ truth.T_platform_board
+    view, there = truth.view, truth.T_base_platform[0, truth.count :]
+    exact = view.T_camera_base @ there @ view.T_platform_board
     off = pose_difference(predicted, exact)
     assert np.sqrt(np.mean(np.sum(off[:, 3:] ** 2, axis=1))) < 3e-4
 
@@ -271,17 +272,14 @@ def test_without_a_board_on_the_platform():
 
 
 def test_runs_do_not_touch_one_another():
-    settings = Settings()
-    truth = simulate("design", settings, 3, np.random.default_rng(0))
-    from pkmcal.reproduce.paper_c_methods import at_poses, start
+    from pkmcal.studies.paper_c import at_poses, start
 
+    truth = H4ByBoard().simulated("design", 3, np.random.default_rng(0))
     machine = model("design")
-    begin = start(machine, truth)
-    every = at_poses(machine, truth, settings, begin, "implicit", whitened=True)
-    one = truth._replace(
-        theta=truth.theta[2:], poses=truth.poses[2:], joints=truth.joints[2:], seen=truth.seen[2:]
-    )
-    alone = at_poses(machine, one, settings, start(machine, one), "implicit", whitened=True)
+    every = at_poses(machine, truth, start(machine, truth), "implicit", whitened=True)
+    names = ("theta", "T_base_platform", "joints", "T_camera_board")
+    one = replace(truth, **{name: getattr(truth, name)[2:] for name in names})
+    alone = at_poses(machine, one, start(machine, one), "implicit", whitened=True)
     np.testing.assert_allclose(every.solution.cost[2], alone.solution.cost[0], rtol=1e-6)
 
 
@@ -328,11 +326,11 @@ def test_one_axis_is_found_and_tested():
 
 def test_the_axis_in_both_frames():
     rng = np.random.default_rng(3)
-    truth = simulate("design", Settings(), 1, rng)
-    axis = rotation_axis(measurements(truth, Settings()).poses, "schoenflies")
+    truth = H4ByBoard().simulated("design", 1, rng)
+    axis = rotation_axis(measurements(truth).poses, "schoenflies")
     for own, frame in (
-        (axis.axis_camera, truth.T_camera_base[:3, 2]),
-        (axis.axis_board, truth.T_platform_board[2, :3]),
+        (axis.axis_camera, truth.view.T_camera_base[0, :3, 2]),
+        (axis.axis_board, truth.view.T_platform_board[2, :3]),
     ):
         assert abs(own @ frame) > np.cos(np.radians(0.1))
     assert "turn about one axis, as far as their noise tells" in axis.sentence
@@ -355,7 +353,7 @@ def test_machines_that_should_not_turn_and_those_that_may():
 
 def test_a_machine_with_rods_is_found_out():
     """[C] IV.B: the hypothesis of four freedoms can fail."""
-    settings = Settings(rods=2e-3)
-    truth = simulate("rods", settings, 1, np.random.default_rng(0))
-    axis = rotation_axis(measurements(truth, settings).poses, "schoenflies")
+    setting = H4ByBoard(deviations=Deviations(rods=2e-3))
+    truth = setting.simulated("rods", 1, np.random.default_rng(0))
+    axis = rotation_axis(measurements(truth).poses, "schoenflies")
     assert not axis.tenable

@@ -19,8 +19,8 @@ from pkmcal.geometry.rigid import (
     rotation,
     rotation_vector,
 )
-from pkmcal.identify.hand_eye import solve_pairs
 from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
 from pkmcal.simulation.configurations import draw_configurations

@@ -15,7 +15,6 @@ from pkmcal.check.repeats import _findings, _Look, _station_row
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
-from pkmcal.identify.axis_measurements import to_coordinates
 from pkmcal.measurements import concatenate
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.legs import StationEdges
@@ -33,6 +32,7 @@ from pkmcal.observe.repeats import (
     repeat_scatter,
     same_edges,
 )
+from pkmcal.papers.axis_measurements import to_coordinates
 from pkmcal.session.load import load_session
 from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges, simulate_session
 from pkmcal.simulation.configurations import draw_configurations

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.identify.conditions import conditions
 from pkmcal.identify.words import explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
+from pkmcal.papers.conditions import conditions
 from pkmcal.report.identifiability import STUB, section
 from test_report_case import make_case, report_html
 from test_report_page import Found

@@ -11,17 +11,24 @@ import pytest
 
 from conftest import run
 from pkmcal.commands.reproduce import Paper
-from pkmcal.identify.axis_measurements import AxisNoise
-from pkmcal.report.reproduction import reproduction_html
-from pkmcal.reproduce import Options, reproduce
-from pkmcal.reproduce import paper_a_expected as expected
-from pkmcal.reproduce.paper_a_photographs import MeasuredNoise
-from pkmcal.reproduce.paper_a_simulation import Settings
-from pkmcal.reproduce.paper_a_study import BOUND, JOINT, METHODS, PRINTED, study
-from pkmcal.reproduce.paper_a_tables import table_1
+from pkmcal.papers.axis_measurements import AxisNoise
+from pkmcal.report.page import page_html
+from pkmcal.studies import engine
+from pkmcal.studies import paper_a_expected as expected
+from pkmcal.studies.engine import Sample
+from pkmcal.studies.expected import Compared
+from pkmcal.studies.paper_a import BOUND, JOINT, METHODS, PRINTED, HexapodByAxes
+from pkmcal.studies.paper_a_photographs import MeasuredNoise
+from pkmcal.studies.paper_a_report import table_1
+from pkmcal.studies.reproduction import PAPERS, Options, reproduce
+from pkmcal.studies.statistics import Summary
 from test_report_page import Found, browse
 
 RUNS = 25
+
+
+def study(runs, seed=20020, **setting):
+    return engine.run(HexapodByAxes(**setting), runs, seed)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +43,7 @@ def found():
 
 @pytest.fixture(scope="module")
 def page(found):
-    return reproduction_html(found)
+    return page_html(found)
 
 
 # ------------------------------------------------------------------ the command
@@ -61,7 +68,7 @@ def test_the_command(tmp_path):
 
 
 def test_in_words(tmp_path, monkeypatch, found):
-    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda _paper, _options: found)
+    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda _paper, _options: found)
     done = run("reproduce", "-o", tmp_path)
     assert done.code == 0
     assert max(map(len, done.out.replace(str(tmp_path), "").splitlines())) <= 80
@@ -74,14 +81,18 @@ def test_in_words(tmp_path, monkeypatch, found):
 
 
 def test_another_seed_draws_anew():
-    first, again, other = (study(runs=3, seed=seed).accuracy[JOINT] for seed in (1, 1, 2))
+    first, again, other = (study(runs=3, seed=seed).of(JOINT) for seed in (1, 1, 2))
     assert first == again != other
 
 
 def test_a_failed_reproduction_has_its_exit_code(tmp_path, monkeypatch, found):
-    bad = replace(found.checks[1], passed=False)
-    failed = replace(found, checks=(found.checks[0], bad))
-    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda _paper, _options: failed)
+    checks = found.parts[-1].checks
+    bad = replace(checks[1], passed=False)
+    part = replace(found.parts[-1], checks=(checks[0], bad))
+    verdict = replace(found.verdict, usable=False, reasons=(bad.sentence,))
+    failed = replace(found, verdict=verdict, stamp="Not reproduced", parts=(part,))
+    failed.document["passed"] = False
+    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda _paper, _options: failed)
     done = run("reproduce", "-o", tmp_path)
     assert done.code == 1
     assert "✗ " + bad.sentence[:40] in done.out
@@ -103,7 +114,7 @@ def test_refuses(words, said, tmp_path):
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda *_: pytest.fail("worked"))
+    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda *_: pytest.fail("worked"))
     (tmp_path / "file").touch()
     done = run("reproduce", "-o", tmp_path / "file" / "out")
     assert done.code == 2
@@ -111,83 +122,87 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path, monke
 
 
 def test_a_folder_with_other_files_is_left_alone(tmp_path, monkeypatch, found):
-    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda *_: pytest.fail("worked first"))
+    monkeypatch.setattr(
+        "pkmcal.studies.reproduction.reproduce", lambda *_: pytest.fail("worked first")
+    )
     (tmp_path / "thesis.tex").write_text("mine")
     done = run("reproduce", "a", "-o", tmp_path)
     assert done.code == 2
     assert "something other than reproductions; found thesis.tex" in done.err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
     (tmp_path / "thesis.tex").rename(tmp_path / "paper-c.json")  # an earlier one of another paper
-    monkeypatch.setattr("pkmcal.reproduce.reproduce", lambda *_: found)
+    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda *_: found)
     assert run("reproduce", "a", "-o", tmp_path).code == 0
 
 
 def test_every_paper_of_the_command_has_its_module():
     from importlib import import_module
 
-    for paper in Paper:
-        assert callable(import_module(f"pkmcal.reproduce.paper_{paper.value}").reproduce)
+    assert tuple(paper.value for paper in Paper) == PAPERS
+    for paper in PAPERS:
+        assert callable(import_module(f"pkmcal.studies.paper_{paper}_report").reproduce)
 
 
 # ------------------------------------------------------------------ what is expected
 
 
 def test_every_figure_of_the_prototype_is_compared(short):
-    figures = expected.compared(short)
+    figures = expected.figures_compared(short)
     assert len(figures) == 4 * 5 + 3 * 2
-    assert all(f.error >= 0 and f.rounding > 0 for f in figures)
+    assert all(f.found.error >= 0 and f.rounding > 0 for f in figures)
     assert all(f.tolerable for f in figures)
-    by_name = {(f.method, f.quantity): f for f in figures}
+    by_name = {(*f.key, f.quantity): f for f in figures}
     assert by_name[JOINT, "displacement"].expected == 0.091
     assert by_name[JOINT, "displacement"].rounding == pytest.approx(0.0005)
     assert by_name[PRINTED, "base_z"].rounding == pytest.approx(0.005)
-    assert by_name[BOUND, "base_z"].found == pytest.approx(0.060, abs=0.002)
+    assert by_name[BOUND, "base_z"].found.value == pytest.approx(0.060, abs=0.002)
 
 
 def test_what_differs_and_what_fails():
     """Beyond the Monte-Carlo error is told; beyond what the setting explains fails."""
-    figure = expected.Compared(JOINT, "offset", 0.0600, 0.0010, 0.060, 0.0005)
-    assert not figure.differs
-    assert figure._replace(found=0.0640).differs
-    assert figure._replace(found=0.0640).tolerable
-    assert not figure._replace(found=0.0780).tolerable
+
+    def figure(method, quantity, found, error, wanted, rounding):
+        allowed = expected.tolerance((method,), quantity)
+        return Compared((method,), quantity, Summary(found, error), wanted, rounding, allowed)
+
+    offset = figure(JOINT, "offset", 0.0600, 0.0010, 0.060, 0.0005)
+    assert not offset.differs
+    assert offset._replace(found=Summary(0.0640, 0.0010)).differs
+    assert offset._replace(found=Summary(0.0640, 0.0010)).tolerable
+    assert not offset._replace(found=Summary(0.0780, 0.0010)).tolerable
     # what follows the drawing's error may differ more, nothing else
-    depth = expected.Compared(PRINTED, "base_z", 2.3, 0.01, 1.79, 0.005)
-    assert depth.tolerable
-    assert not depth._replace(quantity="base_xy").tolerable
-
-
-def checks_of(s):
-    return expected.checks(s, expected.compared(s))
+    assert figure(PRINTED, "base_z", 2.3, 0.01, 1.79, 0.005).tolerable
+    assert not figure(PRINTED, "base_xy", 2.3, 0.01, 1.79, 0.005).tolerable
 
 
 def test_checks_pass_and_each_can_fail(short):
-    assert all(check.passed for check in checks_of(short))
+    assert all(check.passed for check in expected.checks(short))
 
     def of_joint(**changes):
-        return replace(
-            short, accuracy={**short.accuracy, JOINT: short.accuracy[JOINT]._replace(**changes)}
-        )
+        own = short.of(JOINT)
+        changed = {name: own[name]._replace(value=value) for name, value in changes.items()}
+        return replace(short, accuracy={**short.accuracy, (JOINT,): {**own, **changed}})
 
-    worse = {name: 1.5 * getattr(short.accuracy[JOINT], name) for name in expected.GROUPS}
+    sample = short.samples[JOINT,]
+    lost = {**sample.values, "chi2": np.append(sample.values["chi2"][1:], 100.0)}
     broken = [
-        replace(short, converged=RUNS - 1),
+        replace(short, samples={**short.samples, (JOINT,): Sample(lost)}),
         of_joint(displacement=1.2e-4),
         of_joint(orientation=np.radians(0.019)),
-        of_joint(**worse),
-        replace(short, chi2_per_dof=short.chi2_per_dof + 0.1),
+        of_joint(parameters=1.5 * short.of(JOINT)["parameters"].value),
+        of_joint(chi2=short.of(JOINT)["chi2"].value + 0.1),
         of_joint(offset=0.12e-3),
     ]
     for place, spoilt in enumerate(broken):
-        assert not checks_of(spoilt)[place].passed, place
-        assert checks_of(short)[place].passed
+        assert not expected.checks(spoilt)[place].passed, place
+        assert expected.checks(short)[place].passed
 
 
 def test_noise_larger_than_table_1_is_not_a_reproduction():
     """Angles three times as noisy: the end-effector and the prototype's figures are missed."""
     noise = AxisNoise(psi=3 * AxisNoise().psi, theta=3 * AxisNoise().theta)
-    spoilt = study(runs=RUNS, settings=Settings(noise=noise))
-    failed = [check.what for check in checks_of(spoilt) if not check.passed]
+    spoilt = study(runs=RUNS, noise=noise)
+    failed = [check.what for check in expected.checks(spoilt) if not check.passed]
     assert any("displacement" in what for what in failed)
     assert "figures of the independent prototype" in failed
 
@@ -207,7 +222,7 @@ def test_table_1_with_and_without_a_measurement():
 @pytest.mark.slow
 def test_table_1_on_photographs():
     """Edges to a few hundredths of a pixel; depth from the width of a leg, so far worse."""
-    found = reproduce("a", Options(runs=3, photographs=True)).numbers["table_1_measured"]
+    found = reproduce("a", Options(runs=3, photographs=True)).document["table_1_measured"]
     assert 0.01 < found["edge_px"] < 0.08
     middle, worst = found["median"], found["worst"]
     assert all(middle[name] <= worst[name] for name in middle)
@@ -247,7 +262,7 @@ def test_the_page_runs_in_a_browser(page, tmp_path, width):
     assert root["data-errors"] == ""
     assert root["data-overhang"] == "0"
     assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
-    plots = [a for _, a in Found(document).tags if "data-figure" in a]
+    plots = [a for _, a in Found(document).tags if "data-plot" in a]
     assert len(plots) == 1
     assert all(a.get("data-drawn") == "yes" for a in plots)
 
@@ -256,7 +271,7 @@ def test_the_page_runs_in_a_browser(page, tmp_path, width):
 def test_more_poses():
     """--long: as the square root of the poses, and as the prototype."""
     found = reproduce("a", Options(runs=60, long=True))
-    by_poses = found.numbers["by_poses"]
+    by_poses = found.document["by_poses"]
     for poses, wanted in expected.PROTOTYPE_POSES.items():
         ours = 1e3 * by_poses[poses]["found"]["displacement"]
         error = 1e3 * by_poses[poses]["standard_error"]["displacement"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkmcal.identify.bundle import solve_batch
-from pkmcal.identify.registration import Dense, minimise_dense
+from pkmcal.papers.registration import Dense, minimise_dense
 from pkmcal.solver import (
     Linear,
     Stop,

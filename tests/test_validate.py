@@ -10,21 +10,22 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.errors import GeometryError, InputError, ResultError
+from pkmcal.calibration.aside import chosen, clusters, places, regions, select, spread
+from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.judge.comparison import compare, promise, ratio, rms, weighed
+from pkmcal.judge.held import held_machine
+from pkmcal.judge.holdouts import by_regions, hold_out
+from pkmcal.judge.paths import straightness
+from pkmcal.judge.prediction import predict
+from pkmcal.judge.words import validation_verdict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth, true_machine
-from pkmcal.validate.held import held, predict
-from pkmcal.validate.holdouts import by_regions, chosen, hold_out, judge, select
-from pkmcal.validate.judged import promise, ratio, rms, weighed
-from pkmcal.validate.paths import closed_square, square_path, straightness
-from pkmcal.validate.regions import clusters, places, regions, spread
-from pkmcal.validate.words import verdict_of
 from pose_sessions import JOINT_NOISE, T_CAMERA_BASE, measured, papers_case, papers_poses
 
 STATIONS = 3
@@ -58,7 +59,7 @@ def judged_on(drawing, estimate, machine, data, stations):
     found = seen_by(machine, data, stations)
     by_drawing = seen_by(drawing, data, stations)
     rows = np.flatnonzero(found.seen)
-    return judge(drawing, estimate.covariance, data, found, by_drawing, rows)
+    return compare(drawing, estimate.covariance, data, found, by_drawing, rows)
 
 
 def changed(machine, name, by):
@@ -87,11 +88,11 @@ def h4():
 
 
 def test_held_leaves_radii_alone_free():
-    machine = held(load_mechanism("gough-stewart"))
+    machine = held_machine(load_mechanism("gough-stewart"), radii=True)
     names = machine.parameters.free_names()
     assert names
     assert all("radius" in name for name in names)
-    assert held(load_mechanism("h4")).parameters.free_matrix().shape[1] == 0
+    assert held_machine(load_mechanism("h4"), radii=True).parameters.free_matrix().shape[1] == 0
 
 
 def test_residuals_scatter_as_promised(hexapod):
@@ -112,7 +113,7 @@ def test_own_readings_have_no_part_in_a_pose(hexapod):
     start = start_state(estimate.machine, data, stations)
     wrong = replace(data, joints=data.joints + 5e-3 * (np.arange(len(data.joints)) == 4)[:, None])
     good, bad = (predict(estimate.machine, d, start) for d in (data, wrong))
-    shift = bad.residuals[4] - good.residuals[4]
+    shift = bad.errors.residuals[4] - good.errors.residuals[4]
     assert np.abs(shift - 5e-3).max() < 2e-5
     assert np.abs(bad.T_base_platform[4] - good.T_base_platform[4]).max() < 2e-5
 
@@ -124,10 +125,10 @@ def test_own_readings_have_no_part_where_a_board_needs_the_others(h4):
     wrong = replace(few, joints=few.joints + 1e-2 * (np.arange(12) == 4)[:, None])
     start = start_state(estimate.machine, few, T_CAMERA_BASE[None])
     good, bad = (predict(estimate.machine, d, start) for d in (few, wrong))
-    shift = bad.residuals[4] - good.residuals[4]
+    shift = bad.errors.residuals[4] - good.errors.residuals[4]
     assert np.abs(shift - 1e-2).max() < 2e-4  # to first order of a leave-one-out by leverage
     # the others do take notice, through the camera's and the board's place
-    assert np.abs(bad.residuals[5] - good.residuals[5]).max() > 1e-5
+    assert np.abs(bad.errors.residuals[5] - good.errors.residuals[5]).max() > 1e-5
     del drawing
 
 
@@ -146,7 +147,7 @@ def test_better_than_the_drawing(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, true)
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
-    verdict = verdict_of(judged, (), estimate.machine)
+    verdict = validation_verdict(judged, (), estimate.machine)
     assert verdict.usable
     assert "times better than the drawing: 0." in verdict.headline
     assert judged.ratio.low > 3
@@ -158,7 +159,7 @@ def test_a_leg_that_changed_is_named(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, changed(true, "legs[3].length.offset", 1e-3))
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
-    verdict = verdict_of(judged, (), estimate.machine)
+    verdict = validation_verdict(judged, (), estimate.machine)
     assert not verdict.usable
     assert judged.ratio.better  # it is still better than the drawing
     assert "joint 3 reads" in verdict.reasons[0]
@@ -170,7 +171,7 @@ def test_a_calibration_that_made_it_worse(hexapod):
     _, _, stations, data = legs_case(60, true)
     worse = changed(estimate.machine, "legs[3].length.offset", 0.02)
     judged = judged_on(drawing, estimate, worse, data, stations)
-    verdict = verdict_of(judged, (), worse)
+    verdict = validation_verdict(judged, (), worse)
     assert not verdict.usable
     assert verdict.headline.startswith("The drawing predicts the readings")
     assert "made the machine worse" in verdict.reasons[0]
@@ -181,7 +182,7 @@ def test_the_drawing_itself_is_not_better_than_the_drawing(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, true)
     judged = judged_on(drawing, estimate, drawing, data, stations)
-    verdict = verdict_of(judged, (), drawing)
+    verdict = validation_verdict(judged, (), drawing)
     assert not verdict.usable
     assert not judged.ratio.better
 
@@ -191,8 +192,8 @@ def test_a_board_on_an_h4(h4):
     new = measured(true, papers_poses()[rng.permutation(81)[:12]], rng)
     start = start_state(estimate.machine, new.measurements, T_CAMERA_BASE[None])
     found = predict(estimate.machine, new.measurements, start)
-    judged = judge(drawing, estimate.covariance, new.measurements, found, None, np.arange(12))
-    verdict = verdict_of(judged, (), estimate.machine)
+    judged = compare(drawing, estimate.covariance, new.measurements, found, None, np.arange(12))
+    verdict = validation_verdict(judged, (), estimate.machine)
     assert verdict.usable, verdict
     assert "° against" in verdict.headline
     assert new.measurements.joint_noise == JOINT_NOISE
@@ -239,24 +240,6 @@ def test_straightness():
     assert found.rms <= found.largest < 1.2e-3
 
 
-def test_a_square_under_its_own_model_and_under_another():
-    drawing = load_mechanism("h4")
-    middle = pose(np.eye(3), np.array([0, 0, -0.45]))
-    own = closed_square(drawing, drawing, middle)
-    assert max(own.side, own.shape, own.place) < 1e-10
-    larger = true_machine(drawing, 1.0, np.random.default_rng(2))
-    off = closed_square(drawing, larger, middle)
-    assert 1e-4 < off.shape <= off.place
-    assert off.side > 1e-4
-    assert square_path(middle, 0.1, 5).shape == (20, 4, 4)
-
-
-def test_a_square_that_cannot_be_driven():
-    drawing = load_mechanism("h4")
-    with pytest.raises(GeometryError, match="leaves the workspace"):
-        closed_square(drawing, drawing, pose(np.eye(3), np.array([0, 0, -0.45])), side=3.0)
-
-
 # regions and hold-outs
 
 
@@ -297,7 +280,7 @@ def test_regions_judged_together(hexapod):
     drawing, _, estimate, data = hexapod
     found = by_regions(drawing, data, estimate, 3)
     assert sum(len(item.left_out.rows) for item in found) == estimate.configurations.sum()
-    verdict = verdict_of(None, found, drawing)
+    verdict = validation_verdict(None, found, drawing)
     assert verdict.usable, verdict
     assert "of regions that it did not see" in verdict.headline
 
@@ -306,7 +289,7 @@ def test_poor_extrapolation_is_told(hexapod):
     drawing, _, estimate, data = hexapod
     item = hold_out(drawing, data, estimate, chosen(drawing, estimate, 4))
     far = replace(item, left_out=replace(item.left_out, after=5 * item.left_out.after))
-    (warning,) = verdict_of(None, (far,), drawing).warnings
+    (warning,) = validation_verdict(None, (far,), drawing).warnings
     assert warning.startswith("Extrapolation is poor where the platform is spread")
 
 
@@ -377,7 +360,7 @@ def test_validate_in_words(kept, session):
 def test_the_drawing_is_the_drawing_again(kept, demo):
     """Held-out regions must not know, through the drawing, what they told the calibration."""
     from pkmcal.calibration.results import load
-    from pkmcal.validation import drawing_of
+    from pkmcal.judge.validate import drawing_of
 
     drawn = load_mechanism(demo.session / "mechanism.yaml")
     found = drawing_of(load(kept.folder / "c"))

@@ -10,11 +10,11 @@ import pytest
 from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
 from pkmcal.identify.bundle import bundle, what_data_tell
-from pkmcal.identify.conditions import conditions
 from pkmcal.identify.verdict import LEFT_OPEN, judge
 from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.papers.conditions import conditions
 from pkmcal.report.parameters import parameter_groups, unidentified
 from test_words import heaved, make, moved
 

@@ -12,14 +12,7 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.measurements import Measurements
-from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulation import Settings
-from pkmcal.simulation.demo import demo_camera
-from pkmcal.simulation.edges import EdgeNoise, simulate_edges
-from pkmcal.simulation.truth import draw_truth, true_machine
-from pkmcal.solver import Solution, Stop
-from pkmcal.watching.causes import (
+from pkmcal.judge.causes import (
     Cause,
     arms,
     common_scale,
@@ -30,18 +23,26 @@ from pkmcal.watching.causes import (
     whole_machine,
     zeros,
 )
-from pkmcal.watching.chances import (
+from pkmcal.judge.changes import (
     POWER,
     change,
     chi_square,
     detectable,
+    explained,
+    judge,
     likelihood,
+    made_tests,
     together,
 )
-from pkmcal.watching.evidence import Evidence, Trust, evidence
-from pkmcal.watching.figures import judgement_document
-from pkmcal.watching.judged import explained, family, judge
-from pkmcal.watching.words import Circumstances, verdict_of
+from pkmcal.judge.held import Evidence, Trust, evidence, hold
+from pkmcal.judge.words import LookedAt, watch_verdict
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.simulation import Settings
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.truth import draw_truth, true_machine
+from pkmcal.solver import Solution, Stop
 from pose_sessions import T_CAMERA_BASE, measured, papers_case, papers_poses
 
 ALPHA = 0.01
@@ -90,7 +91,7 @@ class Watched:
         """Of one session of ``machine``, held against a calibration of the true one."""
         calibrated, data = self.calibrated(rng), self.seen(machine, rng, few)
         start = start_state(calibrated, data, self.pool.T_camera_base)
-        return evidence(calibrated, self.covariance, data, start, Trust.full(data))
+        return evidence(hold(calibrated, data, start, Trust.full(data)), self.covariance)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +116,7 @@ def moved(machine, **by):
 
 def looked(n=FEW):
     """The circumstances of n new configurations."""
-    return Circumstances(tuple("abcdefghijkl"[:n]), np.zeros(n, bool), np.ones(n, bool), 1.0)
+    return LookedAt(tuple("abcdefghijkl"[:n]), np.zeros(n, bool), np.ones(n, bool), 1.0)
 
 
 def board_case(name, rng, **model):
@@ -131,7 +132,7 @@ def by_board(estimate, machine, poses, rng):
     """Evidence of a board on a machine's platform in some poses."""
     data = measured(machine, poses, rng).measurements
     start = start_state(estimate.machine, data, T_CAMERA_BASE[None])
-    return evidence(estimate.machine, estimate.covariance, data, start, Trust.full(data))
+    return evidence(hold(estimate.machine, data, start, Trust.full(data)), estimate.covariance)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +183,8 @@ def test_the_calibrations_errors_must_be_in_the_noise(watched):
         rng = np.random.default_rng([k, 8])
         calibrated, data = watched.calibrated(rng), watched.seen(watched.true, rng)
         start = start_state(calibrated, data, watched.pool.T_camera_base)
-        exact = evidence(calibrated, 0 * watched.covariance, data, start, Trust.full(data))
+        held = hold(calibrated, data, start, Trust.full(data))
+        exact = evidence(held, 0 * watched.covariance)
         found = chi_square(exact, every)
         factor.append(found.chi2 / found.dof)
     assert np.mean(factor) > 1.4
@@ -193,9 +195,9 @@ def test_other_frames_and_cameras_change_nothing(watched):
     rng = np.random.default_rng(2)
     data, calibrated = watched.seen(watched.true, rng), watched.calibrated(rng)
     start = start_state(calibrated, data, watched.pool.T_camera_base)
-    first = evidence(calibrated, watched.covariance, data, start, Trust.full(data))
+    first = evidence(hold(calibrated, data, start, Trust.full(data)), watched.covariance)
     away = replace(start, T_camera_base=perturb(start.T_camera_base, 0.01 * rng.normal(size=6)))
-    again = evidence(calibrated, watched.covariance, data, away, Trust.full(data))
+    again = evidence(hold(calibrated, data, away, Trust.full(data)), watched.covariance)
     every = whole_machine(calibrated)
     assert chi_square(again, every).chi2 == pytest.approx(chi_square(first, every).chi2, abs=1e-4)
     frames = generators(calibrated.layout, calibrated.values) @ freedoms(calibrated)
@@ -212,7 +214,7 @@ def test_the_regression_predicts_what_a_change_does(watched, by):
     data = watched.seen(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
     seen = [
-        evidence(machine, watched.covariance, data, start, Trust.full(data))
+        evidence(hold(machine, data, start, Trust.full(data)), watched.covariance)
         for machine in (watched.true, moved(watched.true, leg3_length__offset=-by))
     ]
     cause = whole_legs(watched.true)[2]
@@ -228,7 +230,7 @@ def test_a_changed_offset_is_found_and_named(watched):
     judged = judge(
         watched.evidence(moved(watched.true, leg3_length__offset=1e-3), rng), watched.true, ALPHA
     )
-    verdict = verdict_of(judged, looked())
+    verdict = watch_verdict(judged, looked())
     assert judged.changed
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("zero", (2,))
@@ -249,7 +251,7 @@ def test_a_joint_that_moved(watched):
     assert (first.cause.part, first.cause.legs) == ("base", (1,))
     off = first.change.value - [2e-3, -1e-3, 0]
     assert off @ np.linalg.solve(first.change.covariance, off) < 20
-    text = verdict_of(judged, looked(8)).reasons[0]
+    text = watch_verdict(judged, looked(8)).reasons[0]
     assert "the base joint of leg 2 by 2." in text
     assert "mm in the base frame" in text
 
@@ -261,7 +263,7 @@ def test_two_changes_are_both_named(watched):
     judged = judge(watched.evidence(now, rng, few=8), watched.true, ALPHA)
     causes = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
     assert causes == {("zero", (2,)), ("zero", (4,))}
-    verdict = verdict_of(judged, looked(8))
+    verdict = watch_verdict(judged, looked(8))
     assert "legs 3 and 5 have changed" in verdict.headline
     assert verdict.reasons[1].startswith("Besides, the zero of")
 
@@ -273,7 +275,7 @@ def test_warming_is_told_from_a_leg(watched):
     judged = judge(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
     assert judged.findings[0].suspect.cause.part == "scale"
     assert abs(judged.scale_change.value[0] - 2e-3) < 4 * judged.scale_change.sigma[0]
-    verdict = verdict_of(judged, looked())
+    verdict = watch_verdict(judged, looked())
     assert "all its lengths have another scale" in verdict.headline
     assert "K warmer" in verdict.reasons[0]
 
@@ -287,7 +289,7 @@ def test_causes_that_look_alike_are_all_named(watched):
     alike = {(s.cause.part, s.cause.legs) for s in (finding.suspect, *finding.others)}
     assert ("platform", (3,)) in alike
     assert len(alike) > 1
-    assert "These data cannot tell that from" in verdict_of(judged, looked(3)).reasons[0]
+    assert "These data cannot tell that from" in watch_verdict(judged, looked(3)).reasons[0]
 
 
 def test_detectable_changes_are_detected_so_often(watched):
@@ -322,7 +324,7 @@ def test_what_is_not_seen_is_not_detected(watched):
 
 def flat(n=6, p=3):
     """Evidence of p parameters, each seen in a row of its own."""
-    return Evidence(np.zeros(n), np.eye(n, p) * 1e6, np.zeros(1), None)
+    return Evidence(np.zeros(n), np.eye(n, p) * 1e6)
 
 
 def test_chances_of_several_tests():
@@ -385,7 +387,7 @@ def test_an_h4_by_its_board(h4):
     true, estimate, rng = h4
     poses = papers_poses()[rng.permutation(81)]
     same = judge(by_board(estimate, true, poses[:5], rng), estimate.machine, ALPHA)
-    verdict = verdict_of(same, looked(5))
+    verdict = watch_verdict(same, looked(5))
     assert verdict.usable, verdict
     assert "motor's zero by 0." in verdict.headline
     assert "°" in verdict.headline
@@ -400,11 +402,11 @@ def test_too_few_poses_of_a_board(h4):
     """One pose of a board tells no more than where camera and board are."""
     true, estimate, rng = h4
     judged = judge(by_board(estimate, true, papers_poses()[:1], rng), estimate.machine, ALPHA)
-    verdict = verdict_of(judged, looked(1))
+    verdict = watch_verdict(judged, looked(1))
     assert not verdict.usable
     assert "too few to tell" in verdict.headline
     assert "Of legs 1 to 4 these data tell nothing." in verdict.reasons
-    document = judgement_document(judged, estimate.machine)
+    document = judged.document(estimate.machine)
     assert not document["changed"]
     assert len(document["legs"]) == 4
 
@@ -438,7 +440,7 @@ def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
     start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
     estimate = bundle(drawing, case.measurements, start)
     judged = judge(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
-    verdict = verdict_of(judged, looked(3))
+    verdict = watch_verdict(judged, looked(3))
     assert not verdict.usable
     assert not judged.changed
     assert "which is more than the drawing's tolerance" in verdict.reasons[0]
@@ -448,24 +450,31 @@ def test_poses_that_cannot_be_found(watched, monkeypatch):
     rng = np.random.default_rng(1)
     data = watched.seen(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
-    module = "pkmcal.watching.evidence.minimise"
+    module = "pkmcal.judge.held.minimise"
     monkeypatch.setattr(module, lambda *_, **__: Solution(None, None, None, (Stop.STALLED,)))
     with pytest.raises(ResultError, match="poses were not found with the calibrated machine"):
-        evidence(watched.true, watched.covariance, data, start, Trust.full(data))
+        hold(watched.true, data, start, Trust.full(data))
 
 
 def test_a_family_that_sees_nothing():
     machine = load_mechanism("gough-stewart")
-    blind = Evidence(np.zeros(3), np.zeros((3, 54)), np.zeros(1), None)
-    assert family(blind, machine).chance == 1.0
+    blind = Evidence(np.zeros(3), np.zeros((3, 54)))
     judged = judge(blind, machine, ALPHA)
+    assert judged.tests == ()
     assert not judged.changed
-    verdict = verdict_of(judged, looked(1))
+    verdict = watch_verdict(judged, looked(1))
     assert not verdict.usable
     assert "Of legs 1 to 6 these data tell nothing." in verdict.reasons
 
 
 # studies
+
+
+def least_chance(watched, machine, k):
+    """Of all tests of one session of a machine."""
+    found = watched.evidence(machine, np.random.default_rng([k, 77]))
+    legs, zero, _ = made_tests(found, watched.true)
+    return min(t.adjusted for t in (*legs, *zero) if t and t.dof)
 
 
 @pytest.mark.slow
@@ -474,12 +483,7 @@ def test_false_alarms_and_power_of_many_sessions(watched, capsys):
     lines: list[str] = []
     for off, count in ((0.0, 1000), (1e-4, 200), (2e-4, 200), (5e-4, 200), (1e-3, 200)):
         now = moved(watched.true, leg3_length__offset=off)
-        least = np.array(
-            [
-                family(watched.evidence(now, np.random.default_rng([k, 77])), watched.true).chance
-                for k in range(count)
-            ]
-        )
+        least = np.array([least_chance(watched, now, k) for k in range(count)])
         shares = {alpha: float(np.mean(least < alpha)) for alpha in (0.01, 0.05, 0.1)}
         lines.append(f"{off * 1e3:.1f} mm: {shares}")
         if off == 0.0:

@@ -17,20 +17,18 @@ from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.identify.bundle import start_state
+from pkmcal.judge.causes import magnification, magnified
+from pkmcal.judge.changes import change
+from pkmcal.judge.held import Trust, evidence, hold
+from pkmcal.judge.watch import watch
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.report.calibration import save
-from pkmcal.session.load import load_session
+from pkmcal.session.load import digests, load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth
-from pkmcal.validate.independence import digests
-from pkmcal.watch import watch
-from pkmcal.watching.causes import magnification
-from pkmcal.watching.chances import change
-from pkmcal.watching.evidence import Trust, evidence
-from pkmcal.watching.lens import magnified
 
 
 def photographed(folder, drawing, machine, camera, seed, **settings):
@@ -236,7 +234,7 @@ def test_a_cameras_magnification_is_told():
         start = start_state(drawing, data, truth.T_camera_base)
         wide = magnified(data, observed, (camera, camera))
         exact = np.diag(np.full(len(drawing.parameters), 1e-12))
-        found = evidence(drawing, exact, data, start, Trust.full(data), wide)
+        found = evidence(hold(drawing, data, start, Trust.full(data), wide), exact)
         assert found.by.shape[1] == len(drawing.parameters) + 1
         got.append(change(found, cause))
     assert got[1].sigma[0] < longer / 4

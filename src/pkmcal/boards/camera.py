@@ -25,8 +25,9 @@ from pkmcal.boards.selection import (
 )
 from pkmcal.cameras.contract import Camera
 from pkmcal.errors import InputError, ResultError
-from pkmcal.files import closest, listed
+from pkmcal.files import closest
 from pkmcal.geometry.rigid import dot
+from pkmcal.wording import listed
 
 if TYPE_CHECKING:
     # self-import

@@ -20,9 +20,10 @@ from pkmcal.boards.find import (
     find_chessboard,
 )
 from pkmcal.errors import InputError
-from pkmcal.files import Document, listed
+from pkmcal.files import Document
 from pkmcal.observe.images import decode
 from pkmcal.session.photographs import photograph_header
+from pkmcal.wording import listed
 
 LOOKED_AT = 3
 """Photographs that are examined more closely; one good one is enough."""

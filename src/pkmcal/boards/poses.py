@@ -30,10 +30,10 @@ from pkmcal.boards.find import detect_board
 from pkmcal.boards.fit import BoardPoses, Views, board_poses, fit_poses, tilted_back
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
-from pkmcal.files import listed
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
 from pkmcal.measurements import PoseSet, Rejection
 from pkmcal.observe.repeats import Groups, groups_of
+from pkmcal.wording import listed
 
 UNEXPLAINED = 0.004
 """Share of the image's width that corners lie off their prediction, rms, from which the board file

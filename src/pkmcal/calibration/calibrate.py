@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pkmcal.boards.views import Boards
+from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.doubts import check_poses, richer_models, scale_doubt
 from pkmcal.calibration.gather import CameraRefinement, known_stations, refinement_of, with_poses
 from pkmcal.calibration.recognise import (
@@ -22,18 +23,16 @@ from pkmcal.calibration.recognise import (
 )
 from pkmcal.calibration.turns import Progress, identify_poses, take_turns
 from pkmcal.identify.bundle import what_data_tell
-from pkmcal.identify.conditions import conditions
-from pkmcal.identify.paper_methods import Method as PaperMethod
-from pkmcal.identify.paper_methods import by_paper
 from pkmcal.identify.problem import Estimate
 from pkmcal.identify.verdict import judge
 from pkmcal.identify.words import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
+from pkmcal.papers.conditions import conditions
+from pkmcal.papers.methods import Method as PaperMethod
+from pkmcal.papers.methods import by_paper
 from pkmcal.session.load import Session, load_session
-from pkmcal.validate.aside import set_aside
-from pkmcal.validate.holdouts import HoldOut, chosen, judged_without
 
 Method = Literal["bundle"] | PaperMethod
 
@@ -44,7 +43,8 @@ class Calibration:
 
     boards : the calibration board, where stations observe one. findings : what the data tell of
     the machine and what they leave open. timings : seconds by step. holdout : configurations that
-    the estimate did not see, and what it predicts of them, where that was asked for.
+    the estimate did not see, where that was asked for; :func:`pkmcal.judge.holdouts.holdout_of`
+    tells what it predicts of them.
     """
 
     session: Session
@@ -58,7 +58,7 @@ class Calibration:
     timings: dict[str, float] = field(default_factory=dict)
     boards: Boards = field(default_factory=Boards)
     findings: Findings | None = None
-    holdout: HoldOut | None = None
+    holdout: LeftOut | None = None
 
     @property
     def machine(self) -> Machine:
@@ -83,7 +83,7 @@ def calibrate(
     seed : of the random search for the stations' poses.
     refine_camera : estimate the cameras' intrinsics with the machine, from their calibration's
         covariance on.
-    holdout : configurations, spread over the workspace, to leave out and then to predict.
+    holdout : configurations, spread over the workspace, to leave out, to judge the result by them.
     progress : called with the step in words and the share done.
     Raises InputError where the session is at fault, ResultError where nothing can be said.
     """
@@ -161,7 +161,7 @@ def _calibrate(
         timings=clock.laps,
         boards=boards,
         findings=findings,
-        holdout=judged_without(session.machine, whole, estimate, out) if out else None,
+        holdout=LeftOut(out, whole) if out else None,
     )
 
 

@@ -13,13 +13,13 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference, rotation_vector
 from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.hand_eye import start_from_poses
 from pkmcal.identify.mounts import mean_pose
 from pkmcal.identify.problem import Estimate, State
-from pkmcal.identify.rotation_axis import RotationAxis, rotation_axis
 from pkmcal.identify.verdict import POOR, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
+from pkmcal.papers.hand_eye import start_from_poses
+from pkmcal.papers.rotation_axis import RotationAxis, rotation_axis
 from pkmcal.session.load import Session
 
 BAD = 2.0

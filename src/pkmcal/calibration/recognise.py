@@ -13,7 +13,6 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.views import Boards, find_boards
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.files import listed
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import unrecognised
 from pkmcal.observe.images import decode, decode_all
@@ -21,6 +20,7 @@ from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import StationPose, View, find_station
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import label_of
+from pkmcal.wording import listed
 
 WORKERS = 2
 """Threads beside one another: decoding and array work release Python's lock."""
@@ -30,8 +30,6 @@ NEARLY = 2.0
 MOST = 0.5
 """Share of the configurations that the drawing has to reach for the rest to be believed."""
 ALMOST_ALL = 0.9
-MOST_TURN = 90.0
-"""degrees"""
 
 NOWHERE = StationPose(np.eye(4), score=1.0, chance=1.0)
 """Of a station for whose search there was no start."""
@@ -138,37 +136,30 @@ def _check_signs(session: Session, bad: list[str]) -> None:
 def _taken(session: Session, joints: Array) -> float:
     """Share of the readings (K, m) that the drawing's machine can take."""
     found = session.machine.forward_result(joints)
-    turn = _turn(found.T_base_platform) if _folds(session) else np.zeros(len(joints))
-    return float(np.mean(found.converged & (np.abs(turn) <= MOST_TURN)))
-
-
-def _folds(session: Session) -> bool:
-    """Whether the platform has side bars that allow no more than a quarter turn."""
-    joints = {leg.platform.joint for leg in session.machine.document.legs}
-    return bool(joints & {"bar", "hinged-bar"})
+    turn = _turn(found.T_base_platform)
+    return float(np.mean(found.converged & ~(np.abs(turn) > session.machine.most_turn[0])))
 
 
 def _turn(poses: Array) -> Array:
-    """Turns (K,) about z, degrees."""
-    return np.rad2deg(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
+    """Turns (K,) about z, rad."""
+    return np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
 
 
 def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
-    """Raise `InputError` where an articulated platform would turn by more than its bars allow."""
-    if not _folds(session):
-        return
-    turn = _turn(poses)
-    bad = np.flatnonzero((np.abs(turn) > MOST_TURN) & usable)
+    """Raise `InputError` where an articulated platform would turn by more than its parts allow."""
+    turn, (most, in_the_way) = _turn(poses), session.machine.most_turn
+    bad = np.flatnonzero((np.abs(turn) > most) & usable)
     if not bad.size:
         return
     _check_signs(session, [session.configurations[k] for k in bad])
     worst = bad[np.argmax(np.abs(turn[bad]))]
     raise InputError(
-        "the readings turn the platform beyond 90 degrees, where its side bars lie on each other",
+        f"the readings turn the platform beyond {np.rad2deg(most):.0f} degrees, where {in_the_way}",
         where=f"{session.document['joints']['file']}, configuration"
         f" {listed([session.configurations[k] for k in bad])}",
-        found=f"{turn[worst]:.1f} degrees (configuration {session.configurations[worst]})",
-        expected=f"less than {MOST_TURN:.0f} degrees to either side",
+        found=f"{np.rad2deg(turn[worst]):.1f} degrees "
+        f"(configuration {session.configurations[worst]})",
+        expected=f"less than {np.rad2deg(most):.0f} degrees to either side",
         next_step="Check these readings, and the zero of the motors",
     )
 

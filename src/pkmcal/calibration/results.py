@@ -33,7 +33,7 @@ from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.decided import decided_by
 from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document, mechanism_text
 from pkmcal.outcome import Verdict
-from pkmcal.validate.independence import digests
+from pkmcal.session.load import digests
 from pkmcal.wording import listed
 
 if TYPE_CHECKING:

@@ -20,7 +20,6 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.recognise import WORKERS
 from pkmcal.errors import InputError, ResultError
-from pkmcal.files import listed
 from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.problem import Estimate, State
 from pkmcal.identify.start import better_start
@@ -28,6 +27,7 @@ from pkmcal.measurements import EdgeSet, Measurements, Observation, Rejection, c
 from pkmcal.observe import legs
 from pkmcal.observe.repeats import combined
 from pkmcal.session.load import Session
+from pkmcal.wording import listed
 
 ROUNDS = 3
 """Most looks at the edges, each from the estimate before."""

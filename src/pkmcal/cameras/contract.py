@@ -13,7 +13,7 @@ import pkgutil
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
@@ -60,11 +60,13 @@ class Camera(ABC):
     image_size : (width, height) in pixels.
     parameters : (n,) intrinsics in the order of ``parameter_names``; pixels for focal and
         center, none for the rest. Pixel centres are at integers, as in OpenCV.
+    own : fields of the model's file between ``center`` and ``distortion``.
     """
 
     model: ClassVar[str]
     parameter_names: ClassVar[tuple[str, ...]]
     schema: ClassVar[type[CameraSchema]]
+    own: ClassVar[tuple[str, ...]] = ()
 
     image_size: tuple[int, int]
     parameters: Array
@@ -104,13 +106,29 @@ class Camera(ABC):
         """True where a point of the camera frame (..., 3) is imaged by this model, (...)."""
 
     @classmethod
-    @abstractmethod
-    def from_document(cls, document: Any) -> Camera:
-        """The camera of a file's fields, checked by the model's ``schema``."""
+    def from_document(cls, document: Any) -> Self:
+        """The camera of a file's fields, checked by the model's ``schema``.
 
-    @abstractmethod
+        Parameters stand in the order of the fields: focal, center, the model's ``own``, distortion,
+        which may be absent or shorter.
+        """
+        own = [getattr(document, name) for name in cls.own]
+        k = np.zeros(len(cls.parameter_names) - 4 - len(own))
+        k[: len(document.distortion)] = document.distortion
+        return cls(document.image_size, np.concatenate([document.focal, document.center, own, k]))
+
     def document(self) -> dict[str, Any]:
         """The fields of a camera file, the inverse of :meth:`from_document`."""
+        p = self.parameters.tolist()
+        own = dict(zip(self.own, p[4:], strict=False))
+        return {
+            "model": self.model,
+            "image_size": list(self.image_size),
+            "focal": p[:2],
+            "center": p[2:4],
+            **own,
+            "distortion": p[4 + len(own) :],
+        }
 
     def in_image(self, pixels: Array, margin: float = 0.0) -> Booleans:
         """True where pixels (..., 2) lie in the image, ``margin`` px from its border; (...)."""

@@ -15,7 +15,6 @@ from pkmcal.errors import InputError
 from pkmcal.files import (
     Document,
     closest,
-    listed,
     parse_yaml,
     read_text,
     read_yaml,
@@ -24,6 +23,7 @@ from pkmcal.files import (
     write_text,
     yaml_text,
 )
+from pkmcal.wording import listed
 
 
 def load_camera(path: Path | str, label: str | None = None) -> Camera:

@@ -7,7 +7,7 @@ growing with t, or at 180 degrees.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, final
+from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
 from pydantic import Field
@@ -120,24 +120,6 @@ class Fisheye(Camera):
         roots = np.roots(np.trim_zeros([k[3], k[2], k[1], k[0], 1.0], "f"))
         real = roots[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)].real
         return float(min(np.sqrt(real.min()), np.pi)) if real.size else float(np.pi)
-
-    @classmethod
-    def from_document(cls, document: FisheyeSchema) -> Fisheye:
-        """From a camera file's checked fields; distortion may be absent or shorter."""
-        k = np.zeros(4)
-        k[: len(document.distortion)] = document.distortion
-        return cls(document.image_size, np.concatenate([document.focal, document.center, k]))
-
-    def document(self) -> dict[str, Any]:
-        """The fields of a camera file."""
-        p = self.parameters.tolist()
-        return {
-            "model": self.model,
-            "image_size": list(self.image_size),
-            "focal": p[:2],
-            "center": p[2:4],
-            "distortion": p[4:],
-        }
 
 
 def _angle(points: Array) -> tuple[Array, Array]:

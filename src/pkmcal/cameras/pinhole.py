@@ -188,21 +188,3 @@ class Pinhole(Camera):
         distorted, by_xy = distort(xy, self.parameters[4:])
         good = front & unfolded(xy, by_xy, self.parameters[4:])
         return xy, good, distorted, by_xy
-
-    @classmethod
-    def from_document(cls, document: PinholeSchema) -> Pinhole:
-        """From a camera file's checked fields; distortion may be absent or shorter."""
-        k = np.zeros(5)
-        k[: len(document.distortion)] = document.distortion
-        return cls(document.image_size, np.concatenate([document.focal, document.center, k]))
-
-    def document(self) -> dict[str, Any]:
-        """The fields of a camera file."""
-        p = self.parameters.tolist()
-        return {
-            "model": self.model,
-            "image_size": list(self.image_size),
-            "focal": p[:2],
-            "center": p[2:4],
-            "distortion": p[4:],
-        }

@@ -8,7 +8,7 @@ more than 90 degrees from the axis have images; the field ends where two rays wo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, final
+from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
 from pydantic import Field
@@ -36,6 +36,7 @@ class Unified(Camera):
 
     model: ClassVar[str] = "unified"
     schema: ClassVar[type[CameraSchema]] = UnifiedSchema
+    own: ClassVar[tuple[str, ...]] = ("xi",)
     parameter_names: ClassVar[tuple[str, ...]] = (
         "focal.x", "focal.y", "center.x", "center.y", "xi", "k1", "k2", "p1", "p2",
     )  # fmt: skip
@@ -109,25 +110,3 @@ class Unified(Camera):
         distorted, by_xy = distort(xy, self._five())
         good = inside & unfolded(xy, by_xy, self._five())
         return (distance, depth), xy, distorted, good, by_xy
-
-    @classmethod
-    def from_document(cls, document: UnifiedSchema) -> Unified:
-        """From a camera file's checked fields; distortion may be absent or shorter."""
-        k = np.zeros(4)
-        k[: len(document.distortion)] = document.distortion
-        return cls(
-            document.image_size,
-            np.concatenate([document.focal, document.center, [document.xi], k]),
-        )
-
-    def document(self) -> dict[str, Any]:
-        """The fields of a camera file."""
-        p = self.parameters.tolist()
-        return {
-            "model": self.model,
-            "image_size": list(self.image_size),
-            "focal": p[:2],
-            "center": p[2:4],
-            "xi": p[4],
-            "distortion": p[5:],
-        }

@@ -19,7 +19,6 @@ from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
 from pkmcal.calibration.recognise import read_photographs
 from pkmcal.errors import InputError
 from pkmcal.files import plain
-from pkmcal.identify.axis_measurements import AxisNoise
 from pkmcal.measurements import EdgeSet
 from pkmcal.observe import legs
 from pkmcal.observe.predict import legs_in_camera
@@ -39,6 +38,7 @@ from pkmcal.observe.repeats import (
     same_edges,
 )
 from pkmcal.outcome import Finding, Level, Part, Row, Table
+from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.session.load import Session, Station, load_session
 
 SHARED = 0.3

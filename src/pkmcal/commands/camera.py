@@ -89,7 +89,8 @@ def camera(
 def of_session(folder: Path) -> tuple[list[Path], Path]:
     """A session's photographs of its board, all of one camera, and the board's file."""
     from pkmcal.errors import InputError
-    from pkmcal.files import listed, read_yaml
+    from pkmcal.files import read_yaml
+    from pkmcal.wording import listed
 
     session = read_yaml(folder / "session.yaml")
     stations: dict[str, Any] = session.data.get("stations") or {}

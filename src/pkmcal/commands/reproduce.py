@@ -4,25 +4,15 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from pkmcal.commands import console
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pkmcal.outcome import Table
-    from pkmcal.report.reproduction import Reproduction
-
-MARKED = {True: "good", False: "wrong"}
-WHAT = {".html": "open it in a browser", ".json": "everything, for programs"}
-STYLES = {"paper": "yellow", "prototype": "dim", "ours": ""}
-
 
 class Paper(StrEnum):
-    """A paper that can be reproduced; its figures are in pkmcal.reproduce.paper_x."""
+    """A paper that can be reproduced."""
 
     A = "a"
     C = "c"
@@ -49,69 +39,35 @@ def reproduce(
     as_json: console.Json = False,
 ) -> int:
     """Compute the papers' tables and figures again."""
-    from pkmcal.files import check_own_folder
-    from pkmcal.reproduce import Options
-    from pkmcal.reproduce import reproduce as computed
+    from pkmcal.commands.finish import NUMBERS, PAGE, contents, tell
+    from pkmcal.files import check_own_folder, write_folder
+    from pkmcal.studies.reproduction import Options
+    from pkmcal.studies.reproduction import reproduce as computed
 
-    ours = {f"paper-{paper.value}{ending}" for paper in Paper for ending in WHAT}
+    files = {
+        paper.value: {f"paper-{paper.value}.html": PAGE, f"paper-{paper.value}.json": NUMBERS}
+        for paper in Paper
+    }
+    ours = {name for names in files.values() for name in names}
     check_own_folder(out, ours, "reproductions", "earlier reproductions")
-    wanted = list(dict.fromkeys(papers or list(Paper)))
+    wanted = [paper.value for paper in dict.fromkeys(papers or list(Paper))]
     with console.progress(as_json) as told:
         options = Options(runs, seed, long, photographs, told)
-        found = [computed(paper.value, options) for paper in wanted]
-    files = save(found, out)
-    code = 0 if all(one.passed for one in found) else 1
+        found = {paper: computed(paper, options) for paper in wanted}
+    texts: dict[str, str] = {}
+    for paper, outcome in found.items():
+        texts |= contents(outcome, files[paper])
+    write_folder(out, texts)
+    code = max(outcome.exit_code for outcome in found.values())
     if as_json:
-        documents = {one.letter: one.document() for one in found}
-        console.print_json({"papers": documents, "files": files, "exit_code": code})
+        documents = {paper: outcome.document for paper, outcome in found.items()}
+        written = [str(out / name) for name in texts]
+        console.print_json({"papers": documents, "files": written, "exit_code": code})
         return code
     terminal = console.out()
-    for one in found:
-        tell(terminal, one)
-    console.print_files(terminal, [(path, WHAT[Path(path).suffix]) for path in files])
+    for outcome in found.values():
+        tell(terminal, outcome)
+        terminal.print()
+    shown = [(str(out / name), what) for paper in found for name, what in files[paper].items()]
+    console.print_files(terminal, shown)
     return code
-
-
-def save(found: list[Reproduction], folder: Path) -> list[str]:
-    """Write a page and a JSON file a paper; returns their paths."""
-    from pkmcal.files import json_text, write_folder
-    from pkmcal.report.reproduction import reproduction_html
-
-    texts: dict[str, str] = {}
-    for one in found:
-        texts[f"paper-{one.letter}.html"] = reproduction_html(one)
-        texts[f"paper-{one.letter}.json"] = json_text(one.document())
-    write_folder(folder, texts)
-    return [str(folder / name) for name in texts]
-
-
-def tell(out: Console, found: Reproduction) -> None:
-    """Headline, tables, remarks and expectations."""
-    mark = console.MARKS[MARKED[found.passed]]
-    out.print(found.cited, style="dim", markup=False)
-    out.print()
-    console.print_points(out, [(mark, found.headline)])
-    for part in found.parts:
-        for table in part.tables:
-            if table.brief:
-                _tell_table(out, table)
-    out.print()
-    console.print_points(out, [(console.MARKS["note"], text) for text in found.remarks])
-    out.print()
-    points = [(console.MARKS[MARKED[c.passed]], c.sentence) for c in found.checks]
-    console.print_points(out, points)
-    out.print()
-
-
-def _tell_table(out: Console, table: Table) -> None:
-    from rich.table import Table as RichTable
-
-    shown = RichTable(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for place, column in enumerate(table.columns):
-        shown.add_column(column, justify="right" if place else "left", no_wrap=True)
-    for row in table.rows:
-        cells = (console.escaped(text) for text in (row.name, *row.cells))
-        shown.add_row(*cells, style=STYLES[row.source])
-    out.print()
-    out.print(table.title, style="bold", markup=False)
-    out.print(shown)

@@ -1,25 +1,44 @@
-"""``c``: a C99 header and source with the machine's values and kinematics, and a self-test."""
+"""``c``: a C99 header and source with the machine's values and kinematics, and a self-test.
+
+The C files lie in ``c_source/``, complete, with a built-in machine's numbers. Here the comment on
+top and the part between two marks are written anew; everything else goes out as it stands there.
+"""
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+import re
+import textwrap
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, final
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.export.c_header import HEADER, SELFTEST, SOURCE, header_text, selftest_text
-from pkmcal.export.c_read import closure, constants
-from pkmcal.export.c_source import source_text
-from pkmcal.export.c_tables import tables_of
-from pkmcal.export.contract import Difference, Exporter
-from pkmcal.export.samples import samples
-from pkmcal.export.source import Source
+from pkmcal.export.contract import Difference, Exporter, exact, largest
+from pkmcal.export.limbs import CONSTANT, FLOAT, SLIDE, TURN, Limbs, rods_of
+from pkmcal.export.source import Source, samples
+from pkmcal.geometry.rigid import cross, dot, perturb
+from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import inverse_result
 from pkmcal.outcome import Finding, Level
 
+FOLDER = Path(__file__).parent / "c_source"
+HEADER, SOURCE, SELFTEST = "pkmcal_kinematics.h", "pkmcal_kinematics.c", "pkmcal_selftest.c"
+BEGIN = "/* ---- the machine ---- */\n"
+END = "/* ---- what follows is the same for every machine ---- */\n"
 PAIRS = 12
 ROUNDING = 1e-12
 """m, rad: a thousand times the rounding of a double at 1 m; poses themselves close to it."""
+CONVENTIONS = (
+    "Units: m and rad.",
+    "pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.",
+    "twist: omega_x, omega_y, omega_z (rad/s), tau_x, tau_y, tau_z (m/s): R changes by omega x R,"
+    " t by tau, both along the base frame's axes.",
+    "length of a rod = reading + offset. Readings in the order of the machine's columns.",
+    "C99, math.h alone; no memory is allotted, nothing but the arguments is written, so that all"
+    " functions can run at once in several threads. Do not compile with -ffast-math.",
+)
 
 
 @final
@@ -31,39 +50,49 @@ class CSource(Exporter):
 
     def files(self, source: Source) -> dict[str, str]:
         """Header, source and self-test."""
-        tables = tables_of(source.machine)
-        poses, joints = samples(source.machine, PAIRS)
+        rods = rods_of(source.machine)
+        about = source.header(*CONVENTIONS)
+        sigmas = (
+            "",
+            "Parameters (sigma: standard deviation of sampling, not of what the model leaves out;"
+            " held: by the choice of frames, or by the mechanism file):",
+            *source.sigma_lines(),
+        )
+        test = (
+            "Self-test: reference pairs of readings and poses, computed by pkmcal. Compile and"
+            " run:",
+            f"cc -std=c99 -O2 {SELFTEST} {SOURCE} -lm && ./a.out",
+        )
         return {
-            HEADER: header_text(source, tables),
-            SOURCE: source_text(source, tables),
-            SELFTEST: selftest_text(source, poses, joints),
+            HEADER: _filled(HEADER, about, _sizes(source.machine, rods)),
+            SOURCE: _filled(SOURCE, (*about, *sigmas), _tables(source.machine, rods)),
+            SELFTEST: _filled(SELFTEST, (*source.header(), *test), _pairs(source.machine)),
         }
 
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
-        """The constants as they stand in the text close the machine where it closes."""
+        """The numbers as they stand in the text close the machine where it closes."""
         machine = source.machine
-        found, test = constants(files[SOURCE]), constants(files[SELFTEST])
         poses, joints = samples(machine)
         hinges = inverse_result(machine.layout, machine.values, poses)[1]
-        off = _largest(closure(found, poses, joints, hinges))
-        home = np.concatenate([machine.home()[:3, :3].ravel(), machine.home()[:3, 3]])
-        ranges = machine.joint_ranges.copy()
-        ranges = np.where(np.isfinite(ranges), ranges, np.array([-np.inf, np.inf]))
-        same = np.array_equal(found["home"], home) and np.array_equal(
-            found["range"], ranges.ravel()
+        off = closure(files[SOURCE], poses, joints, hinges)
+        home, ranges = (_numbers(files[SOURCE], name) for name in ("HOME", "RANGE"))
+        same = np.array_equal(home, _flat(machine.home())) and np.array_equal(
+            ranges.reshape(-1, 2), _bounds(machine)
         )
-        pairs = test["POSES"].reshape(-1, 12)
+        pairs = _numbers(files[SELFTEST], "POSES").reshape(-1, 12)
         transform = np.tile(np.eye(4), (len(pairs), 1, 1))
         transform[:, :3, :3], transform[:, :3, 3] = pairs[:, :9].reshape(-1, 3, 3), pairs[:, 9:]
-        readings = test["READINGS"].reshape(-1, machine.n_joints)
+        readings = _numbers(files[SELFTEST], "READINGS").reshape(-1, machine.n_joints)
         return [
             Difference(
-                f"closure of the constants read again, at {len(poses)} poses", off, ROUNDING
+                f"closure of the constants read again, at {len(poses)} poses",
+                largest(off),
+                ROUNDING,
             ),
             Difference("home pose and ranges read again", 0.0 if same else np.inf, 0.0),
             Difference(
                 f"readings of the self-test's {len(pairs)} poses",
-                _largest(machine.inverse(transform) - readings),
+                largest(machine.inverse(transform), readings),
                 ROUNDING,
                 "m or rad",
             ),
@@ -83,15 +112,259 @@ class CSource(Exporter):
         if passive.size:
             names = ", ".join(map(str, passive))
             out.append(Finding(Level.NOTE, f"Passive legs ({names}) are not in the source."))
-        if source.machine.layout.shares_motors:
-            out.append(
-                Finding(
-                    Level.NOTE,
-                    "Several rods share a motor: the source has no pkmcal_inverse_jacobian.",
-                )
-            )
+        if _coupled(source.machine):
+            shared = "motor" if source.machine.layout.shares_motors else "bar"
+            text = f"Several rods share a {shared}: the source has no pkmcal_inverse_jacobian."
+            out.append(Finding(Level.NOTE, text))
         return tuple(out)
 
 
-def _largest(values: Array) -> float:
-    return float(np.abs(values).max(initial=0.0))
+def _coupled(machine: Machine) -> bool:
+    """Whether a reading does not follow from its own rod alone."""
+    return machine.layout.shares_motors or machine.layout.n_internal > 0
+
+
+def _bounds(machine: Machine) -> Array:
+    """Smallest and largest readings (m, 2), without end where the file is silent."""
+    silent = np.array([-np.inf, np.inf])
+    return np.where(np.isfinite(machine.joint_ranges), machine.joint_ranges, silent)
+
+
+# What is written into the files
+
+
+def _filled(name: str, about: Iterable[str], numbers: str) -> str:
+    """A file of the folder with another comment on top and another machine's numbers."""
+    text = (FOLDER / name).read_text(encoding="utf-8")
+    above, _, below = text.partition(BEGIN)
+    above = above[above.index("*/\n") + 3 :]
+    return f"{c_comment(about)}{above}{BEGIN}\n{numbers}\n{END}{below.partition(END)[2]}"
+
+
+def _sizes(machine: Machine, rods: Limbs) -> str:
+    readings = ", ".join(f"joint {k + 1} {unit}" for k, unit in enumerate(machine.joint_units))
+    return (
+        f"#define PKMCAL_JOINTS {machine.n_joints} /* readings: {readings} */\n"
+        f"#define PKMCAL_RODS {len(rods)}\n"
+        "/* 1 where several rods share a motor or a bar: readings are then found by iteration. */\n"
+        f"#define PKMCAL_COUPLED {int(_coupled(machine))}\n"
+    )
+
+
+def _tables(machine: Machine, rods: Limbs) -> str:
+    """The machine's numbers, 17 significant digits each."""
+    layout, home = machine.layout, machine.home()
+    free = np.argmax(layout.motion, axis=0).tolist()
+    away = rods.ends - rods.ends.mean(axis=0)
+    radius = float(np.sqrt(np.mean(np.sum(away**2, axis=1)))) or 1.0
+    # what rounding is measured by
+    size = max(
+        np.abs(part).max()
+        for part in (machine.base_centers(), home[:3, 3], machine.platform_centers())
+    )
+    defines = (
+        f"#define FREEDOMS {len(free)}\n#define HINGES {layout.n_internal}\n"
+        f"#define AXES {len(layout.angles)}\n"
+        f"#define SIZE {c_number(size)} /* m, the machine's size */\n"
+        f"#define RADIUS {c_number(radius)} /* m, the platform's: makes turns lengths */\n"
+    )
+    note = "of omega_x, omega_y, omega_z, tau_x, tau_y, tau_z those that the platform has"
+    return "\n".join(
+        [
+            defines,
+            f"/* {note} */\nstatic const int FREE[FREEDOMS] = {{{', '.join(map(str, free))}}};\n",
+            _rods(machine, rods),
+            _axes(machine, rods),
+            f"static const pkmcal_pose HOME = {_pose(home)};\n",
+            c_array(
+                "RANGE", "[PKMCAL_JOINTS][2]", _bounds(machine), "m or rad, by the mechanism file"
+            ),
+        ]
+    )
+
+
+def _rods(machine: Machine, rods: Limbs) -> str:
+    """RODS, of each rod the fields that are not zero."""
+    foot, swing, rate, floating = np.zeros((4, len(rods), 3))
+    for k, held in enumerate(rods.held):
+        bar, w = rods.bar[k], rods.hinge_axis[k]
+        if held == TURN:
+            foot[k] = dot(w, bar) * w  # what lies along the hinge does not turn
+            swing[k], rate[k] = bar - foot[k], cross(w, bar)
+        if held == FLOAT:
+            floating[k] = bar
+    out: list[str] = []
+    for k, leg in enumerate(rods.leg):
+        driven = rods.drive[k] != CONSTANT
+        numbers: dict[str, Any] = {
+            "middle": machine.layout.middle[leg - 1] if rods.drive[k] in (SLIDE, TURN) else 0.0,
+            "length": rods.length[k],
+            "base": rods.base[k],
+            "arm": rods.arm[k],
+            "rate": rods.rate[k],
+            "platform": rods.platform[k] + foot[k],
+            "hinge": int(rods.hinge[k]) + 1,
+            "hinge_axis": rods.hinge_axis[k],
+            "swing": swing[k],
+            "swing_rate": rate[k],
+            "floating": floating[k],
+        }
+        fields = [f"        .drive = {rods.drive[k].upper()},"]
+        fields += [f"        .joint = {rods.joint[k]},"] * driven
+        fields += [
+            f"        .{name} = {value if isinstance(value, int) else c_value(value)},"
+            for name, value in numbers.items()
+            if np.any(value) or name in ("length", "base", "platform")
+        ]
+        body = "\n".join(fields)
+        out.append(f"    /* leg {leg} of the mechanism file */\n    {{\n{body}\n    }},\n")
+    return f"static const rod_data RODS[PKMCAL_RODS] = {{\n{''.join(out)}}};\n"
+
+
+def _axes(machine: Machine, rods: Limbs) -> str:
+    """AXIS, of each equation the axes that take part in it."""
+    angles = machine.layout.angles
+    base, platform = machine.base_axes(), machine.platform_axes()
+    out: list[str] = []
+    for leg, on_base, on_platform in zip(
+        angles.leg, angles.on_base, angles.on_platform, strict=True
+    ):
+        kind = "TORSION" if on_base and on_platform else "ON_BASE" if on_base else "ON_PLATFORM"
+        fields = f".rod = {np.flatnonzero(rods.leg == leg + 1)[0]}, .kind = {kind}"
+        if on_base:
+            fields += f",\n     .base = {c_value(base[leg])}"
+        if on_platform:
+            fields += f",\n     .platform = {c_value(platform[leg])}"
+        out.append(f"    {{{fields}}},\n")
+    rows = "".join(out) or "    {.rod = 0},\n"
+    return f"/* one row at least */\nstatic const axis_data AXIS[AXES + 1] = {{\n{rows}}};\n"
+
+
+def _pairs(machine: Machine) -> str:
+    """Reference poses and readings, with starts nearby."""
+    poses, joints = samples(machine, PAIRS)
+    starts = perturb(poses, 0.02 * machine.layout.motion.sum(axis=1))
+    # a machine's name may hold anything; in a string it must not end it
+    name = "".join(c for c in machine.name if c.isalnum() or c in " -_.")
+    lists = "\n".join(
+        f"static const pkmcal_pose {what}[PAIRS] = {{\n    "
+        + ",\n    ".join(_pose(T) for T in of)
+        + "\n};\n"
+        for what, of in (("POSES", poses), ("STARTS", starts))
+    )
+    return (
+        f'#define MACHINE "{name}"\n#define PAIRS {len(poses)}\n'
+        "#define LIMIT 1e-10 /* m and rad; a few digits above the rounding of a double */\n\n"
+        + c_array("READINGS", "[PAIRS][PKMCAL_JOINTS]", joints)
+        + "\n"
+        + lists
+    )
+
+
+def _pose(T: Array) -> str:
+    return f"{{{c_value(T[:3, :3])}, {c_value(T[:3, 3])}}}"
+
+
+def _flat(T: Array) -> Array:
+    """A pose's numbers (12,) in the order of the C structure."""
+    return np.concatenate([T[:3, :3].ravel(), T[:3, 3]])
+
+
+def c_number(value: float) -> str:
+    """A C constant of type double."""
+    if not np.isfinite(value):
+        return "HUGE_VAL" if value > 0 else "-HUGE_VAL"
+    text = exact(value)
+    return text if any(mark in text for mark in ".e") else text + ".0"
+
+
+def c_value(value: Any) -> str:
+    """A number, or rows of numbers in braces."""
+    if np.ndim(value):
+        return "{" + ", ".join(c_value(part) for part in value) + "}"
+    return c_number(float(value))
+
+
+def c_array(name: str, shape: str, values: Array | Sequence[Array], note: str = "") -> str:
+    """A C constant array of doubles, a row a line, with a comment above."""
+    above = f"/* {note} */\n" if note else ""
+    body = ",\n    ".join(c_value(row) for row in values)
+    return f"{above}static const double {name}{shape} = {{\n    {body}\n}};\n"
+
+
+def c_comment(lines: Iterable[str]) -> str:
+    """Lines as one C comment; nothing in them ends it, or joins lines."""
+    safe = (
+        line.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("?", ".")
+        for line in lines
+    )
+    wrapped = [part for line in safe for part in textwrap.wrap(line, 96) or [""]]
+    body = "\n".join(f" * {line}".rstrip() for line in wrapped)
+    return f"/*\n{body}\n */\n"
+
+
+# What is read from the files again
+
+_COMMENT = re.compile(r"/\*.*?\*/", re.S)
+_NUMBER = re.compile(r"-?HUGE_VAL|[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_FIELD = re.compile(r"\.(\w+) = (\{[^{}]*\}|[^\s,{}]+)")
+
+
+def _body(text: str, name: str) -> str:
+    """What stands between the braces of a constant, without comments."""
+    plain = _COMMENT.sub("", text)
+    found = re.search(rf"static const \w+ {name}[^=]*= (.*?);", plain, re.S)
+    return found.group(1) if found else ""
+
+
+def _numbers(text: str, name: str) -> Array:
+    """A constant's numbers, flat."""
+    huge = {"HUGE_VAL": np.inf, "-HUGE_VAL": -np.inf}
+    words = _NUMBER.findall(_body(text, name))
+    return np.array([huge[word] if word in huge else float(word) for word in words])
+
+
+def _records(text: str, name: str, first: str) -> list[dict[str, Any]]:
+    """A constant's rows by field, each beginning with the field ``first``; words as they are."""
+    out: list[dict[str, Any]] = []
+    for field, value in _FIELD.findall(_body(text, name)):
+        if field == first:
+            out.append({})
+        numbers = np.array([float(word) for word in _NUMBER.findall(value)])
+        out[-1][field] = value if value.isupper() else numbers if value[0] == "{" else numbers[0]
+    return out
+
+
+def closure(text: str, poses: Array, joints: Array, hinges: Array) -> Array:
+    """The rods' and axes' equations (n, E), m, by the numbers in a source, in the words of its
+    comments.
+
+    poses (n, 4, 4), joints (n, m), hinges (n, h): as for the machine.
+    """
+    none, rot = np.zeros(3), poses[:, :3, :3]
+    lines: list[Array] = []
+    out: list[Array] = []
+    for rod in _records(text, "RODS", "drive"):
+        q = joints[:, int(rod.get("joint", 0)), None]
+        phi = hinges[:, int(rod["hinge"]) - 1, None] if "hinge" in rod else np.zeros(1)
+        a, longer = rod["base"], np.zeros(1)
+        match rod["drive"]:
+            case "TELESCOPE":
+                longer = q[:, 0]
+            case "SLIDE":
+                a = a + q * rod["rate"]
+            case "TURN":
+                a = a + np.cos(q) * rod["arm"] + np.sin(q) * rod["rate"]
+            case _:
+                pass
+        swing, rate = (rod.get(name, none) for name in ("swing", "swing_rate"))
+        own = rod["platform"] + np.cos(phi) * swing + np.sin(phi) * rate
+        b = (rot @ own[..., None])[..., 0] + poses[:, :3, 3] + rod.get("floating", none)
+        lines.append(b - a)
+        out.append(np.linalg.norm(b - a, axis=1) - rod["length"] - longer)
+    for axis in _records(text, "AXIS", "rod"):
+        if "kind" in axis:
+            base, turned = axis.get("base"), rot @ axis.get("platform", none)
+            w = turned if base is None else np.cross(base, turned) if turned.any() else base
+            out.append(np.sum(lines[int(axis["rod"])] * w, axis=1))
+    return np.stack(out, axis=1)

@@ -1,8 +1,9 @@
-"""What a format of other programs offers; a new one is one file in this folder.
+"""What a format of other programs offers, and an export from start to end.
 
-An exporter turns a :class:`~pkmcal.export.source.Source` into texts, and reads them again by
-itself, as the other program would: with that program's units, signs and formulas, and with nothing
-of ours but the text. :func:`pkmcal.export.writing.export` writes only what agrees.
+A format is one file in this folder: a subclass of :class:`Exporter`, which turns a
+:class:`~pkmcal.export.source.Source` into texts and reads them again by itself, as the other
+program would: with that program's units, signs and formulas, and with nothing of ours but the text.
+:func:`export` gives out only what agrees with the machine.
 """
 
 from __future__ import annotations
@@ -10,12 +11,20 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError, ResultError
 from pkmcal.export.source import Source
+from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.outcome import Finding
+from pkmcal.wording import listed
 
 
 @dataclass(frozen=True)
@@ -70,3 +79,97 @@ def exporters() -> dict[str, Exporter]:
     for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
         importlib.import_module(f"{package}.{module.name}")
     return {cls.name: cls() for cls in sorted(Exporter.__subclasses__(), key=lambda c: c.name)}
+
+
+def exporter_of(name: str) -> Exporter:
+    """A format by its word after ``--to``; InputError lists them."""
+    known = exporters()
+    if name in known:
+        return known[name]
+    guess = closest(name, known)
+    raise InputError(
+        "there is no such format to export to",
+        found=name,
+        expected=(f"{guess}, or another of " if guess else "") + listed(list(known), 20),
+    )
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was made: texts by file name, how far they are from the machine, and what to know."""
+
+    exporter: Exporter
+    files: dict[str, str]
+    differences: tuple[Difference, ...]
+    notes: tuple[Finding, ...]
+
+
+def export(source: Source, name: str, *, force: bool = False) -> Export:
+    """Make a format's texts, read them again, and compare; nothing is written.
+
+    Raises InputError for a machine that the format cannot express, ResultError for a calibration
+    that was refused, unless forced, and where a text read again is not the machine.
+    """
+    exporter = exporter_of(name)
+    if not (source.usable or force):
+        raise ResultError(
+            "this calibration was refused, and is not exported: "
+            + " ".join((source.headline, *source.reasons)),
+            where=source.origin,
+            next_step="Calibrate again; or export it all the same with --force, and its files"
+            " say so",
+        )
+    files = exporter.files(source)
+    differences = tuple(exporter.check(files, source))
+    for difference in differences:
+        if difference.beyond:
+            raise ResultError(
+                f"the {name} files, read again, are not the machine ({difference.what});"
+                " nothing was written",
+                found=f"{difference.largest:.3g} {difference.unit}",
+                expected=f"at most {difference.limit:.3g} {difference.unit}",
+                next_step="This is a defect of pkmcal: report it, with the mechanism file",
+            )
+    return Export(exporter, files, differences, tuple(exporter.notes(files, source)))
+
+
+def write(made: Export, folder: Path) -> None:
+    """Write the files, whole or not at all."""
+    check_own_folder(folder, made.files, "this export", "an earlier export")
+    write_folder(folder, made.files)
+
+
+def exact(value: float) -> str:
+    """Seventeen significant digits: a double comes back as it was."""
+    return f"{value:.17g}"
+
+
+def commented(lines: Iterable[str], mark: str) -> str:
+    """Lines behind a mark each, such as ``#`` or ``;``."""
+    return "".join(f"{mark} {line}".rstrip() + "\n" for line in lines)
+
+
+def largest(values: Any, expected: Any = 0.0) -> float:
+    """The largest absolute difference of two arrays, or sets of numbers; 0 for none."""
+    off = np.asarray(values, dtype=float) - np.asarray(expected, dtype=float)
+    return float(np.abs(off).max(initial=0.0))
+
+
+def quaternion(rot: Array) -> Array:
+    """Unit quaternion (4,) x y z w of a rotation matrix (3, 3), w not negative."""
+    from scipy.spatial.transform import Rotation
+
+    q = Rotation.from_matrix(rot).as_quat()
+    return q if q[3] >= 0 else -q
+
+
+def rotation_of(q: Array) -> Array:
+    """The rotation matrix (3, 3) of a quaternion (4,) x y z w of any length but zero."""
+    x, y, z, w = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

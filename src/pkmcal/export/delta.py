@@ -1,15 +1,31 @@
-"""A delta as firmwares know it: three towers or three arms, and a workspace to compare over."""
+"""Deltas as firmwares know them: parameters fitted over the workspace, and how they are told.
+
+Firmwares know ideal deltas: parallel towers on one circle, arms in vertical planes through one
+axis. A calibrated machine has more freedoms, so a firmware's model follows it with an error, which
+is told. The firmware's frame may lie otherwise than the base frame: where it lies is found along.
+
+Model, firmware's frame, mm and degrees: a linear tower j carries its rod's end at
+``(R cos a_j, R sin a_j, m_j)``, an arm at ``((R + U_j cos m_j) (cos a_j, sin a_j), H_j + U_j sin
+m_j)``; the rod's length is L_j, and m_j = rate_j * reading_j + zero_j the motor's position.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.export.c_tables import CRANK, SLIDER, Tables, tables_of
+from pkmcal.export.contract import Difference
+from pkmcal.export.limbs import FLOAT, SLIDE, TURN, Limbs, limbs_of, rods_of
+from pkmcal.export.source import Source
+from pkmcal.geometry.rigid import apply, dot, pose, rotation
 from pkmcal.mechanisms import Machine
+from pkmcal.outcome import Finding, Level
 
 STEPS = 7
 """Readings of each motor in the grid: ends, middle, and two on each side."""
@@ -20,9 +36,22 @@ FASTEST = 4.0
 motion of its motor, and firmwares divide by that angle."""
 UPRIGHT = 0.8
 """Least vertical part of a tower, and radial part of an arm's plane: 37 degrees off at most."""
-KINDS = {SLIDER: "linear", CRANK: "rotary"}
 MM = 1e3
 DEGREE = 180 / np.pi
+FOLLOWS = 0.05
+"""mm at the tool beyond which a person is warned: a good kit's repeatability."""
+REFUSED = 5.0
+"""mm at the tool beyond which the parameters describe another machine."""
+ROUNDING = 2e-6
+"""m at the tool: settings have 0.1 µm and 0.00001 degrees, and weak poses enlarge that by eight."""
+_ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")
+_STATED = re.compile(r"off by ([0-9.]+) mm at most")
+
+Inverse = Callable[[Array], Array]
+"""A firmware's own inverse kinematics: points (n, 3) mm to motor positions (n, 3)."""
+
+
+# The machine
 
 
 @dataclass(frozen=True)
@@ -62,33 +91,35 @@ def delta_of(machine: Machine, program: str) -> Delta:
 
     program : who asks, for the sentence.
     """
-    kinds = {leg.base.joint for leg in machine.document.legs}
-    if machine.document.motion != "translation" or kinds not in ({"slider"}, {"crank"}):
-        found = f"{machine.n_legs} legs on {', '.join(sorted(kinds))} joints"
-        raise _no_delta(machine, program, f"motion {machine.document.motion}, {found}")
-    tables = tables_of(machine)
-    if tables.n_rods != 3 or tables.n_joints != 3 or tables.floating.any():
-        raise _no_delta(machine, program, f"{tables.n_rods} rods, {tables.n_joints} motors")
-    ranges = tables.ranges[tables.joint]
+    limbs, motion = limbs_of(machine), machine.document.motion
+    if motion != "translation" or set(limbs.drive) not in ({SLIDE}, {TURN}):
+        joints = sorted({leg.base.joint for leg in machine.document.legs})
+        found = f"motion {motion}, {machine.n_legs} legs on {', '.join(joints)} joints"
+        raise _no_delta(machine, program, found)
+    rods = rods_of(machine)
+    if len(rods) != 3 or machine.n_joints != 3 or FLOAT in rods.held:
+        raise _no_delta(machine, program, f"{len(rods)} rods, {machine.n_joints} motors")
+    ranges = machine.joint_ranges[rods.joint]
     if not np.isfinite(ranges).all():
         raise InputError(
             f"mechanism {machine.name!r} gives no range for a motor, so its ends are not known",
             expected="range: [min, max] at every slider or crank",
             next_step="Add the ranges: the firmware's end switches are put at their upper ends",
         )
-    kind = KINDS[int(tables.kind[0])]
-    rate, zero = _towers(tables) if kind == "linear" else _arms(tables, ranges.mean(axis=1))
+    linear = rods.drive[0] == SLIDE
+    rate, zero = _towers(rods) if linear else _arms(rods, ranges.mean(axis=1))
     if np.isnan(zero).any():
-        what = "towers that lean" if kind == "linear" else "arms that do not swing outwards"
+        what = "towers that lean" if linear else "arms that do not swing outwards"
         raise _no_delta(machine, program, what)
-    poses, readings, by_reading = workspace(machine, tables)
+    arm = np.ones(3) if linear else np.sqrt(dot(rods.arm, rods.arm))
+    poses, readings, by_reading = _workspace(machine, rods.joint, arm)
     return Delta(
         machine=machine,
-        kind=kind,
-        joint=tables.joint,
-        hinge=tables.base - tables.arm_fixed @ machine.home()[:3, :3].T,
-        arm=tables.arm,
-        rod=tables.length,
+        kind="linear" if linear else "rotary",
+        joint=rods.joint,
+        hinge=rods.base - rods.platform @ machine.home()[:3, :3].T,
+        arm=arm,
+        rod=rods.length,
         rate=rate,
         zero=zero,
         ends=np.where(rate > 0, ranges[:, 1], ranges[:, 0]),
@@ -108,36 +139,28 @@ def _no_delta(machine: Machine, program: str, found: str) -> InputError:
     )
 
 
-def _towers(t: Tables) -> tuple[Array, Array]:
+def _towers(rods: Limbs) -> tuple[Array, Array]:
     """Rate (mm/m) and zero (mm) of ideal towers; NaN where they lean."""
-    up = t.along[:, 2]
-    sign = np.sign(up)
-    zero = np.where(np.abs(up) > UPRIGHT, MM * t.base[:, 2], np.nan)
-    return sign * MM, zero
+    up = rods.axis[:, 2]
+    return np.sign(up) * MM, np.where(np.abs(up) > UPRIGHT, MM * rods.base[:, 2], np.nan)
 
 
-def _arms(t: Tables, middle: Array) -> tuple[Array, Array]:
-    """Rate (degree/rad) and zero (degrees) of ideal arms; NaN where they are none."""
-    centre = t.base.mean(axis=0)
-    radial = (t.base - centre) * [1, 1, 0]
+def _arms(rods: Limbs, middle: Array) -> tuple[Array, Array]:
+    """Rate (degree/rad) and zero (degrees) of ideal arms, as they are in the middle of their range
+    (3,) rad; NaN where they are none.
+    """
+    radial = (rods.base - rods.base.mean(axis=0)) * [1, 1, 0]
     radial = radial / np.linalg.norm(radial, axis=1, keepdims=True)
-
-    def part(v: Array, w: Array) -> Array:
-        return np.sum(v * w, axis=1)
-
-    plane = np.hypot(part(t.outward, radial), part(t.sideways, radial))
-    turn = middle + t.angle
-    c, s = np.cos(turn), np.sin(turn)
-    out = c * part(t.outward, radial) + s * part(t.sideways, radial)
-    up = c * t.outward[:, 2] + s * t.sideways[:, 2]
-    d_out = c * part(t.sideways, radial) - s * part(t.outward, radial)
-    d_up = c * t.sideways[:, 2] - s * t.outward[:, 2]
-    sign = np.sign(out * d_up - up * d_out)
-    zero = np.arctan2(up, out) - sign * middle
-    return sign * DEGREE, np.where(plane > UPRIGHT, DEGREE * zero, np.nan)
+    size = np.sqrt(dot(rods.arm, rods.arm))[:, None]
+    c, s = np.cos(middle)[:, None], np.sin(middle)[:, None]
+    at, ahead = (c * rods.arm + s * rods.rate) / size, (c * rods.rate - s * rods.arm) / size
+    out, d_out = dot(at, radial), dot(ahead, radial)
+    sign = np.sign(out * ahead[:, 2] - at[:, 2] * d_out)
+    zero = np.arctan2(at[:, 2], out) - sign * middle
+    return sign * DEGREE, np.where(np.hypot(out, d_out) > UPRIGHT, DEGREE * zero, np.nan)
 
 
-def workspace(machine: Machine, tables: Tables) -> tuple[Array, Array, Array]:
+def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Array, Array]:
     """Poses of a grid of readings that are well held, readings by leg, and position by reading."""
     ends = machine.joint_ranges
     axes = [np.linspace(low, high, STEPS) for low, high in ends]
@@ -147,16 +170,16 @@ def workspace(machine: Machine, tables: Tables) -> tuple[Array, Array, Array]:
     back = machine.inverse(poses)
     good = found.converged & (found.singularity > LEAST)
     good &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
-    ways = np.linalg.norm(machine.inverse_jacobian(poses)[:, tables.joint, 3:], axis=-1)
-    good &= np.nan_to_num(ways * tables.arm, nan=np.inf).max(axis=1) < FASTEST
+    ways = np.linalg.norm(machine.inverse_jacobian(poses)[:, joint, 3:], axis=-1)
+    good &= np.nan_to_num(ways * arm, nan=np.inf).max(axis=1) < FASTEST
     if not good.any():
         raise InputError(
             f"mechanism {machine.name!r} closes nowhere within its ranges",
             next_step="Check the ranges in the mechanism file",
         )
     poses = poses[good]
-    by_reading = machine.forward_jacobian(poses)[:, 3:, :][..., tables.joint]
-    return poses, grid[good][:, tables.joint], by_reading
+    by_reading = machine.forward_jacobian(poses)[:, 3:, :][..., joint]
+    return poses, grid[good][:, joint], by_reading
 
 
 def reach(delta: Delta) -> float:
@@ -174,3 +197,318 @@ def reach(delta: Delta) -> float:
     outside = np.flatnonzero(~inside)
     last = outside[0] if outside.size else inside.size
     return float(radii[last - 1]) if last else 0.0
+
+
+# The fit
+
+
+@dataclass(frozen=True)
+class Freedoms:
+    """What a format's parameters leave free.
+
+    nominal : (3,) degrees, the towers' directions; angles : they may differ from it. rods, arms,
+    heights : one for each leg, else one for all. flat : hips at Z = 0, so that Z moves instead.
+    """
+
+    nominal: tuple[float, float, float]
+    angles: bool = True
+    rods: bool = True
+    arms: bool = True
+    heights: bool = True
+    flat: bool = False
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A firmware's parameters, mm and degrees; arrays (3,) in the firmware's order of towers.
+
+    order : the legs of the mechanism file, from 0. angle : tower directions.
+    T_firmware_base : (4, 4) m.
+    largest, rms : mm, error at the tool over the grid, its poses taken as commands.
+    """
+
+    kind: str
+    order: Integers
+    radius: float
+    angle: Array
+    rod: Array
+    arm: Array
+    height: Array
+    rate: Array
+    zero: Array
+    T_firmware_base: Array
+    largest: float = 0.0
+    rms: float = 0.0
+
+    def motors(self, points: Array, near: Array) -> Array:
+        """Motor positions (n, 3) at points (n, 3) mm in the firmware's frame; of an arm's two the
+        one nearest to ``near`` (n, 3) degrees.
+        """
+        angle = self.angle / DEGREE
+        along = points[:, :1] * np.cos(angle) + points[:, 1:2] * np.sin(angle) - self.radius
+        across = points[:, 1:2] * np.cos(angle) - points[:, :1] * np.sin(angle)
+        square = self.rod**2 - across**2
+        if self.kind == "linear":
+            return points[:, 2:] + np.sqrt(np.maximum(square - along**2, 0.0))
+        up = points[:, 2:] - self.height
+        away = np.hypot(along, up)
+        share = (away**2 + self.arm**2 - square) / (2 * self.arm * away)
+        half = np.arccos(np.clip(share, -1.0, 1.0))
+        both = (np.arctan2(up, along) + np.stack([half, -half])) * DEGREE
+        both = both + 360 * np.round((near - both) / 360)
+        return np.where(np.abs(both[0] - near) < np.abs(both[1] - near), both[0], both[1])
+
+
+def fitted(delta: Delta, freedoms: Freedoms, program: str) -> Fit:
+    """The parameters that put the tool nearest to where it should be, over the workspace.
+
+    Raises InputError where they leave an error of more than :data:`REFUSED`.
+    """
+    from scipy.optimize import least_squares
+
+    start = _start(delta, freedoms)
+    packed = _Packed(start, freedoms)
+    points = delta.positions
+    readings = delta.readings[:, start.order]
+    by_reading = MM * delta.by_reading[:, :, start.order]
+
+    def off(x: Array) -> Array:
+        return _tool_error(packed.fit(x), points, readings, by_reading).ravel()
+
+    # central differences: at an exact model the error ends below a nanometre
+    solution = least_squares(off, packed.zeros, jac="3-point", method="lm", xtol=1e-14, ftol=1e-14)
+    found = packed.fit(solution.x)
+    error = np.linalg.norm(_tool_error(found, points, readings, by_reading), axis=1)
+    found = replace(
+        found, largest=float(error.max()), rms=float(np.sqrt(np.mean(np.square(error))))
+    )
+    if not found.largest <= REFUSED:
+        raise InputError(
+            f"{program} cannot follow this machine: its parameters leave the tool off",
+            found=f"{found.largest:.2f} mm",
+            expected=f"at most {REFUSED:g} mm over the workspace",
+            next_step="Set towers or arms nearer to the drawing, or export the machine with --to c",
+        )
+    return found
+
+
+def _tool_error(fit: Fit, positions: Array, readings: Array, by_reading: Array) -> Array:
+    """How far (n, 3) mm the tool goes wrong, to first order, where the firmware commands it."""
+    points = MM * apply(fit.T_firmware_base, positions)
+    own = fit.rate * readings + fit.zero
+    wrong = (fit.motors(points, own) - own) / fit.rate
+    return (by_reading @ wrong[..., None])[..., 0]
+
+
+class _Packed:
+    """Changes of a start's parameters as one vector x, in mm and degrees, zero at the start."""
+
+    def __init__(self, start: Fit, freedoms: Freedoms) -> None:
+        self.start = start
+        rotary = start.kind == "rotary"
+        parts: list[tuple[str, int]] = [("radius", 1), ("zero", 3), ("tilt", 2), ("shift", 2)]
+        parts.append(("rod", 3 if freedoms.rods else 1))
+        parts.append(("angle", 3) if freedoms.angles else ("yaw", 1))
+        if rotary:
+            parts.append(("arm", 3 if freedoms.arms else 1))
+            if freedoms.flat:
+                parts.append(("lift", 1))
+            else:
+                parts.append(("height", 3 if freedoms.heights else 1))
+        self.parts = parts
+        self.zeros = np.zeros(sum(count for _, count in parts))
+
+    def fit(self, x: Array) -> Fit:
+        """The parameters at x."""
+        cuts = np.cumsum([count for _, count in self.parts])[:-1]
+        names = [name for name, _ in self.parts]
+        by = dict(zip(names, np.split(x, cuts), strict=True))
+        own = {
+            name: getattr(self.start, name) + by[name]
+            for name in ("rod", "angle", "arm", "height", "zero")
+            if name in by
+        }
+        turn = np.concatenate([by["tilt"], by.get("yaw", np.zeros(1))]) / DEGREE
+        shift = np.concatenate([by["shift"], by.get("lift", np.zeros(1))]) / MM
+        placed = self.start.T_firmware_base
+        placed = pose(rotation(turn) @ placed[:3, :3], placed[:3, 3] + shift)
+        radius = self.start.radius + float(by["radius"][0])
+        return replace(self.start, radius=radius, T_firmware_base=placed, **own)
+
+
+def _start(delta: Delta, freedoms: Freedoms) -> Fit:
+    """The machine taken as ideal: circle through the three hinges, order by their directions."""
+    hinge = MM * delta.hinge
+    centre = _circle(hinge[:, :2])
+    away = hinge[:, :2] - centre
+    azimuth = np.arctan2(away[:, 1], away[:, 0]) * DEGREE
+    nominal = np.array(freedoms.nominal)
+    order = _order(azimuth, nominal)
+    off = _wrapped(azimuth[order] - nominal)
+    yaw = 0.0 if freedoms.angles else -float(off.mean())
+    height = hinge[order, 2]
+    lift = _lift(delta)
+    if freedoms.flat and delta.kind == "rotary":
+        lift = -float(height.mean())
+    if not freedoms.heights or freedoms.flat:
+        height = np.full(3, height.mean())
+    height = np.zeros(3) if freedoms.flat else height + lift
+    turn = rotation(np.array([0.0, 0.0, yaw / DEGREE]))
+    shift = np.array([0.0, 0.0, lift]) - turn @ np.append(centre, 0.0)
+    each = (freedoms.rods, freedoms.arms)
+    rod, arm = (
+        v[order] if own else np.full(3, v.mean())
+        for v, own in zip((MM * delta.rod, MM * delta.arm), each, strict=True)
+    )
+    zero = delta.zero[order] + (lift if delta.kind == "linear" else 0.0)
+    return Fit(
+        kind=delta.kind,
+        order=order,
+        radius=float(np.linalg.norm(away, axis=1).mean()),
+        angle=nominal + off if freedoms.angles else nominal,
+        rod=rod,
+        arm=arm,
+        height=height,
+        rate=delta.rate[order],
+        zero=zero,
+        T_firmware_base=pose(turn, shift / MM),
+    )
+
+
+def _lift(delta: Delta) -> float:
+    """How far, mm, the firmware's Z is above the base's z: not, or so that no Z is negative."""
+    lowest = float(MM * delta.positions[:, 2].min())
+    return 0.0 if lowest >= 0 else float(np.ceil(-lowest))
+
+
+def _order(azimuth: Array, nominal: Array) -> Integers:
+    """The legs nearest to the nominal directions, of the orders that go anticlockwise."""
+    around = np.argsort(azimuth % 360)
+    first = np.argsort(nominal % 360)
+    place = np.argsort(first)
+    turns = [np.roll(around, k)[place] for k in range(3)]
+    off = [float(np.sum(_wrapped(azimuth[order] - nominal) ** 2)) for order in turns]
+    return turns[int(np.argmin(off))]
+
+
+def _wrapped(angle: Array) -> Array:
+    return (angle + 180) % 360 - 180
+
+
+def _circle(points: Array) -> Array:
+    """Centre (2,) of the circle through three points (3, 2)."""
+    d = points[1:] - points[0]
+    return points[0] + np.linalg.solve(2 * d, np.sum(d**2, axis=1))
+
+
+# The words of the files
+
+
+def mm(value: float) -> str:
+    """A length as firmwares read it."""
+    return _number(value, 4)
+
+
+def degrees(value: float) -> str:
+    """An angle as firmwares read it."""
+    return _number(value, 5)
+
+
+def _number(value: float, digits: int) -> str:
+    text = f"{value:.{digits}f}"
+    return text[1:] if float(text) == 0 and text.startswith("-") else text
+
+
+def about(source: Source, delta: Delta, fit: Fit, names: str, program: str) -> list[str]:
+    """Header lines: conventions, which leg is which motor, the frame, and the error that is left.
+
+    names : the motors' letters, in the firmware's order.
+    """
+    unit, word = ("mm", "m") if fit.kind == "linear" else ("degrees", "rad")
+    motors = [
+        f"Motor {name} is leg {j + 1}, joint {delta.joint[j] + 1}:"
+        f" motor position ({unit}) = {rate:.9g} * reading ({word}) {zero + 0.0:+.6f}."
+        for name, j, rate, zero in zip(names, fit.order, fit.rate, fit.zero, strict=True)
+    ]
+    rows = [
+        f"firmware_from_base row {k + 1}: {' '.join(f'{v:.12g}' for v in np.round(row, 12) + 0.0)}"
+        for k, row in enumerate(_in_mm(fit.T_firmware_base)[:3])
+    ]
+    sort = "Towers" if fit.kind == "linear" else "Arms' angles above the horizontal"
+    return [
+        *source.header(),
+        f"For {program}. Units: mm and degrees. {sort}; the rod's length is a value of its own.",
+        *motors,
+        "The firmware's frame: p_firmware = firmware_from_base p_base, mm. The point that moves is"
+        " the platform frame's origin; a tool's length below it is not in these values.",
+        *rows,
+        f"{error_sentence(fit, program)} Compared over {len(delta.poses)} poses of the workspace.",
+        "End switches are taken to be at the upper end of each motor's range in the mechanism"
+        f" file: readings {', '.join(f'{q:.6g}' for q in delta.ends[fit.order])} {word}."
+        " Where a switch is elsewhere, add the difference to that motor's value below.",
+    ]
+
+
+def _in_mm(transform: Array) -> Array:
+    out = np.array(transform)
+    out[:3, 3] *= MM
+    return out
+
+
+def error_sentence(fit: Fit, program: str) -> str:
+    """How well the settings follow the machine; rounded up, so that it holds."""
+    largest = math.ceil(fit.largest * 1e3) / 1e3
+    return (
+        f"{program}'s model follows this machine with the tool off by {largest:.3f} mm at most,"
+        f" {fit.rms:.3f} mm root mean square."
+    )
+
+
+def end_motors(delta: Delta, fit: Fit) -> Array:
+    """Motor positions (3,) at the end switches, in the firmware's order."""
+    return fit.rate * delta.ends[fit.order] + fit.zero
+
+
+def placed(text: str) -> Array:
+    """``firmware_from_base`` read again from a text, (4, 4), its shift in m."""
+    out = np.eye(4)
+    rows = _ROW.findall(text)
+    out[:3] = [[float(word) for word in row.split()] for row in rows]
+    out[:3, 3] /= MM
+    return out
+
+
+def stated(text: str) -> float:
+    """The error that a text admits, m."""
+    found = _STATED.search(text)
+    return float(found.group(1)) / MM if found else 0.0
+
+
+def tool_difference(text: str, delta: Delta, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
+    """The firmware's formulas on the text's values, the machine's own forward kinematics after.
+
+    zero : (3,) motor positions at reading zero by the text's end switches.
+    """
+    points = MM * apply(placed(text), delta.positions)
+    readings = np.zeros_like(delta.readings)
+    readings[:, delta.joint[fit.order]] = (inverse(points) - zero) / fit.rate
+    result = delta.machine.forward_result(np.nan_to_num(readings, nan=1e3), delta.poses)
+    off = np.linalg.norm(result.T_base_platform[:, :3, 3] - delta.positions, axis=1)
+    largest = float(np.where(result.converged, off, np.inf).max())
+    told = stated(text)
+    return Difference(
+        f"tool over {len(delta.poses)} poses by the firmware's formulas",
+        largest,
+        # the fit is judged to first order, so a large error may be a fiftieth larger
+        1.02 * told + ROUNDING,
+    )
+
+
+def follows(fit: Fit, program: str) -> Finding:
+    """The note on how well, a doubt where it is not well."""
+    text = error_sentence(fit, program)
+    if fit.largest > FOLLOWS:
+        cause = "towers that are not parallel" if fit.kind == "linear" else "tilted arms"
+        text += f" It has no values for {cause} and the like; --to c has them all."
+        return Finding(Level.DOUBTFUL, text)
+    return Finding(Level.NOTE, text)

@@ -15,12 +15,24 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.contract import Difference, Exporter
-from pkmcal.export.delta import DEGREE, MM, Delta, delta_of, reach
-from pkmcal.export.delta_fit import Fit, Freedoms, fitted
-from pkmcal.export.delta_text import about, degrees, end_motors, follows, mm, tool_difference
+from pkmcal.export.contract import Difference, Exporter, commented
+from pkmcal.export.delta import (
+    DEGREE,
+    MM,
+    Delta,
+    Fit,
+    Freedoms,
+    about,
+    degrees,
+    delta_of,
+    end_motors,
+    fitted,
+    follows,
+    mm,
+    reach,
+    tool_difference,
+)
 from pkmcal.export.source import Source
-from pkmcal.export.text import commented
 from pkmcal.outcome import Finding
 
 FILE = "pkmcal_printer.cfg"

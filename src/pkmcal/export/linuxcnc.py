@@ -4,6 +4,12 @@ Meaning of the pins: LinuxCNC's src/emc/kinematics. genhexkins' joint is the str
 ``base.N`` to ``platform.N``; A, B, C are roll, pitch and yaw in degrees, R = Rz(C) Ry(B) Rx(A).
 With HOME_ABSOLUTE_ENCODER a joint is at the encoder's position plus HOME_OFFSET (homing.c), so
 offsets stand there.
+
+Both delta modules know ideal deltas alone: one radius, one length of rods, towers 120 degrees
+apart; they are fitted. Joint 0 of lineardeltakins is the tower at (0, R), joints 1 and 2 are at 210
+and 330 degrees; rotarydeltakins' arms are at -90, 30 and 150 degrees, and turn downwards
+(lineardeltakins-common.h, rotarydeltakins-common.h; some older rotarydeltakins exchange joints 1
+and 2).
 """
 
 from __future__ import annotations
@@ -15,23 +21,37 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.c_tables import Tables, tables_of
-from pkmcal.export.contract import Difference, Exporter
-from pkmcal.export.delta import DEGREE, MM
-from pkmcal.export.linuxcnc_delta import delta_check, delta_files, delta_notes
-from pkmcal.export.samples import samples
-from pkmcal.export.source import Source
-from pkmcal.export.text import commented, exact, sigma_lines
+from pkmcal.export.contract import Difference, Exporter, commented, exact, largest
+from pkmcal.export.delta import (
+    DEGREE,
+    MM,
+    Delta,
+    Fit,
+    Freedoms,
+    about,
+    degrees,
+    delta_of,
+    fitted,
+    follows,
+    mm,
+    tool_difference,
+)
+from pkmcal.export.limbs import Limbs, rods_of
+from pkmcal.export.source import Source, samples
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Finding, Level
 
 HAL, INI = "pkmcal_kinematics.hal", "pkmcal_kinematics.ini"
+PROGRAM = "LinuxCNC"
+LINEAR = Freedoms((90.0, 210.0, 330.0), angles=False, rods=False)
+ROTARY = Freedoms((-90.0, 30.0, 150.0), angles=False, rods=False, arms=False, flat=True)
 STRUTS = 6
 MAX_ERROR = 500.0
 """genhexkins' own limit on the sum of the struts' errors, beyond which it gives up."""
 ROUNDING = 1e-12
 """m: pins hold 17 digits; angles go through degrees and back."""
-_SETP = re.compile(r"^setp genhexkins\.(base|platform)\.(\d)\.([xyz]) (\S+)$", re.M)
+_STRUT = re.compile(r"^setp genhexkins\.(base|platform)\.(\d)\.([xyz]) (\S+)$", re.M)
+_PIN = re.compile(r"^setp \w+deltakins\.(\w+) (\S+)$", re.M)
 _OFFSET = re.compile(r"^HOME_OFFSET = (\S+)$", re.M)
 
 
@@ -45,29 +65,33 @@ class LinuxCnc(Exporter):
     def files(self, source: Source) -> dict[str, str]:
         """A HAL file and words for the INI file."""
         if source.machine.document.motion == "translation":
-            return dict(zip((HAL, INI), delta_files(source), strict=True))
-        tables = _hexapod(source.machine)
-        return {HAL: _hal(source, tables), INI: _ini(source, tables)}
+            delta, fit = _fit(source)
+            return {HAL: _delta_hal(source, delta, fit), INI: _delta_ini(source, delta, fit)}
+        struts = _hexapod(source.machine)
+        return {HAL: _hal(source, struts), INI: _ini(source, struts)}
 
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
-        """The pins and words read again, and genhexkins' own inverse kinematics."""
-        if source.machine.document.motion == "translation":
-            return delta_check(files[HAL], files[INI], source)
-        poses, readings = samples(source.machine)
+        """Pins and words read again, moved by LinuxCNC's own formulas."""
+        hal, machine = files[HAL], source.machine
         offsets = np.array([float(word) for word in _OFFSET.findall(files[INI])])
-        joints = genhexkins(files[HAL], world(poses))
-        off = np.abs((joints - offsets) / MM - readings).max()
+        if machine.document.motion == "translation":
+            delta, fit = _fit(source)
+            pins = {name: float(value) for name, value in _PIN.findall(hal)}
+            if fit.kind == "linear":
+                return [tool_difference(hal, delta, fit, lambda p: linear_joints(pins, p), offsets)]
+            # motors count upwards, LinuxCNC's joints downwards
+            return [tool_difference(hal, delta, fit, lambda p: -rotary_joints(pins, p), -offsets)]
+        poses, readings = samples(machine)
+        off = largest((genhexkins(hal, world(poses)) - offsets) / MM, readings)
         return [
-            Difference(
-                f"readings at {len(poses)} poses by genhexkins' formulas", float(off), ROUNDING
-            )
+            Difference(f"readings at {len(poses)} poses by genhexkins' formulas", off, ROUNDING)
         ]
 
     def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
-        """Where offsets went."""
+        """Where offsets went, or how well the pins follow the machine."""
         del files
         if source.machine.document.motion == "translation":
-            return delta_notes(source)
+            return (follows(_fit(source)[1], PROGRAM),)
         return (
             Finding(
                 Level.NOTE,
@@ -77,27 +101,32 @@ class LinuxCnc(Exporter):
         )
 
 
-def _hexapod(machine: Machine) -> Tables:
-    """The machine's numbers where genhexkins can express it; else InputError."""
-    carriers = {leg.base.joint for leg in machine.document.legs}
-    driven = bool(machine.layout.rod_reads[machine.layout.closing].all())
-    rods = int(machine.layout.closing.sum())
-    axes = len(machine.layout.angles)
-    ok = machine.document.motion == "spatial" and rods == STRUTS and driven and not axes
-    if not ok or machine.layout.n_internal:
+# Hexapods
+
+
+def _hexapod(machine: Machine) -> Limbs:
+    """The struts in the order of the joints where genhexkins can express the machine; else
+    InputError.
+    """
+    layout = machine.layout
+    rods, axes = int(layout.closing.sum()), len(layout.angles)
+    ok = machine.document.motion == "spatial" and rods == STRUTS and not axes
+    if not ok or not layout.rod_reads[layout.closing].all() or layout.n_internal:
+        joints = sorted({leg.base.joint for leg in machine.document.legs})
         raise InputError(
             f"LinuxCNC's genhexkins moves six telescopic legs on fixed joints, and mechanism"
             f" {machine.name!r} is another machine",
-            found=f"motion {machine.document.motion}, {rods} rods on {', '.join(sorted(carriers))}"
-            f" joints, {int(machine.layout.rod_reads.sum())} of them telescopic"
+            found=f"motion {machine.document.motion}, {rods} rods on {', '.join(joints)}"
+            f" joints, {int(layout.rod_reads.sum())} of them telescopic"
             + (f", {axes} equations of axes" if axes else ""),
             expected="a hexapod; or a linear or rotary delta, for lineardeltakins, rotarydeltakins",
             next_step="Export it with --to c, and build a kinematics module from that",
         )
-    return tables_of(machine)
+    struts = rods_of(machine)
+    return struts.of(np.argsort(struts.joint))
 
 
-def _about(source: Source) -> tuple[str, ...]:
+def _hexapod_header(source: Source) -> tuple[str, ...]:
     return source.header(
         "Units: mm and degrees. Strut N is joint N; base.N in the base frame, platform.N in the"
         " platform frame.",
@@ -107,19 +136,24 @@ def _about(source: Source) -> tuple[str, ...]:
     )
 
 
-def _hal(source: Source, t: Tables) -> str:
-    order = np.argsort(t.joint)
-    limit = max(MAX_ERROR, STRUTS * float(np.nanmax(_limits(t), initial=0.0)))
+def _limits(machine: Machine, struts: Limbs) -> Array:
+    """Smallest and largest strut lengths (6, 2) mm."""
+    return MM * (machine.joint_ranges[struts.joint] + struts.length[:, None])
+
+
+def _hal(source: Source, struts: Limbs) -> str:
+    limits = _limits(source.machine, struts)
+    limit = max(MAX_ERROR, STRUTS * float(np.nanmax(limits, initial=0.0)))
     lines = [
-        commented((*_about(source), "", *sigma_lines(source, ("center", "offset"))), "#"),
+        commented((*_hexapod_header(source), "", *source.sigma_lines(("center", "offset"))), "#"),
         "loadrt genhexkins\n",
     ]
-    for n, rod in enumerate(order):
-        lines.append(f"# strut {n}: leg {t.leg[rod]} of the mechanism file")
-        for name, values in (("base", t.base), ("platform", t.arm_fixed)):
+    for n, leg in enumerate(struts.leg):
+        lines.append(f"# strut {n}: leg {leg} of the mechanism file")
+        for name, values in (("base", struts.base), ("platform", struts.platform)):
             lines += [
                 f"setp genhexkins.{name}.{n}.{axis} {exact(MM * value)}"
-                for axis, value in zip("xyz", values[rod].tolist(), strict=True)
+                for axis, value in zip("xyz", values[n].tolist(), strict=True)
             ]
     lines += [
         "",
@@ -135,19 +169,12 @@ def _hal(source: Source, t: Tables) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _limits(t: Tables) -> Array:
-    """Smallest and largest strut lengths (6, 2) mm in the order of the joints."""
-    order = np.argsort(t.joint)
-    return MM * (t.ranges[t.joint[order]] + t.length[order, None])
-
-
-def _ini(source: Source, t: Tables) -> str:
-    order = np.argsort(t.joint)
-    home = world(t.home[None])[0]
+def _ini(source: Source, struts: Limbs) -> str:
+    home = world(source.machine.home()[None])[0]
     lines = [
         commented(
             (
-                *_about(source),
+                *_hexapod_header(source),
                 "HOME_OFFSET holds for absolute encoders that read 1000 * reading. With a home"
                 " switch, set HOME_ABSOLUTE_ENCODER = 0 and add 1000 * the reading at the switch.",
             ),
@@ -158,9 +185,9 @@ def _ini(source: Source, t: Tables) -> str:
         "# where forward kinematics begins",
         f"HOME = {' '.join(f'{v:.6f}' for v in home + 0.0)}",
     ]
-    for n, (rod, (low, high)) in enumerate(zip(order, _limits(t).tolist(), strict=True)):
+    for n, (low, high) in enumerate(_limits(source.machine, struts).tolist()):
         lines.append(f"\n[JOINT_{n}]\nTYPE = LINEAR\nHOME_ABSOLUTE_ENCODER = 2")
-        lines.append(f"HOME_OFFSET = {exact(float(MM * t.length[rod]))}")
+        lines.append(f"HOME_OFFSET = {exact(float(MM * struts.length[n]))}")
         if np.isfinite(low) and np.isfinite(high):
             lines.append(f"MIN_LIMIT = {low:.4f}\nMAX_LIMIT = {high:.4f}")
     return "\n".join(lines) + "\n"
@@ -179,7 +206,7 @@ def world(poses: Array) -> Array:
 def genhexkins(hal: str, pose: Array) -> Array:
     """Joints (n, 6) mm at X, Y, Z, A, B, C (n, 6), by the pins that a HAL file sets."""
     pins = {name: np.zeros((STRUTS, 3)) for name in ("base", "platform")}
-    for name, strut, axis, value in _SETP.findall(hal):
+    for name, strut, axis, value in _STRUT.findall(hal):
         pins[name][int(strut), "xyz".index(axis)] = float(value)
     (sa, sb, sc), (ca, cb, cc) = np.sin(pose[:, 3:].T / DEGREE), np.cos(pose[:, 3:].T / DEGREE)
     rows = [
@@ -190,3 +217,86 @@ def genhexkins(hal: str, pose: Array) -> Array:
     rot = np.array(rows).transpose(2, 0, 1)
     end = pins["platform"] @ rot.transpose(0, 2, 1) + pose[:, None, :3]
     return np.linalg.norm(end - pins["base"], axis=-1)
+
+
+# Deltas
+
+
+def _fit(source: Source) -> tuple[Delta, Fit]:
+    delta = delta_of(source.machine, PROGRAM)
+    return delta, fitted(delta, LINEAR if delta.kind == "linear" else ROTARY, PROGRAM)
+
+
+def _delta_hal(source: Source, delta: Delta, fit: Fit) -> str:
+    lines = about(source, delta, fit, "012", PROGRAM)
+    lines = [line for line in lines if not line.startswith("End switches")]
+    if fit.kind == "linear":
+        pins = [
+            f"setp lineardeltakins.R {mm(fit.radius)}",
+            f"setp lineardeltakins.L {mm(fit.rod[0])}",
+        ]
+    else:
+        lines.append("LinuxCNC's joints are the motors' angles with the other sign: downwards.")
+        pins = [
+            "# of platformradius and footradius the difference alone moves the machine",
+            f"setp rotarydeltakins.platformradius {mm(fit.radius)}",
+            "setp rotarydeltakins.footradius 0.0000",
+            f"setp rotarydeltakins.thighlength {mm(fit.arm[0])}",
+            f"setp rotarydeltakins.shinlength {mm(fit.rod[0])}",
+        ]
+    return "\n".join([commented(lines, "#"), f"loadrt {fit.kind}deltakins", *pins]) + "\n"
+
+
+def _delta_ini(source: Source, delta: Delta, fit: Fit) -> str:
+    linear = fit.kind == "linear"
+    sign = 1.0 if linear else -1.0  # arms count downwards
+    rate, zero = sign * fit.rate, sign * fit.zero
+    word, number = ("LINEAR", mm) if linear else ("ANGULAR", degrees)
+    ini = [
+        commented(
+            (
+                *source.header(),
+                f"Units: mm and degrees. Joint N = rate * reading + HOME_OFFSET; rates are"
+                f" {', '.join(f'{r:.9g}' for r in rate)}, the encoders' scales.",
+                "HOME_OFFSET holds for absolute encoders. With a home switch, set"
+                " HOME_ABSOLUTE_ENCODER = 0 and add rate * the reading at the switch.",
+            ),
+            "#",
+        ),
+        f"[KINS]\nKINEMATICS = {fit.kind}deltakins\nJOINTS = 3\n",
+        "[TRAJ]\nCOORDINATES = XYZ\nLINEAR_UNITS = mm\nANGULAR_UNITS = degree",
+    ]
+    ranges = delta.machine.joint_ranges[delta.joint][fit.order]
+    for n in range(3):
+        ends = np.sort(rate[n] * ranges[n] + zero[n])
+        ini.append(f"\n[JOINT_{n}]\nTYPE = {word}\nHOME_ABSOLUTE_ENCODER = 2")
+        ini.append(f"HOME_OFFSET = {number(zero[n])}")
+        ini.append(f"MIN_LIMIT = {ends[0]:.4f}\nMAX_LIMIT = {ends[1]:.4f}")
+    return "\n".join(ini) + "\n"
+
+
+def linear_joints(pins: dict[str, float], points: Array) -> Array:
+    """Joints (n, 3) mm at points (n, 3) mm."""
+    half, side = 0.5 * pins["R"], np.sqrt(3) / 2 * pins["R"]
+    towers = np.array([[0.0, pins["R"]], [-side, -half], [side, -half]])
+    d = towers - points[:, None, :2]
+    return points[:, 2:] + np.sqrt(pins["L"] ** 2 - d[..., 0] ** 2 - d[..., 1] ** 2)
+
+
+def rotary_joints(pins: dict[str, float], points: Array) -> Array:
+    """Joints (n, 3) degrees at points (n, 3) mm, downwards: joint 0 swings in the YZ plane, the
+    others are it, the point turned.
+    """
+    pfr, thigh, shin, foot = (
+        pins[name] for name in ("platformradius", "thighlength", "shinlength", "footradius")
+    )
+    z = points[:, 2]
+    out: list[Array] = []
+    for turn in (0.0, -120.0, 120.0):
+        c, s = np.cos(turn / DEGREE), np.sin(turn / DEGREE)
+        x, y = points[:, 0] * c - points[:, 1] * s, points[:, 0] * s + points[:, 1] * c
+        a = 0.5 * (x**2 + (y - foot) ** 2 + z**2 + thigh**2 - shin**2 - pfr**2) / z
+        b = (foot - pfr - y) / z
+        knee = (pfr + a * b + np.sqrt(thigh**2 * (b**2 + 1) - (a - b * pfr) ** 2)) / (b**2 + 1)
+        out.append(np.arctan2(b * knee - a, knee - pfr) * DEGREE)
+    return np.stack(out, axis=1)

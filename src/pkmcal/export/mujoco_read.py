@@ -1,39 +1,54 @@
 """A MuJoCo model read again from its text, with kinematics of its own.
 
-Nothing here knows a machine: bodies, joints and equality constraints mean what MuJoCo's
-documentation of MJCF says of them, as far as :mod:`pkmcal.export.mujoco_model` uses them.
+MuJoCo itself need not be there for an export, so that what is written is tested by this: bodies,
+joints and equality constraints as MuJoCo's documentation of MJCF tells them, as far as
+:mod:`pkmcal.export.mujoco_model` uses them. Nothing here knows a machine.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 from xml.etree.ElementTree import Element, fromstring
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
-from pkmcal.geometry.rigid import cross, pose, rotation, rotation_vector
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.export.contract import rotation_of
+from pkmcal.geometry.rigid import (
+    apply,
+    inverse,
+    perturb,
+    pose,
+    pose_difference,
+    rotation,
+    rotation_vector,
+)
 
+ZERO = np.zeros(3)
 STEPS = 30
 CLOSED = 1e-13
 """m or rad of a step below which nothing changes any more."""
+SMALL = 1e-7
+"""m or rad, of the differences that derivatives are taken from: right to as much."""
+DEPENDENT = 1e-6
+"""Share of the largest singular value below which constraints say the same; above that error."""
 
 
-@dataclass(frozen=True)
-class ReadJoint:
-    """A joint: ``hinge``, ``slide`` or ``free``; axis (3,) in its body's frame; first freedom."""
+class ReadJoint(NamedTuple):
+    """A ``hinge``, ``slide`` or ``free`` joint; axis (3,) in its body's frame; first freedom; its
+    value as drawn (a free joint's is none).
+    """
 
     name: str
     kind: str
     axis: Array
-    ref: float
-    body: int
     dof: int
+    ref: float
 
 
-@dataclass(frozen=True)
-class ReadBody:
+class ReadBody(NamedTuple):
     """A body: its parent's number (0 is the world), place in it as drawn (4, 4), and joints."""
 
     name: str
@@ -42,65 +57,85 @@ class ReadBody:
     joints: tuple[ReadJoint, ...]
 
 
-@dataclass(frozen=True)
-class Loop:
-    """``connect`` or ``weld``: points (3,) in the two bodies' frames that coincide, and of a weld
-    the second's orientation in the first (3, 3).
+class Loop(NamedTuple):
+    """Two bodies' frames, moved to where they meet (4, 4) each, that coincide: their points in a
+    ``connect``, their orientations as well in a ``weld``.
     """
 
     kind: str
     bodies: tuple[int, int]
-    points: tuple[Array, Array]
-    rot: Array
+    frames: tuple[Array, Array]
 
 
 @dataclass(frozen=True)
 class ReadModel:
-    """What a text says. n_dofs : freedoms. couplings : (joint, joint, ratio) by dofs.
+    """What a text says.
 
-    sites, radii : points (body, (3,)) and cylinders' radii (m) by name. actuated : dofs of the
-    actuators' joints, in order. ctrl : (m,) their values in the keyframe.
+    A state x (..., d) has each freedom's value, m or rad: a free joint's are the rotation vector
+    from its body's drawn orientation, and the shift. drawn, key : the states as drawn, and in the
+    keyframe. couplings : (joint, joint, ratio) by freedoms. sites, radii : points (body, (3,)) and
+    cylinders' radii (m) by name. actuated : freedoms of the actuators' joints, in order;
+    ctrl : (m,) their values in the keyframe.
     """
 
     bodies: tuple[ReadBody, ...]
-    n_dofs: int
+    drawn: Array
     loops: tuple[Loop, ...]
     couplings: tuple[tuple[int, int, float], ...]
     sites: dict[str, tuple[int, Array]]
     radii: dict[str, float]
-    actuators: tuple[str, ...]
-    actuated: tuple[int, ...]
+    actuated: Integers
     ctrl: Array
-    key: State
+    key: Array
 
-    def number(self, name: str) -> int:
-        """A body's number by its name."""
-        return next(k for k, b in enumerate(self.bodies) if b.name == name)
+    def places(self, x: Array) -> dict[str, Array]:
+        """Poses (..., 4, 4) of all bodies by name, world frame."""
+        names = (body.name for body in self.bodies)
+        return dict(zip(names, _placed(self.bodies, x), strict=True))
 
-    def joints(self) -> Iterator[ReadJoint]:
-        """All joints in order."""
-        for part in self.bodies:
-            yield from part.joints
+    def site_places(self, x: Array) -> dict[str, Array]:
+        """Where the named points are, (..., 3) m, world frame."""
+        at = _placed(self.bodies, x)
+        return {name: apply(at[body], point) for name, (body, point) in self.sites.items()}
 
+    def gaps(self, x: Array) -> Array:
+        """What is left of the equality constraints (..., E), m and rad."""
+        at, out = _placed(self.bodies, x), list[Array]()
+        for loop in self.loops:
+            first, second = (at[k] @ T for k, T in zip(loop.bodies, loop.frames, strict=True))
+            out.append(first[..., :3, 3] - second[..., :3, 3])
+            if loop.kind == "weld":
+                turn = first[..., :3, :3] @ second[..., :3, :3].swapaxes(-1, -2)
+                out.append(rotation_vector(turn))
+        away = x - self.drawn
+        for first, second, ratio in self.couplings:
+            out.append((away[..., first] - ratio * away[..., second])[..., None])
+        return np.concatenate(out, axis=-1)
 
-@dataclass(frozen=True)
-class State:
-    """Joints' values by freedom (n_dofs,), without meaning for a free joint's: it has its body's
-    pose (4, 4) in ``free``.
-    """
+    def closed(self, x: Array, held: Booleans, goal: Array | None = None) -> Array:
+        """States (n, d) with their loops closed by Gauss-Newton; held : (d,) freedoms that stay.
 
-    x: Array
-    free: dict[int, Array] = field(default_factory=lambda: dict[int, Array]())
+        goal : (n, 4, 4) poses that the body ``platform`` shall take besides.
+        """
 
+        def left(x: Array) -> Array:
+            gaps = self.gaps(x)
+            if goal is None:
+                return gaps
+            wanted = goal if x.ndim == 2 else goal[:, None]
+            off = pose_difference(self.places(x)["platform"], wanted)
+            return np.concatenate([gaps, off], axis=-1)
 
-@dataclass(frozen=True)
-class _Placed:
-    """Bodies' poses (4, 4), and each freedom's axis (3,), anchor (3,), and whether it turns."""
-
-    T_world_body: list[Array]
-    axis: Array
-    anchor: Array
-    turns: Booleans
+        steps = SMALL * np.eye(x.shape[-1])[~held]
+        for _ in range(STEPS):
+            value = left(x)
+            by_freedom = (left(x[:, None] + steps) - value[:, None]).swapaxes(-1, -2) / SMALL
+            step = np.linalg.pinv(by_freedom, rcond=DEPENDENT) @ value[..., None]
+            x = x.copy()
+            x[:, ~held] -= step[..., 0]
+            if np.abs(step).max() < CLOSED:
+                break
+        return x
 
 
 def read(text: str) -> ReadModel:
@@ -111,119 +146,33 @@ def read(text: str) -> ReadModel:
     radii: dict[str, float] = {}
     world = root.find("worldbody")
     dofs = 0 if world is None else _collect(world, 0, bodies, 0, sites, radii)
-    joints = {j.name: j for b in bodies for j in b.joints}
-    drawn = State(
-        _drawn(bodies, dofs), {k: b.T_parent_body for k, b in enumerate(bodies) if _is_free(b)}
-    )
-    placed = _place(bodies, dofs, drawn)
-    names = {b.name: k for k, b in enumerate(bodies)}
+    joints = {j.name: j for body in bodies for j in body.joints}
+    drawn = np.zeros(dofs)
+    for j in joints.values():
+        drawn[j.dof] = j.ref
+    at = dict(zip((body.name for body in bodies), enumerate(_placed(bodies, drawn)), strict=True))
     nodes = [node for part in root.findall("equality") for node in part]
-    loops = [_loop(n, names, placed) for n in nodes if n.tag in ("connect", "weld")]
-    couplings = [
-        (joints[n.attrib["joint1"]].dof, joints[n.attrib["joint2"]].dof, _vector(n, "polycoef")[1])
-        for n in nodes
-        if n.tag == "joint"
-    ]
     drives = root.findall("actuator/position")
     key = root.find("keyframe/key")
     return ReadModel(
         tuple(bodies),
-        dofs,
-        tuple(loops),
-        tuple(couplings),
+        drawn,
+        tuple(_loop(n, at) for n in nodes if n.tag in ("connect", "weld")),
+        tuple(
+            (
+                joints[n.attrib["joint1"]].dof,
+                joints[n.attrib["joint2"]].dof,
+                float(_vector(n, "polycoef")[1]),
+            )
+            for n in nodes
+            if n.tag == "joint"
+        ),
         sites,
         radii,
-        tuple(n.attrib["name"] for n in drives),
-        tuple(joints[n.attrib["joint"]].dof for n in drives),
+        np.array([joints[n.attrib["joint"]].dof for n in drives], dtype=int),
         np.zeros(0) if key is None else _vector(key, "ctrl"),
-        drawn if key is None else _of_qpos(bodies, dofs, _vector(key, "qpos")),
+        drawn if key is None else _of_qpos(bodies, drawn, _vector(key, "qpos")),
     )
-
-
-def site_places(model: ReadModel, state: State) -> dict[str, Array]:
-    """Where the named points are, (3,) m, world frame."""
-    at = _place(model.bodies, model.n_dofs, state).T_world_body
-    return {name: _apply(at[k], p) for name, (k, p) in model.sites.items()}
-
-
-def body_pose(model: ReadModel, state: State, name: str) -> Array:
-    """A body's pose (4, 4) in the world frame."""
-    return _place(model.bodies, model.n_dofs, state).T_world_body[model.number(name)]
-
-
-def constraints(model: ReadModel, state: State) -> tuple[Array, Array]:
-    """The equality constraints' residuals (E,), m and rad, and their derivatives (E, n_dofs) by
-    changes as in :func:`moved`; a weld's turn is differentiated where it is closed.
-    """
-    placed = _place(model.bodies, model.n_dofs, state)
-    values: list[Array] = []
-    rows: list[Array] = []
-    drawn = _drawn(list(model.bodies), model.n_dofs)
-    for loop in model.loops:
-        (k1, k2), (p1, p2) = loop.bodies, loop.points
-        T1, T2 = placed.T_world_body[k1], placed.T_world_body[k2]
-        w1, w2 = _apply(T1, p1), _apply(T2, p2)
-        sign = _chain(model, k1).astype(float) - _chain(model, k2)
-        arms = np.where(_chain(model, k1)[:, None], w1, w2) - placed.anchor
-        swept = np.where(placed.turns[:, None], cross(placed.axis, arms), placed.axis)
-        values.append(w1 - w2)
-        rows.append((sign[:, None] * swept).T)
-        if loop.kind == "weld":
-            values.append(rotation_vector(T1[:3, :3] @ loop.rot @ T2[:3, :3].T))
-            rows.append((sign[:, None] * placed.turns[:, None] * placed.axis).T)
-    for first, second, ratio in model.couplings:
-        x = state.x - drawn
-        values.append(np.array([x[first] - ratio * x[second]]))
-        row = np.zeros(model.n_dofs)
-        row[first], row[second] = 1.0, -ratio
-        rows.append(row[None])
-    return np.concatenate(values), np.concatenate(rows)
-
-
-def closed(model: ReadModel, state: State, held: Booleans) -> State:
-    """The state with its loops closed by Gauss-Newton; held : (n_dofs,) freedoms that stay."""
-    for _ in range(STEPS):
-        value, by_dof = constraints(model, state)
-        step = np.zeros(model.n_dofs)
-        step[~held] = -np.linalg.lstsq(by_dof[:, ~held], value, rcond=1e-10)[0]
-        state = moved(model, state, step)
-        if np.abs(step).max() < CLOSED:
-            break
-    return state
-
-
-def moved(model: ReadModel, state: State, step: Array) -> State:
-    """The state after small changes (n_dofs,); a free joint's are (omega, tau), world frame."""
-    free = dict(state.free)
-    for j in model.joints():
-        if j.kind == "free":
-            d, T = step[j.dof : j.dof + 6], free[j.body]
-            free[j.body] = pose(rotation(d[:3]) @ T[:3, :3], T[:3, 3] + d[3:])
-    return State(state.x + step, free)
-
-
-def platform_dofs(model: ReadModel) -> Booleans:
-    """(n_dofs,) which freedoms are the body ``platform``'s."""
-    out = np.zeros(model.n_dofs, dtype=bool)
-    for j in model.bodies[model.number("platform")].joints:
-        out[j.dof : j.dof + _width(j.kind)] = True
-    return out
-
-
-def with_platform(model: ReadModel, state: State, T: Array) -> State:
-    """The state with the body ``platform`` as near to a pose (4, 4) as its freedoms allow."""
-    number = model.number("platform")
-    if number in state.free:
-        return State(state.x, {**state.free, number: T})
-    x = state.x.copy()
-    for _ in range(2):  # the turn moves no axis of a slide, so one would do but for rounding
-        placed = _place(model.bodies, model.n_dofs, State(x, state.free))
-        here = placed.T_world_body[number]
-        omega = rotation_vector(T[:3, :3] @ here[:3, :3].T)
-        for j in model.bodies[number].joints:
-            wanted = omega if j.kind == "hinge" else T[:3, 3] - here[:3, 3]
-            x[j.dof] += placed.axis[j.dof] @ wanted
-    return State(x, state.free)
 
 
 def _collect(
@@ -241,116 +190,72 @@ def _collect(
         if "name" in geom.attrib:
             radii[geom.attrib["name"]] = float(_vector(geom, "size")[0])
     for child in node.findall("body"):
-        me = len(bodies)
-        joints: list[ReadJoint] = []
+        me, joints = len(bodies), list[ReadJoint]()
         for j in child:
             if j.tag in ("joint", "freejoint"):
                 kind = "free" if j.tag == "freejoint" else j.attrib["type"]
                 axis = _vector(j, "axis", "0 0 1")
                 axis = axis / np.linalg.norm(axis)
                 ref = float(j.get("ref", "0"))
-                joints.append(ReadJoint(j.attrib["name"], kind, axis, ref, me, dofs))
-                dofs += _width(kind)
-        place = pose(_matrix(_vector(child, "quat", "1 0 0 0")), _vector(child, "pos", "0 0 0"))
+                joints.append(ReadJoint(j.attrib["name"], kind, axis, dofs, ref))
+                dofs += 6 if kind == "free" else 1
+        place = _pose(_vector(child, "pos", "0 0 0"), _vector(child, "quat", "1 0 0 0"))
         bodies.append(ReadBody(child.attrib["name"], number, place, tuple(joints)))
         dofs = _collect(child, me, bodies, dofs, sites, radii)
     return dofs
 
 
-def _width(kind: str) -> int:
-    return 6 if kind == "free" else 1
-
-
-def _is_free(body: ReadBody) -> bool:
-    return any(j.kind == "free" for j in body.joints)
-
-
-def _drawn(bodies: list[ReadBody], n_dofs: int) -> Array:
-    x = np.zeros(n_dofs)
-    for part in bodies:
-        for j in part.joints:
-            x[j.dof] = j.ref
-    return x
-
-
-def _of_qpos(bodies: list[ReadBody], n_dofs: int, qpos: Array) -> State:
-    """A keyframe: scalars, and of a free joint its place and quaternion."""
-    x, free, at = np.zeros(n_dofs), dict[int, Array](), 0
-    for number, part in enumerate(bodies):
-        for j in part.joints:
-            if j.kind == "free":
-                free[number] = pose(_matrix(qpos[at + 3 : at + 7]), qpos[at : at + 3])
-                at += 7
-            else:
-                x[j.dof] = qpos[at]
-                at += 1
-    return State(x, free)
-
-
-def _place(bodies: list[ReadBody] | tuple[ReadBody, ...], n_dofs: int, state: State) -> _Placed:
-    """Where everything is: joints act one after the other, each in the frame so far."""
-    at: list[Array] = []
-    axis, anchor = np.zeros((n_dofs, 3)), np.zeros((n_dofs, 3))
-    turns = np.zeros(n_dofs, dtype=bool)
-    for number, part in enumerate(bodies):
-        here = at[part.parent] @ part.T_parent_body if number else np.eye(4)
-        for j in part.joints:
-            if j.kind == "free":
-                here = state.free[number]
-                axis[j.dof : j.dof + 6] = np.concatenate([np.eye(3), np.eye(3)])
-                turns[j.dof : j.dof + 3] = True
-                anchor[j.dof : j.dof + 6] = here[:3, 3]
-                continue
-            value = state.x[j.dof] - j.ref
-            axis[j.dof], anchor[j.dof] = here[:3, :3] @ j.axis, here[:3, 3]
-            turns[j.dof] = j.kind == "hinge"
-            turn, way = (value, 0.0) if j.kind == "hinge" else (0.0, value)
-            here = here @ pose(rotation(turn * j.axis), way * j.axis)
-        at.append(here)
-    return _Placed(at, axis, anchor, turns)
-
-
-def _loop(node: Element, names: dict[str, int], placed: _Placed) -> Loop:
+def _loop(node: Element, at: dict[str, tuple[int, Array]]) -> Loop:
     """A closure; the second body's share is taken from the model as drawn, as MuJoCo does.
 
     ``connect``: its anchor is a point of the first body. ``weld``: the second body's origin.
     """
-    first, second = names[node.attrib["body1"]], names[node.attrib["body2"]]
-    T1, T2 = placed.T_world_body[first], placed.T_world_body[second]
-    T_1_2 = np.linalg.inv(T1) @ T2
+    (first, T1), (second, T2) = at[node.attrib["body1"]], at[node.attrib["body2"]]
     if node.tag == "weld":
-        points = (T_1_2[:3, 3], np.zeros(3))
+        frames = inverse(T1) @ T2, np.eye(4)
     else:
-        own = _vector(node, "anchor")
-        points = (own, _apply(np.linalg.inv(T2), _apply(T1, own)))
-    return Loop(node.tag, (first, second), points, T_1_2[:3, :3])
+        anchor = pose(np.eye(3), _vector(node, "anchor"))
+        frames = anchor, inverse(T2) @ T1 @ anchor
+    return Loop(node.tag, (first, second), frames)
 
 
-def _chain(model: ReadModel, number: int) -> Booleans:
-    """(n_dofs,) the freedoms between a body and the world."""
-    out = np.zeros(model.n_dofs, dtype=bool)
-    while number:
-        for j in model.bodies[number].joints:
-            out[j.dof : j.dof + _width(j.kind)] = True
-        number = model.bodies[number].parent
-    return out
+def _of_qpos(bodies: Sequence[ReadBody], drawn: Array, qpos: Array) -> Array:
+    """The state (d,) of a keyframe: scalars, and of a free joint its place and quaternion."""
+    x, at = drawn.copy(), 0
+    for body in bodies:
+        for j in body.joints:
+            if j.kind == "free":
+                here = _pose(qpos[at : at + 3], qpos[at + 3 : at + 7])
+                x[j.dof : j.dof + 6] = pose_difference(here, body.T_parent_body)
+                at += 7
+            else:
+                x[j.dof] = qpos[at]
+                at += 1
+    return x
 
 
-def _apply(T: Array, p: Array) -> Array:
-    return T[:3, :3] @ p + T[:3, 3]
+def _placed(bodies: Sequence[ReadBody], x: Array) -> list[Array]:
+    """Poses (..., 4, 4) of bodies: their joints act one after the other, each in the frame so far;
+    a free joint's body stands in the world.
+    """
+    at: list[Array] = []
+    for body in bodies:
+        here = at[body.parent] @ body.T_parent_body if at else body.T_parent_body
+        for j in body.joints:
+            if j.kind == "free":
+                here = perturb(here, x[..., j.dof : j.dof + 6])
+                continue
+            way = (x[..., j.dof, None] - j.ref) * j.axis
+            turns = j.kind == "hinge"
+            here = here @ (pose(rotation(way), ZERO) if turns else pose(np.eye(3), way))
+        at.append(here)
+    return at
+
+
+def _pose(place: Array, quat: Array) -> Array:
+    """A pose (4, 4) by a place (3,) and MuJoCo's quaternion (4,), scalar first."""
+    return pose(rotation_of(np.roll(quat, -1)), place)
 
 
 def _vector(node: Element, key: str, default: str = "") -> Array:
     return np.array([float(v) for v in node.get(key, default).split()])
-
-
-def _matrix(q: Array) -> Array:
-    """The rotation (3, 3) of a quaternion (4,), scalar first."""
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any, ClassVar, final
 
-import numpy as np
 import yaml
 
 from pkmcal import __version__
-from pkmcal.export.contract import Difference, Exporter
+from pkmcal.export.contract import Difference, Exporter, commented, largest
 from pkmcal.export.source import Source
-from pkmcal.export.text import commented, sigma_lines
 from pkmcal.files import json_text
 from pkmcal.mechanisms import mechanism_text
 
@@ -34,7 +32,7 @@ class MechanismYaml(Exporter):
 
     def files(self, source: Source) -> dict[str, str]:
         """``mechanism.yaml`` with everything that is known of its values on top."""
-        lines = [*source.header(*CONVENTIONS), "", *sigma_lines(source)]
+        lines = [*source.header(*CONVENTIONS), "", *source.sigma_lines()]
         return {MECHANISM: commented(lines, "#") + mechanism_text(source.machine)}
 
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
@@ -43,7 +41,7 @@ class MechanismYaml(Exporter):
         table = source.machine.parameters
         values = table.unit_axes(source.machine.values)
         found = [_at(document, name) for name in table.names]
-        return [Difference(f"{len(found)} values read again", _largest(found, values), 0.0)]
+        return [Difference(f"{len(found)} values read again", largest(found, values), 0.0)]
 
 
 @final
@@ -97,11 +95,11 @@ class MachineJson(Exporter):
         found = [p["value"] for p in document["parameters"]]
         again = [_at(document["mechanism"], name) for name in table.names]
         out = [
-            Difference(f"{len(found)} values read again", _largest(found, values), 0.0),
-            Difference("values in the mechanism", _largest(again, values), 0.0),
+            Difference(f"{len(found)} values read again", largest(found, values), 0.0),
+            Difference("values in the mechanism", largest(again, values), 0.0),
         ]
         if source.covariance is not None:
-            off = _largest(document["covariance"], source.covariance)
+            off = largest(document["covariance"], source.covariance)
             out.append(Difference("covariance read again", off, 0.0, "m^2"))
         return out
 
@@ -113,7 +111,3 @@ def _at(document: Any, name: str) -> float:
     for key in keys[:-1]:
         node = node[int(key) - 1] if key.isdigit() else node[key]
     return float(node["xyz".index(keys[-1])] if isinstance(node, list) else node[keys[-1]])
-
-
-def _largest(found: Any, values: Any) -> float:
-    return float(np.abs(np.array(found, dtype=float) - np.asarray(values)).max(initial=0.0))

@@ -18,11 +18,10 @@ import yaml
 from pkmcal.arrays import Array
 from pkmcal.cameras.files import read_camera, write_camera
 from pkmcal.errors import InputError
-from pkmcal.export.contract import Difference, Exporter
+from pkmcal.export.contract import Difference, Exporter, commented, exact, quaternion, rotation_of
 from pkmcal.export.source import Source
-from pkmcal.export.text import commented, exact
-from pkmcal.files import listed
 from pkmcal.outcome import Finding, Level
+from pkmcal.wording import listed
 
 LAUNCH = "static_transforms.launch.yaml"
 BASE = "base"
@@ -153,27 +152,15 @@ def _camera_info(source: Source, station: str, frame: str) -> str:
     return commented(about, "#") + text
 
 
-def quaternion(rot: Array) -> Array:
-    """Unit quaternion (4,) x y z w of a rotation matrix (3, 3), w not negative."""
-    from scipy.spatial.transform import Rotation
-
-    q = Rotation.from_matrix(rot).as_quat()
-    return q if q[3] >= 0 else -q
-
-
 def transforms(text: str) -> dict[str, Array]:
     """T_base_camera (4, 4) by frame, as tf2 makes it of a launch file's arguments."""
     out: dict[str, Array] = {}
     for entry in yaml.safe_load(text)["launch"]:
         words = entry["node"]["args"].split()
         given = dict(zip(words[::2], words[1::2], strict=True))
-        x, y, z, w = (float(given[f"--q{axis}"]) for axis in "xyzw")
         matrix = np.eye(4)
-        matrix[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
+        q = np.array([float(given[f"--q{axis}"]) for axis in "xyzw"])
+        matrix[:3, :3] = rotation_of(q)
         matrix[:3, 3] = [float(given[f"--{axis}"]) for axis in "xyz"]
         out[given["--child-frame-id"].removesuffix("_optical_frame")] = matrix
     return out

@@ -6,12 +6,12 @@ import numpy as np
 
 from pkmcal.errors import PkmcalError
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.four_step import four_step
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import State
 from pkmcal.identify.robust import norms
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
+from pkmcal.papers.four_step import four_step
 
 
 def better_start(machine: Machine, measurements: Measurements, known: State) -> State:

@@ -26,9 +26,9 @@ from pkmcal.identify.words_text import said_of
 from pkmcal.mechanisms import Machine
 
 if TYPE_CHECKING:
-    from pkmcal.identify.conditions import Condition
     from pkmcal.identify.covariance import Direction, Identifiability
     from pkmcal.measurements import EdgeSet, Measurements
+    from pkmcal.papers.conditions import Condition
 
 INSIDE = (0.999, 0.95)
 """Shares of a change (squared) that lie in the open space for it to explain part of that space:

@@ -6,10 +6,11 @@ from importlib import resources
 from pathlib import Path
 
 from pkmcal.errors import InputError
-from pkmcal.files import closest, listed, read_yaml, validate, yaml_text
+from pkmcal.files import closest, read_yaml, validate, yaml_text
 from pkmcal.mechanisms.document import MechanismDocument, Model
 from pkmcal.mechanisms.machine import Machine, machine_from_document
 from pkmcal.mechanisms.parameters import ParameterTable
+from pkmcal.wording import listed
 
 __all__ = [
     "Machine",

@@ -34,7 +34,7 @@ from pkmcal.mechanisms.document import (
     PassiveLength,
 )
 from pkmcal.mechanisms.joints import AngleLayout, angle_layout, angle_rows
-from pkmcal.mechanisms.motors import middles, motor_columns
+from pkmcal.mechanisms.motors import bodies, middles, motor_columns
 
 
 @dataclass(frozen=True)
@@ -235,12 +235,11 @@ def _constant(node: Any, kind: ParameterKind) -> float:
 
 
 def _internal(document: MechanismDocument) -> Integers:
-    """The column of each leg's internal coordinate, by its bar; -1 without."""
-    carriers = platform_carriers()
-    nodes = [leg.platform for leg in document.legs]
-    bars = [node.bar if carriers[node.joint].turns else None for node in nodes]
-    known = sorted({bar for bar in bars if bar is not None})
-    return np.array([-1 if bar is None else known.index(bar) for bar in bars], dtype=int)
+    """The column of each leg's internal coordinate, by the body that it ends on; -1 without."""
+    kinds = platform_carriers()
+    turns = np.array([kinds[leg.platform.joint].turns for leg in document.legs])
+    on = np.where(turns, bodies(document), -1)
+    return np.where(turns, np.searchsorted(np.unique(on[turns]), on), -1)
 
 
 class BaseEnds(NamedTuple):
@@ -450,6 +449,19 @@ def stacked(first: Array, second: Array) -> Array:
     out = fresh(first, (*shape, split + second.shape[-2], first.shape[-1]))
     out[..., :split, :], out[..., split:, :] = first, second
     return out
+
+
+def skeletons(layout: LimbLayout, theta: Array, leg_reading: Array) -> tuple[Array, ...]:
+    """What carries each leg's end on the base, for pictures: L arrays (..., k, 3), m, base frame.
+
+    From where a motor holds an arm to the end A, which is the last point; A alone where there is
+    no arm. leg_reading : (..., L).
+    """
+    out: dict[int, Array] = {}
+    for g in layout.base:
+        points = g.carrier.skeleton(g.of(theta), leg_reading[..., g.legs])
+        out |= {int(j): points[..., k, :, :] for k, j in enumerate(g.legs)}
+    return tuple(out[j] for j in range(layout.n_legs))
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,24 @@ camera sees of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
+import json
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Annotated, Any, Literal, Union
 
 import numpy as np
-from pydantic import AfterValidator, Discriminator, Field, Tag
-from pydantic_core import PydanticKnownError
+from pydantic import AfterValidator, Discriminator, Field, GetJsonSchemaHandler, Tag, TypeAdapter
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from pkmcal.arrays import Array
 from pkmcal.files import Schema
-from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.contract import (
+    Carrier,
+    ParameterKind,
+    base_carriers,
+    platform_carriers,
+)
 from pkmcal.mechanisms.parameters import EVERY
 
 
@@ -81,20 +89,43 @@ MOTIONS: dict[str, Array] = {
 """Columns: the directions (omega, tau) in which the platform can move, base frame; neighbours."""
 
 
-def _one_of(schemas: Iterable[type[Schema]], key: str) -> Any:
-    """The union of the schemas, told apart by one key, so that errors name the right field."""
-    kinds = tuple(dict.fromkeys(schemas))
-    if len(kinds) == 1:
-        return kinds[0]
-    return Annotated[Union[kinds], Field(discriminator=key)]  # noqa: UP007 - made at run time
+class _OneOfTheCarriers:
+    """A part that is in the schema of one of the carriers known when a file is read, told apart by
+    ``joint``, so that errors name the right field.
+    """
+
+    def __init__(self, carriers: Callable[[], Mapping[str, type[Carrier]]]) -> None:
+        self.carriers = carriers
+
+    def adapter(self) -> TypeAdapter[Any]:
+        """What reads the union of the carriers' schemas."""
+        return _union(tuple(dict.fromkeys(c.schema for c in self.carriers().values())))
+
+    def read(self, value: Any) -> Any:
+        """The part, from a file's content or from another machine's document."""
+        if isinstance(value, Schema):
+            return value
+        return self.adapter().validate_json(json.dumps(value))  # as :func:`pkmcal.files.validate`
+
+    def __get_pydantic_core_schema__(self, *_: Any) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.read)
+
+    def __get_pydantic_json_schema__(
+        self, _: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        return handler(self.adapter().core_schema)
 
 
-if TYPE_CHECKING:  # a type checker cannot see what the carriers' folder holds
-    BaseNode = Any
-    PlatformNode = Any
-else:
-    BaseNode = _one_of((c.schema for c in base_carriers().values()), "joint")
-    PlatformNode = _one_of((c.schema for c in platform_carriers().values()), "joint")
+@cache
+def _union(schemas: tuple[type[Schema], ...]) -> TypeAdapter[Any]:
+    one: Any = schemas[0]
+    if len(schemas) > 1:
+        one = Annotated[Union[schemas], Field(discriminator="joint")]  # noqa: UP007 - at run time
+    return TypeAdapter(one)
+
+
+BaseNode = Annotated[Any, _OneOfTheCarriers(base_carriers)]
+PlatformNode = Annotated[Any, _OneOfTheCarriers(platform_carriers)]
 
 
 class Tube(Schema):

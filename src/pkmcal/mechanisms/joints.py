@@ -23,7 +23,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
-from pkmcal.mechanisms.carriers.contract import ParameterKind
+from pkmcal.mechanisms.carriers.contract import ParameterKind, base_carriers, platform_carriers
 from pkmcal.mechanisms.document import Leg, MechanismDocument
 
 AXIS = tuple(ParameterKind(f"axis.{axis}", "1", "axis") for axis in "xyz")
@@ -39,13 +39,14 @@ def equations(document: MechanismDocument) -> tuple[tuple[int, Equation], ...]:
 
 
 def _equations(leg: Leg) -> list[Equation]:
+    base = base_carriers()[leg.base.joint].axis_role(leg.base)
+    platform = platform_carriers()[leg.platform.joint].axis_role(leg.platform)
     found: list[Equation] = []
-    if leg.base.joint == "revolute":
+    if base == "square":
         found.append("revolute base")
-    if leg.platform.joint == "revolute":
+    if platform == "square":
         found.append("revolute platform")
-    ends = (leg.base, leg.platform)
-    if all(end.joint == "universal" and end.axis is not None for end in ends):
+    if base == platform == "twist":
         found.append("torsion")
     return found
 

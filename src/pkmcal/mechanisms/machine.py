@@ -77,6 +77,13 @@ class Machine:
         """
         return motor_ranges(self.document)
 
+    @property
+    def most_turn(self) -> tuple[float, str]:
+        """How far the platform may turn about z to either side, rad, and what is then in the way;
+        infinity for a rigid one.
+        """
+        return min((g.carrier.most_turn, g.carrier.in_the_way) for g in self.layout.platform)
+
     def with_values(self, values: Array) -> Machine:
         """The same machine with other parameter values (P,)."""
         return replace(self, values=np.array(values, dtype=float))

@@ -55,14 +55,27 @@ def motor_ranges(document: MechanismDocument) -> Array:
 
 
 def motor_units(document: MechanismDocument) -> tuple[str, ...]:
-    """``m`` or ``rad`` of each reading: a driven carrier with an angle among its numbers turns."""
+    """``m`` or ``rad`` of each reading: of a rod m, of a driven carrier its own."""
     columns = motor_columns(document)
     out = ["m"] * (int(columns.max(initial=-1)) + 1)
     for leg, column in zip(document.legs, columns.tolist(), strict=True):
         carrier = base_carriers()[leg.base.joint]
-        if column >= 0 and carrier.driven and any(p.unit == "rad" for p in carrier.parameters):
-            out[column] = "rad"
+        if column >= 0 and carrier.driven:
+            out[column] = carrier.unit
     return tuple(out)
+
+
+def bodies(document: MechanismDocument) -> Integers:
+    """On which body of an articulated platform each leg ends, (L,), counted in the order of their
+    numbers in the file; -1 where on the platform itself.
+    """
+    fields = [platform_carriers()[leg.platform.joint].body for leg in document.legs]
+    own = [
+        (field, getattr(leg.platform, field)) if field else None
+        for field, leg in zip(fields, document.legs, strict=True)
+    ]
+    known = sorted({body for body in own if body is not None})
+    return np.array([-1 if body is None else known.index(body) for body in own], dtype=int)
 
 
 def middles(document: MechanismDocument) -> Array:
@@ -78,8 +91,8 @@ Group = tuple[str, ...]
 def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
     """Entries that change together.
 
-    Legs on one motor turn about one axis and legs on one bar hang on one hinge. A leg of a planar
-    machine stays in its plane, so both of its ends have one height.
+    Legs on one motor turn about one axis, legs on one body of the platform hang on one hinge. A
+    leg of a planar machine stays in its plane, so both of its ends have one height.
     """
     return (*_heights(document), *_shared(document))
 
@@ -88,26 +101,33 @@ def built_in_fixed(document: MechanismDocument) -> tuple[str, ...]:
     """Entries that are no unknowns: what leaves a planar machine's plane."""
     if document.motion != "planar":
         return ()
-    held = {"crank": "axis", "slider": "axis.z"}
-    legs = enumerate(document.legs, start=1)
     return tuple(
-        f"legs[{j}].base.{held[leg.base.joint]}" for j, leg in legs if leg.base.joint in held
+        f"legs[{j}].{side}.{field}"
+        for j, leg in enumerate(document.legs, start=1)
+        for side, carriers in (("base", base_carriers()), ("platform", platform_carriers()))
+        for field in carriers[getattr(leg, side).joint].held_in_plane
     )
 
 
 def sharing(document: MechanismDocument) -> Iterator[tuple[str, tuple[int, ...], tuple[str, ...]]]:
-    """Sides with the legs (from 0) that stand on one motor or one bar, and what they share."""
+    """Sides with the legs (from 0) that stand on one motor, or on one body of the platform, and
+    what they share.
+    """
     columns = motor_columns(document)
     for column in range(columns.max(initial=-1) + 1):
         legs = tuple(j for j in range(len(columns)) if columns[j] == column)
         kinds = {base_carriers()[document.legs[j].base.joint] for j in legs}
         if len(legs) > 1 and len(kinds) == 1:
             yield "base", legs, kinds.pop().shared
-    nodes = [leg.platform for leg in document.legs]
-    for bar in dict.fromkeys(getattr(node, "bar", None) for node in nodes):
-        legs = tuple(j for j, node in enumerate(nodes) if getattr(node, "bar", None) == bar)
-        if bar is not None and len(legs) > 1:
-            yield "platform", legs, platform_carriers()[nodes[legs[0]].joint].shared
+    on = bodies(document)
+    for body in dict.fromkeys(on.tolist()):
+        legs = tuple(np.flatnonzero(on == body).tolist())
+        if body >= 0 and len(legs) > 1:
+            yield (
+                "platform",
+                legs,
+                platform_carriers()[document.legs[legs[0]].platform.joint].shared,
+            )
 
 
 def _shared(document: MechanismDocument) -> Iterator[Group]:

@@ -354,7 +354,6 @@ def _connected(inside: Booleans, start: tuple[int, ...]) -> Booleans:
 
 BETWEEN = 8
 """Poses looked at from one of the path's to the next."""
-HALVINGS = 30
 
 
 @dataclass(frozen=True)

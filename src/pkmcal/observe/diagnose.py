@@ -9,8 +9,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.files import listed
 from pkmcal.observe.stations import GOOD_SCORE, StationPose, View, find_station
+from pkmcal.wording import listed
 
 CLEARLY_BETTER = 0.75
 """A hypothesis must lower the score to this share of the best other one's to be named."""

@@ -17,6 +17,7 @@ from pkmcal.geometry.cylinders import SIDE_SIGNS, line_through
 from pkmcal.geometry.rigid import apply, cross, dot
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.mechanisms.kinematics import inverse_result
 
 JOINT_MARGIN = 0.006
 """Metres left out at both ends of a tube: collars and joint housings hide or imitate edges."""
@@ -66,8 +67,14 @@ class LegsInCamera:
 def legs_in_camera(
     machine: Machine, T_camera_base: Array, T_base_platform: Array, joints: Array
 ) -> LegsInCamera:
-    """Leg axes in a camera's frame; T_camera_base (..., 4, 4) and poses (K, 4, 4) broadcast."""
-    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    """Leg axes in a camera's frame; T_camera_base (..., 4, 4) and poses (K, 4, 4) broadcast.
+
+    An articulated platform's hinges turn as its legs make them.
+    """
+    layout, internal = machine.layout, None
+    if layout.n_internal:
+        internal = inverse_result(layout, machine.values, T_base_platform)[1]
+    ends = limb_ends(layout, machine.values, joints, T_base_platform, internal)
     camera = T_camera_base[..., None, :, :]
     a, b = apply(camera, ends.a), apply(camera, ends.b)
     return LegsInCamera(a, b, line_through(a, b)[0])

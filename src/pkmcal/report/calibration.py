@@ -15,6 +15,7 @@ from pkmcal.calibration.results import REPORT, check_output, texts_of, versions
 from pkmcal.files import write_folder
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.problem import Estimate
+from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.outcome import Finding, Level, Outcome, Part, Plot, Verdict
 from pkmcal.report import (
@@ -28,16 +29,15 @@ from pkmcal.report import (
     provenance,
     residuals,
     scene,
-    validation_page,
+    validation,
 )
 from pkmcal.report.toolpoint import ToolPoint, tool_point
 from pkmcal.session.load import Session
-from pkmcal.validate.figures import holdout_document
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.words import Findings
-    from pkmcal.validate.holdouts import HoldOut
+    from pkmcal.judge.holdouts import HoldOut
 
 MODEL_ERROR = Markup(
     "<strong>What σ means here.</strong> The standard deviations say how much the result would"
@@ -56,7 +56,7 @@ RESIDUALS = (
 
 def outcome_of(calibration: Calibration) -> Outcome:
     """Everything that `pkmcal calibrate` tells and writes."""
-    c = calibration
+    c, held_out = calibration, holdout_of(calibration)
     told = report_of(
         c.session,
         c.observation,
@@ -64,22 +64,21 @@ def outcome_of(calibration: Calibration) -> Outcome:
         c.verdict,
         findings=c.findings,
         timings=c.timings,
-        holdout=c.holdout,
+        holdout=held_out,
     )
     groups = parameters.parameter_groups(c.session.machine, c.estimate)
-    open_, held_out = parameters.unidentified(groups, c.estimate, c.findings), None
-    if c.holdout:
-        held_out = holdout_document(c.holdout, c.session.configurations)
+    open_ = parameters.unidentified(groups, c.estimate, c.findings)
+    numbers = held_out and held_out.document(c.session.configurations)
     centres, tool = _uncertainty(c.session, c.estimate)
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, open_, held_out),
+        texts=texts_of(c, open_, numbers),
         summary={
             "verdict": asdict(c.verdict),
             "figures": headline.numbers(c.observation, c.estimate, centres, tool),
             "session_warnings": c.session.warnings,
-            "holdout": held_out,
+            "holdout": numbers,
             "timings": c.timings,
         },
     )
@@ -121,7 +120,7 @@ def report_of(
         findings and _identifiability(findings, estimate),
         _photographs(session, edges, estimate, shifts, centres) if photographed else None,
         measured and measured.part,
-        holdout and _held_out(holdout, session),
+        holdout and validation.held_out(holdout, session),
         _residuals(session, edges, estimate, shifts, measured and measured.axes),
         _left_out(session, observation, estimate, findings),
         _stations(session, estimate, camera),
@@ -205,16 +204,6 @@ def _photographs(
         pictures=pictures.pictures(session, edges, estimate, shifts, centres),
     )
     return Part("photographs", "Photographs", html=html)
-
-
-def _held_out(holdout: HoldOut, session: Session) -> Part:
-    joints = validation_page.joints_of(session)
-    return Part(
-        "heldout",
-        "Held out",
-        said=(validation_page.holdout_sentence(holdout, joints),),
-        tables=(replace(validation_page.holdout_table(holdout, joints), brief=False),),
-    )
 
 
 def _residuals(

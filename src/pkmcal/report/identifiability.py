@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.identify.conditions import Condition
 from pkmcal.identify.words import Findings, Sentence
 from pkmcal.mechanisms import ParameterTable
+from pkmcal.papers.conditions import Condition
 from pkmcal.report.charts import Bar, BarChart
 from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, count, joined

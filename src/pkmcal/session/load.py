@@ -7,6 +7,7 @@ any work is spent; each fault is an `InputError` with file, line and field.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
-from pkmcal.files import (
-    Document,
-    Keys,
-    Table,
-    listed,
-    read_csv,
-    read_yaml,
-    shown,
-    validate,
-    wanted_file,
-)
+from pkmcal.files import Document, Keys, Table, read_csv, read_yaml, shown, validate, wanted_file
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
@@ -38,6 +29,7 @@ from pkmcal.session.schema import (
     TrackerStationDocument,
     Vector,
 )
+from pkmcal.wording import listed
 
 __all__ = [
     "Photograph",
@@ -393,3 +385,14 @@ def _resolved(
 def _inside(folder: Path, path: Path) -> str:
     """A path as session.yaml would write it."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
+
+
+def digests(session: Session) -> dict[str, list[str]]:
+    """Short digests of the photographs' files by configuration."""
+    out: dict[str, list[str]] = {}
+    for station in session.stations:
+        for photo in station.photographs:
+            name = session.configurations[photo.configuration]
+            digest = blake2b(photo.path.read_bytes(), digest_size=8).hexdigest()
+            out.setdefault(name, []).append(digest)
+    return out

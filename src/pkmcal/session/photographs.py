@@ -11,7 +11,8 @@ from string import Formatter
 from typing import BinaryIO
 
 from pkmcal.errors import InputError
-from pkmcal.files import closest, listed, shown
+from pkmcal.files import closest, shown
+from pkmcal.wording import listed
 
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START = b"\xff\xd8"

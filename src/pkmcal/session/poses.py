@@ -16,9 +16,10 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.files import Table, closest, listed, read_csv
+from pkmcal.files import Table, closest, read_csv
 from pkmcal.geometry.rigid import pose, register, rotation
 from pkmcal.measurements import PoseSet
+from pkmcal.wording import listed
 
 Kind = Literal["poses", "points", "heights"]
 POINT, QUATERNION, VECTOR = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("rx", "ry", "rz")

@@ -10,7 +10,8 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Table, listed
+from pkmcal.files import Table
+from pkmcal.wording import listed
 
 # A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
 # is out by less than this part of the stroke is told, and one that is further out is refused.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
@@ -10,12 +12,12 @@ from pkmcal.geometry.rigid import dot, perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import on_manifold, singularity
-from pkmcal.simulation.drives import drives_of, reaches, side_bars
+from pkmcal.simulation.drives import drives_of, reaches
 
 FARTHEST_TILT = np.deg2rad(35)
 """More than universal joints of this kind allow."""
-FARTHEST_TURN = np.deg2rad(70)
-"""Of an articulated platform about z; at a right angle its side bars lie on each other."""
+FARTHEST_TURN = 7 / 9
+"""Of an articulated platform about z, in the turn at which its own parts are in the way."""
 LEAST_SINGULAR = 0.12
 """Smallest singular value of the scaled inverse Jacobian: a reading's error grows by eight."""
 GUIDE = 4.0
@@ -69,11 +71,9 @@ def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
 
 
 def unfolded(machine: Machine, T_base_platform: Array) -> Booleans:
-    """(n,) True where the side bars of an articulated platform, if it is one, stand apart."""
-    if not side_bars(machine):
-        return np.ones(T_base_platform.shape[:-2], dtype=bool)
+    """(n,) True where the parts of an articulated platform, if it is one, stand apart."""
     turn = np.arctan2(T_base_platform[..., 1, 0], T_base_platform[..., 0, 0])
-    return np.abs(turn) < FARTHEST_TURN
+    return np.abs(turn) < FARTHEST_TURN * machine.most_turn[0]
 
 
 def _candidates(
@@ -124,12 +124,11 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
         if j < i:
             gap = points[:, i, :, None] - points[:, j, None, :]
             apart &= np.sqrt(dot(gap, gap).min(axis=(-1, -2))) > widths[i] + widths[j]
-        if j != i and drives.slider[j]:
-            start, axis = drives.ends[j, 0], drives.axis[j]
-            length = float((drives.ends[j, 1] - start) @ axis)
-            s = np.clip((points[:, i] - start) @ axis, min(0, length), max(0, length))
-            gap = points[:, i] - start - s[..., None] * axis
-            clear = np.sqrt(dot(gap, gap).min(axis=-1)) > widths[i] + GUIDE * widths[j]
-            # carriages side by side on one guide have their own legs beside it
-            apart &= clear | (dot(drives.away[i], drives.away[j]) > BESIDE)
+        # carriages side by side on one guide have their own legs beside it
+        if j != i and drives.guides[j] and drives.away[i] @ drives.away[j] <= BESIDE:
+            for start, stop in pairwise(drives.ways[j]):
+                axis = (stop - start) / np.linalg.norm(stop - start)
+                s = np.clip((points[:, i] - start) @ axis, 0, (stop - start) @ axis)
+                gap = points[:, i] - start - s[..., None] * axis
+                apart &= np.sqrt(dot(gap, gap).min(axis=-1)) > widths[i] + GUIDE * widths[j]
     return apart

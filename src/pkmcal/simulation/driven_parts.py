@@ -1,13 +1,16 @@
-"""Cranks with their motors, guides with their carriages and side bars, as parts of the scene.
+"""Arms with their motors, guides with their carriages and side bars, as parts of the scene.
 
 Sizes follow the legs' joints, so that a drawing needs no more than its kinematics and its tubes.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import cross
 from pkmcal.simulation.casting import Part
 from pkmcal.simulation.drives import Drives
 from pkmcal.simulation.shapes import Ball, Box, Cylinder
@@ -22,84 +25,116 @@ RAIL = 1.2
 
 
 def motor_radius(arm: float, ball: float) -> float:
-    """Of a crank's motor, m."""
+    """Of an arm's motor, m."""
     return max(MOTOR * arm, 2.2 * ball)
 
 
-def crank_parts(
-    drives: Drives, j: int, a: Array, balls: Array, plate: Array, up: Array, finish: Finish
+def arm_parts(
+    drives: Drives, j: int, chain: Array, balls: Array, plate: Array, up: Array, finish: Finish
 ) -> list[Part]:
-    """The arm of leg j to its end ``a`` (3,), the hub, the motor beside it, and its bracket.
+    """The arm of leg j, the hub, the motor beside it, and its bracket.
 
-    balls : (L,) radii of the joints. plate : (3,) on the base plate's face; up : unit, to the legs.
+    chain : (k, 3) along the arm, from its motor to the leg's end. balls : (L,) radii of the joints.
+    plate : (3,) on the base plate's face; up : unit, to the legs.
     """
     foot, v, ball = drives.foot[j], drives.axis[j], float(balls[j])
-    arm = float(np.linalg.norm(a - foot))
-    e = (a - foot) / arm
-    wide = motor_radius(arm, ball)
+    wide = motor_radius(float(np.linalg.norm(chain[-1] - foot)), ball)
     length = min(2.4 * wide, 0.6 * _room(drives.foot, j))
     way = _motor_side(drives, j) * v
     first = foot + 1.1 * ball * way
     post = float((foot - plate) @ up)
     middle = first + 0.5 * length * way
-    half = np.array([arm / 2, 0.7 * ball, 1.1 * ball])
-    web = Box((foot + a) / 2, np.stack([e, v, np.cross(e, v)]), half)
     return [
-        Part(web, finish.platform),
+        *(Part(_web(start, stop, v, ball), finish.platform) for start, stop in pairwise(chain)),
         Part(Cylinder(foot - 1.1 * ball * v, v, 1.7 * ball, 2.2 * ball), finish.steel),
         Part(Cylinder(first, way, wide, length), finish.joint),
         Part(Cylinder(middle, -up, 0.6 * wide, max(post, 1e-4)), finish.joint),
-        Part(Ball(a, ball), finish.joint),
+        Part(Ball(chain[-1], ball), finish.joint),
     ]
 
 
+def _web(start: Array, stop: Array, v: Array, ball: float) -> Box:
+    """A straight piece of an arm, flat along its motor's axis v."""
+    length = float(np.linalg.norm(stop - start))
+    e = (stop - start) / length
+    across = v - float(v @ e) * e
+    if np.linalg.norm(across) < 1e-6:
+        across = cross(e, np.eye(3)[np.abs(e).argmin()])
+    across = across / float(np.linalg.norm(across))
+    half = np.array([length / 2, 0.7 * ball, 1.1 * ball])
+    return Box((start + stop) / 2, np.stack([e, across, np.cross(e, across)]), half)
+
+
 def _room(feet: Array, j: int) -> float:
-    """Distance to the nearest other crank, m."""
+    """Distance to the nearest other motor, m."""
     apart = np.linalg.norm(np.delete(feet, j, axis=0) - feet[j], axis=1)
-    # cranks on one motor stand in one place
+    # arms on one motor stand in one place
     apart = apart[apart > 1e-2 * apart.max(initial=0.0)]
     return float(apart.min(initial=np.inf))
 
 
 def _motor_side(drives: Drives, j: int) -> float:
-    """+1 or -1: along the axis or against it, away from the other cranks where that says much."""
-    off = drives.foot[j] - drives.foot[drives.crank].mean(axis=0)
+    """+1 or -1: along the axis or against it, away from the other arms where that says much."""
+    off = drives.foot[j] - drives.foot[drives.arms].mean(axis=0)
     outward = float(off @ drives.axis[j])
     return -1.0 if outward < -0.1 * np.linalg.norm(off) else 1.0
 
 
-def slider_parts(
+def guide_parts(
     drives: Drives, j: int, a: Array, balls: Array, plate: Array, finish: Finish
 ) -> list[Part]:
-    """The guide of leg j and the carriage with the leg's end ``a`` (3,); as :func:`crank_parts`.
+    """The guide of leg j and the carriage with the leg's end ``a`` (3,); as :func:`arm_parts`.
 
-    A guide that stands reaches down, or up, to the base plate.
+    A straight guide that stands reaches down, or up, to the base plate; a bent one is drawn in
+    straight pieces.
     """
-    v, away, ball = drives.axis[j], drives.away[j], float(balls[j])
-    rot = np.stack([v, np.cross(away, v), away])
+    foot, away, ball = drives.foot[j], drives.away[j], float(balls[j])
     along, across, deep = (ball * size for size in CARRIAGE)
-    block = Box(a + (ball + deep) * away, rot, np.array([along, across, deep]))
-    low, high = (float((end - drives.foot[j]) @ v) for end in drives.ends[j])
-    low, high = min(low, high) - 1.2 * along, max(low, high) + 1.2 * along
-    if drives.upright[j]:
-        base = float(plate[2] - drives.foot[j, 2]) / v[2]
-        low, high = min(low, base), max(high, base)
-    width = RAIL * ball
-    centre = drives.foot[j] + (low + high) / 2 * v + (ball + 2 * deep + width) * away
-    rail = Box(centre, rot, np.array([(high - low) / 2, width, width]))
+    width, spare, back = RAIL * ball, 1.2 * along, ball + 2 * deep + RAIL * ball
+    way = drives.ways[j]
+    rails: list[Box] = []
+    if len(way) == 2:
+        v = drives.axis[j]
+        low, high = (float((end - foot) @ v) for end in way)
+        low, high = min(low, high) - spare, max(low, high) + spare
+        if drives.upright[j]:
+            base = float(plate[2] - foot[2]) / v[2]
+            low, high = min(low, base), max(high, base)
+        rot = np.stack([v, np.cross(away, v), away])
+        centre = foot + (low + high) / 2 * v + back * away
+        rails.append(Box(centre, rot, np.array([(high - low) / 2, width, width])))
+    else:
+        for start, stop in pairwise(way):
+            rot = _turned_along(stop - start, away)
+            half = (float(np.linalg.norm(stop - start)) + width) / 2
+            rails.append(
+                Box((start + stop) / 2 + back * rot[2], rot, np.array([half, width, width]))
+            )
+        middles = (way[1:] + way[:-1]) / 2
+        nearest = int(np.argmin(np.linalg.norm(middles - a, axis=1)))
+        rot = _turned_along(way[nearest + 1] - way[nearest], away)
+    block = Box(a + (ball + deep) * rot[2], rot, np.array([along, across, deep]))
     return [
-        Part(rail, finish.platform),
+        *(Part(rail, finish.platform) for rail in rails),
         Part(block, finish.joint),
-        Part(Cylinder(a, away, 0.6 * ball, ball), finish.joint),
+        Part(Cylinder(a, rot[2], 0.6 * ball, ball), finish.joint),
         Part(Ball(a, ball), finish.joint),
     ]
+
+
+def _turned_along(piece: Array, away: Array) -> Array:
+    """Rows (3, 3) along a piece of a guide, across it, and from it, nearest to ``away``."""
+    v = piece / np.linalg.norm(piece)
+    back = away - (away @ v) * v
+    back = back / np.linalg.norm(back)
+    return np.stack([v, np.cross(back, v), back])
 
 
 def beams(drives: Drives, balls: Array, finish: Finish) -> list[Part]:
     """Two beams across guides that lie side by side, and one that joins them; none where the
     guides are not parallel.
     """
-    rows = np.flatnonzero(drives.slider & ~drives.upright)
+    rows = np.flatnonzero(drives.guides & ~drives.upright)
     if rows.size < 2 or np.abs(drives.axis[rows] @ drives.axis[rows[0]]).min() < 0.99:
         return []
     u, away = drives.axis[rows[0]], drives.away[rows].mean(axis=0)

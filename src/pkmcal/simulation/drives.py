@@ -3,77 +3,127 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import dot
+from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import leg_readings, limb_ends
+from pkmcal.mechanisms.closure import leg_readings, limb_ends, skeletons
+from pkmcal.mechanisms.motors import bodies
 
 INSET = 0.1
 """Share of its range that a motor stays from its stops where reaches are compared."""
 NO_RANGE = 0.25
 """Length of a guide on either side, in the leg's length, where the file gives no range."""
+PIECES = 16
+"""Straight pieces that a bent guide is drawn with."""
+STRAIGHT = 1e-9
+"""A guide's way off the line between its ends, m, below which it is one piece."""
 
 
 @dataclass(frozen=True)
 class Drives:
     """What moves the legs' ends on the base; base frame, m, one row a leg.
 
-    crank, slider : (L,) which it is; neither is a joint that stands still.
-    foot : (L, 3) the joint, a crank's axis beside its arm, or the middle of a guide.
-    axis : (L, 3) unit axis of a crank, or direction of a guide; zero where there is none.
-    arm : (L,) length of a crank's arm, zero elsewhere.
-    ends : (L, 2, 3) the leg's end at both ends of a guide; elsewhere the foot twice.
+    arms, guides : (L,) whether an arm carries the leg's end, or it runs along a guide; neither is
+        a joint that stands still.
+    foot : (L, 3) the joint, where the motor holds the arm, or the middle of a guide.
+    axis : (L, 3) unit axis of an arm's motor, or direction of a guide; zero where there is none.
+    arm : (L,) how far the leg's end is from the foot of its arm, zero elsewhere.
+    ways : L arrays (n, 3), the leg's end along its guide from one stop to the other, two points of
+        a straight one; elsewhere the foot twice.
     away : (L, 3) unit, square to a guide and away from the platform; zero elsewhere.
     """
 
-    crank: Booleans
-    slider: Booleans
+    arms: Booleans
+    guides: Booleans
     foot: Array
     axis: Array
     arm: Array
-    ends: Array
+    ways: tuple[Array, ...]
     away: Array
 
     @property
     def any(self) -> bool:
         """Whether there is a motor on the base at all."""
-        return bool((self.crank | self.slider).any())
+        return bool((self.arms | self.guides).any())
 
     @property
     def upright(self) -> Booleans:
         """(L,) guides that stand rather than lie."""
-        return self.slider & (np.abs(self.axis[:, 2]) > np.sqrt(0.5))
+        return self.guides & (np.abs(self.axis[:, 2]) > np.sqrt(0.5))
+
+    @cached_property
+    def ends(self) -> Array:
+        """(L, 2, 3) the leg's end at both ends of a guide; elsewhere the foot twice."""
+        return np.stack([way[[0, -1]] for way in self.ways])
 
 
 def drives_of(machine: Machine) -> Drives:
-    """The machine's motors, from its closure: no carrier's formula is repeated here."""
-    joints = [leg.base.joint for leg in machine.document.legs]
-    crank, slider = (np.array([j == kind for j in joints]) for kind in ("crank", "slider"))
-    zero = np.zeros(machine.n_joints)
-    ends = limb_ends(machine.layout, machine.values, zero, np.eye(4))
-    a, by_reading = np.array(ends.a), np.broadcast_to(ends.a_by_reading, ends.a.shape)
-    half_turn = limb_ends(machine.layout, machine.values, zero + np.pi, np.eye(4)).a
-    foot = np.where(crank[:, None], (a + half_turn) / 2, a)
-    arm = a - foot
-    turned = np.cross(arm, by_reading) / np.maximum(dot(arm, arm), 1e-300)[:, None]
-    axis = np.where(crank[:, None], turned, np.where(slider[:, None], by_reading, 0.0))
-    low, high = _guide_ranges(machine).T
-    both = np.stack([a + low[:, None] * by_reading, a + high[:, None] * by_reading], axis=1)
-    both = np.where(slider[:, None, None], both, foot[:, None])
-    foot = np.where(slider[:, None], both.mean(axis=1), foot)
-    size = np.where(crank, np.sqrt(dot(arm, arm)), 0.0)
-    return Drives(crank, slider, foot, axis, size, both, _away(machine, foot, axis, slider))
+    """The machine's motors, from its carriers: none is known by its name here."""
+    layout, zero = machine.layout, np.zeros(machine.n_legs)
+    chains = skeletons(layout, machine.values, zero)
+    driven = np.zeros(machine.n_legs, dtype=bool)
+    for g in layout.base:
+        driven[g.legs] = g.carrier.driven
+    several = np.array([len(chain) > 1 for chain in chains])
+    arms, guides = driven & several, driven & ~several
+    a, by_reading = _placed(machine, zero)
+    foot = np.array([chain[0] for chain in chains])
+    arm = np.where(arms, np.sqrt(dot(a - foot, a - foot)), 0.0)
+    turned = cross(by_reading, _placed(machine, zero + np.pi / 2)[1])
+    axis = np.where(arms[:, None], _unit(turned, a - foot), 0.0)
+    ways = [np.stack([p, p]) for p in foot]
+    low, high = _guide_ranges(machine, by_reading).T
+    for j in np.flatnonzero(guides):
+        readings = np.where(np.arange(machine.n_legs) == j, _steps(low[j], high[j]), 0.0)
+        way, along = (x[:, j] for x in _placed(machine, readings))
+        ways[j] = way if _is_bent(way) else way[[0, -1]]
+        foot[j] = way[PIECES // 2] if _is_bent(way) else ways[j].mean(axis=0)
+        axis[j] = _unit(along[PIECES // 2], by_reading[j])
+    away = _away(machine, foot, axis, guides)
+    return Drives(arms, guides, foot, axis, arm, tuple(ways), away)
 
 
-def _guide_ranges(machine: Machine) -> Array:
+def _placed(machine: Machine, leg_reading: Array) -> tuple[Array, Array]:
+    """Legs' ends on the base and their derivatives, (..., L, 3) each, at readings (..., L)."""
+    shape = (*leg_reading.shape, 3)
+    a, by_reading = np.empty(shape), np.empty(shape)
+    for g in machine.layout.base:
+        own = g.of(machine.values), leg_reading[..., g.legs]
+        a[..., g.legs, :], by_reading[..., g.legs, :] = g.carrier.place(*own)
+    return a, by_reading
+
+
+def _steps(low: float, high: float) -> Array:
+    """Readings (PIECES + 1, 1) from one stop of a guide to the other."""
+    return np.linspace(low, high, PIECES + 1)[:, None]
+
+
+def _is_bent(way: Array) -> bool:
+    """Whether a way (n, 3) leaves the line between its ends."""
+    u = (way[-1] - way[0]) / max(float(np.linalg.norm(way[-1] - way[0])), 1e-300)
+    return float(np.linalg.norm(np.cross(way - way[0], u), axis=1).max()) > STRAIGHT
+
+
+def _unit(v: Array, otherwise: Array) -> Array:
+    """Vectors (..., 3) of length one; where they are none, some direction square to another."""
+    aside = np.cross(otherwise, np.eye(3)[np.abs(otherwise).argmin(axis=-1)])
+    v = np.where(dot(v, v)[..., None] > 1e-12 * dot(otherwise, otherwise)[..., None], v, aside)
+    size = np.linalg.norm(v, axis=-1, keepdims=True)
+    # what is a unit vector stays what it is, to the last digit
+    return v / np.where(np.abs(size - 1) < 1e-12, 1.0, np.maximum(size, 1e-300))
+
+
+def _guide_ranges(machine: Machine, by_reading: Array) -> Array:
     """Least and largest reading of each leg, (L, 2); about home's where the file is silent."""
     layout, home = machine.layout, machine.home()
     readings = machine.inverse(home[None])[0]
     ends = limb_ends(layout, machine.values, readings, home)
-    spare = NO_RANGE * np.linalg.norm(ends.b - ends.a, axis=1)
+    speed = np.linalg.norm(by_reading, axis=1)
+    spare = NO_RANGE * np.linalg.norm(ends.b - ends.a, axis=1) / np.where(speed > 0, speed, 1.0)
     middle = leg_readings(layout, readings)
     ranges = machine.joint_ranges
     told = np.stack([leg_readings(layout, ranges[:, k]) for k in (0, 1)], axis=-1)
@@ -81,7 +131,7 @@ def _guide_ranges(machine: Machine) -> Array:
     return np.where(np.isfinite(told).all(axis=1, keepdims=True), told, guess)
 
 
-def _away(machine: Machine, foot: Array, axis: Array, slider: Booleans) -> Array:
+def _away(machine: Machine, foot: Array, axis: Array, guides: Booleans) -> Array:
     """Where guides stand back from their legs' ends: the platform's joints lie on the other side,
     all of them, so that two carriages on one guide agree about it.
     """
@@ -93,7 +143,7 @@ def _away(machine: Machine, foot: Array, axis: Array, slider: Booleans) -> Array
     aside = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
     back = np.where((dot(back, back) > 1e-6)[:, None], back, aside)
     size = np.linalg.norm(back, axis=1, keepdims=True)
-    return np.where(slider[:, None], back / np.maximum(size, 1e-300), 0.0)
+    return np.where(guides[:, None], back / np.maximum(size, 1e-300), 0.0)
 
 
 def reaches(machine: Machine) -> tuple[Array, Array]:
@@ -104,9 +154,8 @@ def reaches(machine: Machine) -> tuple[Array, Array]:
     that the machine needs.
     """
     poses, readings = [machine.home()], [machine.inverse(machine.home()[None])[0]]
-    joints = {leg.base.joint for leg in machine.document.legs}
     ranges = machine.joint_ranges
-    if joints & {"crank", "slider"} and np.isfinite(ranges).all():
+    if any(g.carrier.driven for g in machine.layout.base) and np.isfinite(ranges).all():
         share = np.array([[INSET], [1 - INSET]])
         wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
         found = machine.forward_result(wanted)
@@ -117,7 +166,6 @@ def reaches(machine: Machine) -> tuple[Array, Array]:
 
 
 def side_bars(machine: Machine) -> tuple[Integers, ...]:
-    """Legs of each side bar of an articulated platform, in the order of the bars."""
-    bars = [getattr(leg.platform, "bar", None) for leg in machine.document.legs]
-    known = sorted({bar for bar in bars if bar is not None})
-    return tuple(np.flatnonzero([bar == one for bar in bars]) for one in known)
+    """Legs of each body of an articulated platform, in the order of their numbers."""
+    on = bodies(machine.document)
+    return tuple(np.flatnonzero(on == body) for body in range(on.max(initial=-1) + 1))

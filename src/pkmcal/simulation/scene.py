@@ -13,14 +13,14 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, rotation
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.mechanisms.closure import leg_readings, limb_ends, skeletons
 from pkmcal.simulation.casting import Part, Scene
 from pkmcal.simulation.driven_parts import (
+    arm_parts,
     beams,
-    crank_parts,
+    guide_parts,
     motor_radius,
     nacelle_parts,
-    slider_parts,
 )
 from pkmcal.simulation.drives import Drives, drives_of, reaches, side_bars
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
@@ -111,15 +111,16 @@ def discs_of(machine: Machine) -> Discs:
 def _held(machine: Machine, drives: Drives, balls: Array) -> tuple[Array, float]:
     """Points (n, 3) beyond which the base plate lies, and by how much at least, m.
 
-    Of joints and cranks where they are; of guides all that their carriages and the platform reach.
+    Of joints and arms' motors where they are; of guides all that their carriages and the platform
+    reach.
     """
-    if drives.slider.any():
+    if drives.guides.any():
         a, b = reaches(machine)
         reached = (a, b) if drives.upright.any() else (a,)
         points = np.concatenate([drives.ends.reshape(-1, 3), *(p.reshape(-1, 3) for p in reached)])
         return points, 6.0 * float(balls.max())
-    cranks = zip(drives.arm[drives.crank], balls[drives.crank], strict=True)
-    sizes = [motor_radius(arm, ball) for arm, ball in cranks]
+    arms = zip(drives.arm[drives.arms], balls[drives.arms], strict=True)
+    sizes = [motor_radius(arm, ball) for arm, ball in arms]
     return drives.foot, 1.3 * max(sizes, default=0.0)
 
 
@@ -130,13 +131,14 @@ def machine_parts(
     ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
     balls = _ball_radii(machine)
     bars = side_bars(machine)
+    chains = skeletons(machine.layout, machine.values, leg_readings(machine.layout, joints))
     parts = _base(discs, balls[:, 0], finish)
     parts += _platform(discs, bars, np.array(ends.b), balls[:, 1], T_base_platform, finish)
     for j in range(machine.n_legs):
-        driven = bool(discs.drives.crank[j] or discs.drives.slider[j])
+        driven = bool(discs.drives.arms[j] or discs.drives.guides[j])
         bare = finish.forearm if driven else finish.steel
         parts += _leg(machine, j, ends.a[j], ends.b[j], finish, bare)
-        parts += _base_end(discs, j, ends.a[j], balls[:, 0], finish)
+        parts += _base_end(discs, j, chains[j], balls[:, 0], finish)
     return parts
 
 
@@ -153,13 +155,13 @@ def _base(discs: Discs, balls: Array, finish: Finish) -> list[Part]:
     return parts
 
 
-def _base_end(discs: Discs, j: int, a: Array, balls: Array, finish: Finish) -> list[Part]:
-    """What holds leg j's end at a (3,) on the base."""
-    drives, up = discs.drives, discs.side * Z
-    if drives.crank[j]:
-        return crank_parts(drives, j, a, balls, discs.base, up, finish)
-    if drives.slider[j]:
-        return slider_parts(drives, j, a, balls, discs.base, finish)
+def _base_end(discs: Discs, j: int, chain: Array, balls: Array, finish: Finish) -> list[Part]:
+    """What holds leg j's end on the base, the last point of its chain (k, 3)."""
+    drives, up, a = discs.drives, discs.side * Z, chain[-1]
+    if drives.arms[j]:
+        return arm_parts(drives, j, chain, balls, discs.base, up, finish)
+    if drives.guides[j]:
+        return guide_parts(drives, j, a, balls, discs.base, finish)
     return _joint(a, -up, float((a - discs.base) @ up), balls[j], finish)
 
 

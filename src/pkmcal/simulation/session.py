@@ -24,6 +24,7 @@ from pkmcal.simulation.render import Sensor, View, photograph, render
 from pkmcal.simulation.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
 from pkmcal.simulation.surfaces import SmoothNoise
 from pkmcal.simulation.truth import FILE, Settings, Truth, draw_truth, stream, truth_document
+from pkmcal.wording import listed
 
 Progress = Callable[[int, int], None]
 
@@ -150,11 +151,15 @@ def _check(folder: Path, drawing: Machine) -> None:
             what=f"mechanism {drawing.name!r} has no tubes, so its photographs would show no legs",
             expected="tubes: [{radius: ..., from: ..., to: ...}] on its legs",
         )
-    if drawing.layout.n_internal:
+    hinged = {
+        drawing.document.legs[j].platform.joint
+        for j in np.flatnonzero(drawing.layout.internal >= 0)
+    }
+    if hinged:
         raise InputError(
             what=f"mechanism {drawing.name!r} has side bars that turn on hinges, and how far they"
             " turn is not known where it is drawn",
-            expected="platform joints other than hinged-bar",
+            expected=f"platform joints other than {listed(sorted(hinged))}",
             next_step="simulate the machine with one rod a forearm, such as h4",
         )
     try:

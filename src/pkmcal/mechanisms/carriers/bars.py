@@ -12,12 +12,15 @@ import numpy as np
 from pydantic import Field
 
 from pkmcal.arrays import Array
+from pkmcal.errors import InputError
 from pkmcal.files import Schema
 from pkmcal.geometry.batches import turned
 from pkmcal.geometry.rigid import cross, dot, rotation, skew
 from pkmcal.mechanisms.carriers.contract import (
+    Chain,
     Direction,
     PlatformCarrier,
+    Site,
     direction_by_frame,
     moved_direction,
     moved_point,
@@ -28,6 +31,10 @@ from pkmcal.mechanisms.carriers.contract import (
 
 BarNumber = Annotated[int, Field(ge=1, description="the number of the side bar, from 1")]
 Point = Annotated[tuple[float, float, float], Field(description="a point [x, y, z] in metres")]
+
+
+FOLDED = "its side bars lie on each other"
+"""Where the platform has turned by a right angle."""
 
 
 class BarDocument(Schema):
@@ -57,11 +64,27 @@ class Bar(PlatformCarrier):
     [C] fig. 3: hinge (s h, 0, 0), center (0, t d, 0).
     """
 
+    body: ClassVar = "bar"
     floats: ClassVar = True
+    most_turn: ClassVar = np.pi / 2
+    in_the_way: ClassVar = FOLDED
     joints: ClassVar = ("bar",)
     schema: ClassVar = BarDocument
     shared: ClassVar = ("hinge",)
     parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("hinge", "m", "center"))
+
+    @classmethod
+    def check(cls, node: BarDocument, site: Site) -> None:
+        """Bars keep their direction where the platform only turns with them."""
+        super().check(node, site)
+        if site.motion == "spatial":
+            raise InputError(
+                f"leg {site.leg} ends on a bar that keeps its direction, on a platform that may "
+                "tilt",
+                where=site.where("joint"),
+                expected="motion: schoenflies, or joint: hinged-bar with an axis and two rods a "
+                "motor",
+            )
 
     @staticmethod
     def place(
@@ -105,6 +128,12 @@ class Bar(PlatformCarrier):
         del parameters
         return turned_blocks(6, (0, e), (3, f))
 
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """From the hinge's place on the platform along the base frame's axes."""
+        center, hinge = parameters[..., :3], parameters[..., 3:]
+        return Chain("float", hinge, np.zeros_like(center), center)
+
 
 @final
 class HingedBar(PlatformCarrier):
@@ -112,7 +141,10 @@ class HingedBar(PlatformCarrier):
     frame; phi is the bar's internal coordinate (errata, [C] "Rods").
     """
 
+    body: ClassVar = "bar"
     turns: ClassVar = True
+    most_turn: ClassVar = np.pi / 2
+    in_the_way: ClassVar = FOLDED
     joints: ClassVar = ("hinged-bar",)
     schema: ClassVar = HingedBarDocument
     shared: ClassVar = ("hinge", "axis")
@@ -121,6 +153,17 @@ class HingedBar(PlatformCarrier):
         *vectors("hinge", "m", "center"),
         *vectors("axis", "1", "axis"),
     )
+
+    @classmethod
+    def check(cls, node: HingedBarDocument, site: Site) -> None:
+        """A bar that turns freely lets the platform tilt."""
+        super().check(node, site)
+        if site.motion != "spatial":
+            raise InputError(
+                f"leg {site.leg} ends on a bar that turns about a hinge, which tilts the platform",
+                where=site.where("joint"),
+                expected="motion: spatial, or joint: bar",
+            )
 
     @staticmethod
     def place(
@@ -237,6 +280,13 @@ class HingedBar(PlatformCarrier):
         out[..., :3, 0], out[..., 3:6, 0] = -w, w
         out[..., :3, 1] = cross(w, parameters[..., :3])
         return out
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """About w, through the hinge's place on the platform."""
+        axis = parameters[..., 6:]
+        w = axis / np.sqrt(dot(axis, axis))[..., None]
+        return Chain("turn", parameters[..., 3:6], w, parameters[..., :3])
 
 
 def _cos_sin(internal: Array | None) -> tuple[Array, Array]:

@@ -11,21 +11,30 @@ also its derivatives by the parameters.
 from __future__ import annotations
 
 import importlib
+import os
 import pkgutil
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import cache
 from math import hypot
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator
 
 from pkmcal.arrays import Array
+from pkmcal.errors import InputError
 from pkmcal.files import Schema
 from pkmcal.geometry.rigid import apply, skew
 
 SHORTEST = 1e-6
 """An axis shorter than this is a row of zeros, not a direction."""
+IN_PLANE = 1e-6
+"""Metres out of a plane, and radians off its normal, that rounding in a file explains."""
+
+AxisRole = Literal["square", "twist"]
+"""What a joint's axis adds to a spatial machine: the limb is square to it, or, where both ends'
+axes do so, the limb does not twist between them."""
 
 
 def _direction(axis: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -78,10 +87,41 @@ class CarriedPoint(NamedTuple):
     by_parameters: Array
 
 
+class Site(NamedTuple):
+    """Where a carrier stands in a mechanism file: leg from 1, ``base`` or ``platform``, the file's
+    motion, and what names the place of one of the part's keys, or of the whole part.
+    """
+
+    leg: int
+    side: str
+    motion: str
+    where: Callable[..., str]
+
+
+class Chain(NamedTuple):
+    """The one elementary joint that carries a limb's end, for programs of bodies and joints.
+
+    motion : what the arm does by the reading (base side) or by the platform (platform side):
+        ``fixed`` it stands on its body, ``slide`` it goes along the axis, ``turn`` it turns about
+        it, by the right-hand rule, ``float`` it keeps its direction where the platform turns.
+    point : (..., 3) m, where the arm stands: on the axis, if there is one; in the body's frame.
+    axis : (..., 3) unit, in the body's frame; zeros where the motion has none.
+    arm : (..., 3) m, from the point to the limb's end at reading or internal coordinate zero; in
+        the body's frame, of a floating one along the base frame's axes.
+    """
+
+    motion: Literal["fixed", "slide", "turn", "float"]
+    point: Array
+    axis: Array
+    arm: Array
+
+
 class Carrier(ABC):
     """What both sides share: words in files, schema, parameters, and changes of the frames.
 
-    shared : fields that legs on one motor, or on one bar, have in common.
+    joints : the words. schema : their fields; the first three parameters are ``center``.
+    shared : fields that legs on one motor, or on one body of the platform, have in common.
+    held_in_plane : fields that are no unknowns on a planar machine, which they would tilt.
 
     Frames change by E on base coordinates and F on platform coordinates, (..., 4, 4), see
     :mod:`pkmcal.identify.gauge`.
@@ -91,6 +131,29 @@ class Carrier(ABC):
     schema: ClassVar[type[Schema]]
     parameters: ClassVar[tuple[ParameterKind, ...]]
     shared: ClassVar[tuple[str, ...]] = ()
+    held_in_plane: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def check(cls, node: Any, site: Site) -> None:
+        """Raise InputError for what the schema lets pass and no machine can be.
+
+        On a planar machine an ``axis`` is what the part turns about, unless its carrier says
+        otherwise.
+        """
+        axis = getattr(node, "axis", None)
+        if site.motion == "planar" and axis is not None and hypot(axis[0], axis[1]) > IN_PLANE:
+            raise InputError(
+                f"leg {site.leg} of a planar machine turns about an axis that is not the plane's",
+                where=site.where("axis"),
+                found=f"[{axis[0]:g}, {axis[1]:g}, {axis[2]:g}]",
+                expected="[0, 0, 1]: a planar machine moves in the base frame's x-y plane",
+            )
+
+    @staticmethod
+    def axis_role(node: Any) -> AxisRole | None:
+        """What the ``axis`` of a part adds to the closure of a spatial machine."""
+        del node
+        return None
 
     @staticmethod
     @abstractmethod
@@ -107,14 +170,25 @@ class Carrier(ABC):
     def carried(parameters: Array, e: Array, f: Array) -> Array:
         """Derivative (..., n, n) of :meth:`moved` by the parameters."""
 
+    @staticmethod
+    def chain(parameters: Array) -> Chain | None:
+        """The same end as an elementary joint, for parameters (..., n), which exports build from;
+        None where it is none, and then C, MuJoCo and the firmwares refuse the machine.
+        """
+        del parameters
+        return None
+
 
 class BaseCarrier(Carrier):
     """Gives A, the limb's end on the base side, as a function of the joint reading.
 
-    driven : the reading moves A; the rod then has a length of its own.
+    driven : the reading moves A; the rod then has a length of its own. unit : of the reading, m or
+    rad. A driven carrier's schema may have ``motor``, the reading's column from 1, and ``range``,
+    its smallest and largest reading.
     """
 
     driven: ClassVar[bool] = False
+    unit: ClassVar[Literal["m", "rad"]] = "m"
 
     @staticmethod
     @abstractmethod
@@ -144,17 +218,33 @@ class BaseCarrier(Carrier):
         del parameters, length, near
         return np.full(point_b.shape[:-1], np.nan)
 
+    @classmethod
+    def skeleton(cls, parameters: Array, readings: Array) -> Array:
+        """Points (..., k, 3) along the arm that carries A, from where the motor holds it to A
+        itself, for pictures; m, base frame.
+
+        A alone, as here, has no arm: it stands still, or runs along a guide, wherever its readings
+        take it.
+        """
+        return cls.place(parameters, readings)[0][..., None, :]
+
 
 class PlatformCarrier(Carrier):
     """Gives B, the limb's end on the platform side, as a function of the platform's pose.
 
+    body : the field whose number says on which body of an articulated platform the leg ends.
     turns : B also turns about a hinge, by an internal coordinate of the pose that no reading
-    knows; legs with the same ``bar`` in the file share it.
+    knows; legs on the same body share it.
     floats : ``center`` is told along the base frame's axes.
+    most_turn : how far the platform turns about z to either side, rad, until something is in the
+    way; ``in_the_way`` says what.
     """
 
+    body: ClassVar[str] = ""
     turns: ClassVar[bool] = False
     floats: ClassVar[bool] = False
+    most_turn: ClassVar[float] = np.inf
+    in_the_way: ClassVar[str] = ""
 
     @staticmethod
     @abstractmethod
@@ -256,21 +346,32 @@ def turned_blocks(n: int, *blocks: tuple[int, Array]) -> Array:
     return out
 
 
-@cache
 def base_carriers() -> dict[str, type[BaseCarrier]]:
-    """The base carrier of every joint kind known to mechanism files."""
+    """The base carrier of every joint kind known to mechanism files: of the modules beside this
+    one, of those that ``PKMCAL_CARRIERS`` names, and of any module imported before.
+    """
     _import_all()
     return {joint: cls for cls in BaseCarrier.__subclasses__() for joint in cls.joints}
 
 
-@cache
 def platform_carriers() -> dict[str, type[PlatformCarrier]]:
-    """The platform carrier of every joint kind known to mechanism files."""
+    """The platform carrier of every joint kind known to mechanism files, as for the base."""
     _import_all()
     return {joint: cls for cls in PlatformCarrier.__subclasses__() for joint in cls.joints}
 
 
+@cache
 def _import_all() -> None:
     package = __name__.rpartition(".")[0]
     for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
         importlib.import_module(f"{package}.{module.name}")
+    for name in os.environ.get("PKMCAL_CARRIERS", "").replace(",", " ").split():
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise InputError(
+                "a module with carriers cannot be imported",
+                where="the environment's PKMCAL_CARRIERS",
+                found=str(error),
+                expected="names of Python modules, which stand where Python looks for them",
+            ) from None

@@ -8,13 +8,16 @@ import numpy as np
 from pydantic import Field
 
 from pkmcal.arrays import Array
+from pkmcal.errors import InputError
 from pkmcal.files import Schema
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
+    Chain,
     Direction,
     Interval,
     ParameterKind,
+    Site,
     direction_by_frame,
     moved_direction,
     moved_point,
@@ -24,6 +27,8 @@ from pkmcal.mechanisms.carriers.contract import (
 )
 
 UP = np.array([0.0, 0.0, 1.0])
+SLANTED = 1e-3
+"""A direction nearer to the axis than this (rad) shows no angle about it."""
 ZERO = tuple(ParameterKind(f"zero.{axis}", "1", "", np.nan) for axis in "xyz")
 
 
@@ -70,9 +75,11 @@ class Crank(BaseCarrier):
     """
 
     driven: ClassVar = True
+    unit: ClassVar = "rad"
     joints: ClassVar = ("crank",)
     schema: ClassVar = CrankDocument
     shared: ClassVar = ("center", "axis", "radial")
+    held_in_plane: ClassVar = ("axis",)
     parameters: ClassVar = (
         *vectors("center", "m", "center"),
         *vectors("axis", "1", "axis"),
@@ -82,6 +89,26 @@ class Crank(BaseCarrier):
         ParameterKind("radial", "m", "center"),
         *ZERO,
     )
+
+    @classmethod
+    def check(cls, node: CrankDocument, site: Site) -> None:
+        """The direction from which the crank's angle counts is one."""
+        super().check(node, site)
+        direction = node.zero if node.zero is not None else (0.0, 0.0, 1.0)
+        if np.linalg.norm(np.cross(direction, node.axis)) > SLANTED:
+            return
+        if node.zero is None:
+            raise InputError(
+                f"the crank of leg {site.leg} turns about a vertical axis, so no horizontal "
+                "direction square to it is the first",
+                where=site.where("axis"),
+                expected="zero: [x, y, z], the arm's direction at angle 0",
+            )
+        raise InputError(
+            f"the crank of leg {site.leg} has its zero direction along its axis",
+            where=site.where("zero"),
+            expected="the arm's direction at angle 0, across the axis",
+        )
 
     @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
@@ -131,6 +158,14 @@ class Crank(BaseCarrier):
         first, second = apart
         return near + np.where(np.abs(first) <= np.abs(second), first, second)
 
+    @classmethod
+    def skeleton(cls, parameters: Array, readings: Array) -> Array:
+        """The arm's foot on the crank's axis, and A."""
+        frame = _frame(parameters)
+        along, radial = (parameters[..., k, None] for k in (8, 9))
+        foot = parameters[..., :3] + along * frame.v + radial * frame.e0
+        return np.stack(np.broadcast_arrays(foot, cls.place(parameters, readings)[0]), axis=-2)
+
     @staticmethod
     def moved(parameters: Array, e: Array, f: Array) -> Array:
         """Centre and axis move with the base frame; ``zero`` and the vertical stay, so that the
@@ -173,6 +208,15 @@ class Crank(BaseCarrier):
         out[..., :3, 3:6] = _by_axis(lag, before.v, parameters)
         out[..., :3, 9] = moved_direction(before.e0, e) - after.e0
         return out
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """The arm as at reading zero, about v; its foot is ``center + along v + radial e0``."""
+        frame = _frame(parameters)
+        arm, _, along, radial = (parameters[..., k, None] for k in range(6, 10))
+        out, _ = _turned(frame, parameters, np.zeros(parameters.shape[:-1]))
+        foot = parameters[..., :3] + along * frame.v + radial * frame.e0
+        return Chain("turn", foot, frame.v, arm * out)
 
 
 def _frame(parameters: Array) -> _Frame:

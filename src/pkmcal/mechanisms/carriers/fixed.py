@@ -9,12 +9,14 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
+    Chain,
+    Site,
     moved_point,
     point_by_frame,
     turned_blocks,
     vectors,
 )
-from pkmcal.mechanisms.carriers.joint import JointDocument
+from pkmcal.mechanisms.carriers.joint import JointDocument, check_joint, joint_axis_role
 
 CENTER = vectors("center", "m", "center")
 
@@ -26,6 +28,13 @@ class FixedPoint(BaseCarrier):
     joints: ClassVar = ("spherical", "universal", "revolute")
     schema: ClassVar = JointDocument
     parameters: ClassVar = CENTER
+    axis_role = staticmethod(joint_axis_role)
+
+    @classmethod
+    def check(cls, node: JointDocument, site: Site) -> None:
+        """An axis where the joint has one, and none where not."""
+        check_joint(node, site)
+        super().check(node, site)
 
     @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
@@ -56,3 +65,9 @@ class FixedPoint(BaseCarrier):
         """A turn."""
         del parameters, f
         return turned_blocks(3, (0, e))
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """The centre, without a joint."""
+        none = np.zeros_like(parameters)
+        return Chain("fixed", parameters, none, none)

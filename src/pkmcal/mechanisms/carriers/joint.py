@@ -1,11 +1,16 @@
-"""A joint at a limb's end as it stands in the file: a centre, and perhaps an axis."""
+"""A joint at a limb's end as it stands in the file: a centre, and perhaps an axis.
+
+A spherical joint has a centre. A universal joint has its first axis, fixed to the body that it
+stands on; a revolute joint has one axis, and the limb turns about it.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
+from pkmcal.errors import InputError
 from pkmcal.files import Schema
-from pkmcal.mechanisms.carriers.contract import Direction
+from pkmcal.mechanisms.carriers.contract import AxisRole, Direction, Site
 
 
 class JointDocument(Schema):
@@ -14,3 +19,26 @@ class JointDocument(Schema):
     joint: Literal["spherical", "universal", "revolute"]
     center: tuple[float, float, float]
     axis: Direction | None = None
+
+
+def check_joint(node: JointDocument, site: Site) -> None:
+    """Raise InputError for an axis too many or too few."""
+    if node.joint == "spherical" and node.axis is not None:
+        raise InputError(
+            f"leg {site.leg} has a spherical joint with an axis",
+            where=site.where("axis"),
+            expected="no axis, or joint: universal or revolute",
+        )
+    if node.joint == "revolute" and node.axis is None and site.motion != "planar":
+        raise InputError(
+            f"leg {site.leg} has a revolute joint without an axis",
+            where=site.where(),
+            expected=f"axis: [x, y, z] in the {site.side} frame, the direction that it turns about",
+        )
+
+
+def joint_axis_role(node: Any) -> AxisRole | None:
+    """A revolute joint's limb is square to its axis; a universal joint with an axis holds twist."""
+    if node.joint == "revolute":
+        return "square"
+    return "twist" if node.joint == "universal" and node.axis is not None else None

@@ -9,13 +9,15 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.batches import turned
 from pkmcal.mechanisms.carriers.contract import (
+    Chain,
     PlatformCarrier,
+    Site,
     moved_point,
     point_by_frame,
     turned_blocks,
 )
 from pkmcal.mechanisms.carriers.fixed import CENTER
-from pkmcal.mechanisms.carriers.joint import JointDocument
+from pkmcal.mechanisms.carriers.joint import JointDocument, check_joint, joint_axis_role
 
 
 @final
@@ -25,6 +27,13 @@ class RigidPlatform(PlatformCarrier):
     joints: ClassVar = ("spherical", "universal", "revolute")
     schema: ClassVar = JointDocument
     parameters: ClassVar = CENTER
+    axis_role = staticmethod(joint_axis_role)
+
+    @classmethod
+    def check(cls, node: JointDocument, site: Site) -> None:
+        """An axis where the joint has one, and none where not."""
+        check_joint(node, site)
+        super().check(node, site)
 
     @staticmethod
     def place(
@@ -61,3 +70,9 @@ class RigidPlatform(PlatformCarrier):
         """A turn."""
         del parameters, e
         return turned_blocks(3, (0, f))
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """The centre, without a joint."""
+        none = np.zeros_like(parameters)
+        return Chain("fixed", parameters, none, none)

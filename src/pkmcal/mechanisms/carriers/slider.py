@@ -8,12 +8,16 @@ import numpy as np
 from pydantic import Field
 
 from pkmcal.arrays import Array
+from pkmcal.errors import InputError
 from pkmcal.files import Schema
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import (
+    IN_PLANE,
     BaseCarrier,
+    Chain,
     Direction,
     Interval,
+    Site,
     direction_by_frame,
     moved_direction,
     moved_point,
@@ -44,7 +48,18 @@ class Slider(BaseCarrier):
     joints: ClassVar = ("slider",)
     schema: ClassVar = SliderDocument
     shared: ClassVar = ("axis",)
+    held_in_plane: ClassVar = ("axis.z",)
     parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("axis", "1", "axis"))
+
+    @classmethod
+    def check(cls, node: SliderDocument, site: Site) -> None:
+        """A planar machine's guides lie in its plane."""
+        if site.motion == "planar" and abs(node.axis[2]) > IN_PLANE:
+            raise InputError(
+                f"the slider of leg {site.leg} leaves the plane of a planar machine",
+                where=site.where("axis"),
+                expected="[x, y, 0]: a planar machine moves in the base frame's x-y plane",
+            )
 
     @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
@@ -98,3 +113,11 @@ class Slider(BaseCarrier):
         """Turns."""
         del parameters, f
         return turned_blocks(6, (0, e), (3, e))
+
+    @staticmethod
+    def chain(parameters: Array) -> Chain:
+        """A slide from the centre along v."""
+        center, axis = parameters[..., :3], parameters[..., 3:]
+        return Chain(
+            "slide", center, axis / np.sqrt(dot(axis, axis))[..., None], np.zeros_like(center)
+        )

@@ -1,0 +1,198 @@
+"""Configurations put aside before an estimate is made: which, and the estimate without them.
+
+They are spread over the workspace, or a region of it. What the calibrated machine then predicts of
+them is judged in :mod:`pkmcal.judge.holdouts`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.calibration.turns import Turns
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import rotation_vector
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.problem import Estimate
+from pkmcal.measurements import Measurements, Observation
+from pkmcal.mechanisms import Machine
+
+LEAST = 3
+"""Configurations without which a calibration of the rest means nothing."""
+
+ROUNDS = 100
+STANDS_OUT = 0.7
+"""Standard deviations of the whole workspace by which a region must lie off its middle to be named
+by that direction."""
+AXES = (
+    ("turned about −x", "turned about +x"),
+    ("turned about −y", "turned about +y"),
+    ("turned about −z", "turned about +z"),
+    ("towards −x", "towards +x"),
+    ("towards −y", "towards +y"),
+    ("low", "high"),
+)
+
+
+@dataclass(frozen=True)
+class Region:
+    """rows : (n,) configurations. name : where it is, in words."""
+
+    rows: Integers
+    name: str
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Configurations that an estimate did not see, to judge it by.
+
+    region : which. measurements : of these and of those in use.
+    """
+
+    region: Region
+    measurements: Measurements
+
+
+def places(machine: Machine, poses: Array) -> Array:
+    """Where poses (n, 4, 4) are, as points (n, 6) in metres: turns times the platform's radius,
+    then positions; both from the mean.
+    """
+    joints = machine.platform_centers()
+    radius = float(np.sqrt(np.mean(np.sum((joints - joints.mean(axis=0)) ** 2, axis=1))))
+    turns = rotation_vector(poses[:, :3, :3] @ poses[0, :3, :3].T)
+    out = np.concatenate([turns * radius, poses[:, :3, 3]], axis=1)
+    return out - out.mean(axis=0)
+
+
+def clusters(points: Array, n: int) -> Integers:
+    """Number (k,) of each point's cluster: k-means, begun at points far from one another.
+
+    No random draw: the same points give the same clusters.
+    """
+    centres = points[[int(np.argmax(np.sum(points**2, axis=1)))]]
+    for _ in range(n - 1):
+        far = _distances(points, centres).min(axis=1)
+        centres = np.concatenate([centres, points[[int(np.argmax(far))]]])
+    owner = np.argmin(_distances(points, centres), axis=1)
+    for _ in range(ROUNDS):
+        inside = owner[:, None] == np.arange(n)
+        centres = (inside.T @ points) / np.maximum(inside.sum(axis=0), 1)[:, None]
+        new = np.argmin(_distances(points, centres), axis=1)
+        if np.array_equal(new, owner) or len(np.unique(new)) < n:
+            break
+        owner = new
+    return owner
+
+
+def spread(points: Array, n: int) -> Integers:
+    """Some points, n in rising order, spread over all: the middle one of each of n clusters."""
+    owner = clusters(points, n)
+    chosen: list[int] = []
+    for k in range(n):
+        rows = np.flatnonzero(owner == k)
+        middle = points[rows].mean(axis=0)
+        chosen.append(int(rows[np.argmin(np.sum((points[rows] - middle) ** 2, axis=1))]))
+    return np.sort(np.array(chosen))
+
+
+def regions(points: Array, rows: Integers, n: int) -> tuple[Region, ...]:
+    """The regions, n, of configurations ``rows`` at points (k, 6), see :func:`places`."""
+    owner = clusters(points, n)
+    scale = points.std(axis=0)
+    scale = np.where(scale > 1e-6, scale, np.inf)  # a direction in which nothing moves
+    found = [np.flatnonzero(owner == k) for k in range(n)]
+    return tuple(
+        Region(rows[own], _named(points[own].mean(axis=0) / scale)) for own in found if own.size
+    )
+
+
+def _named(middle: Array) -> str:
+    """A region by the two directions in which it lies off the middle the most."""
+    order = np.argsort(-np.abs(middle))[:2]
+    words = [AXES[k][int(middle[k] > 0)] for k in order if abs(middle[k]) > STANDS_OUT]
+    return ", ".join(words) or "the middle"
+
+
+def _distances(points: Array, centres: Array) -> Array:
+    """Squared distances (k, n)."""
+    return np.sum((points[:, None] - centres) ** 2, axis=-1)
+
+
+def chosen(drawing: Machine, whole: Estimate, n: int) -> Region:
+    """Some configurations, n, to hold out, spread over the workspace."""
+    rows = np.flatnonzero(whole.configurations)
+    _check(n, rows.size - n, rows.size, "configurations held out")
+    points = places(drawing, whole.state.T_base_platform[rows])
+    return Region(rows[spread(points, n)], "spread over the workspace")
+
+
+def by_region(drawing: Machine, whole: Estimate, n: int) -> tuple[Region, ...]:
+    """The configurations that were seen, in n regions of the workspace."""
+    rows = np.flatnonzero(whole.configurations)
+    _check(n, rows.size - rows.size // n, rows.size, "regions")
+    points = places(drawing, whole.state.T_base_platform[rows])
+    return regions(points, rows, n)
+
+
+def _check(n: int, left: int, total: int, what: str) -> None:
+    if n >= 1 and left >= max(LEAST, total // 2) and not (what == "regions" and n < 2):
+        return
+    least = 2 if what == "regions" else 1
+    most = total if what == "regions" else total - max(LEAST, total // 2)
+    if most < least:
+        raise InputError(
+            "there are too few configurations to hold any out",
+            found=f"{total} seen",
+            expected=f"{2 * LEAST} at least",
+            next_step="Photograph more configurations",
+        )
+    raise InputError(
+        f"this number of {what} is not possible",
+        found=str(n),
+        expected=f"{least} to {most}, for {total} configurations that were seen",
+    )
+
+
+def select(measurements: Measurements, keep: Booleans) -> Measurements:
+    """The measurements of some configurations (K,); readings keep their rows.
+
+    Boards on the base hang on no configuration and stay.
+    """
+    edges, poses = measurements.edges, measurements.poses
+    on_base = ~measurements.on_platform[poses.mount]
+    return replace(
+        measurements,
+        edges=edges.select(keep[edges.configuration]),
+        poses=poses.select(keep[poses.configuration] | on_base),
+    )
+
+
+def set_aside(drawing: Machine, turns: Turns, out: Region) -> Turns:
+    """What the last turn left, as if a region's configurations had not been taken.
+
+    They did help to find legs in the photographs; no number of the estimate comes from them.
+    """
+    keep = np.ones(len(turns.measurements.joints), dtype=bool)
+    keep[out.rows] = False
+    measurements = select(turns.measurements, keep)
+    return turns._replace(
+        observation=replace(_without(turns.observation, keep), poses=measurements.poses),
+        measurements=measurements,
+        estimate=bundle(drawing, measurements, turns.estimate.state),
+    )
+
+
+def _without(observation: Observation, keep: Booleans) -> Observation:
+    """An observation of the configurations to keep, (K,), edges renumbered."""
+    kept = keep[observation.edges.configuration]
+    points = kept[observation.point_edge]
+    numbers = np.cumsum(kept) - 1
+    return replace(
+        observation,
+        edges=observation.edges.select(kept),
+        rejected=tuple(r for r in observation.rejected if keep[r.configuration]),
+        points=observation.points[points],
+        point_edge=numbers[observation.point_edge[points]],
+    )

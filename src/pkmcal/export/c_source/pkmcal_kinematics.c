@@ -1,0 +1,903 @@
+/*
+ * Machine gough-stewart, exported by pkmcal 0.1.0 from the built-in machine gough-stewart.
+ * Drawing only, not calibrated.
+ * Frames: as in the mechanism file.
+ * Units: m and rad.
+ * pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.
+ * twist: omega_x, omega_y, omega_z (rad/s), tau_x, tau_y, tau_z (m/s): R changes by omega x R, t
+ * by tau, both along the base frame's axes.
+ * length of a rod = reading + offset. Readings in the order of the machine's columns.
+ * C99, math.h alone; no memory is allotted, nothing but the arguments is written, so that all
+ * functions can run at once in several threads. Do not compile with -ffast-math.
+ *
+ * Parameters (sigma: standard deviation of sampling, not of what the model leaves out; held: by
+ * the choice of frames, or by the mechanism file):
+ * legs[1].base.center.x = 0.2693 m
+ * legs[1].base.center.y = 0.02 m
+ * legs[1].base.center.z = 0 m
+ * legs[1].platform.center.x = 0.1143 m
+ * legs[1].platform.center.y = 0.158 m
+ * legs[1].platform.center.z = 0 m
+ * legs[1].length.offset = 0 m
+ * legs[1].tubes[1].radius = 0.014 m
+ * legs[1].tubes[2].radius = 0.009 m
+ * legs[2].base.center.x = 0.2693 m
+ * legs[2].base.center.y = -0.02 m
+ * legs[2].base.center.z = 0 m
+ * legs[2].platform.center.x = 0.1143 m
+ * legs[2].platform.center.y = -0.158 m
+ * legs[2].platform.center.z = 0 m
+ * legs[2].length.offset = 0 m
+ * legs[2].tubes[1].radius = 0.014 m
+ * legs[2].tubes[2].radius = 0.009 m
+ * legs[3].base.center.x = -0.152 m
+ * legs[3].base.center.y = 0.2232 m
+ * legs[3].base.center.z = 0 m
+ * legs[3].platform.center.x = -0.194 m
+ * legs[3].platform.center.y = 0.02 m
+ * legs[3].platform.center.z = 0 m
+ * legs[3].length.offset = 0 m
+ * legs[3].tubes[1].radius = 0.014 m
+ * legs[3].tubes[2].radius = 0.009 m
+ * legs[4].base.center.x = -0.1173 m
+ * legs[4].base.center.y = 0.2432 m
+ * legs[4].base.center.z = 0 m
+ * legs[4].platform.center.x = 0.0796 m
+ * legs[4].platform.center.y = 0.178 m
+ * legs[4].platform.center.z = 0 m
+ * legs[4].length.offset = 0 m
+ * legs[4].tubes[1].radius = 0.014 m
+ * legs[4].tubes[2].radius = 0.009 m
+ * legs[5].base.center.x = -0.1173 m
+ * legs[5].base.center.y = -0.2432 m
+ * legs[5].base.center.z = 0 m
+ * legs[5].platform.center.x = 0.0796 m
+ * legs[5].platform.center.y = -0.178 m
+ * legs[5].platform.center.z = 0 m
+ * legs[5].length.offset = 0 m
+ * legs[5].tubes[1].radius = 0.014 m
+ * legs[5].tubes[2].radius = 0.009 m
+ * legs[6].base.center.x = -0.152 m
+ * legs[6].base.center.y = -0.2232 m
+ * legs[6].base.center.z = 0 m
+ * legs[6].platform.center.x = -0.194 m
+ * legs[6].platform.center.y = -0.02 m
+ * legs[6].platform.center.z = 0 m
+ * legs[6].length.offset = 0 m
+ * legs[6].tubes[1].radius = 0.014 m
+ * legs[6].tubes[2].radius = 0.009 m
+ */
+#include "pkmcal_kinematics.h"
+
+#include <math.h>
+
+/* What a reading moves: a rod's length; its end on the base, along an axis or about one; nothing,
+ * where the rod has none. */
+enum { CONSTANT, TELESCOPE, SLIDE, TURN };
+
+/* A rod between a on the base and b on the platform, with q its reading and phi the turn of the bar
+ * that it ends on, if it ends on one:
+ *   a = base, base + q rate (SLIDE), or base + cos(q) arm + sin(q) rate (TURN), base frame;
+ *   b = t + R (platform + cos(phi) swing + sin(phi) swing_rate) + floating;
+ *   |b - a| = length, or length + q (TELESCOPE).
+ * Fields that are not written are zero. */
+typedef struct {
+    int drive;
+    int joint;            /* column of the reading */
+    double middle;        /* m or rad, mid-range reading of a SLIDE or TURN */
+    double length;        /* m */
+    double base[3];       /* m, joint centre, its place at reading 0, or the foot of its arm */
+    double arm[3];        /* m, from the foot to the end at reading 0, square to the axis */
+    double rate[3];       /* m/m or m/rad, how the end moves at reading 0 */
+    double platform[3];   /* m, platform frame: joint centre, or the foot of its arm on the hinge */
+    int hinge;            /* of the bar that turns, from 1; 0 without */
+    double hinge_axis[3]; /* unit, platform frame */
+    double swing[3];      /* m, platform frame: from the foot to the end at phi = 0 */
+    double swing_rate[3]; /* m/rad */
+    double floating[3];   /* m, base frame: on a bar that keeps its direction */
+} rod_data;
+
+/* An equation of a joint's axis: the rod has no part along w, which is the base's axis, the
+ * platform's, or for two universal joints, so that the rod does not twist, square to both. */
+enum { ON_BASE, ON_PLATFORM, TORSION };
+
+typedef struct {
+    int rod; /* from 0 */
+    int kind;
+    double base[3];     /* unit, base frame */
+    double platform[3]; /* unit, platform frame */
+} axis_data;
+
+/* ---- the machine ---- */
+
+#define FREEDOMS 6
+#define HINGES 0
+#define AXES 0
+#define SIZE 0.35941207075412851 /* m, the machine's size */
+#define RADIUS 0.19500824483994403 /* m, the platform's: makes turns lengths */
+
+/* of omega_x, omega_y, omega_z, tau_x, tau_y, tau_z those that the platform has */
+static const int FREE[FREEDOMS] = {0, 1, 2, 3, 4, 5};
+
+static const rod_data RODS[PKMCAL_RODS] = {
+    /* leg 1 of the mechanism file */
+    {
+        .drive = TELESCOPE,
+        .joint = 0,
+        .length = 0.0,
+        .base = {0.26929999999999998, 0.02, 0.0},
+        .platform = {0.1143, 0.158, 0.0},
+    },
+    /* leg 2 of the mechanism file */
+    {
+        .drive = TELESCOPE,
+        .joint = 1,
+        .length = 0.0,
+        .base = {0.26929999999999998, -0.02, 0.0},
+        .platform = {0.1143, -0.158, 0.0},
+    },
+    /* leg 3 of the mechanism file */
+    {
+        .drive = TELESCOPE,
+        .joint = 2,
+        .length = 0.0,
+        .base = {-0.152, 0.22320000000000001, 0.0},
+        .platform = {-0.19400000000000001, 0.02, 0.0},
+    },
+    /* leg 4 of the mechanism file */
+    {
+        .drive = TELESCOPE,
+        .joint = 3,
+        .length = 0.0,
+        .base = {-0.1173, 0.2432, 0.0},
+        .platform = {0.079600000000000004, 0.17799999999999999, 0.0},
+    },
+    /* leg 5 of the mechanism file */
+    {
+        .drive = TELESCOPE,
+        .joint = 4,
+        .length = 0.0,
+        .base = {-0.1173, -0.2432, 0.0},
+        .platform = {0.079600000000000004, -0.17799999999999999, 0.0},
+    },
+    /* leg 6 of the mechanism file */
+    {
+        .drive = TELESCOPE,
+        .joint = 5,
+        .length = 0.0,
+        .base = {-0.152, -0.22320000000000001, 0.0},
+        .platform = {-0.19400000000000001, -0.02, 0.0},
+    },
+};
+
+/* one row at least */
+static const axis_data AXIS[AXES + 1] = {
+    {.rod = 0},
+};
+
+static const pkmcal_pose HOME = {{{0.99999999999357247, -9.5379877496990761e-17, -3.5854207794893581e-06}, {9.5379797522831603e-17, 1.0, -2.2305547142772206e-17}, {3.5854207794893581e-06, 2.2305205165920852e-17, 0.99999999999357247}}, {6.8825564613636151e-05, -3.0639008595821244e-17, 0.35941207075412851}};
+
+/* m or rad, by the mechanism file */
+static const double RANGE[PKMCAL_JOINTS][2] = {
+    {0.34499999999999997, 0.48499999999999999},
+    {0.34499999999999997, 0.48499999999999999},
+    {0.34499999999999997, 0.48499999999999999},
+    {0.34499999999999997, 0.48499999999999999},
+    {0.34499999999999997, 0.48499999999999999},
+    {0.34499999999999997, 0.48499999999999999}
+};
+
+/* ---- what follows is the same for every machine ---- */
+
+#define EQUATIONS (PKMCAL_RODS + AXES)
+#define UNKNOWNS (FREEDOMS + HINGES)
+#define INVERSE_UNKNOWNS (PKMCAL_JOINTS + HINGES)
+#define MOST_UNKNOWNS (UNKNOWNS > INVERSE_UNKNOWNS ? UNKNOWNS : INVERSE_UNKNOWNS)
+
+/* Where the platform is, and its bars. */
+typedef struct {
+    pkmcal_pose pose;
+    double hinges[HINGES + 1]; /* rad; C has no arrays of none */
+} state;
+
+/* ---- vectors and linear equations ---- */
+
+static double dot(const double a[3], const double b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static void cross(const double a[3], const double b[3], double out[3])
+{
+    out[0] = a[1] * b[2] - a[2] * b[1];
+    out[1] = a[2] * b[0] - a[0] * b[2];
+    out[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+static void turned(const pkmcal_pose *pose, const double v[3], double out[3])
+{
+    int i;
+    for (i = 0; i < 3; ++i) {
+        out[i] = pose->R[i][0] * v[0] + pose->R[i][1] * v[1] + pose->R[i][2] * v[2];
+    }
+}
+
+/* Unit direction from a to b; returns their distance, m. */
+static double direction(const double a[3], const double b[3], double u[3])
+{
+    double size;
+    int i;
+    for (i = 0; i < 3; ++i) {
+        u[i] = b[i] - a[i];
+    }
+    size = sqrt(dot(u, u));
+    for (i = 0; i < 3; ++i) {
+        u[i] /= size;
+    }
+    return size;
+}
+
+static int all_finite(const double *values, int count)
+{
+    int k;
+    for (k = 0; k < count; ++k) {
+        if (!isfinite(values[k])) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Solves m x = v, n of them, x in v's place, with partial pivoting; m is lost. Returns the smallest
+ * pivot. */
+static double solve(int n, double m[][MOST_UNKNOWNS], double v[])
+{
+    double least = HUGE_VAL;
+    int i, j, k;
+    for (k = 0; k < n; ++k) {
+        int best = k;
+        for (i = k + 1; i < n; ++i) {
+            if (fabs(m[i][k]) > fabs(m[best][k])) {
+                best = i;
+            }
+        }
+        if (best != k) {
+            const double held = v[k];
+            v[k] = v[best];
+            v[best] = held;
+            for (j = k; j < n; ++j) {
+                const double moved = m[k][j];
+                m[k][j] = m[best][j];
+                m[best][j] = moved;
+            }
+        }
+        if (!(fabs(m[k][k]) > 0.0)) {
+            return 0.0;
+        }
+        least = fmin(least, fabs(m[k][k]));
+        for (i = k + 1; i < n; ++i) {
+            const double factor = m[i][k] / m[k][k];
+            for (j = k + 1; j < n; ++j) {
+                m[i][j] -= factor * m[k][j];
+            }
+            v[i] -= factor * v[k];
+        }
+    }
+    for (k = n - 1; k >= 0; --k) {
+        for (j = k + 1; j < n; ++j) {
+            v[k] -= m[k][j] * v[j];
+        }
+        v[k] /= m[k][k];
+    }
+    return least;
+}
+
+/* ---- a rod's ends and length ---- */
+
+/* The rod's end on the base, m, base frame. */
+static void base_end(const rod_data *rod, const double joints[PKMCAL_JOINTS], double a[3])
+{
+    double by_arm = 0.0, by_rate = 0.0;
+    int i;
+    if (rod->drive == SLIDE) {
+        by_rate = joints[rod->joint];
+    } else if (rod->drive == TURN) {
+        by_arm = cos(joints[rod->joint]);
+        by_rate = sin(joints[rod->joint]);
+    }
+    for (i = 0; i < 3; ++i) {
+        a[i] = rod->base[i] + by_arm * rod->arm[i] + by_rate * rod->rate[i];
+    }
+}
+
+/* The rod's length, m. */
+static double rod_length(const rod_data *rod, const double joints[PKMCAL_JOINTS])
+{
+    return rod->drive == TELESCOPE ? rod->length + joints[rod->joint] : rod->length;
+}
+
+/* The rod's end on the platform: b the point, arm what turns with the platform, m, base frame. */
+static void platform_end(const rod_data *rod, const state *at, double arm[3], double b[3])
+{
+    int i;
+    if (HINGES > 0 && rod->hinge > 0) {
+        const double c = cos(at->hinges[rod->hinge - 1]), s = sin(at->hinges[rod->hinge - 1]);
+        double own[3];
+        for (i = 0; i < 3; ++i) {
+            own[i] = rod->platform[i] + c * rod->swing[i] + s * rod->swing_rate[i];
+        }
+        turned(&at->pose, own, arm);
+    } else {
+        turned(&at->pose, rod->platform, arm);
+    }
+    for (i = 0; i < 3; ++i) {
+        b[i] = at->pose.t[i] + arm[i] + rod->floating[i];
+    }
+}
+
+/* How fast the rod's end on the platform goes along u with the turn of its bar, m/rad. */
+static double hinge_gain(const rod_data *rod, const state *at, const double u[3])
+{
+    const double c = cos(at->hinges[rod->hinge - 1]), s = sin(at->hinges[rod->hinge - 1]);
+    double own[3], rate[3];
+    int i;
+    for (i = 0; i < 3; ++i) {
+        own[i] = c * rod->swing_rate[i] - s * rod->swing[i];
+    }
+    turned(&at->pose, own, rate);
+    return dot(u, rate);
+}
+
+/* How fast the rod's end on the platform goes along u with the reading, m/m or m/rad. */
+static double reading_gain(const rod_data *rod, const double joints[PKMCAL_JOINTS],
+                           const double u[3])
+{
+    switch (rod->drive) {
+    case TELESCOPE:
+        return 1.0;
+    case SLIDE:
+        return dot(u, rod->rate);
+    case TURN:
+        return cos(joints[rod->joint]) * dot(u, rod->rate)
+               - sin(joints[rod->joint]) * dot(u, rod->arm);
+    default:
+        return 0.0;
+    }
+}
+
+/* Hinges turned back by the platform's turn about them, so that the bars keep their directions:
+ * where an articulated platform stands, about. */
+static void upright(state *at)
+{
+    const pkmcal_pose *p = &at->pose;
+    const double axial[3] = {p->R[2][1] - p->R[1][2], p->R[0][2] - p->R[2][0],
+                             p->R[1][0] - p->R[0][1]};
+    const double real = 1.0 + p->R[0][0] + p->R[1][1] + p->R[2][2];
+    int k;
+    for (k = 0; k < PKMCAL_RODS; ++k) {
+        if (HINGES > 0 && RODS[k].hinge > 0) {
+            at->hinges[RODS[k].hinge - 1] = -2.0 * atan2(dot(axial, RODS[k].hinge_axis), real);
+        }
+    }
+}
+
+/* ---- readings at a pose ---- */
+
+/* The angle, of those that differ by whole turns, nearest to another one, rad. */
+static double nearest(double angle, double near)
+{
+    const double turn = 6.283185307179586476925;
+    return angle - turn * floor((angle - near) / turn + 0.5);
+}
+
+/* The reading at which the rod ends in b: [B] eq. 4; [C] eq. 2 as the errata's Model 31. */
+static pkmcal_status rod_reading(const rod_data *rod, const double b[3], double *reading)
+{
+    double d[3], along, across, square, half, straight, first, second;
+    int i;
+    for (i = 0; i < 3; ++i) {
+        d[i] = b[i] - rod->base[i];
+    }
+    along = dot(d, rod->rate);
+    if (rod->drive == TELESCOPE) {
+        *reading = sqrt(dot(d, d)) - rod->length;
+    } else if (rod->drive == SLIDE) {
+        square = rod->length * rod->length - dot(d, d) + along * along;
+        if (!(square >= 0.0)) {
+            return PKMCAL_OUT_OF_REACH;
+        }
+        half = sqrt(square);
+        *reading = along >= rod->middle ? along - half : along + half;
+    } else {
+        across = dot(d, rod->arm);
+        square = dot(d, d) + dot(rod->arm, rod->arm) - rod->length * rod->length;
+        half = 0.5 * square / sqrt(across * across + along * along);
+        if (!(fabs(half) <= 1.0)) {
+            return PKMCAL_OUT_OF_REACH;
+        }
+        half = acos(half);
+        straight = atan2(along, across);
+        first = nearest(straight + half, rod->middle);
+        second = nearest(straight - half, rod->middle);
+        *reading = fabs(first - rod->middle) <= fabs(second - rod->middle) ? first : second;
+    }
+    return PKMCAL_OK;
+}
+
+/* Each motor's mean of what its rods would read by themselves. */
+static pkmcal_status own_readings(const state *at, double joints[PKMCAL_JOINTS])
+{
+    int count[PKMCAL_JOINTS] = {0}, k;
+    for (k = 0; k < PKMCAL_JOINTS; ++k) {
+        joints[k] = 0.0;
+    }
+    for (k = 0; k < PKMCAL_RODS; ++k) {
+        const rod_data *rod = &RODS[k];
+        double arm[3], b[3], reading = 0.0;
+        if (rod->drive == CONSTANT) {
+            continue;
+        }
+        platform_end(rod, at, arm, b);
+        if (rod_reading(rod, b, &reading) != PKMCAL_OK) {
+            return PKMCAL_OUT_OF_REACH;
+        }
+        joints[rod->joint] += reading;
+        ++count[rod->joint];
+    }
+    for (k = 0; k < PKMCAL_JOINTS; ++k) {
+        joints[k] /= count[k];
+    }
+    return PKMCAL_OK;
+}
+
+/* Normal equations of the rods for readings and hinges at a pose. */
+static void normal_equations(const double joints[PKMCAL_JOINTS], const state *at,
+                             double normal[][MOST_UNKNOWNS], double gradient[INVERSE_UNKNOWNS])
+{
+    int i, j, k;
+    for (i = 0; i < INVERSE_UNKNOWNS; ++i) {
+        gradient[i] = 0.0;
+        for (j = 0; j < INVERSE_UNKNOWNS; ++j) {
+            normal[i][j] = 0.0;
+        }
+    }
+    for (k = 0; k < PKMCAL_RODS; ++k) {
+        const rod_data *rod = &RODS[k];
+        double a[3], b[3], u[3], arm[3], row[INVERSE_UNKNOWNS] = {0.0}, value;
+        base_end(rod, joints, a);
+        platform_end(rod, at, arm, b);
+        value = direction(a, b, u) - rod_length(rod, joints);
+        if (rod->drive != CONSTANT) {
+            row[rod->joint] = -reading_gain(rod, joints, u);
+        }
+        if (rod->hinge > 0) {
+            row[PKMCAL_JOINTS + rod->hinge - 1] = hinge_gain(rod, at, u);
+        }
+        for (i = 0; i < INVERSE_UNKNOWNS; ++i) {
+            gradient[i] += row[i] * value;
+            for (j = 0; j < INVERSE_UNKNOWNS; ++j) {
+                normal[i][j] += row[i] * row[j];
+            }
+        }
+    }
+}
+
+/* Several rods a motor or a bar: readings and hinges that fit all rods best, by Gauss-Newton. */
+static pkmcal_status common_readings(state *at, double joints[PKMCAL_JOINTS])
+{
+    double normal[INVERSE_UNKNOWNS][MOST_UNKNOWNS], step[INVERSE_UNKNOWNS], largest = 1.0;
+    int k, steps;
+    for (steps = 0; steps < 15 && largest > 1e-15; ++steps) {
+        normal_equations(joints, at, normal, step);
+        if (!(solve(INVERSE_UNKNOWNS, normal, step) > 0.0)
+            || !all_finite(step, INVERSE_UNKNOWNS)) {
+            return PKMCAL_SINGULAR;
+        }
+        largest = 0.0;
+        for (k = 0; k < INVERSE_UNKNOWNS; ++k) {
+            largest = fmax(largest, fabs(step[k]));
+        }
+        for (k = 0; k < PKMCAL_JOINTS; ++k) {
+            joints[k] -= step[k];
+        }
+        for (k = 0; k < HINGES; ++k) {
+            at->hinges[k] -= step[PKMCAL_JOINTS + k];
+        }
+    }
+    return PKMCAL_OK;
+}
+
+pkmcal_status pkmcal_inverse(const pkmcal_pose *pose, double joints[PKMCAL_JOINTS])
+{
+    double found[PKMCAL_JOINTS];
+    state at;
+    int k;
+    pkmcal_status status;
+    if (!all_finite(&pose->R[0][0], 9) || !all_finite(pose->t, 3)) {
+        return PKMCAL_BAD_INPUT;
+    }
+    at.pose = *pose;
+    upright(&at);
+    status = own_readings(&at, found);
+    if (PKMCAL_COUPLED && status == PKMCAL_OK) {
+        status = common_readings(&at, found);
+    }
+    for (k = 0; status == PKMCAL_OK && k < PKMCAL_JOINTS; ++k) {
+        joints[k] = found[k];
+    }
+    return status;
+}
+
+#if !PKMCAL_COUPLED
+pkmcal_status pkmcal_inverse_jacobian(const pkmcal_pose *pose,
+                                      double jacobian[PKMCAL_JOINTS][6])
+{
+    double joints[PKMCAL_JOINTS];
+    state at;
+    int i, k;
+    const pkmcal_status status = pkmcal_inverse(pose, joints);
+    if (status != PKMCAL_OK) {
+        return status;
+    }
+    at.pose = *pose;
+    for (k = 0; k < PKMCAL_RODS; ++k) {
+        const rod_data *rod = &RODS[k];
+        double a[3], b[3], u[3], arm[3], moment[3], size, gain;
+        if (rod->drive == CONSTANT) {
+            continue;
+        }
+        base_end(rod, joints, a);
+        platform_end(rod, &at, arm, b);
+        size = direction(a, b, u);
+        gain = reading_gain(rod, joints, u);
+        if (!(size > 0.0) || fabs(gain) < 1e-9) {
+            return PKMCAL_SINGULAR; /* the twist tells the rate of no reading */
+        }
+        cross(arm, u, moment);
+        for (i = 0; i < 3; ++i) {
+            jacobian[rod->joint][i] = moment[i] / gain;
+            jacobian[rod->joint][3 + i] = u[i] / gain;
+        }
+    }
+    return PKMCAL_OK;
+}
+#endif
+
+/* ---- the closure: what is left of the rods' and axes' equations ---- */
+
+/* What the readings alone decide: the rods' ends on the base, and their lengths, m. */
+typedef struct {
+    double a[PKMCAL_RODS][3];
+    double length[PKMCAL_RODS];
+} anchors;
+
+/* A row of the closure, that a point moves along w: by the platform's freedoms, turns in RADIUS. */
+static void set_row(const double moment[3], const double w[3], double row[UNKNOWNS])
+{
+    double by_twist[6];
+    int k;
+    for (k = 0; k < 3; ++k) {
+        by_twist[k] = moment[k] / RADIUS;
+        by_twist[3 + k] = w[k];
+    }
+    for (k = 0; k < FREEDOMS; ++k) {
+        row[k] = by_twist[FREE[k]];
+    }
+    for (k = FREEDOMS; k < UNKNOWNS; ++k) {
+        row[k] = 0.0;
+    }
+}
+
+/* The equation of an axis, m: line . w, with line the rod from a to b ([A] eq. 7; errata, 3-UPU). */
+static double axis_row(const axis_data *axis, const double line[3], const double arm[3],
+                       const state *at, double row[UNKNOWNS])
+{
+    double n[3], w[3], moment[3], more[3], around[3];
+    int i;
+    turned(&at->pose, axis->platform, n);
+    for (i = 0; i < 3; ++i) {
+        w[i] = axis->kind == ON_BASE ? axis->base[i] : n[i];
+        more[i] = 0.0;
+    }
+    if (axis->kind == ON_PLATFORM) {
+        cross(n, line, more);
+    } else if (axis->kind == TORSION) {
+        cross(axis->base, n, w);
+        cross(line, axis->base, around);
+        cross(n, around, more);
+    }
+    cross(arm, w, moment);
+    for (i = 0; i < 3; ++i) {
+        moment[i] += more[i];
+    }
+    set_row(moment, w, row);
+    return dot(line, w);
+}
+
+/* The closure, m: |b - a| - length of each rod, then the axes' equations, with derivatives.
+ * Returns the sum of squares, and the largest in *error. */
+static double closure(const anchors *base, const state *at, double value[EQUATIONS],
+                      double rows[EQUATIONS][MOST_UNKNOWNS], double *error)
+{
+    double arm[PKMCAL_RODS][3], b[PKMCAL_RODS][3], cost = 0.0;
+    int i, k;
+    for (k = 0; k < PKMCAL_RODS; ++k) {
+        double u[3], moment[3];
+        platform_end(&RODS[k], at, arm[k], b[k]);
+        value[k] = direction(base->a[k], b[k], u) - base->length[k];
+        cross(arm[k], u, moment);
+        set_row(moment, u, rows[k]);
+        if (HINGES > 0 && RODS[k].hinge > 0) {
+            rows[k][FREEDOMS + RODS[k].hinge - 1] = hinge_gain(&RODS[k], at, u);
+        }
+    }
+    for (k = 0; k < AXES; ++k) {
+        const int rod = AXIS[k].rod;
+        double line[3];
+        for (i = 0; i < 3; ++i) {
+            line[i] = b[rod][i] - base->a[rod][i];
+        }
+        value[PKMCAL_RODS + k] = axis_row(&AXIS[k], line, arm[rod], at, rows[PKMCAL_RODS + k]);
+    }
+    *error = 0.0;
+    for (k = 0; k < EQUATIONS; ++k) {
+        cost += value[k] * value[k];
+        *error = fmax(*error, fabs(value[k]));
+    }
+    return cost;
+}
+
+/* ---- steps of the platform ---- */
+
+/* Makes R a rotation to the last digit, which it must be but for rounding. */
+static int tidy(double R[3][3])
+{
+    double gram[3][3], out[3][3];
+    int i, j, k;
+    for (i = 0; i < 3; ++i) {
+        for (j = 0; j < 3; ++j) {
+            gram[i][j] = R[0][i] * R[0][j] + R[1][i] * R[1][j] + R[2][i] * R[2][j];
+            if (!(fabs(gram[i][j] - (i == j ? 1.0 : 0.0)) < 1e-6)) {
+                return 0;
+            }
+        }
+    }
+    for (i = 0; i < 3; ++i) {
+        for (j = 0; j < 3; ++j) {
+            double sum = 0.0;
+            for (k = 0; k < 3; ++k) {
+                sum += R[i][k] * ((k == j ? 1.5 : 0.0) - 0.5 * gram[k][j]);
+            }
+            out[i][j] = sum;
+        }
+    }
+    for (i = 0; i < 3; ++i) {
+        for (j = 0; j < 3; ++j) {
+            R[i][j] = out[i][j];
+        }
+    }
+    return 1;
+}
+
+/* Turns the platform's axes by the rotation vector w, rad, about the base's (Rodrigues). */
+static void rotate(double R[3][3], const double w[3])
+{
+    const double angle2 = dot(w, w);
+    double s, c;
+    int i, j;
+    if (angle2 < 1e-8) {
+        s = 1.0 - angle2 / 6.0;
+        c = 0.5 - angle2 / 24.0;
+    } else {
+        const double angle = sqrt(angle2), half = sin(0.5 * angle) / angle;
+        s = sin(angle) / angle;
+        c = 2.0 * half * half;
+    }
+    for (j = 0; j < 3; ++j) {
+        const double v[3] = {R[0][j], R[1][j], R[2][j]};
+        double once[3], twice[3];
+        cross(w, v, once);
+        cross(w, once, twice);
+        for (i = 0; i < 3; ++i) {
+            R[i][j] = v[i] + s * once[i] + c * twice[i];
+        }
+    }
+}
+
+/* The state moved back by a share of Newton's step. */
+static void move(const state *from, const double step[UNKNOWNS], double share, state *to)
+{
+    double twist[6] = {0.0};
+    int k;
+    *to = *from;
+    for (k = 0; k < FREEDOMS; ++k) {
+        twist[FREE[k]] = -share * step[k];
+    }
+    for (k = 0; k < 3; ++k) {
+        twist[k] /= RADIUS;
+        to->pose.t[k] += twist[3 + k];
+    }
+    if (FREE[0] < 3) {
+        rotate(to->pose.R, twist);
+    }
+    for (k = 0; k < HINGES; ++k) {
+        to->hinges[k] -= share * step[FREEDOMS + k];
+    }
+}
+
+/* The largest share, up to 1, of a step that turns by less than half a radian and shifts by less
+ * than the machine's size. */
+static double allowed(const double step[UNKNOWNS])
+{
+    double largest = 0.0;
+    int k;
+    for (k = 0; k < UNKNOWNS; ++k) {
+        const double limit = k >= FREEDOMS ? 0.5 : FREE[k] < 3 ? 0.5 * RADIUS : SIZE;
+        largest = fmax(largest, fabs(step[k]) / limit);
+    }
+    return largest > 1.0 ? 1.0 / largest : 1.0;
+}
+
+/* ---- the pose at readings ---- */
+
+#define CLOSED (1e-14 * SIZE) /* m, some units in the last place of a length */
+#define NEARLY (1e-12 * SIZE) /* m, good enough where no step makes it better */
+#define LEAST_SHARE 0.1       /* of Newton's step; where it still overshoots, it is damped */
+#define LEAST_PIVOT 1e-9      /* below it not six digits of a step would be right */
+#define FIRST_DAMPING 1e-4
+#define LAST_DAMPING 1e6 /* shifts of less than a thousandth of what is missing */
+#define AT_REST 1e-6     /* share of the squares: a step that saves less leads nowhere */
+
+/* Where the iteration is: the state, and the closure there. */
+typedef struct {
+    state at;
+    double value[EQUATIONS];
+    double rows[EQUATIONS][MOST_UNKNOWNS];
+    double cost;  /* m^2, sum of squares of value */
+    double error; /* m, largest of value */
+} iterate;
+
+/* Goes on by a share of a step, where that makes the closure better; else returns 0. */
+static int improved(const anchors *base, const double step[UNKNOWNS], double share, iterate *now)
+{
+    iterate trial;
+    move(&now->at, step, share, &trial.at);
+    trial.cost = closure(base, &trial.at, trial.value, trial.rows, &trial.error);
+    if (!(trial.cost < now->cost)) {
+        return 0;
+    }
+    *now = trial;
+    return 1;
+}
+
+/* One step of Newton's method, or half of it, and so on; returns 0 where none is better. */
+static int newton(const anchors *base, iterate *now, double *pivot)
+{
+    double rows[EQUATIONS][MOST_UNKNOWNS], step[UNKNOWNS], share;
+    int i, k;
+    for (i = 0; i < UNKNOWNS; ++i) {
+        step[i] = now->value[i];
+        for (k = 0; k < UNKNOWNS; ++k) {
+            rows[i][k] = now->rows[i][k];
+        }
+    }
+    *pivot = solve(UNKNOWNS, rows, step);
+    if (!(*pivot > LEAST_PIVOT)) {
+        return 0;
+    }
+    for (share = allowed(step); share > LEAST_SHARE; share *= 0.5) {
+        if (improved(base, step, share, now)) {
+            return 1;
+        }
+    }
+    return 0;
+}
+
+/* One step of Levenberg's and Marquardt's method, for starts from which Newton's leads nowhere. */
+static int damped(const anchors *base, iterate *now)
+{
+    double lambda;
+    int i, j, k;
+    for (lambda = FIRST_DAMPING; lambda < LAST_DAMPING; lambda *= 10.0) {
+        double normal[UNKNOWNS][MOST_UNKNOWNS], step[UNKNOWNS];
+        for (i = 0; i < UNKNOWNS; ++i) {
+            step[i] = 0.0;
+            for (k = 0; k < EQUATIONS; ++k) {
+                step[i] += now->rows[k][i] * now->value[k];
+            }
+            for (j = 0; j < UNKNOWNS; ++j) {
+                normal[i][j] = 0.0;
+                for (k = 0; k < EQUATIONS; ++k) {
+                    normal[i][j] += now->rows[k][i] * now->rows[k][j];
+                }
+            }
+            normal[i][i] *= 1.0 + lambda;
+        }
+        if (solve(UNKNOWNS, normal, step) > 0.0 && improved(base, step, allowed(step), now)) {
+            return 1;
+        }
+    }
+    return 0;
+}
+
+pkmcal_status pkmcal_forward(const double joints[PKMCAL_JOINTS], pkmcal_pose *pose,
+                             pkmcal_report *report)
+{
+    iterate now;
+    anchors base;
+    double pivot = 0.0, before;
+    int k, steps = 0, moved = 1;
+    pkmcal_status status = PKMCAL_NOT_CONVERGED;
+    now.at.pose = *pose;
+    if (!all_finite(joints, PKMCAL_JOINTS) || !all_finite(pose->t, 3)
+        || !tidy(now.at.pose.R)) {
+        return PKMCAL_BAD_INPUT;
+    }
+    upright(&now.at);
+    for (k = 0; k < PKMCAL_RODS; ++k) {
+        base_end(&RODS[k], joints, base.a[k]);
+        base.length[k] = rod_length(&RODS[k], joints);
+    }
+    now.cost = closure(&base, &now.at, now.value, now.rows, &now.error);
+    do {
+        ++steps;
+        before = now.cost;
+        moved = newton(&base, &now, &pivot);
+        if (!moved && now.error > NEARLY) {
+            moved = damped(&base, &now);
+        }
+        if (now.error > NEARLY && now.cost > (1.0 - AT_REST) * before) {
+            moved = 0;
+        }
+    } while (moved && now.error > CLOSED && steps < PKMCAL_MOST_STEPS);
+    if (now.error < NEARLY) {
+        status = pivot > LEAST_PIVOT ? PKMCAL_OK : PKMCAL_SINGULAR;
+    } else if (!moved) {
+        status = PKMCAL_OUT_OF_REACH;
+    }
+    if (status == PKMCAL_OK) {
+        *pose = now.at.pose;
+    }
+    if (report) {
+        report->steps = steps;
+        report->error = now.error;
+        report->pivot = pivot;
+    }
+    return status;
+}
+
+/* ---- what else a controller asks ---- */
+
+void pkmcal_home(pkmcal_pose *pose)
+{
+    *pose = HOME;
+}
+
+int pkmcal_out_of_range(const double joints[PKMCAL_JOINTS])
+{
+    const double slack = 1e-12; /* a reading on its limit is within, by its last digits */
+    int k;
+    for (k = 0; k < PKMCAL_JOINTS; ++k) {
+        if (!(joints[k] >= RANGE[k][0] - slack && joints[k] <= RANGE[k][1] + slack)) {
+            return k + 1;
+        }
+    }
+    return 0;
+}
+
+const char *pkmcal_status_text(pkmcal_status status)
+{
+    switch (status) {
+    case PKMCAL_OK:
+        return "ok";
+    case PKMCAL_NOT_CONVERGED:
+        return "no convergence: begin nearer to the pose";
+    case PKMCAL_SINGULAR:
+        return "singular: the platform is not held by its rods";
+    case PKMCAL_OUT_OF_REACH:
+        return "out of reach";
+    case PKMCAL_BAD_INPUT:
+        return "bad input: not finite, or no rotation";
+    }
+    return "unknown status";
+}

@@ -1,0 +1,146 @@
+"""A machine's limbs as elementary joints: what C sources, models and firmwares are made of.
+
+Each limb's end is carried by a joint that its carrier names (:class:`Chain`), so that no format
+knows a kind of joint by its word in mechanism files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import cross, dot
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.carriers.contract import Chain
+from pkmcal.mechanisms.closure import CarrierGroup
+
+CONSTANT, TELESCOPE, SLIDE, TURN = "constant", "telescope", "slide", "turn"
+FIXED, FLOAT = "fixed", "float"
+
+
+@dataclass(frozen=True)
+class Limbs:
+    """Numbers by limb (L of them), m and rad.
+
+    leg : (L,) its number in the mechanism file, from 1.
+    drive : what its reading moves: the rod's length, or its end along or about an axis; nothing.
+    joint : (L,) column of the reading, -1 without. length : (L,) the rod's, of a telescope at
+    reading zero; NaN for a passive rod.
+    base : (L, 3) base frame, the fixed end, a sliding end at reading zero, or on a turning end's
+    axis the foot of its arm. axis : (L, 3) unit. arm : (L, 3) from the foot to the end at reading
+    zero, square to the axis; zero where nothing turns.
+    held : what its end on the platform stands on: the platform itself (``fixed``), or a bar that
+    turns on it (``turn``) or keeps its direction (``float``).
+    platform : (L, 3) platform frame, the end or the bar's hinge. bar : (L, 3) from the hinge to the
+    end, platform frame at angle zero, or base frame. hinge : (L,) column of the bar's angle, -1
+    without. hinge_axis : (L, 3) unit, platform frame.
+    """
+
+    leg: Integers
+    drive: tuple[str, ...]
+    joint: Integers
+    length: Array
+    base: Array
+    axis: Array
+    arm: Array
+    held: tuple[str, ...]
+    platform: Array
+    bar: Array
+    hinge: Integers
+    hinge_axis: Array
+
+    def __len__(self) -> int:
+        return len(self.leg)
+
+    @property
+    def rate(self) -> Array:
+        """How the end on the base moves with its reading where that is zero, (L, 3)."""
+        slides = np.array([drive == SLIDE for drive in self.drive])
+        return np.where(slides[:, None], self.axis, cross(self.axis, self.arm))
+
+    @property
+    def ends(self) -> Array:
+        """The ends on the platform (L, 3), platform frame; of a floating bar its hinge."""
+        turns = np.array([held == TURN for held in self.held])
+        return np.where(turns[:, None], self.platform + self.bar, self.platform)
+
+    def of(self, limbs: Integers) -> Limbs:
+        """Some of them."""
+
+        def chosen(values: Any) -> Any:
+            return tuple(values[k] for k in limbs) if isinstance(values, tuple) else values[limbs]
+
+        return replace(self, **{name: chosen(value) for name, value in vars(self).items()})
+
+
+def limbs_of(machine: Machine) -> Limbs:
+    """All limbs of a machine; InputError where a carrier is no elementary joint."""
+    layout, values = machine.layout, machine.parameters.unit_axes(machine.values)
+    base, axis, arm, moved = _chains(machine, "base", layout.base, (FIXED, SLIDE, TURN))
+    hinge, hinge_axis, bar, held = _chains(
+        machine, "platform", layout.platform, (FIXED, TURN, FLOAT)
+    )
+    # an arm that nothing turns belongs to its place; of one that turns, what lies along the axis
+    turns = np.array([kind == TURN for kind in moved])[:, None]
+    along = np.where(turns, dot(axis, arm)[:, None] * axis, arm)
+    barred = np.array([kind != FIXED for kind in held])[:, None]
+    driven = np.where(layout.rod_reads, TELESCOPE, moved)
+    rods = np.where(layout.rod >= 0, layout.rod, 0)
+    return Limbs(
+        leg=np.arange(machine.n_legs) + 1,
+        drive=tuple(np.where(layout.actuated >= 0, driven, CONSTANT).tolist()),
+        joint=layout.actuated,
+        length=np.where(layout.rod >= 0, values[rods], np.nan),
+        base=base + along,
+        axis=axis,
+        arm=arm - along,
+        held=held,
+        platform=hinge + np.where(barred, 0.0, bar),
+        bar=np.where(barred, bar, 0.0),
+        hinge=layout.internal,
+        hinge_axis=hinge_axis,
+    )
+
+
+def rods_of(machine: Machine) -> Limbs:
+    """The limbs whose length is known: passive ones move nothing.
+
+    Raises InputError where they and the joints' axes do not just hold the platform.
+    """
+    layout = machine.layout
+    unknowns = layout.motion.shape[1] + layout.n_internal
+    if layout.n_equations != unknowns:
+        raise InputError(
+            f"the rods and axes of mechanism {machine.name!r} do not just hold its platform",
+            found=f"{layout.n_equations} equations for {unknowns} unknowns",
+            expected="as many of both, for Newton's method",
+        )
+    return limbs_of(machine).of(np.flatnonzero(layout.closing))
+
+
+def _chains(
+    machine: Machine, side: str, groups: tuple[CarrierGroup, ...], known: tuple[str, ...]
+) -> tuple[Array, Array, Array, tuple[str, ...]]:
+    """Points, axes and arms (L, 3) of one side's joints, and their motions."""
+    values = machine.parameters.unit_axes(machine.values)
+    point, axis, arm = np.zeros((3, machine.n_legs, 3))
+    motion = [""] * machine.n_legs
+    for group in groups:
+        chain: Chain | None = group.carrier.chain(group.of(values))
+        if chain is None or chain.motion not in known:
+            leg = int(group.legs[0])
+            raise InputError(
+                f"leg {leg + 1} of mechanism {machine.name!r} is carried on its {side} side by no"
+                " joint that an export knows",
+                found=getattr(machine.document.legs[leg], side).joint,
+                expected="a joint that is one of " + ", ".join(known),
+                next_step="Give its carrier a chain, see docs/export.md",
+            )
+        point[group.legs], axis[group.legs], arm[group.legs] = chain.point, chain.axis, chain.arm
+        for leg in group.legs:
+            motion[leg] = chain.motion
+    return point, axis, arm, tuple(motion)

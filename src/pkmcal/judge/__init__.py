@@ -1,0 +1,1 @@
+"""A calibrated machine held against new data: validation, hold-outs, and the watch for changes."""

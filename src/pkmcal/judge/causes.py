@@ -1,0 +1,251 @@
+"""What may have changed, as directions of the machine's parameters: legs, their parts, warming.
+
+Beside them stands a camera whose picture became larger. Focus, temperature and a lens that was
+touched change the focal length first; its effect on edges and boards is not a machine's, but some
+of it looks like one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.cameras import Camera
+from pkmcal.identify.gauge import centre_index
+from pkmcal.judge.held import MAGNIFIED
+from pkmcal.measurements import Measurements, Observation
+from pkmcal.mechanisms import Machine
+from pkmcal.wording import split_name
+
+LegPart = Literal[
+    "zero", "rod", "arm", "base", "platform", "hinge", "all", "pair", "scale", "camera"
+]
+
+PARTS: dict[str, LegPart] = {
+    "length.offset": "zero",
+    "base.angle": "zero",
+    "base.along": "zero",
+    "length.constant": "rod",
+    "base.arm": "arm",
+    "base.": "base",
+    "platform.hinge": "hinge",
+    "platform.": "platform",
+}
+"""The part of a leg by how a parameter's path begins; the first that fits."""
+
+FOCAL = ("focal.x", "focal.y")
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A change that is looked for.
+
+    columns : (P + C, k), the change of the machine's parameters (m, rad), then of the cameras'
+    magnification, by k numbers, each in ``sizes`` (k,): a drawing's tolerance, or MAGNIFIED.
+    legs : from 0. unit : of the k numbers: m, rad, or nothing for a ratio.
+    """
+
+    part: LegPart
+    legs: tuple[int, ...]
+    columns: Array
+    sizes: Array
+    unit: str
+    camera: int = -1
+
+
+def arms(machine: Machine) -> tuple[tuple[int, ...], ...]:
+    """Legs that one motor moves together, from 0, in the order of their first; the rest alone."""
+    column = machine.layout.actuated
+    groups: dict[int, list[int]] = {}
+    for leg in range(machine.n_legs):
+        key = int(column[leg]) if column[leg] >= 0 else -1 - leg
+        groups.setdefault(key, []).append(leg)
+    return tuple(tuple(legs) for legs in groups.values())
+
+
+def whole_legs(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
+    """Everything of each arm but its tubes."""
+    return tuple(_of_names(machine, "all", legs, n_cameras) for legs in arms(machine))
+
+
+def zeros(machine: Machine, n_cameras: int = 0) -> tuple[Cause | None, ...]:
+    """The zero of each arm's reading, None for one without: what a slipped encoder changes."""
+    return tuple(
+        cause if (cause := _of_names(machine, "zero", legs, n_cameras)).sizes.size else None
+        for legs in arms(machine)
+    )
+
+
+def whole_machine(machine: Machine, n_cameras: int = 0) -> Cause:
+    """Everything but the tubes."""
+    return _of_names(machine, "all", tuple(range(machine.n_legs)), n_cameras)
+
+
+def common_scale(machine: Machine, n_cameras: int = 0) -> Cause:
+    """All lengths longer by one factor against the readings, by its excess over 1."""
+    table = machine.parameters
+    lengths = np.array(
+        [u == "m" and k != "axis" for u, k in zip(table.units, table.kinds, strict=True)]
+    )
+    column = np.pad(np.where(lengths, machine.values, 0.0), (0, n_cameras))[:, None]
+    return Cause("scale", tuple(range(machine.n_legs)), column, np.array([MAGNIFIED]), "")
+
+
+def magnification(machine: Machine, camera: int, n_cameras: int) -> Cause:
+    """A camera's picture larger by a factor, by its excess over 1."""
+    column = np.zeros((len(machine.parameters) + n_cameras, 1))
+    column[len(machine.parameters) + camera] = 1.0
+    return Cause("camera", (), column, np.array([MAGNIFIED]), "", camera)
+
+
+def single_causes(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
+    """All that one mishap may change: a part of a leg, neighbouring joints, scale, a lens."""
+    out = [
+        cause
+        for legs in arms(machine)
+        for part in dict.fromkeys(PARTS.values())
+        if (cause := _of_names(machine, part, legs, n_cameras)).sizes.size
+    ]
+    for side in ("base", "platform"):
+        out += [_together(machine, side, pair, n_cameras) for pair in _neighbours(machine, side)]
+    cameras = [magnification(machine, c, n_cameras) for c in range(n_cameras)]
+    return (*out, common_scale(machine, n_cameras), *cameras)
+
+
+def joined(causes: Sequence[Cause]) -> Cause:
+    """Several causes at once, each by its own numbers."""
+    return Cause(
+        "all",
+        tuple(dict.fromkeys(leg for cause in causes for leg in cause.legs)),
+        np.concatenate([cause.columns for cause in causes], axis=1),
+        np.concatenate([cause.sizes for cause in causes]),
+        causes[0].unit,
+    )
+
+
+def part_of(name: str) -> LegPart | None:
+    """The part of a leg that a parameter belongs to; None for its tubes' radii."""
+    path = split_name(name)[1]
+    return next((part for start, part in PARTS.items() if path.startswith(start)), None)
+
+
+def joint_of(machine: Machine, side: str, leg: int, n_cameras: int = 0) -> Cause:
+    """A leg's joint on one side, base or platform, moved by a vector."""
+    index = centre_index(machine.layout)[side == "platform"][leg]
+    columns = np.eye(len(machine.parameters) + n_cameras)[:, index]
+    part: LegPart = "base" if side == "base" else "platform"
+    return Cause(part, (leg,), columns, machine.parameters.tolerance[index], "m")
+
+
+def _of_names(machine: Machine, part: LegPart, legs: tuple[int, ...], n_cameras: int) -> Cause:
+    """The parameters of some legs' part, each changed by itself; two rods of an arm as well.
+
+    A motor's zero is one number, however many rods hang on it.
+    """
+    table = machine.parameters
+    rows = [
+        k
+        for k, name in enumerate(table.names)
+        if (split_name(name)[0] or 0) - 1 in legs
+        and (own := part_of(name)) is not None
+        and part in (own, "all")
+    ]
+    tolerance = table.tolerance[rows]
+    columns = np.eye(len(table) + n_cameras)[:, rows]
+    if part == "zero" and len(legs) > 1 and len(rows) > 1:
+        columns, tolerance = columns.sum(axis=1, keepdims=True), tolerance[:1]
+    units = {table.units[k] for k in rows}
+    return Cause(part, legs, columns, tolerance, units.pop() if len(units) == 1 else "m")
+
+
+def _neighbours(machine: Machine, side: str) -> list[tuple[int, int]]:
+    """Pairs of legs whose joints on one side are each other's nearest, and not of one arm."""
+    index = centre_index(machine.layout)[side == "platform"]
+    if machine.n_legs < 4:  # three joints have no sides
+        return []
+    centres = machine.values[index]
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    np.fill_diagonal(apart, np.inf)
+    nearest = np.argmin(apart, axis=1)
+    own = {pair for arm in arms(machine) for pair in [(i, j) for i in arm for j in arm]}
+    pairs = {(min(i, j), max(i, j)) for i, j in enumerate(nearest.tolist()) if nearest[j] == i}
+    # a mount that two joints share is shorter than the way to the next one
+    close = [p for p in pairs if apart[p] < 0.7 * np.sort(apart[p[0]])[1]]
+    return sorted(set(close) - own)
+
+
+def _together(machine: Machine, side: str, pair: tuple[int, int], n_cameras: int) -> Cause:
+    """Two neighbouring joints moved by the same vector."""
+    index = centre_index(machine.layout)[side == "platform"]
+    columns = np.zeros((len(machine.parameters) + n_cameras, 3))
+    for leg in pair:
+        columns[index[leg], np.arange(3)] = 1.0
+    part: LegPart = "base" if side == "base" else "platform"
+    return Cause(part, pair, columns, machine.parameters.tolerance[index[pair[0]]], "m")
+
+
+def magnified(
+    measurements: Measurements, observation: Observation, cameras: Sequence[Camera]
+) -> Measurements:
+    """The measurements with one more unknown a camera: the excess of its focal lengths over the
+    calibrated ones, relative.
+
+    cameras : (S,) of the stations that have one, which come first. Edges get their answer by the
+    pixels that support them; a board's pose has it by its corners.
+    """
+    number = np.asarray(measurements.camera_of_station)
+    n_cameras = int(number.max(initial=-1)) + 1
+    poses = measurements.poses
+    return replace(
+        measurements,
+        edges=replace(
+            measurements.edges, by_intrinsics=_edges_magnified(observation, cameras)[..., None]
+        ),
+        poses=replace(poses, by_intrinsics=_poses_magnified(measurements, cameras)[..., None]),
+        intrinsics_factor=np.ones((n_cameras, 1, 1)),
+        intrinsics_at=np.zeros((n_cameras, 1)),
+    )
+
+
+def _focal(camera: Camera) -> Array:
+    """Change (n,) of the parameters when the focal lengths grow by their own size."""
+    focal = np.isin(np.array(camera.parameter_names), FOCAL)
+    return np.where(focal, camera.parameters, 0.0)
+
+
+def _edges_magnified(observation: Observation, cameras: Sequence[Camera]) -> Array:
+    """Turns (N, 2) of the measured normals, their pixels held, by the relative excess.
+
+    A plane that holds the rays r has ``r . n = 0``; as rays turn by dr, ``r . dn = -n . dr``, least
+    squares over an edge's points.
+    """
+    edges, at = observation.edges, observation.point_edge
+    ray, turn = np.zeros((2, len(at), 3))
+    for station, camera in enumerate(cameras):
+        mine = edges.station[at] == station
+        ray[mine] = camera.ray(observation.points[mine])
+        by = camera.ray_jacobians(observation.points[mine])[1]
+        turn[mine] = by @ _focal(camera)
+    good = np.isfinite(ray + turn).all(axis=1)
+    rows = np.einsum("ni,nij->nj", ray[good], edges.basis[at[good]])
+    value = -np.einsum("ni,ni->n", turn[good], edges.normal[at[good]])
+    normal, right = np.zeros((len(edges), 2, 2)), np.zeros((len(edges), 2))
+    np.add.at(normal, at[good], rows[:, :, None] * rows[:, None])
+    np.add.at(right, at[good], rows * value[:, None])
+    return (np.linalg.pinv(normal, hermitian=True) @ right[..., None])[..., 0]
+
+
+def _poses_magnified(measurements: Measurements, cameras: Sequence[Camera]) -> Array:
+    """Changes (N, 6) of the boards' poses, corners held, by the relative excess; a tracker's 0."""
+    poses = measurements.poses
+    out = np.zeros((len(poses), 6))
+    if not poses.by_intrinsics.shape[-1]:
+        return out
+    for station, camera in enumerate(cameras):
+        mine, focal = poses.station == station, _focal(camera)
+        out[mine] = poses.by_intrinsics[mine, :, : len(focal)] @ focal
+    return out

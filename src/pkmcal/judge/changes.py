@@ -1,0 +1,477 @@
+"""Tests of a change of a calibrated machine, their power, and what explains a change best.
+
+For a cause with columns D the statistic is the length of w's part along X D
+(:class:`~pkmcal.judge.held.Evidence`): chi-square of as many degrees of freedom as X D has
+directions that the data see at all. Its null distribution holds whatever they are, for what is left
+out depends on X alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.judge.causes import (
+    Cause,
+    common_scale,
+    joined,
+    joint_of,
+    single_causes,
+    whole_legs,
+    whole_machine,
+    zeros,
+)
+from pkmcal.judge.held import Evidence
+from pkmcal.mechanisms import Machine
+
+SEEN = 1.0
+"""Standard deviations that a change of one tolerance must make for its direction to be tested; a
+direction that is hardly seen would only add noise to the test."""
+POWER = 0.9
+"""Probability with which a detectable change is detected."""
+DRAWS = 20_000
+"""Draws of noise: a share of 0.01 of them is then known to 7 % of itself."""
+ODDS = 2 * np.log(100.0)
+"""Two causes are told apart where one makes the data a hundred times as likely as the other."""
+MOST_CAUSES = 4
+"""Changes that are looked for one after the other; more are a machine that was taken apart."""
+
+
+class Directions(NamedTuple):
+    """What the data see of a cause: q (n, d) orthonormal in w, and gain (d, k) with q^T X D."""
+
+    q: Array
+    gain: Array
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """A statistic, its degrees of freedom and the probability of as much by chance alone.
+
+    adjusted : the same for the largest of all tests that were made; NaN where it stands alone.
+    """
+
+    chi2: float
+    dof: int
+    chance: float
+    adjusted: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Change:
+    """A cause's k numbers as the data tell them, if nothing else changed.
+
+    value, sigma : (k,) m, rad or a ratio. covariance : (k, k). What is not seen is left at zero,
+    with an infinite sigma.
+    """
+
+    value: Array
+    sigma: Array
+    covariance: Array
+
+    def document(self) -> dict[str, Any]:
+        """For programs."""
+        return {"change": self.value, "sigma": self.sigma}
+
+
+def directions(found: Evidence, cause: Cause) -> Directions:
+    """The directions in w of a cause that the data see."""
+    scaled = found.by @ (cause.columns * cause.sizes)
+    u, s, vt = np.linalg.svd(scaled, full_matrices=False)
+    seen = s > SEEN
+    return Directions(u[:, seen], s[seen, None] * vt[seen] / cause.sizes)
+
+
+def chi_square(found: Evidence, cause: Cause) -> ChiSquare:
+    """Whether the data show the cause."""
+    from scipy.special import chdtrc
+
+    q = directions(found, cause).q
+    chi2, dof = float(np.sum((q.T @ found.w) ** 2)), q.shape[1]
+    return ChiSquare(chi2, dof, float(chdtrc(dof, chi2)) if dof else 1.0)
+
+
+def likelihood(found: Evidence, cause: Cause) -> float:
+    """Twice the log of how many times likelier the data are with the cause than with no change.
+
+    The change's numbers are averaged over normal distributions of their ``sizes``: what one cause
+    explains by 0.5 mm and another by 8 mm is rather the first's, and a cause of three numbers must
+    explain more than one of a single number.
+    """
+    q, gain = directions(found, cause)
+    told, scaled = q.T @ found.w, gain * cause.sizes
+    spread = np.eye(len(told)) + scaled @ scaled.T
+    expected = float(told @ np.linalg.solve(spread, told))
+    return float(told @ told) - expected - float(np.linalg.slogdet(spread)[1])
+
+
+@dataclass(frozen=True)
+class CommonLevel:
+    """What several tests made at once are worth.
+
+    least : (DRAWS,) the smallest chance of all tests in each draw of pure noise, in order. count :
+    of the tests that see anything.
+    """
+
+    least: Array
+    count: int
+
+    def adjusted(self, chance: float) -> float:
+        """How often noise gives any of the tests such a chance, or a smaller one.
+
+        Where the draws are too few to tell, the chance times the number of tests (Bonferroni).
+        """
+        often = (np.searchsorted(self.least, chance, side="right") + 1) / (len(self.least) + 1)
+        return float(min(often, self.count * chance, 1.0))
+
+    def single(self, alpha: float) -> float:
+        """The chance below which a single test counts, so that noise makes any of them count with
+        probability alpha.
+        """
+        inside = int(alpha * (len(self.least) + 1)) - 1
+        drawn = float(self.least[inside]) if inside >= 0 and self.count else 0.0
+        return max(drawn, alpha / max(self.count, 1))
+
+
+def together(found: Evidence, causes: Sequence[Cause]) -> CommonLevel:
+    """The tests of several causes made at once: the same noise goes through all of them.
+
+    Tests overlap (legs share what poses take up), so that the usual allowance for their number
+    would be too careful; the null distribution of the smallest chance is drawn instead.
+    """
+    from scipy.special import chdtrc
+
+    noise = np.random.default_rng(0).standard_normal((DRAWS, len(found.w)))
+    parts = [q for q in (directions(found, cause).q for cause in causes) if q.shape[1]]
+    least = np.ones(DRAWS)
+    for q in parts:
+        np.minimum(least, chdtrc(q.shape[1], np.sum((noise @ q) ** 2, axis=1)), out=least)
+    return CommonLevel(np.sort(least), len(parts))
+
+
+def change(found: Evidence, cause: Cause) -> Change:
+    """The change by least squares, nothing else changed."""
+    seen = directions(found, cause)
+    inverse = np.linalg.pinv(seen.gain)
+    covariance = inverse @ inverse.T
+    # a number of which a part is not seen is not told
+    lost = (
+        1 - np.diag(inverse @ seen.gain) > 1e-2
+        if seen.gain.size
+        else np.ones(len(cause.sizes), bool)
+    )
+    sigma = np.where(lost, np.inf, np.sqrt(np.diag(covariance)))
+    return Change(inverse @ (seen.q.T @ found.w), sigma, covariance)
+
+
+def detectable(found: Evidence, tester: Cause, along: Array, level: float) -> float:
+    """The smallest change along a direction that a test at a level detects with POWER.
+
+    along : (P + C,) the change of the parameters by one unit (m, rad). inf where it is not seen.
+    """
+    from scipy.special import chdtri, chndtrinc
+
+    q = directions(found, tester).q
+    size = float(np.linalg.norm(q.T @ (found.by @ along)))
+    if not q.shape[1] or size == 0.0:
+        return float("inf")
+    need = float(chndtrinc(chdtri(q.shape[1], level), q.shape[1], 1 - POWER))
+    return float(np.sqrt(need) / size)
+
+
+def detectable_range(
+    found: Evidence, tester: Cause, part: Cause, level: float
+) -> tuple[float, float]:
+    """Smallest detectable changes of a part in the direction that is seen best, and worst."""
+    q = directions(found, tester).q
+    if not q.shape[1] or not part.sizes.size:
+        return float("inf"), float("inf")
+    gain = q.T @ found.by @ part.columns
+    _, _, vt = np.linalg.svd(gain)
+    best, worst = (detectable(found, tester, part.columns @ v, level) for v in (vt[0], vt[-1]))
+    return best, worst
+
+
+@dataclass(frozen=True)
+class LegTest:
+    """One leg, or the legs of one motor.
+
+    legs : from 0. whole : test of all its numbers but the tubes' radii. zero : of its reading's
+    zero alone, with the change of it, if nothing else changed; None for a leg without a reading.
+    unit, tolerance : of that zero. detects_zero : smallest change of it (m or rad) that is detected
+    with POWER. detects_base, detects_platform : the same of its joints (m), in the direction seen
+    best, and worst.
+    """
+
+    legs: tuple[int, ...]
+    whole: ChiSquare
+    zero: ChiSquare | None
+    change: Change | None
+    unit: str
+    tolerance: float
+    detects_zero: float
+    detects_base: tuple[float, float]
+    detects_platform: tuple[float, float]
+
+    @property
+    def chance(self) -> float:
+        """The smaller of both adjusted chances; NaN where nothing is seen of the leg."""
+        both = [t.adjusted for t in (self.whole, self.zero) if t and t.dof]
+        return min(both) if both else float("nan")
+
+    def document(self) -> dict[str, Any]:
+        """For programs, legs from 1; what a test does not see is null."""
+        zero = None
+        if self.zero is not None:
+            zero = {**asdict(self.zero), "unit": self.unit}
+            zero |= self.change.document() if self.change else {}
+        return {
+            "legs": [j + 1 for j in self.legs],
+            **asdict(self.whole),
+            "zero": zero,
+            "detectable": {
+                "zero": self.detects_zero,
+                "base": self.detects_base,
+                "platform": self.detects_platform,
+            },
+        }
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A cause with the change that it would have made; chi2 : what it explains."""
+
+    cause: Cause
+    change: Change
+    chi2: float
+
+    def document(self, machine: Machine) -> dict[str, Any]:
+        """For programs, with its numbers' names: parameters, or what a ratio is of."""
+        columns = self.cause.columns
+        names = (*machine.parameters.names, *("magnification",) * len(columns))
+        numbers = [names[int(abs(column).argmax())] for column in columns.T]
+        return {
+            "part": self.cause.part,
+            "legs": [j + 1 for j in self.cause.legs],
+            "numbers": ["scale"] if self.cause.part == "scale" else numbers,
+            **self.change.document(),
+            "chi2": self.chi2,
+        }
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A cause that explains the data best beside the others found.
+
+    test : what it explains. others : causes that these data cannot tell from it, best first.
+    """
+
+    suspect: Suspect
+    test: ChiSquare
+    others: tuple[Suspect, ...]
+
+
+@dataclass(frozen=True)
+class ChangeTests:
+    """All tests. machine : of all legs' numbers together. scale : of all lengths by one factor.
+
+    alpha : share of machines that did not change that may be flagged. level : of a single test, so
+    that all together keep alpha. left : what the findings leave unexplained of ``machine``.
+    """
+
+    legs: tuple[LegTest, ...]
+    machine: ChiSquare
+    scale: ChiSquare
+    scale_change: Change
+    findings: tuple[Explanation, ...]
+    left: ChiSquare
+    alpha: float
+    level: float
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything is shown to have changed."""
+        return min((t.adjusted for t in self.tests), default=1.0) < self.alpha
+
+    @property
+    def tests(self) -> tuple[ChiSquare, ...]:
+        """All tests that see anything."""
+        legs = [t for leg in self.legs for t in (leg.whole, leg.zero)]
+        return tuple(t for t in (self.machine, self.scale, *legs) if t is not None and t.dof)
+
+    def document(self, machine: Machine) -> dict[str, Any]:
+        """All tests and findings for programs: m, rad and ratios, legs from 1."""
+        return {
+            "alpha": self.alpha,
+            "level": self.level,
+            "power": POWER,
+            "changed": self.changed,
+            "machine": asdict(self.machine),
+            "legs": [leg.document() for leg in self.legs],
+            "scale": {**asdict(self.scale), **self.scale_change.document()},
+            "findings": [
+                {
+                    **finding.suspect.document(machine),
+                    "test": asdict(finding.test),
+                    "or": [other.document(machine) for other in finding.others],
+                }
+                for finding in self.findings
+            ],
+            "unexplained": asdict(self.left),
+        }
+
+
+def made_tests(
+    found: Evidence, machine: Machine
+) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare | None, ...], CommonLevel]:
+    """Every test on new data, chances adjusted for their number, and what they are worth together.
+
+    First of all legs, of all lengths by one factor, and of each arm's legs; then of each arm's
+    zero, None for one without a reading.
+    """
+    cameras = found.by.shape[1] - len(machine.parameters)
+    causes = [whole_machine(machine, cameras), common_scale(machine, cameras)]
+    causes += whole_legs(machine, cameras)
+    zero = zeros(machine, cameras)
+    level = together(found, [*causes, *(cause for cause in zero if cause)])
+
+    def test(cause: Cause) -> ChiSquare:
+        told = chi_square(found, cause)
+        return replace(told, adjusted=level.adjusted(told.chance))
+
+    return tuple(map(test, causes)), tuple(cause and test(cause) for cause in zero), level
+
+
+def judge(found: Evidence, machine: Machine, alpha: float) -> ChangeTests:
+    """Every test on new data, and what explains a change.
+
+    alpha : share of machines that did not change that may be flagged.
+    """
+    cameras = found.by.shape[1] - len(machine.parameters)
+    (every, scale, *wholes), own, level = made_tests(found, machine)
+    single = level.single(alpha)
+    rows = zip(whole_legs(machine, cameras), zeros(machine, cameras), wholes, own, strict=True)
+    out = ChangeTests(
+        legs=tuple(_leg(found, machine, *row, single) for row in rows),
+        machine=every,
+        scale=scale,
+        scale_change=change(found, common_scale(machine, cameras)),
+        findings=(),
+        left=every,
+        alpha=alpha,
+        level=single,
+    )
+    if not out.changed:
+        return out
+    findings = explained(found, single_causes(machine, cameras), alpha)
+    left = _beside(found, [f.suspect.cause for f in findings])
+    left = chi_square(left, whole_machine(machine, cameras))
+    return replace(out, findings=findings, left=left)
+
+
+def _leg(
+    found: Evidence,
+    machine: Machine,
+    whole: Cause,
+    zero: Cause | None,
+    test: ChiSquare,
+    test_zero: ChiSquare | None,
+    level: float,
+) -> LegTest:
+    """A leg's tests, of all of it and of its zero, and what they would have found."""
+    cameras = found.by.shape[1] - len(machine.parameters)
+    base, platform = (
+        detectable_range(found, whole, joint_of(machine, side, whole.legs[0], cameras), level)
+        for side in ("base", "platform")
+    )
+    least = float("inf")
+    if zero is not None:
+        least = min(detectable(found, t, zero.columns[:, 0], level) for t in (zero, whole))
+    return LegTest(
+        legs=whole.legs,
+        whole=test,
+        zero=test_zero,
+        change=change(found, zero) if zero else None,
+        unit=zero.unit if zero else "m",
+        tolerance=float(zero.sizes[0]) if zero else float("nan"),
+        detects_zero=least,
+        detects_base=base,
+        detects_platform=platform,
+    )
+
+
+def explained(found: Evidence, causes: Sequence[Cause], alpha: float) -> tuple[Explanation, ...]:
+    """Causes one after the other, each the one that is most likely beside those before.
+
+    Each must explain more than chance would in the best of so many. Of two changes, the first that
+    is found may be one that resembles both; so where there are two, all pairs are tried, and after
+    each further one those before are looked at again.
+    """
+    chosen: tuple[Cause, ...] = ()
+    while len(chosen) < MOST_CAUSES:
+        best = _ranked(found, chosen, causes)[0][1]
+        told = chi_square(_beside(found, chosen), best)
+        if not told.dof or len(causes) * told.chance >= alpha:
+            break
+        chosen = (*chosen, best)
+        if len(chosen) == 2:
+            pairs = [(likelihood(found, joined(pair)), pair) for pair in combinations(causes, 2)]
+            chosen = max(pairs, key=lambda item: item[0])[1]
+        chosen = _exchanged(found, chosen, causes)
+    findings = [_finding(found, chosen, k, causes) for k in range(len(chosen))]
+    return tuple(sorted(findings, key=lambda f: -f.suspect.chi2))
+
+
+def _exchanged(
+    found: Evidence, chosen: tuple[Cause, ...], causes: Sequence[Cause]
+) -> tuple[Cause, ...]:
+    """The causes, each replaced by what is most likely beside the others, until all agree."""
+    for _ in range(MOST_CAUSES):
+        before = chosen
+        for k in range(len(chosen)):
+            others = chosen[:k] + chosen[k + 1 :]
+            best = _ranked(found, others, causes)[0][1]
+            chosen = (*chosen[:k], best, *chosen[k + 1 :])
+        if all(old is new for old, new in zip(before, chosen, strict=True)):
+            break
+    return chosen
+
+
+def _ranked(
+    found: Evidence, others: tuple[Cause, ...], causes: Sequence[Cause]
+) -> list[tuple[float, Cause]]:
+    """Causes by how likely they make the data together with others (twice the log of the odds),
+    best first.
+    """
+    free = [c for c in causes if all(c is not other for other in others)]
+    scored = [(likelihood(found, joined((*others, cause))), cause) for cause in free]
+    return sorted(scored, key=lambda item: -item[0])
+
+
+def _finding(
+    found: Evidence, chosen: tuple[Cause, ...], place: int, causes: Sequence[Cause]
+) -> Explanation:
+    """One of the chosen causes beside the others, with what cannot be told from it."""
+    own, others = chosen[place], chosen[:place] + chosen[place + 1 :]
+    left = _beside(found, others)
+    # what explains no more than nothing would is no rival, however weak the best
+    nothing = likelihood(found, joined(others)) if others else 0.0
+    least = max(likelihood(found, joined(chosen)) - ODDS, nothing)
+    near = [c for score, c in _ranked(found, others, causes) if score > least and c is not own]
+    suspects = [Suspect(c, change(left, c), chi_square(left, c).chi2) for c in (own, *near)]
+    return Explanation(suspects[0], chi_square(left, own), tuple(suspects[1:]))
+
+
+def _beside(found: Evidence, chosen: Sequence[Cause]) -> Evidence:
+    """The evidence without what other causes explain: their directions taken out."""
+    left = found
+    for cause in chosen:
+        q = directions(left, cause).q
+        rest = np.linalg.svd(q, full_matrices=True)[0][:, q.shape[1] :]
+        left = replace(left, w=rest.T @ left.w, by=rest.T @ left.by)
+    return left

@@ -1,0 +1,83 @@
+"""What a calibration predicts of configurations that were held out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pkmcal.calibration.aside import Region, by_region, select
+from pkmcal.calibration.calibrate import Calibration
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.problem import Estimate
+from pkmcal.judge.comparison import Comparison, compare
+from pkmcal.judge.prediction import predict
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    """Configurations left out, judged, beside those that the calibration used.
+
+    estimate : from the rest.
+    """
+
+    region: Region
+    estimate: Estimate
+    left_out: Comparison
+    used: Comparison
+
+    def document(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """For programs; names : K, of the configurations."""
+        return {
+            "where": self.region.name,
+            "left_out": self.left_out.document(names),
+            "used": self.used.document(names),
+        }
+
+
+def holdout_of(calibration: Calibration) -> HoldOut | None:
+    """What a calibration predicts of the configurations that it was asked to leave out."""
+    out = calibration.holdout
+    if out is None:
+        return None
+    drawing = calibration.session.machine
+    return judged_without(drawing, out.measurements, calibration.estimate, out.region)
+
+
+def hold_out(
+    drawing: Machine, measurements: Measurements, whole: Estimate, region: Region
+) -> HoldOut:
+    """Calibrate without a region's configurations, then predict them.
+
+    whole : an estimate from all, where the search starts. Stations and boards are registered by all
+    photographs with the machine held; the machine knows those of the rest alone.
+    """
+    keep = np.ones(len(measurements.joints), dtype=bool)
+    keep[region.rows] = False
+    estimate = bundle(drawing, select(measurements, keep), whole.state)
+    return judged_without(drawing, measurements, estimate, region)
+
+
+def judged_without(
+    drawing: Machine, measurements: Measurements, estimate: Estimate, region: Region
+) -> HoldOut:
+    """An estimate that did not see a region's configurations, on them and on those that it saw."""
+    found = predict(estimate.machine, measurements, estimate.state)
+    out = region.rows[found.seen[region.rows]]
+    used = np.setdiff1d(np.flatnonzero(found.seen), out)
+    both = (
+        compare(drawing, estimate.covariance, measurements, found, None, rows)
+        for rows in (out, used)
+    )
+    return HoldOut(region, estimate, *both)
+
+
+def by_regions(
+    drawing: Machine, measurements: Measurements, whole: Estimate, n: int
+) -> tuple[HoldOut, ...]:
+    """Each of n regions of the workspace left out once."""
+    found = by_region(drawing, whole, n)
+    return tuple(hold_out(drawing, measurements, whole, region) for region in found)

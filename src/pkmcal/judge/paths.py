@@ -1,0 +1,96 @@
+"""Straight paths that a session names: how straight its tool points are, [C] IV.D and Table 4."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.judge.prediction import Prediction
+from pkmcal.mechanisms import Machine
+from pkmcal.session.load import Session
+
+SHORTEST = 3
+"""Points without which nothing is straight or bent."""
+
+
+@dataclass(frozen=True)
+class Straightness:
+    """Distances of points from the line that fits them best, m: root mean square ([C] Table 4) and
+    largest.
+    """
+
+    rms: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class LinePath:
+    """A straight path that the session names.
+
+    seen : by the photographs; None where they show fewer than three. drawing, calibrated : by
+    forward kinematics of the readings; None where a machine cannot be closed. n : points.
+    """
+
+    name: str
+    n: int
+    seen: Straightness | None
+    drawing: Straightness | None
+    calibrated: Straightness | None
+
+
+def straightness(points: Array) -> Straightness:
+    """Of points (n, 3), n >= 3; the line is the first principal axis."""
+    centred = points - points.mean(axis=0)
+    along = np.linalg.svd(centred)[2][0]
+    off = np.linalg.norm(centred - np.outer(centred @ along, along), axis=1)
+    return Straightness(float(np.sqrt(np.mean(off**2))), float(off.max()))
+
+
+def paths_of(session: Session) -> dict[str, list[int]]:
+    """Rows of the straight paths' configurations, by the paths' names.
+
+    Raises InputError where the session does not know one, or names too few.
+    """
+    paths: dict[str, Any] = session.document.get("paths") or {}
+    out: dict[str, list[int]] = {}
+    for name, members in paths.items():
+        for k, member in enumerate(members):
+            if member not in session.configurations:
+                raise InputError(
+                    "there is no such configuration",
+                    where=f"session.yaml, paths.{name}[{k + 1}]",
+                    found=member,
+                    expected=f"a name from {session.document['joints']['file']}",
+                )
+        if len(set(members)) < SHORTEST:
+            raise InputError(
+                "too few configurations for a straight path",
+                where=f"session.yaml, paths.{name}",
+                found=str(len(set(members))),
+                expected=f"{SHORTEST} at least",
+            )
+        out[name] = [session.configurations.index(member) for member in members]
+    return out
+
+
+def line_path(
+    name: str, rows: list[int], drawing: Machine, session: Session, found: Prediction
+) -> LinePath:
+    """How straight the tool went through the configurations ``rows``, seen and computed."""
+    seen = found.T_base_platform[rows][found.seen[rows]]
+    by: list[Straightness | None] = []
+    for machine in (drawing, found.machine):
+        result = machine.forward_result(session.joints[rows])
+        closes = bool(result.converged.all())
+        by.append(straightness(result.T_base_platform[:, :3, 3]) if closes else None)
+    return LinePath(
+        name=name,
+        n=len(rows),
+        seen=straightness(seen[:, :3, 3]) if len(seen) >= SHORTEST else None,
+        drawing=by[0],
+        calibrated=by[1],
+    )

@@ -1,0 +1,241 @@
+"""What a machine predicts of readings and tool points that photographs show.
+
+Stations, boards' mounts and the platform's poses are estimated from the photographs, the machine
+is held (:mod:`pkmcal.judge.held`). Where photographs leave open where stations and boards are (a
+board tells a pose in a camera that stands anywhere), readings of *other* configurations tell:
+closures stand in the estimate with the soft deviation :data:`SOFT`, which gives way to anything
+seen, and each configuration's own readings are then taken out again exactly, by their leverage
+(leave-one-out).
+
+With E the rows of readings and P the projector of :mod:`pkmcal.judge.held`, their residuals are
+``E P y``, of which a configuration's own fit leaves the part ``L``, its block of ``E P E^T``: ones
+without their own readings are ``L^-1 E P y``, to first order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import inverse, perturb, pose_difference
+from pkmcal.identify.blocks import BatchState
+from pkmcal.identify.closure_noise import PERFECT
+from pkmcal.identify.gauge import pose_generators
+from pkmcal.identify.problem import State
+from pkmcal.judge.held import Held, hold, too_little
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure
+from pkmcal.mechanisms.kinematics import forward, inverse_result
+from pkmcal.solver import transposed
+
+SOFT = 0.01
+"""Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a
+photograph leaves open, so a seen pose hardly knows them."""
+ALONE = 1e-2
+"""Part of a reading's residual that its own fit leaves, below which hardly anything but the reading
+told where the platform was: what was seen left ten times SOFT open."""
+STEPS = 20
+SETTLED = 1e-10
+"""Frame change (m, rad) below which the frames are laid."""
+OPEN = 1e-9
+"""Share of the largest singular value below which a frame change moves no reading."""
+
+
+@dataclass(frozen=True)
+class ReadingErrors:
+    """Errors of n configurations.
+
+    residuals : (n, m) readings measured less predicted, m or rad. position, orientation : (n,) of
+    the tool point by the readings, m and rad; NaN where the machine cannot be closed.
+    """
+
+    residuals: Array
+    position: Array
+    orientation: Array
+
+    def of(self, rows: Integers) -> ReadingErrors:
+        """Those of some configurations."""
+        return ReadingErrors(self.residuals[rows], self.position[rows], self.orientation[rows])
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a machine predicts of a session; values of configurations that were not seen are NaN.
+
+    machine : as held, with the session's tube radii. seen : (K,) configurations whose pose was
+    seen. T_base_platform : (K, 4, 4) seen, without the configuration's own readings. errors : (K,)
+    of the readings that are predicted from it, and of the tool point.
+    noise : (n, n) covariance of the residuals of the n = K' m seen readings by the photographs'
+    and the readings' noise. by_machine : (n, P) their derivatives by the machine's parameters.
+    """
+
+    machine: Machine
+    seen: Booleans
+    T_base_platform: Array
+    errors: ReadingErrors
+    noise: Array
+    by_machine: Array
+
+
+def predict(machine: Machine, measurements: Measurements, start: State) -> Prediction:
+    """What a machine predicts of readings and tool points, seen by measurements.
+
+    start : stations, mounts and poses in frames near the machine's. Raises ResultError where they
+    are not found, or where nothing but a configuration's own readings tells its pose.
+    """
+    held = hold(machine, replace(measurements, joint_noise=SOFT), start)
+    picks = _picks(held)
+    n, m, n_rows = picks.shape
+    along = picks @ held.reduced.q[0]
+    along = along @ transposed(along)
+    shared = picks @ held.basis[: n * n_rows].reshape(n, n_rows, -1)
+    kept = np.eye(m) - along - shared @ transposed(shared)  # L
+    if float(np.linalg.eigvalsh(kept).min(initial=1.0)) < ALONE:
+        raise too_little()
+    alone = np.linalg.inv(kept)
+    units = _size(held)[..., None] * alone
+
+    found = _without_own(held, transposed(picks) @ alone @ picks)
+    joints = measurements.joints[held.seen]
+    errors = _errors(held.machine, joints, found.T_base_platform[0], found.internal[0])
+    answer = picks @ held.projected(held.by)[: n * n_rows].reshape(n, n_rows, -1)
+    return Prediction(
+        machine=held.machine,
+        seen=held.seen,
+        T_base_platform=_among_all(found.T_base_platform[0], held.seen),
+        errors=ReadingErrors(
+            _among_all(errors.residuals, held.seen),
+            _among_all(errors.position, held.seen),
+            _among_all(errors.orientation, held.seen),
+        ),
+        noise=_noise(along, shared, units, 1 - (measurements.joint_noise / SOFT) ** 2),
+        by_machine=(units @ answer).reshape(n * m, -1),
+    )
+
+
+def _picks(held: Held) -> Array:
+    """E (K', m, r): the rows of readings, one each, out of a configuration's."""
+    problem, state = held.problem, held.batch
+    n_poses, n_equations = state.T_base_platform.shape[1], problem.layout.n_equations
+    columns = [
+        problem.joint_rows(np.broadcast_to(row, (1, n_poses, n_equations)), state)[0]
+        for row in np.eye(n_equations)
+    ]
+    out = np.zeros((n_poses, problem.layout.n_readings, held.linear.value.shape[-1]))
+    out[..., problem.closure_rows] = np.stack(columns, axis=-1)
+    return out
+
+
+def _size(held: Held) -> Array:
+    """Reading (K', m) that one standard deviation of its row is, m or rad, with its sign."""
+    layout, c = held.problem.layout, held.problem.closure(held.batch)
+    by_reading = c.by_reading[0]
+    pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
+    slope = np.sqrt(by_reading**2 @ pick)
+    sign = 1.0 if layout.shares_motors else np.sign(by_reading @ pick)
+    return sign * np.hypot(PERFECT, SOFT * slope) / slope
+
+
+def _without_own(held: Held, alone: Array) -> BatchState:
+    """The poses of fits without each configuration's own readings.
+
+    alone : E^T L^-1 E (K', r, r). ``R^-1 Q^T (1 - A N^+ S^T) alone y``: the answer to readings
+    moved to where the others predict them; S the shared unknowns' rows A, own ones taken out.
+    """
+    moved = alone @ held.linear.value[0, ..., None]
+    rows = held.reduced.rows[0]
+    others = held.linear.by_shared[0] @ (held.inverse @ (transposed(rows) @ moved))
+    own = transposed(held.reduced.q[0]) @ (moved - others)
+    own = np.linalg.solve(held.reduced.r[0], own)[..., 0]
+    return held.problem.moved(held.batch, np.zeros((1, held.problem.n_shared)), own[None])
+
+
+def _noise(along: Array, shared: Array, units: Array, less: float) -> Array:
+    """Covariance (K' m, K' m) of the residuals ``units E P y`` by noise.
+
+    along : D (K', m, m), the readings' rows along their own unknowns; shared : F (K', m, a), along
+    those of all: ``H = E P E^T = 1 - D - F F^T``. Rows have unit variance, but readings are sharper
+    than SOFT by the share ``less`` of it: the covariance of E P y is ``H - less H H``, written
+    without a difference of numbers that are nearly the same.
+    """
+    n, m = along.shape[:2]
+    block = (np.eye(m) - along) @ ((1 - less) * np.eye(m) + less * along)
+    flat = shared.reshape(n * m, -1)
+    inner = less * (np.eye(flat.shape[1]) - flat.T @ flat) - (1 - less) * np.eye(flat.shape[1])
+    far = (units @ along @ shared).reshape(n * m, -1)
+    flat = (units @ shared).reshape(n * m, -1)
+    out = flat @ inner @ flat.T - less * (far @ flat.T + flat @ far.T)
+    k = np.arange(n)
+    out.reshape(n, m, n, m)[k, :, k, :] += units @ block @ transposed(units)
+    return 0.5 * (out + out.T)
+
+
+def _errors(machine: Machine, joints: Array, poses: Array, internal: Array) -> ReadingErrors:
+    """Of a machine on seen poses T_base_platform (n, 4, 4) in its own frames."""
+    found = forward(machine.layout, machine.values, joints, poses, internal)
+    off = np.full((len(poses), 6), np.nan)
+    ok = found.converged
+    off[ok] = pose_difference(poses[ok], found.T_base_platform[ok])
+    return ReadingErrors(
+        joints - machine.inverse(poses),
+        np.linalg.norm(off[:, 3:], axis=1),
+        np.linalg.norm(off[:, :3], axis=1),
+    )
+
+
+def _among_all(values: Array, seen: Booleans) -> Array:
+    """Values (K', ...) of the seen configurations among all, NaN elsewhere."""
+    out = np.full((len(seen), *values.shape[1:]), np.nan)
+    out[seen] = values
+    return out
+
+
+def errors_on(machine: Machine, joints: Array, poses: Array) -> ReadingErrors:
+    """Errors of a machine on seen poses T_base_platform (n, 4, 4) in another machine's frames.
+
+    joints : (n, m). The frames of base and platform, which are a convention, are laid so that the
+    readings agree best. What that takes up is given back by the degrees of freedom, so few
+    configurations flatter nobody.
+    """
+    e, f, used = laid(machine, joints, poses)
+    own = e @ poses @ inverse(f)
+    readings, internal = inverse_result(machine.layout, machine.values, own)
+    found = forward(machine.layout, machine.values, joints, own, internal)
+    off = np.full((len(poses), 6), np.nan)
+    ok = found.converged
+    off[ok] = pose_difference(inverse(e) @ found.T_base_platform[ok] @ f, poses[ok])
+    more = np.sqrt(joints.size / max(joints.size - used, 1))
+    return ReadingErrors(
+        (joints - readings) * more,
+        np.linalg.norm(off[:, 3:], axis=1) * more,
+        np.linalg.norm(off[:, :3], axis=1) * more,
+    )
+
+
+def laid(machine: Machine, joints: Array, poses: Array) -> tuple[Array, Array, int]:
+    """Frame changes E, F (4, 4) after which E X F^-1 closes the machine best at the readings, and
+    how many numbers of them the readings fix.
+
+    Gauss-Newton on the closure, rows that hinges move left out; changes that it does not see are
+    left alone.
+    """
+    e, f = np.eye(4), np.eye(4)
+    used = 0
+    for _ in range(STEPS):
+        own = e @ poses @ inverse(f)
+        internal = inverse_result(machine.layout, machine.values, own)[1]
+        c = closure(machine.layout, machine.values, joints, own, np.nan_to_num(internal))
+        jac, value = c.by_pose @ pose_generators(own), c.value
+        if machine.layout.n_internal:
+            q = np.linalg.qr(c.by_internal)[0]
+            rest = np.eye(q.shape[-2]) - q @ transposed(q)
+            jac, value = rest @ jac, (rest @ value[..., None])[..., 0]
+        y, _, rank, _ = np.linalg.lstsq(jac.reshape(-1, 12), -value.reshape(-1), rcond=OPEN)
+        used = int(rank)
+        e, f = perturb(np.eye(4), y[:6]) @ e, perturb(np.eye(4), y[6:]) @ f
+        if np.abs(y).max() < SETTLED:
+            break
+    return e, f, used

@@ -1,0 +1,154 @@
+"""A calibration on data that it did not see: ``pkmcal validate``.
+
+The session's photographs are measured as for a calibration. Then the calibrated machine is held,
+the platform's poses are seen without their readings, and the readings become predictions.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Booleans
+from pkmcal.calibration.calibrate import Progress
+from pkmcal.calibration.results import SavedCalibration
+from pkmcal.errors import InputError, ResultError
+from pkmcal.files import plain
+from pkmcal.judge.comparison import Comparison, compare
+from pkmcal.judge.holdouts import HoldOut, by_regions
+from pkmcal.judge.new_data import known_rows, look, read
+from pkmcal.judge.paths import LinePath, line_path, paths_of
+from pkmcal.judge.prediction import predict
+from pkmcal.judge.words import validation_verdict
+from pkmcal.mechanisms import Machine
+from pkmcal.outcome import Verdict
+from pkmcal.session.load import Session
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Everything that a validation found.
+
+    calibration : as read back. judged : on configurations that it did not see; None where there are
+    none, and only regions were held out. known : (K,) configurations that it had seen.
+    regions : hold-outs within the session. paths : the straight ones.
+    """
+
+    calibration: SavedCalibration
+    session: Session
+    verdict: Verdict
+    judged: Comparison | None
+    known: Booleans
+    regions: tuple[HoldOut, ...]
+    paths: tuple[LinePath, ...]
+    timings: dict[str, float] = field(default_factory=dict)
+
+    def document(self) -> dict[str, Any]:
+        """Plain data for JSON: m and rad."""
+        names = self.session.configurations
+        found = {
+            "pkmcal_validation": FORMAT,
+            "verdict": asdict(self.verdict),
+            "new_data": self.judged.document(names) if self.judged else None,
+            "known_configurations": [n for n, flag in zip(names, self.known, strict=True) if flag],
+            "regions": [item.document(names) for item in self.regions],
+            "paths": [asdict(path) for path in self.paths],
+            "joints": {
+                "names": self.session.document["joints"]["columns"],
+                "units": self.calibration.machine.joint_units,
+            },
+            "timings": self.timings,
+        }
+        return plain(found)
+
+
+def validate(
+    calibration: SavedCalibration | Path | str,
+    session: Session | Path | str,
+    *,
+    regions: int = 0,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Validation:
+    """Errors of a calibration on a session that it did not see; nothing is written.
+
+    calibration : its folder, or as read back. session : a loaded session, or its folder.
+    regions : besides, hold out so many regions of the session's workspace, one after the other, and
+    calibrate on the rest; the session may then be the calibration's own. seed : of the search.
+    Raises InputError where the two do not belong together.
+    """
+    from threadpoolctl import threadpool_limits
+
+    told = progress or (lambda _text, _share: None)
+    with threadpool_limits(1, "blas"):  # as in calibrate
+        began = time.perf_counter()
+        saved, session = read(calibration, session)
+        lines, known = paths_of(session), known_rows(saved, session)
+        if not regions:
+            _check_independent(known, _photographed(session))
+        looked = look(saved, session, seed, told, 0.8)
+        data, estimate = looked.measurements, looked.estimate
+
+        told("Predicting the readings", 0.8)
+        drawing = drawing_of(saved)
+        found = predict(saved.machine, data, estimate.state)
+        if not regions:
+            _check_independent(known, found.seen)
+        judged = None
+        new = np.flatnonzero(found.seen & ~known)
+        if new.size:
+            try:
+                by_drawing = predict(drawing, data, estimate.state)
+            except ResultError:  # so far off that its poses are not found
+                by_drawing = None
+            judged = compare(drawing, saved.covariance, data, found, by_drawing, new)
+
+        told("Holding out regions", 0.9)
+        held_out = by_regions(drawing, data, estimate, regions) if regions else ()
+        return Validation(
+            calibration=saved,
+            session=session,
+            verdict=validation_verdict(judged, held_out, saved.machine),
+            judged=judged,
+            known=known,
+            regions=held_out,
+            paths=tuple(line_path(*line, drawing, session, found) for line in lines.items()),
+            timings={**looked.timings, "all": time.perf_counter() - began},
+        )
+
+
+def drawing_of(saved: SavedCalibration) -> Machine:
+    """The machine as drawn: its values, and where the drawing holds an estimate.
+
+    A calibration read back has its own values for a drawing; regions would be held out of an
+    estimate that is held to what they told.
+    """
+    table = replace(saved.machine.parameters, drawing=saved.drawing.copy())
+    return replace(saved.machine, parameters=table, values=saved.drawing.copy())
+
+
+def _photographed(session: Session) -> Booleans:
+    """(K,) configurations with a photograph; all where a tracker may have seen them."""
+    out = np.full(len(session.configurations), bool(session.trackers))
+    for station in session.stations:
+        out[[photo.configuration for photo in station.photographs]] = True
+    return out
+
+
+def _check_independent(known: Booleans, seen: Booleans) -> None:
+    """Raise `InputError` where nothing that was seen is new to the calibration."""
+    if np.any(seen & ~known):
+        return
+    raise InputError(
+        "the session is not independent: the calibration was made from these photographs",
+        found=f"{int(np.sum(seen & known))} configurations, all of them used",
+        expected="photographs that the calibration did not see",
+        next_step="Take new photographs, calibrate with --holdout N, or hold out regions of this"
+        " session with --regions N",
+    )

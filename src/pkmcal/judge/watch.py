@@ -1,0 +1,193 @@
+"""Is a machine still as its calibration says: ``pkmcal watch``.
+
+New photographs, boards or poses with their readings are measured as for a calibration. Then the
+calibrated machine is held, the platform's poses and the stations are found, and what is left over
+is tested for a change of each leg. Nothing is calibrated anew.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.calibration.aside import select
+from pkmcal.calibration.calibrate import Calibration, Progress
+from pkmcal.calibration.results import SavedCalibration
+from pkmcal.errors import InputError
+from pkmcal.files import plain
+from pkmcal.identify.assembly import seen_configurations
+from pkmcal.judge.causes import magnified
+from pkmcal.judge.changes import ChangeTests, judge
+from pkmcal.judge.held import Held, Trust, evidence, hold
+from pkmcal.judge.new_data import known_rows, look, read
+from pkmcal.judge.words import LookedAt, watch_verdict
+from pkmcal.outcome import Verdict
+from pkmcal.session.load import Session
+
+FORMAT = 1
+ALPHA = 0.01
+"""Share of machines that did not change that are flagged all the same."""
+LEAST_ALPHA, MOST_ALPHA = 1e-6, 0.2
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Everything that a look at a calibrated machine found.
+
+    calibration : as read back. judged : the tests. residuals : (K,) root mean squares of each
+    configuration's residuals with the machine held, in standard deviations. known : (K,)
+    configurations that the calibration had used, left out. seen : (K,) those that were looked at.
+    noise_scale, pose_scale : factors on the stated noise that were used.
+    """
+
+    calibration: SavedCalibration
+    session: Session
+    verdict: Verdict
+    judged: ChangeTests
+    residuals: Array
+    known: Booleans
+    seen: Booleans
+    noise_scale: float
+    pose_scale: float
+    timings: dict[str, float] = field(default_factory=dict)
+
+    def document(self) -> dict[str, Any]:
+        """Plain data for JSON: m and rad."""
+        names = self.session.configurations
+        return plain(
+            {
+                "pkmcal_watch": FORMAT,
+                "verdict": asdict(self.verdict),
+                **self.judged.document(self.calibration.machine),
+                "configurations": [n for n, flag in zip(names, self.seen, strict=True) if flag],
+                "known_configurations": [
+                    n for n, flag in zip(names, self.known, strict=True) if flag
+                ],
+                "noise_scale": self.noise_scale,
+                "pose_scale": self.pose_scale,
+                "timings": self.timings,
+            }
+        )
+
+
+def watch(
+    calibration: SavedCalibration | Path | str,
+    session: Session | Path | str,
+    *,
+    alpha: float = ALPHA,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Watch:
+    """Test a calibrated machine on new data; nothing is written.
+
+    calibration : its folder, or as read back. session : a loaded session, or its folder; a few
+    configurations are enough. alpha : share of unchanged machines that may be flagged. seed : of
+    the search for the stations. Raises InputError where the two do not belong together.
+    """
+    from threadpoolctl import threadpool_limits
+
+    check_alpha(alpha)
+    told = progress or (lambda _text, _share: None)
+    with threadpool_limits(1, "blas"):  # as in calibrate
+        began = time.perf_counter()
+        saved, session = read(calibration, session)
+        _check_usable(saved)
+        known = known_rows(saved, session)
+        _check_new(known, np.ones_like(known))
+        looked = look(saved, session, seed, told, 0.9)
+        seen = seen_configurations(looked.measurements)
+        _check_new(known, seen)
+
+        told("Testing for changes", 0.9)
+        old = saved.document.get("statistics") or {}
+        before = float(old.get("noise_scale", 1.0))
+        trust = Trust.of(looked.estimate, before, float(old.get("pose_scale", 1.0)))
+        held = _hold_new(saved, session, looked, trust, ~known)
+        judged = judge(evidence(held, saved.covariance), saved.machine, alpha)
+        around = LookedAt(
+            session.configurations,
+            known,
+            seen,
+            trust.noise_scale / before,
+            cameras_of(session),
+        )
+        return Watch(
+            calibration=saved,
+            session=session,
+            verdict=watch_verdict(judged, around),
+            judged=judged,
+            residuals=held.residuals(),
+            known=known,
+            seen=seen & ~known,
+            noise_scale=trust.noise_scale,
+            pose_scale=trust.pose_scale,
+            timings={**looked.timings, "all": time.perf_counter() - began},
+        )
+
+
+def check_alpha(alpha: float) -> None:
+    """Raise `InputError` for a share of false alarms that makes no sense."""
+    if not LEAST_ALPHA <= alpha <= MOST_ALPHA:
+        raise InputError(
+            "this share of false alarms is not possible",
+            where="--alpha",
+            found=f"{alpha:g}",
+            expected=f"{LEAST_ALPHA:g} to {MOST_ALPHA:g}, such as {ALPHA:g}",
+        )
+
+
+def cameras_of(session: Session) -> tuple[str, ...]:
+    """Camera files of a session, in the order of their numbers."""
+    return tuple(dict.fromkeys(station.camera_file for station in session.stations))
+
+
+def _hold_new(
+    saved: SavedCalibration, session: Session, looked: Calibration, trust: Trust, keep: Booleans
+) -> Held:
+    """The calibrated machine held on the configurations to keep, (K,)."""
+    data = looked.measurements
+    cameras = [station.camera for station in session.stations]
+    wide = magnified(data, looked.observation, cameras) if cameras else None
+    kept = Trust(
+        trust.edges[keep[data.edges.configuration]],
+        trust.poses[keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]],
+        trust.noise_scale,
+        trust.pose_scale,
+    )
+    return hold(
+        saved.machine,
+        select(data, keep),
+        looked.estimate.state,
+        kept,
+        select(wide, keep) if wide else None,
+    )
+
+
+def _check_usable(saved: SavedCalibration) -> None:
+    """Raise `InputError` for a calibration that says of itself not to be used."""
+    if saved.verdict.usable:
+        return
+    raise InputError(
+        "this calibration should not be used, so nothing can be held against it",
+        where=str(saved.path),
+        found=saved.verdict.reasons[0] if saved.verdict.reasons else saved.verdict.headline,
+        expected="a calibration that was not refused",
+        next_step="Calibrate the machine first",
+    )
+
+
+def _check_new(known: Booleans, seen: Booleans) -> None:
+    """Raise `InputError` where nothing that was seen is new."""
+    if np.any(seen & ~known):
+        return
+    raise InputError(
+        "there is nothing new in this session: the calibration was made from it",
+        found=f"{int(np.sum(seen & known))} configurations, all of them used",
+        expected="photographs, or poses, that were taken after the calibration",
+        next_step="Take three to five new photographs with their readings",
+    )

@@ -1,0 +1,431 @@
+"""What judgements say: is the calibrated machine better than its drawing, by how much, and how sure
+(validate); is it still so, has it changed and where, or do the data tell too little (watch).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.words_names import named
+from pkmcal.judge.changes import POWER, ChangeTests, Explanation, LegTest, Suspect
+from pkmcal.judge.comparison import Comparison, Ratio, ratio, rms
+from pkmcal.judge.holdouts import HoldOut
+from pkmcal.mechanisms import Machine
+from pkmcal.outcome import Verdict
+from pkmcal.wording import SCALES, brief, count, decimals, listed, number
+
+MOSTLY_NOISE = 2**0.5
+"""Factor on the photographs' noise within which that is more than half of the mean square."""
+POOR = 2.0
+"""Factor by which a region's errors must exceed those of the configurations in use to be told."""
+NOISIER = 1.5
+"""Times the calibration's noise from which on the photographs are no longer the same kind."""
+STEEL = 12e-6
+"""Expansion of steel, 1/K, for a picture of what a common scale means."""
+UNEXPLAINED = 1e-3
+"""Chance below which what the findings leave is said to be more than noise."""
+MOST_OTHERS = 4
+"""Causes named beside the best; more are a table's."""
+
+
+def amount(value: float, unit: str) -> str:
+    """``0.07 mm``, ``0.3°``."""
+    scale, name = SCALES[unit]
+    return brief(value * scale) + ("" if name == "°" else " ") + name
+
+
+def factor(value: float) -> str:
+    """A factor with the digits that it deserves."""
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def better(gain: Ratio) -> str:
+    """``14 (±3)``."""
+    return f"{factor(gain.value)} (±{factor(gain.sigma)})"
+
+
+def validation_verdict(
+    judged: Comparison | None, holdouts: Sequence[HoldOut], machine: Machine
+) -> Verdict:
+    """The verdict on new data, or, without any, on the regions held out, pooled."""
+    units = machine.joint_units
+    unit = units[0] if len(set(units)) == 1 else None
+    groups = [judged] if judged else [h.left_out for h in holdouts]
+    before, after = (
+        np.concatenate([getattr(g, name) for g in groups]) for name in ("before", "after")
+    )
+    floor = rms(np.concatenate([np.full(len(g.rows), g.floor) for g in groups]))
+    gain = ratio(before, after)
+    reasons = [*_not_better(gain), *_broken(groups, units)]
+    headline = _validation_headline(gain, before, after, unit, bool(judged))
+    warnings = _regions(holdouts, unit)
+    return Verdict(
+        not reasons, headline, tuple(reasons), tuple(warnings), tuple(_noise(after, floor, unit))
+    )
+
+
+def _validation_headline(
+    gain: Ratio, before: Array, after: Array, unit: str | None, new: bool
+) -> str:
+    where = "" if new else " of regions that it did not see"
+    if gain.high < 1:
+        core = (
+            f"The drawing predicts the readings{where} {factor(1 / gain.value)} times better than"
+            " the calibrated machine"
+        )
+    elif gain.better:
+        core = (
+            f"The calibrated machine predicts the readings{where} {better(gain)} times better than"
+            " the drawing"
+        )
+    else:
+        core = (
+            f"The calibrated machine is not shown to predict the readings{where} better than the"
+            f" drawing: {better(gain)} times"
+        )
+    if unit is None:
+        return core + "."
+    sign = "," if not gain.better and gain.high >= 1 else ":"
+    return f"{core}{sign} {amount(rms(after), unit)} against {amount(rms(before), unit)}."
+
+
+def _not_better(gain: Ratio) -> list[str]:
+    if gain.better:
+        return []
+    if gain.high < 1:
+        return [
+            "The calibration made the machine worse: use the drawing, and look for mixed-up files,"
+            " a machine that was changed, or a camera's calibration that is not its own."
+        ]
+    return [
+        f"On these data it may be {factor(gain.low)} to {factor(gain.high)} times as good as the"
+        " drawing (95 %): too few configurations, or too much noise in them, to tell."
+    ]
+
+
+def _broken(groups: Sequence[Comparison], units: tuple[str, ...]) -> list[str]:
+    """Residuals that the deviations do not promise: the first group's that has such."""
+    for group in groups:
+        if not group.promise.usual:
+            return [_too_large(group, units)]
+        if not group.promise.steady:
+            return [_in_common(group, units)]
+    return []
+
+
+def _too_large(group: Comparison, units: tuple[str, ...]) -> str:
+    said = ""
+    if len(set(units)) == 1:
+        found = rms(group.figures(group.calibrated).joint_rms)
+        promised = rms(group.promise.joint_rms)
+        said = f" ({amount(found, units[0])}, promised {amount(promised, units[0])})"
+    return (
+        f"The residuals are {factor(group.promise.factor)} times larger than the calibration's"
+        f" deviations and the photographs' noise promise{said}; chance does not explain that."
+        " The machine has changed since, or something that the model leaves out moves it."
+    )
+
+
+def _in_common(group: Comparison, units: tuple[str, ...]) -> str:
+    test = group.promise
+    worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
+    off = amount(abs(float(test.common[worst])), units[worst])
+    sigma = amount(float(test.common_sigma[worst]), units[worst])
+    more = "more" if test.common[worst] > 0 else "less"
+    return (
+        f"In all configurations alike, joint {worst + 1} reads {off} (±{sigma}) {more} than"
+        " predicted, which the calibration's deviations do not explain: its homing, its length or a"
+        " joint has changed since, or the calibration is wrong by as much."
+    )
+
+
+def _noise(after: Array, floor: float, unit: str | None) -> list[str]:
+    if unit is None or rms(after) > MOSTLY_NOISE * floor:
+        return []
+    return [
+        f"What is left is mostly the photographs' own noise, {amount(floor, unit)}: the machine may"
+        " be better still. Several stations that see the same configurations would tell."
+    ]
+
+
+def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[str]:
+    """Regions in which a calibration of the rest is poor."""
+    out: list[str] = []
+    for item in holdouts:
+        off, usual = rms(item.left_out.after), rms(item.used.after)
+        if off < POOR * usual:
+            continue
+        how = f": {amount(off, unit)} against {amount(usual, unit)}" if unit else ""
+        out.append(
+            f"Extrapolation is poor where the platform is {item.region.name}"
+            f" ({count(len(item.left_out.rows), 'configuration')}, left out){how}. Photograph"
+            " configurations there before the machine works there."
+        )
+    return out
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """What a verdict says besides the tests.
+
+    configurations : K names. known, seen : (K,) used by the calibration, and looked at. noisier :
+    times the calibration's factor on the stated noise of edges. cameras : names.
+    """
+
+    configurations: tuple[str, ...]
+    known: Booleans
+    seen: Booleans
+    noisier: float
+    cameras: tuple[str, ...] = ()
+
+
+def watch_verdict(judged: ChangeTests, around: LookedAt) -> Verdict:
+    """The verdict; usable means still as calibrated."""
+    warnings = _warnings(around)
+    if judged.changed:
+        return _changed(judged, around, warnings)
+    blind = [leg for leg in judged.legs if is_blind(leg)]
+    if blind:
+        return Verdict(
+            False,
+            "These data are too few to tell whether the machine is still as calibrated.",
+            _blind(blind),
+            warnings,
+            ("Photograph more configurations, with legs near both ends of their ranges.",),
+        )
+    new = int(np.sum(around.seen & ~around.known))
+    headline = (
+        f"Still as calibrated, as far as {count(new, 'new configuration')} can tell:"
+        f" {_would_have(judged)}."
+    )
+    return Verdict(True, headline, (), warnings, _advice(judged))
+
+
+def is_blind(leg: LegTest) -> bool:
+    """Whether not even a change as large as the drawing's tolerance would have been found."""
+    if leg.zero is None:
+        return leg.whole.dof == 0
+    return not leg.detects_zero <= leg.tolerance
+
+
+def said(suspect: Suspect, cameras: Sequence[str] = (), short: bool = False) -> str:
+    """A cause with the change it would have made, as a part of a sentence.
+
+    short : how far a joint moved, but not along what.
+    """
+    cause, value, sigma = suspect.cause, suspect.change.value, suspect.change.sigma
+    who = named(cause.legs) if cause.legs else ""
+    if cause.part == "scale":
+        return f"all lengths against the readings by {_ratio(value[0], sigma[0])}"
+    if cause.part == "camera":
+        name = cameras[cause.camera] if cause.camera < len(cameras) else "a camera"
+        return f"the focal length of {name} by {_ratio(value[0], sigma[0])}"
+    if cause.part in ("base", "platform"):
+        joint = f"the {cause.part} joint{'s' if len(cause.legs) > 1 else ''} of {who}"
+        together = " together" if len(cause.legs) > 1 else ""
+        return f"{joint}{together}{_vector(suspect, short)}"
+    names = {
+        "zero": "the zero of {}'s reading",
+        "rod": "the rod length of {}",
+        "arm": "the arm of {}",
+        "hinge": "the hinge of {}",
+    }
+    what = names[cause.part].format(who)
+    if len(value) > 1:
+        return f"{what}{_vector(suspect, short)}"
+    return f"{what} by {signed(value[0], sigma[0], cause.unit)}"
+
+
+def signed(value: float, sigma: float, unit: str) -> str:
+    """``+0.31 mm (±0.04)``."""
+    factor, name = SCALES[unit]
+    if not np.isfinite(sigma):
+        return "an amount that these data do not tell"
+    places = decimals(sigma * factor)
+    gap = "" if name == "°" else " "
+    size = number(value * factor, places, signed=True)
+    return f"{size}{gap}{name} (±{number(sigma * factor, places)})"
+
+
+def _ratio(value: float, sigma: float) -> str:
+    """``+120 µm/m (±15)``."""
+    places = decimals(sigma * 1e6)
+    return f"{number(value * 1e6, places, signed=True)} µm/m (±{number(sigma * 1e6, places)})"
+
+
+def _vector(suspect: Suspect, short: bool) -> str:
+    """How far a joint moved, if the data tell that, and along what."""
+    cause, change = suspect.cause, suspect.change
+    size = float(np.linalg.norm(change.value[:3]))
+    if len(change.value) != 3 or size == 0 or not np.isfinite(change.sigma).all():
+        return ""
+    along = change.value / size
+    sigma = float(np.sqrt(along @ change.covariance @ along))
+    places = decimals(sigma * 1e3)
+    text = f" by {number(size * 1e3, places)} mm (±{number(sigma * 1e3, places)})"
+    if short:
+        return text
+    parts = ", ".join(number(v * 1e3, places, signed=True) for v in change.value)
+    return f"{text}, ({parts}) mm in the {cause.part} frame"
+
+
+def _changed(judged: ChangeTests, around: LookedAt, warnings: tuple[str, ...]) -> Verdict:
+    cameras = around.cameras
+    findings = judged.findings
+    if not findings:
+        return Verdict(False, "The machine is not as calibrated.", (_unnamed(judged),), warnings)
+    lens = all(f.suspect.cause.part == "camera" for f in findings)
+    if lens:
+        headline = (
+            "The photographs do not fit the calibration, and a camera explains that better than"
+            " the machine: whether the machine is as calibrated cannot be told."
+        )
+    else:
+        headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
+    reasons = [_reason(f, k, cameras) for k, f in enumerate(findings)]
+    if judged.left.dof and judged.left.chance < UNEXPLAINED:
+        reasons.append(
+            "That does not explain all: what is left of the machine's test is more than noise"
+            f" (χ² {judged.left.chi2:.0f} for {count(judged.left.dof, 'degree')} of freedom)."
+        )
+    return Verdict(False, headline, tuple(reasons), warnings, _next(findings))
+
+
+def _changes_headline(findings: Sequence[Explanation]) -> str:
+    """What changed, in short."""
+    causes = [f.suspect.cause for f in findings if f.suspect.cause.part not in ("scale", "camera")]
+    if not causes:
+        return "all its lengths have another scale"
+    legs = {leg for cause in causes for leg in cause.legs}
+    rivals = {leg for f in findings for o in f.others for leg in o.cause.legs} - legs
+    verb = "has" if len(legs) == 1 else "have"
+    return f"{named(legs)} {verb} changed" + (", or another that looks the same" if rivals else "")
+
+
+def _reason(finding: Explanation, place: int, cameras: Sequence[str]) -> str:
+    """One finding: what, how much, as after what, and what it may be instead."""
+    begin = "Most likely it is" if place == 0 else "Besides,"
+    text = f"{begin} {said(finding.suspect, cameras)}{_cause_in_words(finding.suspect)}."
+    if not finding.others:
+        return text
+    named_others = [said(o, cameras, short=True) for o in finding.others[:MOST_OTHERS]]
+    more = len(finding.others) - len(named_others)
+    tail = f"; or {count(more, 'other cause')}" if more else ""
+    return f"{text} These data cannot tell that from {'; or '.join(named_others)}{tail}."
+
+
+def _cause_in_words(suspect: Suspect) -> str:
+    """What such a change usually comes from."""
+    cause = suspect.cause
+    if cause.part == "zero":
+        return ", as after a slipped coupling or encoder, or a homing switch that moved"
+    if cause.part in ("base", "platform") and len(cause.legs) > 1:
+        return ", as with a mount that both share"
+    if cause.part in ("base", "platform"):
+        return ", as with a joint that came loose or was exchanged"
+    if cause.part == "scale":
+        kelvin = abs(suspect.change.value[0]) / STEEL
+        way = "warmer" if suspect.change.value[0] > 0 else "colder"
+        return (
+            f"; a steel frame that is {brief(kelvin)} K {way} than at the calibration, with scales"
+            " in the legs that are not, would do that (12 µm/m/K), and so would readings of"
+            " another scale"
+        )
+    return ", as after focusing or with a lens that was touched" if cause.part == "camera" else ""
+
+
+def _unnamed(judged: ChangeTests) -> str:
+    """Something changed, and no single cause stands out."""
+    legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
+    if legs:
+        which = named(j for leg in legs for j in leg.legs)
+        return f"The test of {which} fails, but which part of it changed cannot be told."
+    return (
+        f"All legs' numbers together fit the new data badly (χ² {judged.machine.chi2:.0f} for"
+        f" {count(judged.machine.dof, 'degree')} of freedom), but no single leg stands out."
+    )
+
+
+def _next(findings: Sequence[Explanation]) -> tuple[str, ...]:
+    parts = {f.suspect.cause.part for f in findings}
+    if parts == {"camera"}:
+        return ("Calibrate the camera again, or set its focus back, and look once more.",)
+    if parts == {"scale"}:
+        return (
+            "Look at the machine when it is as warm as at the calibration, and at the scale of its"
+            " readings; if it stays, calibrate again.",
+        )
+    if any(f.others for f in findings):
+        return (
+            "Look at these parts of the machine; more configurations, and a second station, tell"
+            " such causes apart. Then calibrate again.",
+        )
+    return ("Look at this part of the machine, then calibrate again.",)
+
+
+def _would_have(judged: ChangeTests) -> str:
+    """What would have been found, in words."""
+    zeros = [leg for leg in judged.legs if leg.zero is not None and leg.zero.dof]
+    sizes = np.array([leg.detects_zero for leg in zeros])
+    if not zeros:
+        return "no test of a leg fails"
+    unit = zeros[0].unit
+    factor, name = SCALES[unit]
+    low, high = brief(sizes.min() * factor), brief(sizes.max() * factor)
+    span = low if low == high else f"{low} to {high}"
+    gap = "" if name == "°" else " "
+    what = "leg's length" if unit == "m" else "motor's zero"
+    return (
+        f"a change of any {what} by {span}{gap}{name}, depending on the leg, would have been"
+        f" found with a probability of {POWER:.0%}"
+    )
+
+
+def _blind(legs: Sequence[LegTest]) -> tuple[str, ...]:
+    """Why these data are too few, of legs of which they tell too little."""
+    nothing = [leg for leg in legs if not np.isfinite(leg.detects_zero)]
+    little = [leg for leg in legs if np.isfinite(leg.detects_zero)]
+    out: list[str] = []
+    if nothing:
+        out.append(f"Of {named(j for leg in nothing for j in leg.legs)} these data tell nothing.")
+    if little:
+        factor, name = SCALES[little[0].unit]
+        sizes = [brief(f(leg.detects_zero for leg in little) * factor) for f in (min, max)]
+        span = " to ".join(dict.fromkeys(sizes)) + ("" if name == "°" else " ") + name
+        out.append(
+            f"In {named(j for leg in little for j in leg.legs)} only a change of the reading's zero"
+            f" by {span} would be found, which is more than the drawing's tolerance."
+        )
+    return tuple(out)
+
+
+def _warnings(around: LookedAt) -> tuple[str, ...]:
+    out: list[str] = []
+    both = around.known & around.seen
+    if both.any():
+        names = [n for n, k in zip(around.configurations, both, strict=True) if k]
+        out.append(
+            f"The calibration was made from configuration {listed(names, 4)}: nothing new, and left"
+            " out of the tests."
+        )
+    if around.noisier > NOISIER:
+        out.append(
+            f"The edges scatter {around.noisier:.1f} times as much as in the calibration; focus,"
+            " light, a camera that moved between the photographs, or something that bends. The"
+            " tests allow for it, and find less."
+        )
+    return tuple(out)
+
+
+def _advice(judged: ChangeTests) -> tuple[str, ...]:
+    wide = [leg for leg in judged.legs if leg.zero is None and leg.whole.dof]
+    if wide:
+        who = named(j for leg in wide for j in leg.legs)
+        return (f"Of {who}, which has no reading, only the joints are tested.",)
+    return ()

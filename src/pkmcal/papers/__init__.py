@@ -1,0 +1,1 @@
+"""The papers' own methods: each an equation's function, as printed and corrected."""

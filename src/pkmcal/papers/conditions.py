@@ -1,0 +1,119 @@
+"""[A]'s identifiability conditions: equations counted against unknowns, 10-12, 15 and 17.
+
+They are necessary at most: products and distances of coplanar joints are counted twice (12
+equations of rank 11 occur, and failing counts at full rank; errata). The test is the rank of
+the Jacobian; these numbers are for comparison with the paper and for a first look.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Booleans, Integers
+from pkmcal.mechanisms import Machine
+from pkmcal.papers.four_step_checks import listed
+from pkmcal.papers.legs import legs_of
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One condition of [A].
+
+    equation : its number in the paper. needed, available : counts. met : needed <= available.
+    text : what is counted, a sentence for people.
+    """
+
+    equation: str
+    needed: int
+    available: int
+    met: bool
+    text: str
+
+
+def conditions(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
+    """All conditions for a machine and the legs that each station sees at once, (S, L).
+
+    Necessary at most, see the module.
+    """
+    out = [every_leg(seen), base(machine, seen), offsets(machine, seen), platform(machine, seen)]
+    return (*out, *at_once(machine, seen))
+
+
+def every_leg(seen: Booleans) -> Condition:
+    """[A] 3.3, first condition: each leg is seen by one station at least."""
+    lost = np.flatnonzero(~seen.any(axis=0))
+    text = "every leg is seen by a station"
+    if lost.size:
+        text += f"; none sees {'leg' if lost.size == 1 else 'legs'} {listed(lost)}"
+    return _condition("3.3", seen.shape[1], int(seen.any(axis=0).sum()), text)
+
+
+def base(machine: Machine, seen: Booleans) -> Condition:
+    """[A] 12 with 11 (spatial) or 10 (planar): products of the base joints' vectors.
+
+    Unknowns: 3 + 3(n - 3) + 2r of n centres and r revolute axes. Planar, as printed
+    2 + 2(n - 2); corrected 1 + 2(n - 2), as in 17: two centres leave one distance.
+    Equations: sum over stations of C(n, 2) + C(r, 2) + r(n - 1). A planar machine's axes are
+    all its normal; their products say nothing of the plane's points and are not counted.
+    """
+    n, legs = seen.shape[1], legs_of(machine)
+    count = seen.sum(axis=1)
+    if legs.planar:
+        text = "products of vectors between base joints, for their places in the plane"
+        return _condition("10, 12", 1 + 2 * (n - 2), int(_pairs(count).sum()), text)
+    revolute = legs.base_revolute
+    r = (seen & revolute).sum(axis=1)
+    available = _pairs(count) + _pairs(r) + r * np.maximum(count - 1, 0)
+    needed = 3 + 3 * (n - 3) + 2 * int(revolute.sum())
+    text = "products of vectors between base joints and revolute axes, for centres and axes"
+    return _condition("11, 12", needed, int(available.sum()), text)
+
+
+def offsets(machine: Machine, seen: Booleans) -> Condition:
+    """[A] 15: distances between platform joints against offsets and constant lengths."""
+    closing = machine.layout.closing
+    available = int(_pairs((seen & closing).sum(axis=1)).sum())
+    text = "distances between platform joints of legs with a length, for their offsets"
+    return _condition("15", int(closing.sum()), available, text)
+
+
+def platform(machine: Machine, seen: Booleans) -> Condition:
+    """[A] 17: the same distances against the platform's centres.
+
+    E = 3 + 3(n - 3) spatial, 1 + 2(n - 2) planar; n counts legs with a length, as the centre
+    of a passive leg comes from 19.
+    """
+    closing = machine.layout.closing
+    n = int(closing.sum())
+    needed = 1 + 2 * (n - 2) if legs_of(machine).planar else 3 + 3 * (n - 3)
+    available = int(_pairs((seen & closing).sum(axis=1)).sum())
+    text = "distances between platform joints of legs with a length, for their places"
+    return _condition("17", needed, available, text)
+
+
+def at_once(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
+    """[A] 3.5: three legs with a length at once with each passive leg and platform axis.
+
+    Legs with a revolute joint count among the three themselves, passive ones do not.
+    """
+    legs = legs_of(machine)
+    count = (seen & legs.closing).sum(axis=1)
+    out: list[Condition] = []
+    for j in np.flatnonzero(~legs.closing | legs.platform_revolute):
+        passive = not legs.closing[j]
+        most = int(np.max(np.where(seen[:, j], count, 0), initial=0))
+        what = f"passive leg {j + 1}" if passive else f"the revolute axis of leg {j + 1}"
+        text = f"legs with a length seen at once, for {what} on the platform"
+        out.append(_condition("19" if passive else "18", 3, most, text))
+    return tuple(out)
+
+
+def _condition(equation: str, needed: int, available: int, text: str) -> Condition:
+    return Condition(f"[A] {equation}", needed, available, needed <= available, text)
+
+
+def _pairs(n: Integers) -> Integers:
+    """C(n, 2)."""
+    return n * (n - 1) // 2

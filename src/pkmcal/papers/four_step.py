@@ -1,0 +1,353 @@
+"""[A] section 3: four steps from leg axes to the machine, as printed and corrected.
+
+1. base joints in each station's camera frame: centres ([A] 6, or [B] 14 on the edges
+   themselves), revolute axes (7) — ``leg_axes``;
+2. base joints in one frame (8-9), or by a board on the base (3.3) — ``four_step_base``;
+3. offsets of the readings and constant lengths (13-14) and
+4. platform joints: centres (16), revolute axes (18, 7), passive legs (19), universal axes by
+   the inverse kinematics — ``four_step_platform``.
+
+``corrected`` follows errata: stations and photographs are joined by rigid registration,
+offsets minimise the deviations from each pair's mean distance, and what several stations see
+in one configuration counts as seen at once. ``printed`` uses products of distances,
+consecutive differences and averaged distances as the paper has them.
+
+Arrays: B runs, S stations, C photographs (one station, one configuration), L legs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import dot
+from pkmcal.identify.gauge import BestFit, centre_index, default_gauge
+from pkmcal.identify.gauge import apply as in_gauge
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.papers import four_step_checks as checks
+from pkmcal.papers import linear
+from pkmcal.papers.four_step_base import (
+    Base,
+    Items,
+    Views,
+    apart,
+    base_by_products,
+    base_by_registration,
+    gathered_directions,
+    gathered_points,
+    joined_by_boards,
+    rough_rotations,
+    together,
+    with_boards,
+    with_signs,
+)
+from pkmcal.papers.four_step_platform import (
+    offsets,
+    passive_centres,
+    platform_axes,
+    platform_by_distances,
+    platform_by_registration,
+    universal_axes,
+)
+from pkmcal.papers.leg_axes import (
+    Axes,
+    axes_from_edges,
+    centres_from_axes,
+    in_base,
+    plane_normals,
+    revolute_axes,
+    through_centres,
+)
+from pkmcal.papers.legs import Legs, base_gauge, legs_of, platform_gauge
+from pkmcal.papers.registration import Body, extent, fixes_pose, laid, nearest_rotation
+
+__all__ = ["Axes", "Form", "FourSteps", "centres_from_axes", "four_step", "solve"]
+
+Form = Literal["corrected", "printed"]
+VAGUE = 0.1
+"""Standard deviation of a base centre, of the base's size, beyond which it does not count."""
+
+
+@dataclass(frozen=True)
+class FourSteps:
+    """The steps' results; a spatial machine's frames are those of three centres.
+
+    base, platform (B, L, 3) m, the latter NaN for passive legs that could not be found. offsets
+    (B, L) m, zero for passive legs. T_camera_base (B, S, 4, 4). base_axes, platform_axes
+    (B, L, 3) unit, NaN where the machine has none; as drawn where nothing could be found.
+    T_base_platform (B, K, 4, 4) of the configurations ``configuration`` (K,) where ``posed``
+    (K,): enough legs with a length were seen at once.
+    """
+
+    base: Array
+    offsets: Array
+    platform: Array
+    T_camera_base: Array
+    base_axes: Array
+    platform_axes: Array
+    T_base_platform: Array
+    configuration: Integers
+    posed: Booleans
+
+
+# ------------------------------------------------------------------ the steps on leg axes
+
+
+def base_items(
+    machine: Machine, axes: Axes, a_camera: Array, found: Booleans, views: Views
+) -> Items:
+    """What the views saw of the base: centres, and revolute axes ([A] 7) with their signs.
+
+    a_camera : (B, S, L, 3) centres in the camera frames, found (S, L).
+    """
+    legs, n = legs_of(machine), len(found)
+    centres, seen = gathered_points(a_camera, found, views)
+    if legs.planar:
+        v, v_found = plane_normals(axes.u, axes.seen, axes.station, n, axes.information)
+    else:
+        some = axes.of_legs(np.flatnonzero(legs.base_revolute))
+        v, v_found = revolute_axes(some.u, some.seen, axes.station, n, some.information)
+    v, v_found = gathered_directions(v, v_found, views)
+    items = Items(centres, seen, v, v_found, legs.base, legs.directions)
+    if not items.n_directions:
+        return items
+    return with_signs(items, rough_rotations(machine, axes, items, views))
+
+
+def solve(
+    machine: Machine,
+    axes: Axes,
+    a_camera: Array,
+    found: Booleans,
+    form: Form,
+    views: Views | None = None,
+) -> FourSteps:
+    """Steps 2 to 4 from the base centres in the camera frames, all runs at once.
+
+    a_camera : (B, S, L, 3) with (S, L) whether found; the drawing's values start the search.
+    views : stations joined beforehand, each on its own when absent.
+    """
+    legs = legs_of(machine)
+    views = apart(len(found)) if views is None else views
+    items = base_items(machine, axes, a_camera, found, views)
+    join = base_by_registration if form == "corrected" else base_by_products
+    base = join(items, base_gauge(machine, legs))
+    T_camera_base = views.T_camera_view @ base.T_view_base[:, views.of_station]
+    usable = items.fixed()[views.of_station][axes.station]
+    axes = replace(axes, seen=axes.seen & usable[:, None])
+    merged = in_base(axes, T_camera_base)
+    if form == "corrected":
+        q0, platform = _ends(machine, legs, merged, base.centres)
+    else:
+        a_photo = np.where(found[..., None], a_camera, 0.0)[:, axes.station]
+        q0, platform = _ends_printed(machine, legs, axes, a_photo)
+    if legs.planar:  # a leg lies level, so both its ends have one height
+        rise = legs.platform[:, 2] - legs.base[:, 2]
+        platform[..., 2] = base.centres[..., 2] + rise
+
+    # each configuration's pose ([A] 18), by the legs with a length
+    seen = merged.seen & legs.closing
+    b = base.centres[:, None] + (merged.readings + q0[:, None])[..., None] * merged.u
+    posed = fixes_pose(legs.platform, seen, motion=legs.motion)
+    weight = np.broadcast_to(seen, b.shape[:-1]).astype(float)
+    if form == "printed" and legs.motion.shape[1] == 3 and not legs.planar:
+        # distances leave a translating platform turned against the base frame
+        rot = laid(platform[:, None], b[:, posed], weight[:, posed])[..., :3, :3].mean(axis=1)
+        platform = platform @ np.swapaxes(nearest_rotation(rot), -1, -2)
+    T = laid(platform[:, None], b, weight, motion=legs.motion)
+    if legs.planar:  # the platform frame keeps the height that the drawing gives it
+        T[..., 2, 3] = np.mean(legs.base[:, 2] - legs.platform[:, 2])
+    if not legs.closing.all():
+        rows = merged.seen & posed[:, None]
+        passive, known = passive_centres(merged.u, base.centres, rows, T)
+        passive = np.where(known[:, None], passive, np.nan)
+        platform = np.where(legs.closing[:, None], platform, passive)
+    v, w = _axes(machine, legs, merged, posed, base, Body(platform, T), form)
+    return FourSteps(
+        base.centres, q0, platform, T_camera_base, v, w, T, merged.configuration, posed
+    )
+
+
+def _ends(machine: Machine, legs: Legs, merged: Axes, base: Array) -> tuple[Array, Array]:
+    """Offsets (B, L) and platform centres (B, L, 3), corrected: in the base frame."""
+    with_length = replace(merged, seen=merged.seen & legs.closing)
+    a = np.broadcast_to(base[:, None], merged.u.shape)
+    q0 = offsets(with_length, a, legs.rod, "corrected")
+    b = a + (merged.readings + q0[:, None])[..., None] * merged.u
+    posed = fixes_pose(legs.platform, with_length.seen, motion=legs.motion)
+    gauge = platform_gauge(machine, legs)
+    platform = platform_by_registration(
+        b[:, posed], with_length.seen[posed], legs.platform, gauge, legs.motion
+    )
+    return q0, platform
+
+
+def _ends_printed(machine: Machine, legs: Legs, axes: Axes, a_photo: Array) -> tuple[Array, Array]:
+    """The same as printed: each photograph in its camera frame, a_photo (B, C, L, 3)."""
+    with_length = replace(axes, seen=axes.seen & legs.closing)
+    q0 = offsets(with_length, a_photo, legs.rod, "printed")
+    b = a_photo + (axes.readings + q0[:, None])[..., None] * axes.u
+    gauge = platform_gauge(machine, replace(legs, motion=np.eye(6)))
+    if legs.planar:  # distances say nothing of the heights, which are the base's
+        heights = np.eye(legs.platform.size)[2::3]
+        gauge = np.concatenate([platform_gauge(machine, legs), heights])
+    return q0, platform_by_distances(b, with_length.seen, axes.station, legs.platform, gauge)
+
+
+def _axes(
+    machine: Machine, legs: Legs, merged: Axes, posed: Booleans, base: Base, body: Body, form: Form
+) -> tuple[Array, Array]:
+    """Axes on base and platform (B, L, 3): revolute by [A] 7, universal by the torsion.
+
+    body : the platform's centres and its poses, known where ``posed`` (K,).
+    """
+    u, seen = merged.u, merged.seen & posed[:, None]
+    v = _as_drawn(machine, legs.base_axes, legs.base, base.centres)
+    w = _as_drawn(machine, legs.platform_axes, legs.platform, body.points)
+    if legs.base_revolute.any():
+        v[:, legs.base_revolute] = base.directions
+        if form == "corrected":  # all stations together know a leg's directions better than one
+            found, known = revolute_axes(u, merged.seen, merged.station, 1, merged.information)
+            v = _where(known[0] & legs.base_revolute, found[:, 0], v)
+    if legs.platform_revolute.any():
+        found, known = platform_axes(u, seen, body.poses, merged.information)
+        w = _where(known & legs.platform_revolute, found, w)
+    j = np.flatnonzero(legs.torsion)
+    if j.size:
+        tolerance = machine.parameters.tolerance[machine.layout.base_axis[j, 0]]
+        drawn, rot = (v[:, j], w[:, j]), body.poses[..., :3, :3]
+        v[:, j], w[:, j] = universal_axes(u[:, :, j], rot, seen[:, j], drawn, tolerance)
+    return v, w
+
+
+def _where(legs: Booleans, found: Array, axes: Array) -> Array:
+    """Axes (B, L, 3) replaced by the found ones of some legs, on the same side."""
+    side = np.where(dot(found, axes) < 0, -1.0, 1.0)[..., None]
+    return np.where(legs[:, None], side * found, axes)
+
+
+def _as_drawn(machine: Machine, axes: Array, drawn: Array, centres: Array) -> Array:
+    """The drawing's axes (L, 3) as the found centres (B, L, 3) say that it lies, (B, L, 3).
+
+    Its frame is laid on all centres: three of them alone would turn it by their own errors.
+    """
+    out = np.tile(axes, (len(centres), 1, 1))
+    if np.isnan(axes).all() or isinstance(default_gauge(machine), BestFit):
+        return out
+    known = np.isfinite(centres[..., 0]).astype(float)
+    rot = laid(np.broadcast_to(drawn, centres.shape), np.nan_to_num(centres), known)
+    return (rot[:, None, :3, :3] @ out[..., None])[..., 0]
+
+
+# ------------------------------------------------------------------ the steps on a session
+
+
+def four_step(
+    machine: Machine,
+    measurements: Measurements,
+    *,
+    form: Form = "corrected",
+    T_camera_base_guess: Array | None = None,
+    rng: np.random.Generator | None = None,
+) -> State:
+    """[A]'s four steps on a session: a state that can be used as it is or start the bundle.
+
+    corrected takes the edges themselves for the base centres and survives wrong edges.
+    T_camera_base_guess : (S, 4, 4) for stations that see too few legs well enough, and for all
+    where they share too few; without it, and without a board on the base, they are an error.
+    Poses come from the readings by forward kinematics. Frames are those of three centres.
+    Raises ResultError where the data do not allow a step, with [A]'s condition in words.
+    """
+    edges = measurements.edges
+    checks.can_be_tried(machine, len(edges))
+    found_linear = linear.centres(machine, measurements, "robust", rng)
+    if form == "corrected":
+        edges = through_centres(machine, edges, found_linear.centres)
+    axes = axes_from_edges(machine, replace(measurements, edges=edges), found_linear.weights)
+    found = _well_known(found_linear, machine)
+    a_camera = np.where(found[..., None], found_linear.centres, 0.0)[None]
+    if form == "printed":
+        a_camera, found = centres_from_axes(axes, measurements.n_stations)
+    checks.every_leg_seen(machine, found)
+    views = _views(machine, measurements, axes, a_camera, found, T_camera_base_guess)
+    usable = base_items(machine, axes, a_camera, found, views).fixed()[views.of_station]
+    checks.platform_can_be_found(machine, axes, usable, form)
+    steps = solve(machine, axes, a_camera, found, form, views)
+    checks.lengths_are_fixed(machine, axes, usable, steps.base, steps.T_camera_base, steps.offsets)
+    checks.passive_legs_are_fixed(machine, steps.platform)
+    stations = steps.T_camera_base[0]
+    if T_camera_base_guess is not None:
+        stations = np.where(usable[:, None, None], stations, T_camera_base_guess)
+    theta = _parameters(machine, steps)
+    poses = _poses(machine.with_values(theta), measurements, steps, machine.home())
+    state = with_boards(measurements, theta, stations, poses)
+    if legs_of(machine).framed:
+        return state  # in the machine's own frames already
+    return in_gauge(machine, state, default_gauge(machine))
+
+
+def _well_known(found: linear.LinearCentres, machine: Machine) -> Booleans:
+    """Base centres (S, L) that their edges fix, to a part of the base's own size at least."""
+    size = extent(machine.base_centers())
+    finite = np.all(np.isfinite(found.centres), axis=-1)
+    covariance = np.where(finite[..., None, None], found.covariance, np.eye(3))
+    return finite & (np.linalg.eigvalsh(covariance)[..., -1] < (VAGUE * size) ** 2)
+
+
+def _views(
+    machine: Machine,
+    measurements: Measurements,
+    axes: Axes,
+    a_camera: Array,
+    found: Booleans,
+    guess: Array | None,
+) -> Views:
+    """How the stations are joined: by boards on the base, by the legs they share, or as given."""
+    on_base = ~measurements.on_platform
+    views = joined_by_boards(measurements.poses, on_base, len(found))
+    items = base_items(machine, axes, a_camera, found, views)
+    if guess is None:
+        checks.stations_are_fixed(items, views, machine)
+        checks.stations_are_joined(items, views)
+    elif checks.free_ways(items).shape[-1]:
+        return together(guess)
+    return views
+
+
+def _parameters(machine: Machine, steps: FourSteps) -> Array:
+    """The machine's parameters (P,) with what the steps found (B = 1)."""
+    layout, theta = machine.layout, machine.values.copy()
+    base_index, platform_index = centre_index(layout)
+    theta[base_index], theta[platform_index] = steps.base[0], steps.platform[0]
+    closing = layout.rod >= 0
+    theta[layout.rod[closing]] = steps.offsets[0, closing]
+    for index, axes in (
+        (layout.base_axis, steps.base_axes),
+        (layout.platform_axis, steps.platform_axes),
+    ):
+        has = index[:, 0] >= 0
+        theta[index[has]] = axes[0, has]
+    return theta
+
+
+def _poses(machine: Machine, measurements: Measurements, steps: FourSteps, home: Array) -> Array:
+    """Platform poses (K, 4, 4) by forward kinematics: from home, else from the pose seen.
+
+    home : (4, 4) of the drawing; what the steps found need not assemble at mid-range.
+    """
+    found = machine.forward_result(measurements.joints, home)
+    poses = found.T_base_platform
+    seen = np.zeros(len(poses), dtype=bool)
+    seen[steps.configuration[steps.posed]] = True
+    lost = ~found.converged & seen
+    if lost.any():
+        start = poses.copy()
+        start[steps.configuration] = steps.T_base_platform[0]
+        poses = poses.copy()
+        poses[lost] = machine.forward_result(measurements.joints[lost], start[lost]).T_base_platform
+    return poses

@@ -1,0 +1,318 @@
+"""[A] 3.3, step 2 of four: the base's joints from the stations' frames into one frame.
+
+Items of the base are its L joint centres and then D directions: the revolute joints' axes, or
+the one normal of a planar machine. A station sees directions with either sign; one sign over
+all stations is chosen first (errata, A 9), by the drawing.
+
+What one frame sees is a *view*: a station's, or that of all stations that a calibration board on
+the base joins (3.3, last paragraph). The same photographs show legs and board; where stations
+share too few legs, the board says how they stand to each other.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements, PoseSet
+from pkmcal.mechanisms import Machine
+from pkmcal.papers.leg_axes import Axes
+from pkmcal.papers.registration import (
+    extent,
+    fit_body,
+    fixes_pose,
+    laid,
+    nearest_rotation,
+    points_by,
+)
+
+
+class Views(NamedTuple):
+    """Frames in which joints are gathered: one a station, or one for all that a board joins.
+
+    of_station : (S,) view of each station. T_camera_view : (S, 4, 4).
+    """
+
+    of_station: Integers
+    T_camera_view: Array
+
+    @property
+    def n(self) -> int:
+        """Number of views."""
+        return int(self.of_station.max()) + 1
+
+
+def apart(n_stations: int) -> Views:
+    """Every station a view of its own."""
+    return Views(np.arange(n_stations), np.tile(np.eye(4), (n_stations, 1, 1)))
+
+
+def together(T_camera_base: Array) -> Views:
+    """All stations in one view, their poses (S, 4, 4) given: the view is that base frame."""
+    return Views(np.zeros(len(T_camera_base), dtype=int), np.asarray(T_camera_base))
+
+
+def mean_pose(T: Array, whiten: Array, group: Integers, n_groups: int) -> Array:
+    """Poses (G, 4, 4) nearest to measured ones (N, 4, 4), by their covariances.
+
+    Least squares of whiten @ (left perturbation), Gauss-Newton; every group has a member.
+    """
+    first = np.searchsorted(np.sort(group), np.arange(n_groups))
+    mean = T[np.argsort(group, kind="stable")[first]]
+    information = np.swapaxes(whiten, -1, -2) @ whiten
+    for _ in range(5):
+        normal, right = np.zeros((n_groups, 6, 6)), np.zeros((n_groups, 6))
+        difference = pose_difference(T, mean[group])
+        np.add.at(normal, group, information)
+        np.add.at(right, group, (information @ difference[..., None])[..., 0])
+        mean = perturb(mean, np.linalg.solve(normal, right[..., None])[..., 0])
+    return mean
+
+
+def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> Views:
+    """Views of the stations that boards on the base join; the others stay apart.
+
+    on_base : (M,) mounts that are fixed to the base; poses on others are left out. A station
+    that sees two boards joins the stations of both.
+    """
+    used = poses.select(on_base[poses.mount])
+    if not len(used):
+        return apart(n_stations)
+    pair, group = np.unique(used.station * len(on_base) + used.mount, return_inverse=True)
+    T_camera_mount = mean_pose(used.T_station_target, used.whiten, group, len(pair))
+    seen = list(zip(*np.divmod(pair, len(on_base)), T_camera_mount, strict=True))
+    of_station, of_mount = np.full(n_stations, -1), np.full(len(on_base), -1)
+    T_camera_view = np.tile(np.eye(4), (n_stations, 1, 1))
+    T_view_mount = np.tile(np.eye(4), (len(on_base), 1, 1))
+    for first in range(n_stations):
+        if of_station[first] >= 0:
+            continue
+        of_station[first] = view = of_station.max() + 1
+        for _ in range(n_stations):  # from the first station to its boards, to their stations
+            for s, m, T in seen:
+                if of_station[s] == view and of_mount[m] < 0:
+                    of_mount[m] = view
+                    T_view_mount[m] = inverse(T_camera_view[s]) @ T
+                elif of_mount[m] == view and of_station[s] < 0:
+                    of_station[s] = view
+                    T_camera_view[s] = T @ inverse(T_view_mount[m])
+    return Views(of_station, T_camera_view)
+
+
+def gathered_points(points: Array, found: Booleans, views: Views) -> tuple[Array, Booleans]:
+    """Points of the stations (B, S, L, 3), found (S, L), as the views have them (B, V, L, 3).
+
+    The mean, where several stations of a view know a point.
+    """
+    back = apply(inverse(views.T_camera_view)[:, None], points)
+    return _mean(np.where(found[..., None], back, 0.0), found, views)
+
+
+def gathered_directions(v: Array, found: Booleans, views: Views) -> tuple[Array, Booleans]:
+    """Directions of either sign, (B, S, D, 3), as the views have them: unit (B, V, D, 3).
+
+    One sign in each view: that of the first station that knows the direction.
+    """
+    rot = np.swapaxes(views.T_camera_view[:, None, :3, :3], -1, -2)
+    back = np.where(found[..., None], (rot @ v[..., None])[..., 0], 0.0)
+    same = views.of_station == views.of_station[:, None]
+    first = np.argmax(same[:, :, None] & found[None], axis=1)
+    reference = back[:, first, np.arange(v.shape[2])]
+    mean, known = _mean(
+        back * np.where(dot(back, reference) < 0, -1.0, 1.0)[..., None], found, views
+    )
+    size = np.sqrt(dot(mean, mean))[..., None]
+    return mean / np.where(size > 0, size, 1.0), known
+
+
+def _mean(values: Array, found: Booleans, views: Views) -> tuple[Array, Booleans]:
+    member = (views.of_station == np.arange(views.n)[:, None]).astype(float)
+    count = member @ found
+    total = np.einsum("vs,bsli->bvli", member, values)
+    return total / np.maximum(count, 1)[..., None], count > 0
+
+
+def with_boards(
+    measurements: Measurements, theta: Array, T_camera_base: Array, T_base_platform: Array
+) -> State:
+    """A session's state by one of these methods, its boards where their poses say.
+
+    Where a board sits on the base or the platform is the mean over its photographs, by their
+    covariances; one that none shows is at the body's origin.
+    """
+    poses = measurements.poses
+    mounts = np.tile(np.eye(4), (len(measurements.mounts), 1, 1))
+    if len(poses):
+        moving = measurements.on_platform[poses.mount, None, None]
+        body = np.where(moving, T_base_platform[poses.configuration], np.eye(4))
+        T_camera_body = T_camera_base[poses.station] @ body
+        # the left perturbation of T_camera_board is that of T_body_board, turned
+        turn = np.zeros((len(poses), 6, 6))
+        turn[:, :3, :3] = turn[:, 3:, 3:] = T_camera_body[:, :3, :3]
+        names, group = np.unique(poses.mount, return_inverse=True)
+        T_body_board = inverse(T_camera_body) @ poses.T_station_target
+        mounts[names] = mean_pose(T_body_board, poses.whiten @ turn, group, len(names))
+    return State(
+        theta,
+        T_camera_base,
+        T_base_platform,
+        np.zeros(int(np.max(measurements.camera_of_station)) + 1),
+        T_mount=mounts,
+        on_platform=measurements.on_platform,
+    )
+
+
+class Base(NamedTuple):
+    """The base's joints in its own frame, and the poses of the views on it.
+
+    centres (B, L, 3) m. directions (B, D, 3) unit. T_view_base (B, V, 4, 4).
+    """
+
+    centres: Array
+    directions: Array
+    T_view_base: Array
+
+
+class Items(NamedTuple):
+    """What each of V views saw: centres (B, V, L, 3) m, seen (V, L), directions (B, V, D, 3)
+    unit and seen (V, D); as drawn on the base: (L, 3) and (D, 3).
+    """
+
+    centres: Array
+    centres_seen: Booleans
+    directions: Array
+    directions_seen: Booleans
+    drawn: Array
+    drawn_directions: Array
+
+    @property
+    def lever(self) -> float:
+        """Length (m) by which a direction weighs as a centre does: the base's own size."""
+        return extent(self.drawn)
+
+    @property
+    def measured(self) -> Array:
+        """All items, (B, V, L + D, 3) m."""
+        return np.concatenate([self.centres, self.lever * self.directions], axis=2)
+
+    @property
+    def seen(self) -> Booleans:
+        """Which were seen, (V, L + D)."""
+        return np.concatenate([self.centres_seen, self.directions_seen], axis=1)
+
+    @property
+    def drawing(self) -> Array:
+        """All items as drawn, (L + D, 3) m."""
+        return np.concatenate([self.drawn, self.lever * self.drawn_directions])
+
+    @property
+    def n_directions(self) -> int:
+        """D."""
+        return len(self.drawn_directions)
+
+    def fixed(self) -> Booleans:
+        """Views (V,) whose own items fix their pose."""
+        return fixes_pose(self.drawing, self.seen, self.n_directions)
+
+    def placed(self, items: Array) -> Array:
+        """Poses (B, V, 4, 4) of the views on items (B, L + D, 3)."""
+        weight = np.broadcast_to(self.seen, self.measured.shape[:-1]).astype(float)
+        return laid(items[:, None], self.measured, weight, self.n_directions)
+
+
+def base_by_registration(items: Items, gauge: Array) -> Base:
+    """Step 2 corrected, [A] 9: the views laid over each other, centres and axes together.
+
+    min sum |R_v A_j + t_v - A_j^(v)|^2 + lever^2 |R_v n_i - n_i^(v)|^2 over A, n and the
+    views' poses. gauge : (6, 3 (L + D)) rows that hold the base frame. Views that fix no pose
+    are left out.
+    """
+    use = items.fixed()
+    measured, weight = items.measured, items.seen.astype(float)
+    shape = measured[:, use].shape[:-1]
+    weight = np.broadcast_to(weight[use], shape)
+    body = fit_body(measured[:, use], weight, gauge, items.drawing, directions=items.n_directions)
+    return _base(items, body.points)
+
+
+def base_by_products(items: Items, gauge: Array) -> Base:
+    """Step 2 as printed, [A] 8-9: scalar products of V, vectors between centres and axes.
+
+    C_1 = sum (V_p . V_q |view - V_p . V_q |base)^2, p <= q: squares belong in the sum, as the
+    paper's count of C(n, 2) products has it. The vectors of a view run from its first seen
+    centre to its others; axes are scaled by a length, on which the paper is silent.
+    """
+    n = len(items.drawing)
+    to_p, to_q, view = [np.zeros((0, n))], [np.zeros((0, n))], [np.zeros(0, dtype=int)]
+    for v, seen in enumerate(items.seen):
+        vectors = np.eye(n)[seen]  # rows that give the view's vectors from its items
+        centres = int(items.centres_seen[v].sum())
+        if centres:
+            vectors[:centres] -= vectors[0].copy()
+            vectors = vectors[1:]
+        p, q = np.triu_indices(len(vectors))
+        to_p, to_q = [*to_p, vectors[p]], [*to_q, vectors[q]]
+        view.append(np.full(len(p), v))
+    by_p, by_q = np.concatenate(to_p), np.concatenate(to_q)
+    measured = items.measured[:, np.concatenate(view)]
+    known = dot(*(np.einsum("kn,bknc->bkc", by, measured) for by in (by_p, by_q)))
+
+    def products(points: Array, runs: Integers) -> tuple[Array, Array]:
+        vp, vq = by_p @ points, by_q @ points
+        jac = by_p[..., None] * vq[:, :, None] + by_q[..., None] * vp[:, :, None]
+        return dot(vp, vq) - known[runs], jac
+
+    return _base(items, points_by(products, items.drawing, gauge, len(known)))
+
+
+def _base(items: Items, points: Array) -> Base:
+    """Centres and unit directions from the fitted items, and where the views stand."""
+    n = len(items.drawn)
+    directions = points[:, n:]
+    size = np.sqrt(dot(directions, directions))[..., None]
+    unit = directions / np.where(size > 0, size, 1.0)
+    return Base(points[:, :n], unit, items.placed(points))
+
+
+def with_signs(items: Items, rough: Array) -> Items:
+    """Directions turned to the drawing's side; rough (B, V, 3, 3) rotates base to view."""
+    drawn = (rough[:, :, None] @ items.drawn_directions[:, :, None])[..., 0]
+    sign = np.where(dot(drawn, items.directions) < 0, -1.0, 1.0)
+    return items._replace(directions=items.directions * sign[..., None])
+
+
+def rough_rotations(machine: Machine, axes: Axes, items: Items, views: Views) -> Array:
+    """Rotations (B, V, 3, 3) from base to view, good to the drawing's own errors.
+
+    By the centres where three of them span a plane; else by the legs' directions that the
+    drawing predicts at the readings, which one leg is enough for.
+    """
+    alone = items._replace(
+        directions=items.directions[:, :, :0],
+        directions_seen=items.directions_seen[:, :0],
+        drawn_directions=items.drawn_directions[:0],
+    )
+    by_centres = alone.placed(items.drawn[None])[..., :3, :3]
+    enough = alone.fixed()
+    if enough.all():
+        return by_centres
+    return np.where(enough[:, None, None], by_centres, _by_directions(machine, axes, views))
+
+
+def _by_directions(machine: Machine, axes: Axes, views: Views) -> Array:
+    """Rotations (B, V, 3, 3) that lay the drawn directions of the legs on the seen ones."""
+    joints = axes.readings[..., machine.layout.actuated >= 0]
+    drawn = machine.with_values(machine.parameters.drawing)
+    poses = drawn.forward_result(joints, drawn.home()).T_base_platform
+    b = poses[..., None, :3, :3] @ drawn.platform_centers()[:, :, None]
+    d = b[..., 0] + poses[..., None, :3, 3] - drawn.base_centers()
+    d = d / np.sqrt(dot(d, d))[..., None]
+    back = np.swapaxes(views.T_camera_view[axes.station, None, :3, :3], -1, -2)
+    u = np.where(axes.seen[..., None], (back @ axes.u[..., None])[..., 0], 0.0)
+    member = (views.of_station[axes.station] == np.arange(views.n)[:, None]).astype(float)
+    h = np.einsum("vc,bcli,bclj->bvij", member, u, d, optimize=True)
+    return nearest_rotation(h)

@@ -1,0 +1,217 @@
+"""Where the data do not allow one of [A]'s four steps: said in words, before or after it.
+
+The papers count equations (``conditions``); these are the tests themselves, the rank of each
+step's Jacobian at the drawing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import ResultError
+from pkmcal.mechanisms import Machine
+from pkmcal.papers.four_step_base import Items, Views
+from pkmcal.papers.four_step_platform import COLLAPSED, deviations
+from pkmcal.papers.leg_axes import Axes, in_base
+from pkmcal.papers.legs import Legs, legs_of
+from pkmcal.papers.registration import fixes_pose, loose, parts_of
+
+FLAT = 1e-3
+"""Singular value of the distances' derivatives by the offsets, of 1 a photograph at most, below
+which a combination of offsets is free."""
+VAGUE = 0.5
+"""Standard deviation of a combination of lengths, of a leg's own, beyond which it is free."""
+BUNDLE = "use the joint method (bundle)"
+
+
+def can_be_tried(machine: Machine, edges: int) -> None:
+    """[A] is about legs with a joint fixed to each body, and its steps about pictures of them."""
+    carried = any(group.carrier.driven for group in machine.layout.base)
+    for group in machine.layout.platform:
+        carried |= group.carrier.turns or group.carrier.floats
+    if carried:
+        raise ResultError(
+            what="the four steps are for legs with one joint on the base and one on the platform",
+            found=f"mechanism {machine.name!r} with joints that move on cranks, slides or bars",
+            next_step=BUNDLE,
+        )
+    if not edges:
+        raise ResultError(
+            what="the four steps need photographs of the legs, and no edge of one was measured",
+            next_step=f"photograph the legs, or {BUNDLE} with a board on the platform",
+        )
+
+
+def every_leg_seen(machine: Machine, found: Booleans) -> None:
+    """[A] 3.3, first condition; found (S, L) base centres."""
+    lost = np.flatnonzero(~found.any(axis=0))
+    if lost.size:
+        raise ResultError(
+            what=f"leg {lost[0] + 1} of {machine.n_legs} is seen by no station well enough",
+            expected="every leg seen in two directions at least, [A] 3.3",
+            next_step=f"add configurations or a station, or {BUNDLE}",
+        )
+
+
+def stations_are_fixed(items: Items, views: Views, machine: Machine) -> None:
+    """Every station sees enough of the base to know where it stands."""
+    few = np.flatnonzero(~items.fixed()[views.of_station])
+    if not few.size:
+        return
+    seen = items.centres_seen[views.of_station[few[0]]]
+    which = f" (legs {listed(np.flatnonzero(seen))})" if seen.any() else ""
+    need = "two or more" if legs_of(machine).planar else "three or more that are not on one line"
+    raise ResultError(
+        what=f"station {few[0] + 1} sees too few legs for the four steps",
+        found=f"{seen.sum()} base centres{which}",
+        expected=f"{need}, each leg seen in two directions",
+        next_step=f"give the station's pose, fix a board to the base, or {BUNDLE}",
+    )
+
+
+def stations_are_joined(items: Items, views: Views) -> None:
+    """The stations share enough legs, or a board, to become one frame ([A] 3.3)."""
+    free = free_ways(items)
+    if not free.shape[-1]:
+        return
+    seen = items.seen[items.fixed()]
+    parts = parts_of(items.drawing, seen, free, items.n_directions)
+    a, b = (np.flatnonzero(part[: len(items.drawn)]) for part in parts)
+    sees = [
+        f"station {s + 1} sees legs {listed(np.flatnonzero(items.centres_seen[view]))}"
+        for s, view in enumerate(views.of_station)
+    ]
+    raise ResultError(
+        what=f"the stations share too few legs: the base joints of legs {listed(a)} can "
+        f"move against those of legs {listed(b)}",
+        found="; ".join(sees),
+        expected="stations that share three legs, or fewer with revolute axes, [A] 3.3",
+        next_step="fix a calibration board to the base where the stations see it, or let a "
+        f"station see more legs, or {BUNDLE} with the stations' poses",
+    )
+
+
+def free_ways(items: Items) -> Array:
+    """Ways (L + D, 3, f) in which the views leave base joints free to move against others."""
+    return loose(items.drawing, items.seen[items.fixed()], items.n_directions)
+
+
+def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: str) -> None:
+    """[A] 3.5: enough legs with a length at once, each leg with enough others."""
+    legs = legs_of(machine)
+    seen = axes.seen & usable[axes.station][:, None]
+    if form == "corrected":
+        row = np.unique(axes.configuration, return_inverse=True)[1]
+        seen = np.array([seen[row == k].any(axis=0) for k in range(row.max() + 1)])
+    at_once = seen & legs.closing
+    posed = fixes_pose(legs.platform, at_once, motion=legs.motion)
+    if not posed.any():
+        _too_few_at_once(legs, at_once)
+    known = (legs.platform[legs.closing], at_once[np.ix_(posed, legs.closing)])
+    free = loose(*known, motion=legs.motion)
+    if free.shape[-1]:
+        a, b = parts_of(*known, free, motion=legs.motion)
+        names = np.flatnonzero(legs.closing)
+        raise ResultError(
+            what=f"the platform joints of legs {listed(names[a])} can move against those of legs "
+            f"{listed(names[b])}",
+            found="no configurations that show enough of both at once",
+            expected="each leg seen at once with others that fix the platform, [A] 3.5",
+            next_step=f"photograph the same configurations from more stations, or {BUNDLE}",
+        )
+    _needs_poses(legs, seen & posed[:, None])
+
+
+def _too_few_at_once(legs: Legs, at_once: Booleans) -> None:
+    turns = np.any(legs.motion[:3], axis=1)
+    need = "three or more, not on one line" if turns.all() else "one or more"
+    if turns.any() and not turns.all():  # about z alone
+        need = "two or more" + ("" if legs.planar else ", not one above the other")
+    raise ResultError(
+        what="no configuration shows enough legs with a length at once to place the platform",
+        found=f"{at_once.sum(axis=1).max(initial=0)} at most",
+        expected=f"{need}, [A] 3.5",
+        next_step=f"let a station see more legs, photograph one configuration from several "
+        f"stations, or {BUNDLE}",
+    )
+
+
+def _needs_poses(legs: Legs, seen: Booleans) -> None:
+    """Passive legs and revolute axes need the platform's pose and the leg, twice."""
+    for which, what in (
+        (~legs.closing, "passive leg {}'s platform joint"),
+        (legs.platform_revolute, "the revolute axis of leg {} on the platform"),
+    ):
+        short = np.flatnonzero(which & (seen.sum(axis=0) < 2))
+        if short.size:
+            raise ResultError(
+                what=what.format(short[0] + 1) + " cannot be found",
+                found=f"seen in {seen[:, short[0]].sum()} configurations together with enough "
+                "legs with a length",
+                expected="two directions at least, with three legs with a length at once, [A] 3.5",
+                next_step=f"add configurations or a station that sees it, or {BUNDLE}",
+            )
+
+
+def lengths_are_fixed(
+    machine: Machine, axes: Axes, usable: Booleans, base: Array, T_camera_base: Array, q0: Array
+) -> None:
+    """[A] 3.4: the distances between platform joints tell each offset; no length collapsed.
+
+    base (1, L, 3), T_camera_base (1, S, 4, 4) and offsets q0 (1, L) as the steps found them.
+    """
+    legs = legs_of(machine)
+    not_collapsed(legs, q0[0])
+    seen = axes.seen & usable[axes.station][:, None] & legs.closing
+    merged = in_base(replace(axes, seen=seen), T_camera_base)
+    a = np.broadcast_to(base[:, None], merged.u.shape)
+    value, slopes = (rows[0] for rows in deviations(merged, a, q0, "corrected"))
+    freedom = max(np.count_nonzero(np.any(slopes, axis=1)) - int(legs.closing.sum()), 1)
+    values, vectors = np.linalg.eigh(slopes[:, legs.closing].T @ slopes[:, legs.closing])
+    sigma = np.sqrt(np.sum(value**2) / freedom / np.maximum(values, 1e-300))
+    length = float(np.mean(legs.rod[legs.closing] + merged.readings[0][:, legs.closing]))
+    free = (values < FLAT**2 * len(merged.configuration)) | (sigma > VAGUE * length)
+    if not free.any():
+        return
+    part = np.abs(vectors[:, free]).max(axis=1)
+    names = np.flatnonzero(legs.closing)[part > 0.3 * part.max()]
+    raise ResultError(
+        what=f"the photographs do not tell the lengths of legs {listed(names)}",
+        found="distances between platform joints that do not depend on a combination of them",
+        expected="legs that change their directions against each other, seen at once, [A] 3.4",
+        next_step=f"add configurations that tilt and turn the platform more, or {BUNDLE}",
+    )
+
+
+def not_collapsed(legs: Legs, q0: Array) -> None:
+    """No constant length in the false minimum of [A] 14, where both its joints fall together."""
+    short = np.flatnonzero(legs.constant & (q0 < COLLAPSED * legs.rod))
+    if short.size:
+        raise ResultError(
+            what=f"leg {short[0] + 1} of constant length shrank to nothing in the third step",
+            found=f"{1e3 * q0[short[0]]:.0f} mm",
+            expected=f"about {1e3 * legs.rod[short[0]]:.0f} mm as drawn; at zero length both its "
+            "joints fall together, which fits the photographs for a wrong reason",
+            next_step=f"check the drawing's length, add configurations, or {BUNDLE}",
+        )
+
+
+def passive_legs_are_fixed(machine: Machine, platform: Array) -> None:
+    """[A] 19 needs two directions of a passive leg in the platform frame; NaN centres lack them."""
+    lost = np.flatnonzero(np.isnan(platform[0, :, 0]))
+    if lost.size:
+        raise ResultError(
+            what=f"passive leg {lost[0] + 1} of {machine.n_legs} does not change its direction "
+            "on the platform, so its joint could lie anywhere along it",
+            expected="two directions at least, [A] 3.5",
+            next_step=f"add configurations that tilt or shift the platform, or {BUNDLE}",
+        )
+
+
+def listed(numbers: Integers) -> str:
+    """Leg numbers for people, from 1."""
+    words = [str(k + 1) for k in numbers]
+    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)

@@ -1,0 +1,228 @@
+"""[A] 3.4-3.5, steps 3 and 4 of four: offsets and constant lengths, then the platform's joints.
+
+The platform is rigid, so the distances between its joints do not change:
+``B = A + (q + q0) u`` ([A] 13) for each leg with a length, q = 0 and q0 the length where it is
+constant. Passive legs take no part.
+
+Centres of legs with a length come from their ends (16), then each photograph's platform pose
+(18); with it, a leg's axis told in the platform frame gives a revolute axis (7) and the
+centre of a passive leg (19), and the joints' equations give universal axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.cylinders import tangent_basis
+from pkmcal.geometry.rigid import apply, cross, dot, inverse
+from pkmcal.papers.leg_axes import Axes, across, nearest_points, revolute_axes
+from pkmcal.papers.registration import ANY_MOTION, SCALE, fit_body, minimise_dense, points_by
+
+COLLAPSED = 0.5
+"""A constant length below this part of its drawing is the false minimum B = A."""
+WIDE = 20.0
+"""Tolerances within which the torsion's noise is looked for."""
+TORSION_STEPS, SETTLED = 40, 1e-13
+ROUNDING = 1e-12
+"""Share of the best known direction's information below which a direction is rounding."""
+
+
+def offsets(axes: Axes, a_photo: Array, start: Array, form: str) -> Array:
+    """Step 3, [A] 13-14: offsets (B, L) that keep the distances between platform joints.
+
+    axes : only legs with a length in ``seen``. a_photo : (B, C, L, 3) base centres in each
+    photograph's frame. start : (L,) m, the drawing's: a length of zero is a false minimum.
+    """
+
+    def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
+        value, jac = deviations(axes.of_runs(runs), a_photo[runs], x, form)
+        return value / SCALE, jac / SCALE
+
+    return minimise_dense(rows, np.broadcast_to(start, (len(a_photo), len(start))).copy()).state
+
+
+def deviations(axes: Axes, a_photo: Array, at: Array, form: str) -> tuple[Array, Array]:
+    """The criterion's rows (B, r) m at offsets (B, L), and their derivatives (B, r, L).
+
+    printed: differences of consecutive photographs of a station, C_2 as [A] 14 has it. corrected
+    (errata): deviations from each pair's mean, sum (d_k - mean d)^2.
+    """
+    j, g = np.triu_indices(axes.seen.shape[1], 1)
+    both = axes.seen[:, j] & axes.seen[:, g]
+    used = both.sum(axis=0) > 1
+    j, g, both = j[used], g[used], both[:, used]
+    b = a_photo + (axes.readings + at[:, None])[..., None] * axes.u
+    d = b[:, :, j] - b[:, :, g]
+    distance = np.sqrt(np.maximum(dot(d, d), 1e-300))
+    e = d / distance[..., None]
+    slope = np.zeros((*distance.shape, at.shape[-1]))
+    pair = np.arange(len(j))
+    slope[:, :, pair, j] = dot(e, axes.u[:, :, j])
+    slope[:, :, pair, g] = -dot(e, axes.u[:, :, g])
+    rows = np.concatenate([distance[..., None], slope], axis=-1)
+    if form == "printed":
+        same = axes.station[1:] == axes.station[:-1]
+        use = both[1:] & both[:-1] & same[:, None]
+        rows = np.where(use[..., None], rows[:, 1:] - rows[:, :-1], 0.0)
+    else:
+        mean = np.einsum("cp,bcpl->bpl", both / both.sum(axis=0), rows)
+        rows = np.where(both[..., None], rows - mean[:, None], 0.0)
+    rows = rows.reshape(len(rows), -1, rows.shape[-1])
+    return rows[..., 0], rows[..., 1:]
+
+
+def platform_by_registration(
+    b: Array, seen: Booleans, drawing: Array, gauge: Array, motion: Array = ANY_MOTION
+) -> Array:
+    """Step 4 corrected, [A] 16: platform centres (B, L, 3) from those in K frames.
+
+    min sum |R_k b_j + t_k - B_jk|^2 over b and the poses. b : (B, K, L, 3) m, seen (K, L);
+    each frame fixes its pose. motion : (6, d), how the platform moves in those frames.
+    """
+    weight = np.broadcast_to(seen, b.shape[:-1]).astype(float)
+    return fit_body(b, weight, gauge, drawing, motion=motion).points
+
+
+def platform_by_distances(
+    b: Array, seen: Booleans, station: Integers, drawing: Array, gauge: Array
+) -> Array:
+    """Step 4 as printed, [A] 16: centres whose distances are each station's mean distances.
+
+    b : (B, C, L, 3) in the photographs' frames, seen (C, L), station (C,).
+    """
+    j, g = np.triu_indices(seen.shape[1], 1)
+    both = (seen[:, j] & seen[:, g]).astype(float)
+    of_station = (station == np.unique(station)[:, None]).astype(float)
+    count = of_station @ both
+    d = np.linalg.norm(b[:, :, j] - b[:, :, g], axis=-1)
+    known = np.einsum("sc,bcp->bsp", of_station, d * both) / np.maximum(count, 1)
+    k, pair = np.nonzero(count)
+    j, g, known = j[pair], g[pair], known[:, k, pair]
+    row = np.arange(len(j))
+
+    def distances(points: Array, runs: Integers) -> tuple[Array, Array]:
+        v = points[:, j] - points[:, g]
+        distance = np.sqrt(dot(v, v))
+        jac = np.zeros((*distance.shape, *points.shape[1:]))
+        jac[:, row, j] = v / distance[..., None]
+        jac[:, row, g] = -v / distance[..., None]
+        return distance - known[runs], jac
+
+    return points_by(distances, drawing, gauge, len(b))
+
+
+def platform_axes(
+    u: Array, seen: Booleans, T_base_platform: Array, information: Array | None = None
+) -> tuple[Array, Booleans]:
+    """[A] 18, then 7 in the platform frame: axes v' (B, L, 3) of either sign, (L,) found.
+
+    u : (B, K, L, 3) directions, base frame, and information (B, K, L, 3, 3) on them;
+    T_base_platform (B, K, 4, 4) of the same photographs, by registration: (18) as printed, a
+    cross product, drops the depth (errata).
+    """
+    rot = T_base_platform[..., None, :3, :3]
+    back = np.swapaxes(rot, -1, -2)
+    info = None if information is None else back @ information @ rot
+    none = np.zeros(len(seen), dtype=int)
+    v, found = revolute_axes((back @ u[..., None])[..., 0], seen, none, 1, info)
+    return v[:, 0], found[0]
+
+
+def passive_centres(
+    u: Array, base: Array, seen: Booleans, T_base_platform: Array
+) -> tuple[Array, Booleans]:
+    """[A] 19: centres b (B, L, 3) of legs without a length, u x AB = 0 with B = R b + t.
+
+    Linear in b: in the platform frame, the point nearest to the leg's axes, as (6) on the base.
+    u : (B, K, L, 3), base (B, L, 3) in the base frame. Returns b and (L,) found: two directions.
+    """
+    back = inverse(T_base_platform)[:, :, None]
+    turned = (back[..., :3, :3] @ u[..., None])[..., 0]
+    through = apply(back, np.broadcast_to(base[:, None], u.shape))
+    none = np.zeros(len(seen), dtype=int)
+    b, _ = nearest_points(turned, through, seen, none, 1)
+    return b[:, 0], revolute_axes(turned, seen, none, 1)[1][0]
+
+
+def torsion(u: Array, rot: Array, v: Array, w: Array) -> tuple[Array, Array, Array]:
+    """Twist u . (v x R w) of a universal-universal leg and its slopes by v and w (errata, 3-UPU).
+
+    u : (..., 3) leg, v (..., 3) first axis on the base, w on the platform, rot (..., 3, 3)
+    from platform to base. Zero on the machine; two joints that share a leg cannot twist.
+    """
+    turned = (rot @ w[..., None])[..., 0]
+    by_v = cross(turned, u)
+    by_w = (np.swapaxes(rot, -1, -2) @ cross(u, v)[..., None])[..., 0]
+    return dot(v, by_v), by_v, by_w
+
+
+def universal_axes(
+    u: Array, rot: Array, seen: Booleans, drawn: tuple[Array, Array], tolerance: Array
+) -> tuple[Array, Array]:
+    """First axes of universal-universal legs by the inverse kinematics, [A] 3.5 and errata.
+
+    Least squares of the torsion over the photographs, beside the drawing with its tolerance
+    (rad): what the photographs do not tell stays as drawn. Of a leg's four freedoms that is a
+    common turn of both axes wherever the platform does not turn, as on a 3-UPU. The torsion's
+    own noise is taken from the residuals of a fit that hardly looks at the drawing, so that
+    the data decide where they know better.
+    u : (B, K, L, 3) base frame. rot : (B, K, 3, 3) platform to base. seen : (K, L).
+    drawn : axes v, w (B, L, 3). tolerance : (L,). Returns v, w (B, L, 3) unit.
+    """
+
+    def rows(x: Array) -> tuple[Array, Array]:
+        """Torsions (B, K, L) of axes tilted by x (B, L, 4), and their derivatives."""
+        (v, v_by), (w, w_by) = _tilted(drawn[0], x[..., :2]), _tilted(drawn[1], x[..., 2:])
+        value, by_v, by_w = torsion(u, rot[:, :, None], v[:, None], w[:, None])
+        jac = [by_v[..., None, :] @ v_by[:, None], by_w[..., None, :] @ w_by[:, None]]
+        slope = np.concatenate(jac, axis=-1)[..., 0, :]
+        return np.where(seen, value, 0.0), np.where(seen[..., None], slope, 0.0)
+
+    count = np.maximum(seen.sum(axis=0), 5)
+    start = np.zeros((len(u), u.shape[2], 4))
+    x, variance = _beside_drawing(rows, start, count, WIDE * tolerance)
+    x, _ = _beside_drawing(rows, x, count, tolerance, variance)
+    return _tilted(drawn[0], x[..., :2])[0], _tilted(drawn[1], x[..., 2:])[0]
+
+
+def _tilted(axis: Array, x: Array) -> tuple[Array, Array]:
+    """Unit axes (..., 3) moved by x (..., 2) across themselves, and derivatives (..., 3, 2)."""
+    tangents = tangent_basis(axis, np.eye(3)[np.argmin(np.abs(axis), axis=-1)])
+    moved = axis + (tangents @ x[..., None])[..., 0]
+    size = np.sqrt(dot(moved, moved))[..., None]
+    return moved / size, across(moved / size) @ tangents / size[..., None]
+
+
+def _beside_drawing(
+    rows: Callable[[Array], tuple[Array, Array]],
+    x: Array,
+    count: Integers,
+    tolerance: Array,
+    variance: Array | None = None,
+) -> tuple[Array, Array]:
+    """Gauss-Newton from x (B, L, 4), the drawing x = 0 beside with its tolerance (L,).
+
+    Returns x and the torsion's variance (B, L): as given, or from the residuals of count (L,)
+    photographs, of which a direction that the data know takes one, and the drawing's none.
+    """
+    share = np.zeros(x.shape)
+    noise = np.zeros(x.shape[:-1]) if variance is None else variance
+    for _ in range(TORSION_STEPS):
+        value, jac = rows(x)
+        if variance is None:
+            noise = np.sum(value**2, axis=1) / (count - share.sum(axis=-1))
+        normal = np.einsum("bkli,bklj->blij", jac, jac)
+        values, vectors = np.linalg.eigh(normal)
+        values = np.maximum(values, 0.0)
+        right = (normal @ x[..., None])[..., 0] - np.einsum("bkli,bkl->bli", jac, value)
+        along = (np.swapaxes(vectors, -1, -2) @ right[..., None])[..., 0]
+        # directions that the data do not know at all stay as drawn even without noise
+        hold = noise / tolerance**2 + ROUNDING * values[..., -1] + 1e-300
+        share = values / (values + hold[..., None])
+        before, x = x, (vectors @ (along / (values + hold[..., None]))[..., None])[..., 0]
+        if np.max(np.abs(x - before), initial=0.0) < SETTLED:
+            break
+    return x, noise

@@ -1,0 +1,310 @@
+"""Where camera and board are, from measured board poses and readings alone; no rough pose needed.
+
+Forward kinematics of the drawing gives the platform's poses, the photographs give the board's, so
+``T_camera_board = T_camera_base T_base_platform T_platform_board`` is the robot-world/hand-eye
+problem ([C] III.C). Rotations give both turns where the platform turns about two axes or more;
+where it turns about one, or not at all, positions decide. What neither tells (the board's height
+along the only axis of rotation, all of its place on a platform that does not turn) stays zero.
+
+The drawing is off by millimetres and degrees, so poses and not corners are fitted, with weights
+to match, and a pose that disagrees with the others counts less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.errors import InputError, ResultError
+from pkmcal.geometry.rigid import (
+    dot,
+    inverse,
+    perturb,
+    pose,
+    pose_difference,
+    register,
+    rotation_vector,
+    skew,
+)
+from pkmcal.identify.mounts import mean_pose
+from pkmcal.identify.pose_rows import PoseBlocks, PoseData, pose_rows
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.solver import Linear, Values, minimise, take
+
+TURN = 0.03
+"""Standard deviation (rad) that the drawing's poses are given: two degrees."""
+SHIFT = 0.02
+"""The same of positions, as a share of the limbs' length: 10 mm of half a metre."""
+ROUNDS = 4
+UNKNOWN = 0.3
+"""Standard deviation (rad) of the camera's turn above which the poses do not tell it."""
+LEAST = 3
+"""Configurations that a station and a mount need together."""
+RANKS = (1, 2, 4)
+
+
+class Pair(NamedTuple):
+    """One station and one mount: T_camera_base and T_mount, (B, 4, 4) each."""
+
+    T_camera_base: Array
+    T_mount: Array
+
+
+@dataclass(frozen=True)
+class PairProblem:
+    """solver.LeastSquares of B runs: ``seen = T_camera_base body T_mount``, K poses each.
+
+    body, seen : (B, K, 4, 4). weight : (B, K). turn, shift : rad and m that count as one standard
+    deviation. size : m, the standard deviation of the mount's place, zero expected.
+    """
+
+    body: Array
+    seen: Array
+    weight: Array
+    turn: float
+    shift: float
+    size: float
+
+    @property
+    def _sigma(self) -> Array:
+        return np.repeat([self.turn, self.shift], 3)
+
+    def differences(self, state: Pair) -> Array:
+        """Errors (B, K, 6) of the predicted poses, in standard deviations, without weights."""
+        predicted = state.T_camera_base[:, None] @ self.body @ state.T_mount[:, None]
+        return pose_difference(predicted, self.seen) / self._sigma
+
+    def residuals(self, state: Pair) -> Values:
+        """Weighted errors and the mount's place."""
+        value = np.sqrt(self.weight)[..., None] * self.differences(state)
+        return Values(value, state.T_mount[:, :3, 3] / self.size)
+
+    def linearize(self, state: Pair) -> Linear:
+        """Residuals and exact Jacobian: six numbers of the camera, six of the mount."""
+        one = np.zeros((self.body.shape[1], 1), dtype=int)
+        blocks = PoseBlocks(one, one, one == 0, np.ones(1, dtype=bool), one)
+        data = PoseData(
+            self.seen[:, :, None], np.diag(1 / self._sigma), self.weight[:, :, None],
+            np.zeros((1, 1, 1, 6, 0)),
+        )  # fmt: skip
+        camera, mount = state.T_camera_base[:, None], state.T_mount[:, None]
+        rows = pose_rows(blocks, data, camera, self.body, mount, np.zeros((1, 1, 0)))
+        value = rows.value[:, :, 0]
+        return Linear(
+            value,
+            np.concatenate([rows.by_station, rows.by_mount], axis=-1)[:, :, 0],
+            np.zeros((*value.shape, 0)),
+            np.ones(value.shape, dtype=bool),
+            state.T_mount[:, :3, 3] / self.size,
+            np.eye(12)[9:] / self.size,
+        )
+
+    def moved(self, state: Pair, shared: Array, own: Array) -> Pair:
+        """The pair after a step; a pose has no unknowns of its own."""
+        del own
+        camera = perturb(state.T_camera_base, shared[:, :6])
+        return Pair(camera, perturb(state.T_mount, shared[:, 6:]))
+
+    def select(self, runs: Integers) -> PairProblem:
+        """Some runs only."""
+        parts = (self.body[runs], self.seen[runs], self.weight[runs])
+        return replace(self, body=parts[0], seen=parts[1], weight=parts[2])
+
+
+def solve_pairs(body: Array, seen: Array, size: float) -> Pair:
+    """Camera and mount of B runs from the platform's poses and the board's, (B, K, 4, 4) each.
+
+    size : the limbs' length, m. Closed forms as starts, then least squares with poses that
+    disagree weighing less; of the starts the one that ends best.
+    Raises ResultError where the poses do not tell how the camera stands.
+    """
+    starts = [_placed(body, seen, *turns) for turns in _turns(body, seen)]
+    n, runs = len(starts), len(body)
+    every = Pair(*(np.concatenate(parts) for parts in zip(*starts, strict=True)))
+    body, seen = (np.concatenate([part] * n) for part in (body, seen))
+    problem = PairProblem(body, seen, np.ones(body.shape[:2]), TURN, SHIFT * size, size)
+    apart = np.zeros(body.shape[:2])
+    for _ in range(ROUNDS):
+        every = minimise(problem, every).state
+        apart = np.linalg.norm(problem.differences(every), axis=-1)
+        # weights that fall beyond the poses' usual disagreement, after Cauchy
+        usual = np.maximum(np.median(apart, axis=1, keepdims=True), 1e-9)
+        problem = replace(problem, weight=1 / (1 + (apart / (2.4 * usual)) ** 2))
+    best = np.argmin(np.median(apart, axis=1).reshape(n, runs), axis=0)
+    chosen = best * runs + np.arange(runs)
+    pair = take(every, chosen)
+    _check_told(problem.select(chosen), pair)
+    return pair
+
+
+def _check_told(problem: PairProblem, pair: Pair) -> None:
+    linear = problem.linearize(pair)
+    rows = linear.by_shared.reshape(len(linear.value), -1, 12)
+    normal = np.swapaxes(rows, -1, -2) @ rows + linear.shared_by.T @ linear.shared_by
+    # as loose as a full turn where nothing tells
+    normal = normal + np.diag(np.tile(np.repeat([0.1, 1e-3 / problem.size], 3) ** 2, 2))
+    turn = np.linalg.inv(normal)[:, :3, :3]
+    if np.sqrt(np.linalg.eigvalsh(turn)[:, -1]).max() > UNKNOWN:
+        raise ResultError(
+            what="the boards' poses do not tell how the camera stands to the machine",
+            found="configurations along a line, or all alike",
+            expected="configurations that move the platform in two directions, or turn it",
+            next_step="add such configurations, or give the station's rough pose",
+        )
+
+
+def _turns(body: Array, seen: Array) -> list[tuple[Array, Array]]:
+    """Possible turns of camera and mount, (B, 3, 3) each.
+
+    ``q_seen = q_camera q_body q_mount`` is linear in either, so the sum over the poses has the two
+    as its leading singular vectors. Where the platform turns about one axis two singular values
+    are equal, where it does not turn all four: of what they leave open, the nearest to the turn
+    that lays the positions on one another.
+    """
+    q_body, q_seen = (quaternion(poses[..., :3, :3]) for poses in (body, seen))
+    # signs by the turns from the first pose, which both sides share
+    sign = np.sign(dot(q_body, q_body[:, :1]) * dot(q_seen, q_seen[:, :1]))
+    sign = np.where(sign == 0, 1.0, sign)
+    # q_camera . (q_seen conj(q_mount) conj(q_body)) is linear in q_mount
+    conjugate = np.diag([1.0, -1.0, -1.0, -1.0])
+    each = _left(q_seen) @ _right(q_body @ conjugate) @ conjugate
+    u, _, vt = np.linalg.svd(np.sum(sign[..., None, None] * each, axis=1))
+    laid = quaternion(register(body[..., :3, 3], seen[..., :3, 3])[..., :3, :3])
+    along = np.swapaxes(u, -1, -2) @ laid[..., None]
+    out: list[tuple[Array, Array]] = []
+    for rank in RANKS:
+        kept = along * (np.arange(4) < rank)[:, None]
+        camera, mount = u @ kept, np.swapaxes(vt, -1, -2) @ kept
+        out.append((matrix(camera[..., 0]), matrix(mount[..., 0])))
+    return out
+
+
+def _left(q: Array) -> Array:
+    """Matrix (..., 4, 4) of ``p -> q p``, scalar first."""
+    out = q[..., :1, None] * np.eye(4)
+    out[..., 0, 1:], out[..., 1:, 0] = -q[..., 1:], q[..., 1:]
+    out[..., 1:, 1:] += skew(q[..., 1:])
+    return out
+
+
+def _right(q: Array) -> Array:
+    """Matrix (..., 4, 4) of ``p -> p q``."""
+    out = _left(q)
+    out[..., 1:, 1:] -= 2 * skew(q[..., 1:])
+    return out
+
+
+def quaternion(rot: Array) -> Array:
+    """Unit quaternions (..., 4), scalar first, of rotations (..., 3, 3)."""
+    omega = rotation_vector(rot)
+    angle = np.sqrt(dot(omega, omega))[..., None]
+    axis = omega / np.where(angle > 0, angle, 1.0)
+    return np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], axis=-1)
+
+
+def matrix(q: Array) -> Array:
+    """Rotations (..., 3, 3) of quaternions (..., 4) of any length but zero."""
+    q = q / np.sqrt(dot(q, q))[..., None]
+    w, v = q[..., :1, None], q[..., 1:]
+    k = skew(v)
+    return np.eye(3) + 2 * (w * k + k @ k)
+
+
+def _placed(body: Array, seen: Array, camera: Array, mount: Array) -> Pair:
+    """Places for known turns: ``t_seen = R_camera (R_body t_mount + t_body) + t_camera``, linear;
+    t_mount is held to zero within the limbs' length.
+    """
+    rot = camera[:, None] @ body[..., :3, :3]
+    right = seen[..., :3, 3] - (camera[:, None] @ body[..., :3, 3:])[..., 0]
+    off_rot = (rot - rot.mean(axis=1, keepdims=True)).reshape(len(body), -1, 3)
+    off = (right - right.mean(axis=1, keepdims=True)).reshape(len(body), -1, 1)
+    normal = np.swapaxes(off_rot, -1, -2) @ off_rot + SHIFT**2 * np.eye(3)
+    t_mount = np.linalg.solve(normal, np.swapaxes(off_rot, -1, -2) @ off)
+    t_camera = right.mean(axis=1) - (rot.mean(axis=1) @ t_mount)[..., 0]
+    return Pair(pose(camera, t_camera), pose(mount, t_mount[..., 0]))
+
+
+def start_from_poses(
+    machine: Machine, measurements: Measurements, known: Array | None = None
+) -> State:
+    """A start for the joint estimate, from the measured poses and readings by the drawing.
+
+    known : (S, 4, 4) rough T_camera_base, NaN for stations without one; None without any.
+    Raises InputError for a station that nothing ties to the machine.
+    """
+    found = machine.forward_result(measurements.joints)
+    n_stations = measurements.n_stations
+    usable = found.converged & np.isfinite(found.T_base_platform).all(axis=(-1, -2))
+    poses = np.where(usable[:, None, None], found.T_base_platform, np.nan)
+    stations = np.full((n_stations, 4, 4), np.nan) if known is None else np.array(known, float)
+    stations, mounts = _carried_on(machine, measurements, poses, stations)
+    lost = np.flatnonzero(np.isnan(stations[:, 0, 0]))
+    if lost.size:
+        raise InputError(
+            what=f"nothing ties station {lost[0] + 1} of {n_stations} to the machine",
+            expected=f"a board on the platform in {LEAST} configurations, a board that another"
+            " station also sees, or a rough pose",
+            next_step="give the station's pose: in session.yaml",
+        )
+    return State(
+        machine.values,
+        stations,
+        found.T_base_platform,
+        np.zeros(int(np.max(measurements.camera_of_station)) + 1),
+        T_mount=np.where(np.isnan(mounts), np.eye(4), mounts),
+        on_platform=measurements.on_platform,
+        internal=found.internal,
+    )
+
+
+def _carried_on(
+    machine: Machine, measurements: Measurements, poses: Array, stations: Array
+) -> tuple[Array, Array]:
+    """Stations (S, 4, 4) and mounts (M, 4, 4), NaN where nothing tells them: what is known carried
+    on to what shares a pose with it, and where that ends, the pair that most poses tie.
+
+    poses : T_base_platform (K, 4, 4), NaN where unknown.
+    """
+    seen, on_platform = measurements.poses, measurements.on_platform
+    stations, mounts = stations.copy(), np.full((len(on_platform), 4, 4), np.nan)
+    moving = on_platform[seen.mount]
+    body = np.tile(np.eye(4), (len(seen), 1, 1))
+    body[moving] = poses[seen.configuration[moving]]
+    good = np.isfinite(body[:, 0, 0])
+    target = seen.T_station_target
+    while True:
+        has_station = np.isfinite(stations[seen.station, 0, 0])
+        has_mount = np.isfinite(mounts[seen.mount, 0, 0])
+        to_mount, to_station = good & has_station & ~has_mount, good & has_mount & ~has_station
+        if to_mount.any():
+            m = seen.mount[to_mount][0]
+            rows = to_mount & (seen.mount == m)
+            T_camera_body = stations[seen.station[rows]] @ body[rows]
+            mounts[m] = mean_pose(inverse(T_camera_body) @ target[rows])
+        elif to_station.any():
+            s = seen.station[to_station][0]
+            rows = to_station & (seen.station == s)
+            stations[s] = mean_pose(target[rows] @ inverse(body[rows] @ mounts[seen.mount[rows]]))
+        else:
+            fit = good & moving & ~has_station
+            pair, count = np.unique(
+                [seen.station[fit], seen.mount[fit]], axis=1, return_counts=True
+            )
+            if count.max(initial=0) < LEAST:
+                return stations, mounts
+            s, m = pair[:, np.argmax(count)]
+            rows = good & (seen.station == s) & (seen.mount == m)
+            solved = solve_pairs(body[None, rows], target[None, rows], size_of(machine))
+            stations[s], mounts[m] = solved.T_camera_base[0], solved.T_mount[0]
+
+
+def size_of(machine: Machine) -> float:
+    """The limbs' mean length at home, m."""
+    ends = limb_ends(machine.layout, machine.values, machine.middle_readings(), machine.home())
+    return float(np.linalg.norm(ends.b - ends.a, axis=-1).mean())

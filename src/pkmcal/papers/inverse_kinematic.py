@@ -1,0 +1,512 @@
+"""The inverse-kinematic method of [C]: identified at measured poses, without forward kinematics.
+
+Four forms: ``joint`` (eq. 3), the readings less those that the inverse kinematics wants, or
+``implicit`` (eq. 5), the closure itself; each as printed or whitened by its noise with what the
+machine cannot move (errata, [C]). Whitened, the two are one estimate, near the joint one.
+
+Unknowns are the machine's free parameters, the stations' poses and the mounts' (and the hinges of
+an articulated platform, each pose its own); platform poses are not, they are the measured ones. A
+fixed matrix per pose weighs the rows: as printed, equally; whitened, by what the measured pose's
+and the reading's noise make of them, what the machine cannot move (the two tilts of an H4)
+included. Any machine with a closure.
+
+What the rows cannot tell keeps its first value: of each direction that nothing fixes, the unknown
+that is known best beforehand is held. The paper holds d and an angle about z_B for the same reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import InputError, ResultError
+from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
+from pkmcal.identify.closure_noise import PERFECT
+from pkmcal.identify.gauge import apply as in_gauge
+from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.problem import State
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine, kinematics
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense
+from pkmcal.papers.hand_eye import start_from_poses
+from pkmcal.papers.measured_platform import Seen, Taken, seen_platform, taken
+from pkmcal.papers.rotation_axis import axis_frames
+from pkmcal.solver import (
+    RESTART_DAMPING,
+    Linear,
+    Solution,
+    Stop,
+    Values,
+    eliminate,
+    minimise,
+    of_runs,
+    take,
+    transposed,
+)
+
+Form = Literal["joint", "implicit"]
+PRINTED = 1e-4
+"""Metres (and radians) that count as one standard deviation where rows are not whitened; it only
+sets where the search stops."""
+ROUNDS = 2
+"""Whitening again, at the solution: it changes by a thousandth after the second."""
+MOST_STEPS = 100
+PLACED = 0.1
+"""How well stations and mounts are known before any data, rad and m: far less than a drawing."""
+RANK_TOLERANCE = 1e-8
+"""Singular values of the scaled Jacobian below this share of the largest are zero: with exact
+derivatives at data without noise, rounding leaves 1e-12."""
+
+
+# ------------------------------------------------------------------ the rows
+
+
+class ImplicitState(NamedTuple):
+    """Unknowns of B runs: z (B, nz), T_camera_base (B, S, 4, 4), T_mount (B, M, 4, 4), internal
+    (B, N, n).
+    """
+
+    z: Array
+    T_camera_base: Array
+    T_mount: Array
+    internal: Array
+
+
+class _Rows(NamedTuple):
+    """Rows (B, N, r) without weights, closures and then what is off, and what they came from.
+
+    scale : (B, N, e) of the closures' derivatives.
+    """
+
+    value: Array
+    seen: Seen
+    taken: Taken
+    closure: Closure
+    scale: Array
+
+    @property
+    def by_pose(self) -> Array:
+        """Rows by the platform's whole pose, (B, N, r, 6)."""
+        closures = self.scale[..., None] * (self.closure.by_pose @ self.taken.by)
+        return np.concatenate([closures, self.taken.off_by], axis=-2)
+
+
+@dataclass(frozen=True)
+class ImplicitProblem:
+    """solver.LeastSquares of B runs with N poses each. Stations' unknowns perturb T_base_camera.
+
+    layout, drawing (P,), free (P, nz) : the machine. station, mount : (N,). T_camera_board
+    (B, N, 4, 4) and readings (B, N, m). form : see the module. weigh : (B, N, r, r) of the rows,
+    fixed while the search runs. prior : (c, nz) rows on z. keep : (na,) False for what is held.
+    """
+
+    layout: LimbLayout
+    drawing: Array
+    free: Array
+    station: Integers
+    mount: Integers
+    T_camera_board: Array
+    readings: Array
+    form: Form
+    weigh: Array
+    prior: Array
+    keep: Booleans
+
+    def theta(self, state: ImplicitState) -> Array:
+        """Machine parameters (B, P)."""
+        return self.drawing + state.z @ self.free.T
+
+    def residuals(self, state: ImplicitState) -> Values:
+        """Weighted rows; NaN where the inverse kinematics has no answer."""
+        value = (self.weigh @ self._rows(state).value[..., None])[..., 0]
+        return Values(value, state.z @ self.prior.T)
+
+    def linearize(self, state: ImplicitState) -> Linear:
+        """Weighted rows and exact Jacobian by z, stations and mounts, zero for what is held."""
+        rows = self._rows(state)
+        off = ((0, 0), (0, 0), (0, rows.taken.off.shape[-1]), (0, 0))
+        closures = rows.scale[..., None] * (dense(rows.closure, self.drawing.size) @ self.free)
+        stations = np.eye(state.T_camera_base.shape[1])[self.station]
+        mounts = np.eye(state.T_mount.shape[1])[self.mount]
+        by_shared = np.concatenate([
+            np.pad(closures, off),
+            _placed(rows.by_pose @ rows.seen.by_station, stations),
+            _placed(rows.by_pose @ rows.seen.by_mount, mounts),
+        ], axis=-1)  # fmt: skip
+        by_own = np.pad(rows.scale[..., None] * rows.closure.by_internal, off)
+        value = (self.weigh @ rows.value[..., None])[..., 0]
+        usable = np.isfinite(value)
+        return Linear(
+            np.where(usable, value, 0.0),
+            np.where(usable[..., None], self.weigh @ (by_shared * self.keep), 0.0),
+            np.where(usable[..., None], self.weigh @ by_own, 0.0),
+            usable,
+            state.z @ self.prior.T,
+            np.pad(self.prior, ((0, 0), (0, self.keep.size - self.free.shape[1]))),
+        )
+
+    def _rows(self, state: ImplicitState) -> _Rows:
+        theta = self.theta(state)[:, None]
+        seen = seen_platform(
+            state.T_camera_base[:, self.station], self.T_camera_board, state.T_mount[:, self.mount]
+        )
+        own = taken(self.layout.motion, seen.pose)
+        internal = state.internal if self.layout.n_internal else None
+        readings = self.readings
+        if self.form == "joint":
+            readings = kinematics.inverse(self.layout, theta, own.pose)
+        c = closure(self.layout, theta, readings, own.pose, internal)
+        scale = np.ones(c.value.shape)
+        value = c.value
+        if self.form == "joint":
+            motor = self.layout.row_motor
+            read = motor >= 0
+            # r = measured - wanted, and the closure stays zero: dr = dc / (dc/dq)
+            scale = np.where(read, 1 / np.where(read, c.by_reading, 1.0), 1.0)
+            value = np.where(read, (self.readings - readings)[..., np.maximum(motor, 0)], value)
+        return _Rows(np.concatenate([value, own.off], axis=-1), seen, own, c, scale)
+
+    def whitening(self, state: ImplicitState, noise: Array, joint_noise: float) -> Array:
+        """Matrices (B, N, r, r) that whiten the rows at a state.
+
+        noise : (N, 6, 6) covariance of the measured poses. The rows' covariance is theirs and the
+        reading's, carried through the rows' derivatives.
+        """
+        rows = self._rows(state)
+        by = rows.by_pose @ rows.seen.by_measured
+        covariance = by @ noise @ transposed(by)
+        motors = self.layout.row_motor[:, None] == np.arange(self.layout.n_readings)
+        slope = (rows.scale * rows.closure.by_reading)[..., None] * motors
+        e = slope.shape[-2]
+        covariance[..., :e, :e] += joint_noise**2 * (slope @ transposed(slope))
+        covariance[..., :e, :e] += PERFECT**2 * np.eye(e) * rows.scale[..., None] ** 2
+        return np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def platform_poses(self, state: ImplicitState) -> Array:
+        """The measured poses (B, N, 4, 4) as the machine can take them."""
+        return self._rows(state).taken.pose
+
+    def ideal(self, state: ImplicitState) -> ImplicitProblem:
+        """The same problem with poses and readings that the state explains without any residual.
+
+        Ranks are told there: at the data, noise makes what cannot be told look faintly known.
+        """
+        poses = self.platform_poses(state)
+        readings = kinematics.inverse(self.layout, self.theta(state)[:, None], poses)
+        readings = np.where(np.isfinite(readings), readings, self.readings)
+        seen = state.T_camera_base[:, self.station] @ poses @ state.T_mount[:, self.mount]
+        return replace(self, T_camera_board=seen, readings=readings)
+
+    def moved(self, state: ImplicitState, shared: Array, own: Array) -> ImplicitState:
+        """The state after a step."""
+        shared = shared * self.keep
+        nz, s, m = self.free.shape[1], state.T_camera_base.shape[1], state.T_mount.shape[1]
+        camera = shared[:, nz : nz + 6 * s].reshape(-1, s, 6)
+        mount = shared[:, nz + 6 * s :].reshape(-1, m, 6)
+        return ImplicitState(
+            state.z + shared[:, :nz],
+            inverse(perturb(inverse(state.T_camera_base), camera)),
+            perturb(state.T_mount, mount),
+            state.internal + own,
+        )
+
+    def select(self, runs: Integers) -> ImplicitProblem:
+        """Some runs only."""
+        weigh = of_runs(self.weigh, runs)
+        poses, readings = self.T_camera_board[runs], self.readings[runs]
+        return replace(self, T_camera_board=poses, readings=readings, weigh=weigh)
+
+
+def _placed(values: Array, which: Array) -> Array:
+    """Columns (B, N, r, 6) at the place of their own of n, which (N, n): (B, N, r, 6 n)."""
+    out = which[:, None, :, None] * values[..., None, :]
+    return out.reshape(*values.shape[:-1], -1)
+
+
+# ------------------------------------------------------------------ the method
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """The method's result on B runs.
+
+    problem : with the weights and held unknowns of the end. solution : its state, cost, stops.
+    held : names of what was held. rank : of the Jacobian with everything free.
+    """
+
+    problem: ImplicitProblem
+    solution: Solution
+    held: tuple[str, ...]
+    rank: int
+
+
+def inverse_kinematic(
+    machine: Machine,
+    measurements: Measurements,
+    start: State | None = None,
+    *,
+    form: Form = "implicit",
+    whitened: bool = True,
+    use_drawing: bool | None = None,
+) -> State:
+    """One session's machine, stations and mounts from boards' poses and readings; [C] eq. 3 and 5.
+
+    start : from the drawing by default, see :mod:`pkmcal.papers.hand_eye`. use_drawing : take
+    the drawing's values as measurements with their tolerances; by default where rows are whitened,
+    so that the two can be weighed. Platform poses are then by the readings and the new machine.
+    Raises InputError without a board on the platform, ResultError where the search fails.
+    """
+    begin = start_from_poses(machine, measurements) if start is None else start
+    fit = fit_session(machine, measurements, begin, form, whitened, use_drawing)
+    return _session_state(machine, measurements, begin, fit)
+
+
+def fit_session(
+    machine: Machine,
+    measurements: Measurements,
+    start: State,
+    form: Form = "implicit",
+    whitened: bool = True,
+    use_drawing: bool | None = None,
+) -> PoseFit:
+    """The same as a fit of one run, with what was held."""
+    poses = measurements.poses
+    rows = np.flatnonzero(measurements.on_platform[poses.mount])
+    if not rows.size:
+        raise InputError(
+            what="the inverse-kinematic method needs poses of a board on the platform",
+            found="none",
+            next_step="observe: board at a station, or use the method bundle",
+        )
+    poses = poses.select(rows)
+    problem, state = pose_problem(
+        machine,
+        replace(measurements, poses=poses),
+        poses.T_station_target[None],
+        measurements.joints[None, poses.configuration],
+        start,
+        form,
+    )
+    noise = np.linalg.inv(np.swapaxes(poses.whiten, -1, -2) @ poses.whiten)
+    prior = whitened if use_drawing is None else use_drawing
+    return fit_poses(machine, problem, state, noise if whitened else None,
+                     measurements.joint_noise, prior)  # fmt: skip
+
+
+def pose_problem(
+    machine: Machine,
+    measurements: Measurements,
+    T_camera_board: Array,
+    readings: Array,
+    start: State,
+    form: Form,
+) -> tuple[ImplicitProblem, ImplicitState]:
+    """The problem of B runs on the measurements' stations and mounts, unweighted, and its start.
+
+    T_camera_board : (B, N, 4, 4). readings : (B, N, m). start : of one run, or with a leading
+    axis B on ``T_camera_base`` and ``T_mount``.
+    """
+    layout, table = machine.layout, machine.parameters
+    if form == "joint" and layout.shares_motors:
+        raise InputError(
+            what=f"mechanism {machine.name!r} has several rods on a motor: no reading fits all",
+            expected="the implicit form",
+            next_step="use form='implicit'",
+        )
+    runs, count = T_camera_board.shape[:2]
+    z = table.to_free(start.theta)
+    camera = np.broadcast_to(start.T_camera_base, (runs, *start.T_camera_base.shape[-3:]))
+    mount = np.broadcast_to(start.T_mount, (runs, *start.T_mount.shape[-3:]))
+    n_shared = z.shape[-1] + 6 * camera.shape[1] + 6 * mount.shape[1]
+    off = 6 - layout.motion.shape[1]  # rows that do not count as printed
+    problem = ImplicitProblem(
+        layout=layout,
+        drawing=table.drawing,
+        free=table.free_matrix(),
+        station=measurements.poses.station,
+        mount=measurements.poses.mount,
+        T_camera_board=T_camera_board,
+        readings=readings,
+        form=form,
+        weigh=np.diag(np.repeat([1 / PRINTED, 0.0], [layout.n_equations, off]))[None, None],
+        prior=np.zeros((0, z.shape[-1])),
+        keep=np.ones(n_shared, dtype=bool),
+    )
+    state = ImplicitState(
+        np.broadcast_to(z, (runs, z.shape[-1])).copy(),
+        camera.copy(),
+        mount.copy(),
+        np.zeros((runs, count, layout.n_internal)),
+    )
+    if layout.n_internal:  # the hinges' turns that the poses ask for
+        poses = problem.platform_poses(state)
+        internal = kinematics.inverse_result(layout, problem.theta(state)[:, None], poses)[1]
+        state = state._replace(internal=np.nan_to_num(internal))
+    return problem, state
+
+
+def fit_poses(
+    machine: Machine,
+    problem: ImplicitProblem,
+    start: ImplicitState,
+    noise: Array | None,
+    joint_noise: float,
+    use_drawing: bool,
+) -> PoseFit:
+    """The estimate of B runs. noise : (N, 6, 6) of the poses to whiten by; None as printed.
+
+    As printed, the axis that the boards turn about is found first and held, [C] III.B.
+    """
+    if use_drawing:
+        problem = replace(problem, prior=np.diag(1 / machine.parameters.tolerances_free()))
+    state = on_axis(problem, start)
+    if noise is not None:
+        problem = replace(problem, weigh=problem.whitening(state, noise, joint_noise))
+    keep, rank = unknowns_kept(machine, problem, state, whitened=noise is not None)
+    problem = replace(problem, keep=keep)
+    solution = minimise(problem, state, max_steps=MOST_STEPS)
+    if noise is not None:
+        for _ in range(ROUNDS):
+            state, steps = solution.state, solution.steps
+            problem = replace(problem, weigh=problem.whitening(state, noise, joint_noise))
+            solution = minimise(problem, state, MOST_STEPS, RESTART_DAMPING)
+            solution = replace(solution, steps=steps + solution.steps)
+    names = np.array(unknown_names(machine, state), dtype=object)
+    return PoseFit(problem, solution, tuple(names[~keep]), rank)
+
+
+def on_axis(problem: ImplicitProblem, state: ImplicitState) -> ImplicitState:
+    """The state with base and platform turned until the boards' one axis of rotation is their z.
+
+    For machines that turn about one axis, where one camera sees one board; others stay as they are.
+    The workspace keeps its place before the camera.
+    """
+    if not _one_axis(problem, state):
+        return state
+    frames = axis_frames(problem.T_camera_board[..., :3, :3])
+    camera, mount = state.T_camera_base[:, 0], state.T_mount[:, 0]
+    axis = frames.camera[..., :, 2]
+    sign = np.sign(dot(axis, camera[:, :3, 2]))[:, None]
+    middle = problem.platform_poses(state)[..., :3, 3].mean(axis=1)
+    turn = turn_between(camera[:, :3, 2], sign * axis) @ camera[:, :3, :3]
+    place = apply(camera, middle) - (turn @ middle[..., None])[..., 0]
+    carried = (mount[:, :3, :3] @ (sign * frames.board[:, 2])[..., None])[..., 0]
+    turned = turn_between(carried, np.array([0.0, 0.0, 1.0])) @ mount[:, :3, :3]
+    return state._replace(
+        T_camera_base=pose(turn, place)[:, None], T_mount=pose(turned, mount[:, :3, 3])[:, None]
+    )
+
+
+def _one_axis(problem: ImplicitProblem, state: ImplicitState) -> bool:
+    alone = state.T_camera_base.shape[1] == state.T_mount.shape[1] == 1
+    return alone and int(problem.layout.motion[:3].any(axis=1).sum()) == 1
+
+
+def turn_between(a: Array, b: Array) -> Array:
+    """The shortest turns (..., 3, 3) that lay unit vectors a (..., 3) on b."""
+    across = cross(a, np.broadcast_to(b, a.shape))
+    size = np.sqrt(dot(across, across))[..., None]
+    angle = np.arctan2(size, dot(a, b)[..., None])
+    return rotation(across * angle / np.where(size > 0, size, 1.0))
+
+
+def unknowns_kept(
+    machine: Machine, problem: ImplicitProblem, state: ImplicitState, *, whitened: bool
+) -> tuple[Booleans, int]:
+    """Unknowns (na,) that are estimated, and the rank of the Jacobian with all of them.
+
+    By the first run. As printed, the tilts of a board against the axis of rotation have only a
+    second-order influence ([C] III.C) and are held.
+    """
+    first, begin = problem.select(np.array([0])), take(state, np.array([0]))
+    jac = reduced_jacobian(first.ideal(begin), begin)
+    sizes = np.concatenate([
+        machine.parameters.tolerances_free(),
+        np.full(6 * (state.T_camera_base.shape[1] + state.T_mount.shape[1]), PLACED),
+    ])  # fmt: skip
+    keep = np.ones(len(sizes), dtype=bool)
+    rank, _ = _loose(jac, sizes)
+    if not whitened:
+        keep[_tilts(problem, state)] = False
+    loose = _loose(jac[:, keep], sizes[keep])[1]
+    keep[np.flatnonzero(keep)[_pivots(loose)]] = False
+    return keep, rank
+
+
+def _loose(jac: Array, sizes: Array) -> tuple[int, Array]:
+    """Rank of a Jacobian (rows, n) and the directions (k, n) that nothing fixes, in units of what
+    is known beforehand. Columns scaled by their extreme value, [C] IV.C.
+    """
+    extreme = np.abs(jac).max(axis=0)
+    extreme = np.where(extreme > 0, extreme, 1.0)
+    s, vt = np.linalg.svd(jac / extreme)[1:]
+    rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
+    return rank, vt[rank:] / (extreme * sizes)
+
+
+def reduced_jacobian(problem: ImplicitProblem, state: ImplicitState) -> Array:
+    """Jacobian (rows, na) of one run with hinges eliminated and the drawing's rows, unscaled."""
+    linear = problem.linearize(state)
+    rows = eliminate(linear, np.zeros(1)).rows if linear.by_own.shape[-1] else linear.by_shared
+    return np.concatenate([rows.reshape(-1, rows.shape[-1]), linear.shared_by])
+
+
+def _tilts(problem: ImplicitProblem, state: ImplicitState) -> Integers:
+    """Columns of what the axis found beforehand tells: the mounts' turns that the machine itself
+    cannot make and, where there is one axis and one camera, the camera's.
+    """
+    off = np.flatnonzero(~problem.layout.motion[:3].any(axis=1))
+    stations, mounts = state.T_camera_base.shape[1], state.T_mount.shape[1]
+    bodies = np.arange(0 if _one_axis(problem, state) else stations, stations + mounts)
+    return (problem.free.shape[1] + 6 * bodies[:, None] + off).ravel()
+
+
+def _pivots(loose: Array) -> list[int]:
+    """One column for each row of (k, n), chosen so that the rows are fixed best."""
+    rows, chosen = loose.copy(), list[int]()
+    for _ in range(len(loose)):
+        size = np.sum(rows**2, axis=0)
+        k = int(np.argmax(size > 0.99 * size.max()))  # the first of equals
+        chosen.append(k)
+        along = rows[:, k] / np.linalg.norm(rows[:, k])
+        rows = rows - along[:, None] * (along @ rows)
+    return chosen
+
+
+def unknown_names(machine: Machine, state: ImplicitState) -> tuple[str, ...]:
+    """Names of all unknowns, in the order of the Jacobian's columns."""
+    parts = ("turn x", "turn y", "turn z", "x", "y", "z")
+    stations = [f"station {s + 1}, {p}" for s in range(state.T_camera_base.shape[1]) for p in parts]
+    mounts = [f"board {m + 1}, {p}" for m in range(state.T_mount.shape[1]) for p in parts]
+    return (*machine.parameters.free_names(), *stations, *mounts)
+
+
+def _session_state(
+    machine: Machine, measurements: Measurements, start: State, fit: PoseFit
+) -> State:
+    """The fit as a session's state, in the default frames, poses by the readings."""
+    stop, found = fit.solution.stop[0], fit.solution.state
+    if stop in (Stop.NOT_FINITE, Stop.STALLED):
+        raise ResultError(what=f"the inverse-kinematic method failed: {stop.value}")
+    theta = fit.problem.theta(found)[0]
+    solved = machine.with_values(theta)
+    poses = solved.forward_result(measurements.joints, start.T_base_platform)
+    cameras, mounts = start.T_camera_base.copy(), start.T_mount.copy()
+    for before, after, told in (
+        (cameras, found.T_camera_base[0], fit.problem.station),
+        (mounts, found.T_mount[0], fit.problem.mount),
+    ):
+        before[told] = after[told]  # the others have no pose among the data
+    state = replace(
+        start,
+        theta=theta,
+        T_camera_base=cameras,
+        T_mount=mounts,
+        T_base_platform=poses.T_base_platform,
+        internal=poses.internal,
+    )
+    state = in_gauge(machine, state, default_gauge(machine))
+    return replace(state, theta=machine.parameters.unit_axes(state.theta))

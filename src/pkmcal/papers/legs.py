@@ -1,0 +1,132 @@
+"""What [A]'s four steps need to know of a machine: joints, legs with a length, frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.geometry.rigid import skew
+from pkmcal.identify.gauge import centre_index, default_gauge
+from pkmcal.mechanisms import Machine
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Legs:
+    """The joints of a machine as drawn, m; each body in its own frame.
+
+    base, platform : (L, 3) centres. base_axes, platform_axes : (L, 3) unit, NaN without one.
+    base_revolute, platform_revolute : (L,) legs that are square to an axis on that body, [A] 7;
+    torsion : legs that cannot twist, with an axis on each.
+    rod : (L,) offsets and constant lengths. closing : (L,) legs with a length.
+    constant : (L,) legs of constant length.
+    planar : all axes are the plane's normal. motion : (6, d) of the platform.
+    """
+
+    base: Array
+    platform: Array
+    base_axes: Array
+    platform_axes: Array
+    base_revolute: Booleans
+    platform_revolute: Booleans
+    torsion: Booleans
+    rod: Array
+    closing: Booleans
+    constant: Booleans
+    planar: bool
+    motion: Array
+
+    @property
+    def directions(self) -> Array:
+        """Directions on the base that photographs show, (D, 3): revolute axes, or the normal."""
+        return UP[None] if self.planar else self.base_axes[self.base_revolute]
+
+    @property
+    def framed(self) -> bool:
+        """Whether the frames that the steps hold are the machine's own: by three centres each."""
+        return self.motion.shape[1] == 6 and bool(self.closing.all())
+
+
+def legs_of(machine: Machine) -> Legs:
+    """The machine's joints as its drawing has them."""
+    layout, drawing = machine.layout, machine.parameters.drawing
+    base, platform = (drawing[index] for index in centre_index(layout))
+    base_axes, platform_axes = (
+        np.where(index >= 0, drawing[index], np.nan)
+        for index in (layout.base_axis, layout.platform_axis)
+    )
+    angles = layout.angles
+
+    def having(equation: Booleans) -> Booleans:
+        return np.isin(np.arange(len(base)), angles.leg[equation])
+
+    closing = layout.rod >= 0
+    return Legs(
+        base=base,
+        platform=platform,
+        base_axes=base_axes,
+        platform_axes=platform_axes,
+        base_revolute=having(angles.on_base & ~angles.on_platform),
+        platform_revolute=having(angles.on_platform & ~angles.on_base),
+        torsion=having(angles.on_base & angles.on_platform),
+        rod=np.where(closing, drawing[layout.rod], 0.0),
+        closing=closing,
+        constant=closing & (layout.actuated < 0),
+        planar=machine.document.motion == "planar",
+        motion=layout.motion,
+    )
+
+
+def base_gauge(machine: Machine, legs: Legs) -> Array:
+    """Rows (6, 3 (L + D)) that hold the base frame on the centres, then the directions.
+
+    Three centres for a spatial machine ([A] 3.3, N_d = 3); for a planar one its normal, its
+    mean height, one centre and the direction to another (N_d = 2).
+    """
+    n, d = len(legs.base), len(legs.directions)
+    if not legs.planar:
+        rows = default_gauge(machine).constraints(machine)[:6]
+        rows = rows[:, centre_index(machine.layout)[0].ravel()]
+        return np.concatenate([rows, np.zeros((6, 3 * d))], axis=1)
+    rows = np.zeros((6, n + d, 3))
+    rows[:3, :n] = _plane_rows(legs.base)
+    rows[3, :n, 2] = 1 / np.sqrt(n)
+    rows[4, n, 0] = rows[5, n, 1] = 1.0
+    return rows.reshape(6, -1)
+
+
+def platform_gauge(machine: Machine, legs: Legs) -> Array:
+    """Rows (d, 3 L) that hold the platform frame on the centres of the legs with a length.
+
+    As many as the platform's motion has directions: the others are not free, as the base
+    frame is known by now.
+    """
+    n = len(legs.platform)
+    if legs.planar:
+        rows = np.zeros((3, n, 3))
+        rows[:, legs.closing] = _plane_rows(legs.platform[legs.closing])
+        return rows.reshape(3, -1)
+    if legs.framed:
+        rows = default_gauge(machine).constraints(machine)[6:]
+        return rows[:, centre_index(machine.layout)[1].ravel()]
+    p = legs.platform - legs.platform[legs.closing].mean(axis=0)
+    rows = np.zeros((6, n, 3))
+    rows[:3] = skew(p).transpose(1, 0, 2)
+    rows[3:] = np.eye(3)[:, None]
+    rows[:, ~legs.closing] = 0
+    return legs.motion.T @ rows.reshape(6, -1)
+
+
+def _plane_rows(points: Array) -> Array:
+    """Rows (3, n, 3) that hold points in the x-y plane: the first, and the way to the farthest."""
+    away = points[:, :2] - points[0, :2]
+    far = int(np.argmax(np.linalg.norm(away, axis=1)))
+    along = away[far] / np.linalg.norm(away[far])
+    rows = np.zeros((3, len(points), 3))
+    rows[0, 0, 0] = rows[1, 0, 1] = 1.0
+    rows[2, far, :2] = -along[1], along[0]
+    rows[2, 0, :2] = along[1], -along[0]
+    return rows

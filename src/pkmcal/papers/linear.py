@@ -1,0 +1,261 @@
+"""[B] section IV: each base centre in the camera frame from its leg's edges, linear and robust.
+
+Every edge of a leg says ``n . A = -R`` ([B] 12-13); the edges of all configurations together
+fix A ([B] 14). All functions take many systems at once: leading axes (...), then the n edges
+of one leg at one station, padded with weight zero. Distances in metres, camera frame.
+
+Under wrong edges plain least squares and M-estimators that start from it collapse to A = 0,
+where every residual is only R; least median of squares does not (errata).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import dot
+from pkmcal.measurements import EdgeSet, Measurements
+from pkmcal.mechanisms import Machine
+
+Method = Literal["plain", "huber", "tukey", "least-median", "robust", "errors-in-variables"]
+
+TRIPLES = 500
+"""Random triples: with 35 % wrong edges a clean one is among them but for 1 case in 10^69."""
+HUBER, TUKEY = 1.345, 4.685
+"""95 % efficiency for normal residuals."""
+POORLY_FIXED = 1e-7
+"""Ratio of the normal matrix's eigenvalues below which A is not fixed: one leg direction."""
+
+
+@dataclass(frozen=True)
+class LinearCentres:
+    """Base centres in the camera frames, [B] 14.
+
+    centres : (S, L, 3) m, NaN where a leg was not seen in enough directions.
+    covariance : (S, L, 3, 3). sigma : (S, L) robust scale of the residuals, m.
+    count : (S, L) edges in use. weights : (N,) of the edges.
+    """
+
+    centres: Array
+    covariance: Array
+    sigma: Array
+    count: Integers
+    weights: Array
+
+
+def weighted(n: Array, radius: Array, weight: Array) -> tuple[Array, Array]:
+    """Weighted least squares of [B] 14: A (..., 3) and inverse normal matrix (..., 3, 3).
+
+    n : (..., n, 3). radius, weight : (..., n). NaN where A is not fixed.
+    """
+    # what is not known of a leg leaves it not fixed
+    n, weight = (np.where(np.isfinite(x), x, 0.0) for x in (n, weight))
+    rows = n * weight[..., None]
+    normal = np.swapaxes(rows, -1, -2) @ n
+    values, vectors = np.linalg.eigh(normal)
+    fixed = values[..., 0] > POORLY_FIXED * np.maximum(values[..., -1], 1e-300)
+    safe = np.where(fixed[..., None], values, 1.0)
+    inverse = (vectors / safe[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    right = -np.swapaxes(rows, -1, -2) @ radius[..., None]
+    a = (inverse @ right)[..., 0]
+    return (
+        np.where(fixed[..., None], a, np.nan),
+        np.where(fixed[..., None, None], inverse, np.nan),
+    )
+
+
+def residuals(n: Array, radius: Array, a: Array) -> Array:
+    """N . A + R, (..., n) m: how far A lies from each edge's plane moved in by the radius."""
+    return (n @ a[..., None])[..., 0] + radius
+
+
+def scale_of(r: Array, present: Array) -> Array:
+    """Standard deviation (...) from the median of |r| over the present ones, n - 3 counted."""
+    count = np.sum(present > 0, axis=-1)
+    ordered = np.sort(np.where(present > 0, np.abs(r), np.inf), axis=-1)
+    middle = np.where(count > 0, count // 2, 0)[..., None]
+    median = np.take_along_axis(ordered, middle, axis=-1)[..., 0]
+    return 1.4826 * (1 + 5 / np.maximum(count - 3, 1)) * np.maximum(median, 1e-12)
+
+
+def huber_weights(x: Array) -> Array:
+    """Huber's weights of residuals in standard deviations."""
+    return HUBER / np.maximum(np.abs(x), HUBER)
+
+
+def tukey_weights(x: Array) -> Array:
+    """Tukey's biweight of residuals in standard deviations; 0 from 4.685."""
+    return np.where(np.abs(x) < TUKEY, (1 - (x / TUKEY) ** 2) ** 2, 0.0)
+
+
+def reweighted(
+    n: Array, radius: Array, present: Array, start: Array, kind: Literal["huber", "tukey"]
+) -> tuple[Array, Array, Array]:
+    """Iteratively reweighted least squares from ``start`` (..., 3).
+
+    Returns A, weights (..., n) and the inverse normal matrix. The scale is that of the start:
+    a scale that is estimated anew in each step lets Tukey's weights run away.
+    """
+    weights_of = huber_weights if kind == "huber" else tukey_weights
+    a, inverse, w = start, np.zeros((*start.shape, 3)), present
+    sigma = scale_of(residuals(n, radius, start), present)[..., None]
+    for _ in range(30):
+        w = present * weights_of(residuals(n, radius, a) / sigma)
+        new, inverse = weighted(n, radius, w)
+        step = np.max(np.abs(np.nan_to_num(new - a)), initial=0.0)
+        a = new
+        if step < 1e-10:
+            break
+    return a, w, inverse
+
+
+def least_median(
+    n: Array, radius: Array, present: Array, rng: np.random.Generator, triples: int = TRIPLES
+) -> Array:
+    """Least median of squares: the best of random triples' exact solutions, A (..., 3)."""
+    shape = (*present.shape[:-1], triples, 3)
+    count = np.sum(present > 0, axis=-1)[..., None, None]
+    order = np.argsort(present <= 0, axis=-1, kind="stable")
+    draw = np.minimum((rng.random(shape) * count).astype(int), np.maximum(count - 1, 0))
+    pick = np.take_along_axis(order[..., None, :], draw, axis=-1)
+    rows = np.take_along_axis(n[..., None, :, :], pick[..., None], axis=-2)
+    right = np.take_along_axis(np.broadcast_to(radius, present.shape)[..., None, :], pick, axis=-1)
+    det = np.linalg.det(rows)
+    good = np.abs(det) > 1e-9
+    rows = np.where(good[..., None, None], rows, np.eye(3))
+    a = np.linalg.solve(rows, -right[..., None])[..., 0]
+    r = np.abs(a @ np.swapaxes(n, -1, -2) + np.broadcast_to(radius, present.shape)[..., None, :])
+    r = np.where((present > 0)[..., None, :], r, np.inf)
+    # the quantile that LMedS needs counts present edges only, so sort rather than take a median
+    half = np.broadcast_to((count[..., 0] + 3) // 2, r.shape[:-1])
+    cost = np.take_along_axis(
+        np.sort(r, axis=-1), np.minimum(half, r.shape[-1] - 1)[..., None], axis=-1
+    )[..., 0]
+    best = np.argmin(np.where(good, cost, np.inf), axis=-1)
+    found = np.take_along_axis(a, best[..., None, None], axis=-2)[..., 0, :]
+    return np.where((count[..., 0] >= 3) & good.any(axis=-1, keepdims=True), found, np.nan)
+
+
+def errors_in_variables(
+    n: Array, radius: Array, covariance: Array, weight: Array, start: Array
+) -> tuple[Array, Array]:
+    """Minimum of sum w (n.A + R)^2 / (A^T Sigma_n A): A and its covariance, (..., 3, 3).
+
+    covariance : (..., n, 3, 3) of the normals. The noise of n.A grows with A; leaving that
+    out, or its derivative, shrinks A towards the camera. Gauss-Newton, five steps.
+    """
+    a, inverse = start, np.full((*start.shape, 3), np.nan)
+    for _ in range(8):
+        spread = (covariance @ a[..., None, :, None])[..., 0]
+        sigma = np.sqrt(np.maximum(dot(a[..., None, :], spread), 1e-300))
+        r = residuals(n, radius, a) / sigma
+        jac = (n - (r / sigma)[..., None] * spread) / sigma[..., None]
+        # the step solves jac . da = -r, which is [B] 14 with other rows
+        step, inverse = weighted(jac, r, weight)
+        a = a + step
+    return a, inverse
+
+
+def centres(
+    machine: Machine,
+    measurements: Measurements,
+    method: Method = "robust",
+    rng: np.random.Generator | None = None,
+) -> LinearCentres:
+    """All base centres seen by all stations, [B] 14, with the machine's present radii.
+
+    method : plain, huber and tukey as the paper proposes; least-median alone; robust is least
+    median, then Tukey, then errors-in-variables on what is left; errors-in-variables alone
+    for edges known to be right. rng : draws the triples; seeded with 0 when absent.
+    """
+    edges = measurements.edges
+    group = edges.station * machine.n_legs + edges.leg
+    n_groups = measurements.n_stations * machine.n_legs
+    # each edge's place in its group, as many places as the largest group has edges
+    order = np.argsort(group, kind="stable")
+    place = np.empty(len(group), dtype=int)
+    place[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order])
+    width = int(place.max(initial=-1)) + 1
+
+    def padded(values: Array) -> Array:
+        out = np.zeros((n_groups, width, *values.shape[1:]))
+        out[group, place] = values
+        return out
+
+    n, present, radius = (
+        padded(values) for values in (edges.normal, np.ones(len(edges)), edge_radii(machine, edges))
+    )
+    noise = padded(edges.basis @ edges.covariance @ np.swapaxes(edges.basis, -1, -2))
+    rng = np.random.default_rng(0) if rng is None else rng
+    a, weight, covariance = solve(n, radius, present, noise, method, rng)
+    shape = (measurements.n_stations, machine.n_legs)
+    sigma = scale_of(residuals(n, radius, a), present)
+    return LinearCentres(
+        a.reshape(*shape, 3),
+        covariance.reshape(*shape, 3, 3),
+        sigma.reshape(shape),
+        np.sum(weight > 0.5, axis=-1).reshape(shape),
+        weight[group, place],
+    )
+
+
+def solve(
+    n: Array,
+    radius: Array,
+    present: Array,
+    noise: Array,
+    method: Method,
+    rng: np.random.Generator,
+) -> tuple[Array, Array, Array]:
+    """One method on many systems: A, weights, covariance (see :func:`centres`)."""
+    plain, inverse = weighted(n, radius, present)
+    if method == "plain":
+        sigma = scale_of(residuals(n, radius, plain), present)
+        return plain, present, inverse * sigma[..., None, None] ** 2
+    if method in ("huber", "tukey"):
+        a, w, inverse = reweighted(n, radius, present, plain, method)
+    elif method == "errors-in-variables":
+        a, covariance = errors_in_variables(n, radius, noise, present, plain)
+        return a, present, covariance
+    else:
+        a = least_median(n, radius, present, rng)
+        if method == "least-median":
+            return a, present, np.full((*a.shape, 3), np.nan)
+        a, w, inverse = reweighted(n, radius, present, a, "tukey")
+        # a clean edge may lose most of its Tukey weight; count it fully, a wrong one not at all
+        w = np.where(w > 0.05, 1.0, 0.0) * present
+        a, covariance = errors_in_variables(n, radius, noise, w, a)
+        return a, w, covariance
+    sigma = scale_of(residuals(n, radius, a), present)
+    return a, w, inverse * sigma[..., None, None] ** 2
+
+
+def scale_ratio(points: Array, drawing: Array) -> float:
+    """[B] 16 as printed: mean ratio of the distances; divide the points by it.
+
+    points, drawing : (n, 3). Close pairs dominate it: their ratio is the noisiest.
+    """
+    i, j = np.triu_indices(len(points), 1)
+    measured = np.linalg.norm(points[i] - points[j], axis=-1)
+    return float(np.mean(measured / np.linalg.norm(drawing[i] - drawing[j], axis=-1)))
+
+
+def procrustes_scale(points: Array, drawing: Array) -> float:
+    """Scale r of the similarity that lays the drawing on the points; divide the points by it.
+
+    Maximum over rotations of the least-squares scale: trace of the singular values over the
+    drawing's sum of squares (Umeyama).
+    """
+    p, d = points - points.mean(axis=0), drawing - drawing.mean(axis=0)
+    u, s, vt = np.linalg.svd(p.T @ d)
+    s[-1] *= np.sign(np.linalg.det(u @ vt))
+    return float(s.sum() / np.sum(d**2))
+
+
+def edge_radii(machine: Machine, edges: EdgeSet) -> Array:
+    """The machine's present radius of the tube that each edge bounds, (N,) m."""
+    radii = machine.radii()
+    return np.array([radii[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)])

@@ -1,0 +1,184 @@
+"""[A]'s four steps, [B]'s linear solution and [C]'s inverse-kinematic method as results of their
+own, to compare with.
+
+They come without uncertainties in the papers; here, standard deviations are the spread of the
+method over repetitions with the edges' and readings' stated noise added once more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.errors import ResultError
+from pkmcal.geometry.rigid import apply as move
+from pkmcal.geometry.rigid import inverse, perturb, pose_difference, register
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.covariance import data_share
+from pkmcal.identify.gauge import apply, centre_index, default_gauge
+from pkmcal.identify.problem import Estimate, State, Statistics
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.papers import linear
+from pkmcal.papers.four_step import four_step
+from pkmcal.papers.four_step_base import with_boards
+from pkmcal.papers.hand_eye import start_from_poses
+from pkmcal.papers.inverse_kinematic import inverse_kinematic
+from pkmcal.solver import NONE
+
+Method = Literal["four-step", "linear", "inverse-kinematic"]
+REPETITIONS = 60
+"""Repetitions for the standard deviations: they are then known to 9 %."""
+
+
+def by_paper(
+    method: Method, machine: Machine, measurements: Measurements, joint: Estimate, seed: int = 0
+) -> Estimate:
+    """An estimate by one of the papers' methods on the same edges.
+
+    joint : the joint estimate, for the stations' poses where a station sees too few legs.
+    Raises ResultError where the method cannot be applied.
+    """
+    guess = joint.state.T_camera_base
+    state = _solve(method, machine, measurements, guess)
+    rng = np.random.default_rng(seed)
+    repeats: list[State] = []
+    failed: list[ResultError] = []
+    for _ in range(REPETITIONS):
+        try:
+            repeats.append(_solve(method, machine, _noisy(measurements, rng), guess))
+        except ResultError as error:
+            failed.append(error)
+    if len(failed) > len(repeats):
+        raise failed[0]
+    theta = np.cov(np.stack([r.theta for r in repeats]), rowvar=False)
+    turns = np.stack([pose_difference(r.T_camera_base, state.T_camera_base) for r in repeats])
+    stations = np.stack([np.cov(turns[:, s], rowvar=False) for s in range(turns.shape[1])])
+    return _estimate(machine.with_values(state.theta), measurements, state, theta, stations)
+
+
+def _solve(method: Method, machine: Machine, measurements: Measurements, guess: Array) -> State:
+    if method == "linear":
+        state = linear_state(machine, measurements)
+    elif method == "inverse-kinematic":
+        start = start_from_poses(machine, measurements, guess)
+        state = inverse_kinematic(machine, measurements, start)
+    else:
+        state = four_step(machine, measurements, T_camera_base_guess=guess)
+    state = apply(machine, state, default_gauge(machine))
+    return replace(state, theta=machine.parameters.unit_axes(state.theta))
+
+
+def linear_state(machine: Machine, measurements: Measurements) -> State:
+    """[B] 14 robustly for the base centres, 16 for their scale, 15 for the stations; rest drawn.
+
+    An edge shift or a wrong radius scales what a station sees (16 tells why), so each station's
+    centres are brought to the drawing's size, by Procrustes: as printed, the mean ratio of
+    distances, close pairs and their noise decide.
+    Base centres of several stations are averaged after registration, weighted by how well each
+    station knows them.
+    """
+    found = linear.centres(machine, measurements, "robust")
+    drawing = machine.base_centers()
+    known: Booleans = np.all(np.isfinite(found.centres), axis=-1)
+    if (known.sum(axis=1) < 3).any():
+        raise ResultError(
+            "[B]'s linear method needs three legs, each in two directions, at every station",
+            found=f"{known.sum(axis=1).min()} legs at one of them",
+            next_step="Use the joint method (bundle), which is the default",
+        )
+    centres, stations = np.zeros(found.centres.shape), np.zeros((len(known), 4, 4))
+    for s, (a, k) in enumerate(zip(found.centres, known, strict=True)):
+        centres[s, k] = a[k] / linear.procrustes_scale(a[k], drawing[k])
+        stations[s] = register(drawing[k], centres[s, k])
+    variance = np.trace(found.covariance, axis1=-2, axis2=-1)
+    weight = np.where(known, 1 / np.where(known, variance, 1.0), 0.0)
+    in_base = move(inverse(stations)[:, None], centres)
+    total = weight.sum(axis=0)
+    mean = np.einsum("sl,slc->lc", weight, in_base) / np.where(total > 0, total, 1.0)[:, None]
+    theta = machine.values.copy()
+    base_index, platform_index = centre_index(machine.layout)
+    theta[base_index] = np.where(total[:, None] > 0, mean, drawing)
+    if machine.document.motion == "planar":  # both ends of a leg have one height
+        rise = theta[base_index[:, 2]] - drawing[:, 2]
+        theta[platform_index[:, 2]] = machine.platform_centers()[:, 2] + rise
+    poses = machine.with_values(theta).forward_result(measurements.joints, machine.home())
+    return with_boards(measurements, theta, stations, poses.T_base_platform)
+
+
+def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements:
+    """The measurements with their stated noise added once more."""
+    edges = measurements.edges
+    turn = np.linalg.cholesky(edges.covariance) @ rng.normal(size=(len(edges), 2, 1))
+    normal = edges.normal + (edges.basis @ turn)[..., 0]
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    noise = measurements.joint_noise * rng.normal(size=measurements.joints.shape)
+    poses = measurements.poses
+    # what was not measured has no noise
+    moved = (np.linalg.pinv(poses.whiten) @ rng.normal(size=(len(poses), 6, 1)))[..., 0]
+    return replace(
+        measurements,
+        edges=replace(edges, normal=normal),
+        joints=measurements.joints + noise,
+        poses=replace(poses, T_station_target=perturb(poses.T_station_target, moved)),
+    )
+
+
+def _estimate(
+    machine: Machine, measurements: Measurements, state: State, theta: Array, stations: Array
+) -> Estimate:
+    """The method's result with its residuals; edges far off the rest have weight 0.
+
+    theta : (P, P) and stations (S, 6, 6) covariances.
+    """
+    gauge = default_gauge(machine)
+    assembled = assemble(machine, measurements, gauge, use_drawing=False)
+    batch = batch_of(machine, assembled, state)
+    edges = assembled.problem.block_residuals(batch)[0][assembled.row, assembled.place]
+    edges = np.nan_to_num(edges)
+    distance = np.sqrt(np.sum(edges**2, axis=-1))
+    middle = float(np.median(distance)) if distance.size else 0.0
+    scale = max(middle / np.sqrt(2 * np.log(2)), 1.0)
+    weight = (distance < NONE * scale).astype(float)
+    poses = assembled.problem.pose_residuals(batch)[0, assembled.pose_row, assembled.pose_place]
+    n_poses, n_edges = float(measurements.poses.rows.sum()), float(2 * weight.sum())
+    pose_scale = max(float(np.sqrt(np.sum(poses**2) / n_poses)) if n_poses else 1.0, 1.0)
+    chi2 = float(np.sum(weight[:, None] * (edges / scale) ** 2))
+    # closures are zero to rounding, as poses come from the readings
+    joints = machine.inverse(state.T_base_platform) - measurements.joints
+    return Estimate(
+        machine=machine,
+        state=state,
+        covariance=theta,
+        station_covariance=stations,
+        edge_shift_sigma=np.zeros(len(state.edge_shift)),
+        edge_residuals=edges / scale,
+        pose_residuals=poses / pose_scale,
+        pose_weights=np.ones(len(poses)),
+        mount_covariance=np.zeros((len(state.T_mount), 6, 6)),
+        edge_weights=weight,
+        joint_residuals=joints / measurements.joint_noise,
+        data_share=data_share(machine, state.theta, theta, gauge),
+        configurations=assembled.seen,
+        statistics=Statistics(
+            chi2=chi2,
+            dof=n_edges,
+            chi2_edges=chi2,
+            n_edges=n_edges,
+            chi2_joints=0.0,
+            n_joints=0,
+            chi2_drawing=0.0,
+            n_drawing=0,
+            steps=0,
+            stopped="closed form",
+            noise_scale=scale,
+            chi2_poses=float(np.sum(poses**2)) / pose_scale**2,
+            n_poses=n_poses,
+            dof_poses=n_poses,
+            pose_scale=pose_scale,
+        ),
+        gauge=gauge.name,
+    )

@@ -1,0 +1,289 @@
+"""Points of one rigid body, seen in many frames: the body and its poses together.
+
+The corrected form of [A] 9 (base centres seen from the stations) and of [A] 16 (platform
+centres seen in the photographs): ``min sum w |T_k p_j - m_kj|^2`` over points p and poses T_k.
+Products of distances between coplanar points, as printed, leave the third coordinate to
+second order; this does not.
+
+Items of a body are points, and after them directions (joint axes), which turn but do not shift;
+directions are scaled to metres by a length, so that both kinds can be weighed together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import dot, perturb, pose, register, rotation, skew
+from pkmcal.solver import Linear, Solution, Values, minimise
+
+SCALE = 1e-4
+"""Metres that count as one standard deviation; it only sets where the search stops."""
+LOOSE = 1e-4
+"""Eigenvalue below which a body's items count as loose, of 1 for an item that one frame holds:
+a shape error is then seen a hundredth of its size."""
+ANY_MOTION = np.eye(6)
+"""Motion (6, d) of a free body; columns as in :data:`pkmcal.mechanisms.document.MOTIONS`."""
+
+
+class Body(NamedTuple):
+    """Items (B, n, 3) and the poses (B, K, 4, 4) that map them to the frames they are seen in."""
+
+    points: Array
+    poses: Array
+
+
+@dataclass(frozen=True)
+class BodyProblem:
+    """solver.LeastSquares for a rigid body; measured (B, K, n, 3), weight (B, K, n).
+
+    gauge : (c, 3 n) rows that hold the body's frame. drawing : (n, 3) their reference.
+    shifts : (n,) 1 for points, 0 for directions. motion : (6, d) how the body can move.
+    """
+
+    measured: Array
+    weight: Array
+    gauge: Array
+    drawing: Array
+    shifts: Array
+    motion: Array
+
+    def residuals(self, state: Body) -> Values:
+        """Weighted differences and the gauge's rows."""
+        linear = self.linearize(state)
+        return Values(linear.value, linear.shared_value)
+
+    def linearize(self, state: Body) -> Linear:
+        """Residuals and exact Jacobian."""
+        shape = self.measured.shape
+        rot = state.poses[..., None, :3, :3]
+        turned = (rot @ state.points[:, None, :, :, None])[..., 0]
+        shift = self.shifts[:, None]
+        difference = turned + shift * state.poses[..., None, :3, 3] - self.measured
+        w = np.sqrt(self.weight)[..., None] / SCALE
+        value = np.where(w > 0, difference * w, 0.0)
+        n = shape[2]
+        by_shared = np.zeros((*shape, n, 3))
+        j = np.arange(n)
+        by_shared[:, :, j, :, j, :] = np.moveaxis(
+            np.broadcast_to(rot, (*shape, 3)) * w[..., None], 2, 0
+        )
+        by_own = np.zeros((*shape, 6))
+        by_own[..., :3] = -skew(turned) * w[..., None]
+        by_own[..., 3:] = np.eye(3) * (shift * w)[..., None]
+        held = (state.points - self.drawing).reshape(shape[0], -1) @ self.gauge.T
+        rows = (shape[0], shape[1], 3 * n)
+        return Linear(
+            value.reshape(rows),
+            by_shared.reshape(*rows, 3 * n),
+            by_own.reshape(*rows, 6) @ self.motion,
+            np.ones(rows, dtype=bool),
+            held / SCALE,
+            self.gauge / SCALE,
+        )
+
+    def moved(self, state: Body, shared: Array, own: Array) -> Body:
+        """The body after a step."""
+        poses = perturb(state.poses, own @ self.motion.T)
+        return Body(state.points + shared.reshape(state.points.shape), poses)
+
+    def select(self, runs: Integers) -> BodyProblem:
+        """Some runs only."""
+        return replace(self, measured=self.measured[runs], weight=self.weight[runs])
+
+
+def fit_body(
+    measured: Array,
+    weight: Array,
+    gauge: Array,
+    drawing: Array,
+    *,
+    directions: int = 0,
+    motion: Array = ANY_MOTION,
+) -> Body:
+    """The body and its poses from what was seen; [A] 9 and 16 corrected.
+
+    measured : (B, K, n, 3) m. weight : (B, K, n), 0 where not seen; a frame that leaves its
+    pose undetermined (fewer than three points of a spatial body) should be left out. gauge :
+    (c, 3 n) rows on the items. drawing : (n, 3) m, the start. directions : how many of the
+    last items are directions. motion : (6, d) of the body in the frames it is seen in.
+    """
+    measured = np.where(weight[..., None] > 0, measured, 0.0)
+    points = np.broadcast_to(drawing, (measured.shape[0], *drawing.shape)).copy()
+    shifts = (np.arange(len(drawing)) < len(drawing) - directions).astype(float)
+    start = Body(points, laid(points[:, None], measured, weight, directions, motion))
+    return minimise(BodyProblem(measured, weight, gauge, drawing, shifts, motion), start).state
+
+
+def laid(
+    items: Array, measured: Array, weight: Array, directions: int = 0, motion: Array = ANY_MOTION
+) -> Array:
+    """Poses (..., 4, 4) within ``motion`` that lay items (..., n, 3) on what was seen.
+
+    Least squares over the points, the last ``directions`` items without their shift: the
+    rotation that maximises tr(R^T H), H = sum w m p^T about the points' means (Kabsch; for a
+    motion in the plane its angle, for a translation none).
+    """
+    w = np.maximum(weight, 1e-12)  # a frame that shows nothing gets some pose, not NaN
+    n = items.shape[-2] - directions
+    if motion.shape[1] == 6 and directions == 0:
+        return register(items, measured, w)
+    share = w[..., :n] / w[..., :n].sum(axis=-1, keepdims=True)
+    mean, seen = (np.sum(share[..., None] * p[..., :n, :], axis=-2) for p in (items, measured))
+    centred = items.copy() * np.ones(measured.shape)
+    target = measured * np.ones(centred.shape)
+    centred[..., :n, :] -= mean[..., None, :]
+    target[..., :n, :] -= seen[..., None, :]
+    h = np.swapaxes(target, -1, -2) @ (w[..., None] * centred)
+    if motion.shape[1] == 6:
+        rot = nearest_rotation(h)
+    else:
+        omega = np.zeros(h.shape[:-1])
+        if motion[2].any():  # about z
+            omega[..., 2] = np.arctan2(h[..., 1, 0] - h[..., 0, 1], h[..., 0, 0] + h[..., 1, 1])
+        rot = rotation(omega)
+    shift = seen - (rot @ mean[..., None])[..., 0]
+    return pose(rot, shift @ motion[3:] @ motion[3:].T)
+
+
+def nearest_rotation(h: Array) -> Array:
+    """The rotations R (..., 3, 3) that maximise tr(R^T H); reflections are excluded."""
+    u, _, vt = np.linalg.svd(h)
+    u = u.copy()
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
+
+
+def extent(points: Array) -> float:
+    """Root mean square distance (m) of points (n, 3) from their mean."""
+    away = points - points.mean(axis=0)
+    return float(np.sqrt(np.mean(dot(away, away))))
+
+
+def loose(items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY_MOTION) -> Array:
+    """Ways (n, 3, f) in which a body's items could move against each other unnoticed.
+
+    The null space of the registration's Jacobian at ``items`` (n, 3), without the body's own
+    rigid motions: what frames that see ``seen`` (K, n) together leave open. f = 0 : all is
+    fixed. Every item should be seen.
+    """
+    own = _own_motions(items, directions, motion)
+    mask = np.repeat(seen, 3, axis=1)[:, :, None]
+    # an orthonormal basis of each frame's motions; those that it does not see count as nothing
+    u, s, _ = np.linalg.svd(own * mask, full_matrices=False)
+    u = u * (s > LOOSE * np.sqrt(len(items)))[:, None, :]
+    normal = np.sum(np.eye(len(own)) * mask - u @ np.swapaxes(u, -1, -2), axis=0)
+    rigid = np.linalg.qr(own)[0]
+    values, vectors = np.linalg.eigh(normal + rigid @ rigid.T)
+    return vectors[:, values < LOOSE].reshape(len(items), 3, -1)
+
+
+def parts_of(
+    items: Array, seen: Booleans, free: Array, directions: int = 0, motion: Array = ANY_MOTION
+) -> tuple[Booleans, Booleans]:
+    """Two sets of items (n,) that ``free`` (n, 3, f), found by :func:`loose`, moves against each
+    other: what moves while one frame's items are held, and what while another's are.
+
+    Items that belong to both, such as two joints about whose line the rest turns, are in none.
+    Distances would not do: out of a plane of joints they change in second order only.
+    """
+    own = _own_motions(items, directions, motion)
+    flat = free.reshape(len(own), -1)
+    stay = []
+    for frame in seen:
+        mask = np.repeat(frame, 3)
+        held = own @ np.linalg.lstsq(own[mask], flat[mask], rcond=LOOSE)[0]
+        rate = np.linalg.norm((flat - held).reshape(len(items), -1), axis=1)
+        stay.append(rate < 0.05 * rate.max())
+    first = next(s for s in stay if not s.all())
+    other = next(s for s, frame in zip(stay, seen, strict=True) if (frame & ~first).any())
+    return first & ~other, other & ~first
+
+
+def fixes_pose(
+    items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY_MOTION
+) -> Booleans:
+    """Frames (K,) whose own items, seen (K, n), fix their pose of the body."""
+    own = _own_motions(items, directions, motion)
+    s = np.linalg.svd(own * np.repeat(seen, 3, axis=1)[:, :, None], compute_uv=False)
+    return s[:, -1] > LOOSE * np.sqrt(len(items))
+
+
+def _own_motions(items: Array, directions: int, motion: Array) -> Array:
+    """How the items move with their body, (3 n, d), turns scaled by the body's size."""
+    n = len(items) - directions
+    p = items.copy()
+    p[:n] -= items[:n].mean(axis=0)
+    own = np.zeros((len(items), 3, 6))
+    own[..., :3], own[:n, :, 3:] = -skew(p / np.sqrt(np.mean(dot(p, p)))), np.eye(3)
+    return (own @ motion).reshape(-1, motion.shape[1])
+
+
+@dataclass(frozen=True)
+class Dense:
+    """A plain batched least-squares problem on a vector (B, n), for the papers' criteria.
+
+    rows : function of x (b, n) and the runs' numbers (b,), gives values (b, r) and Jacobian
+    (b, r, n).
+    """
+
+    rows: Callable[[Array, Integers], tuple[Array, Array]]
+    runs: Integers
+
+    def residuals(self, state: Array) -> Values:
+        """Values only."""
+        value, _ = self.rows(state, self.runs)
+        return Values(value[:, None], np.zeros((len(value), 0)))
+
+    def linearize(self, state: Array) -> Linear:
+        """Values and Jacobian; there are no unknowns of a configuration's own."""
+        value, jac = self.rows(state, self.runs)
+        usable: Booleans = np.ones((len(value), 1, value.shape[-1]), dtype=bool)
+        own = np.zeros((*usable.shape, 0))
+        n = state.shape[-1]
+        return Linear(
+            value[:, None], jac[:, None], own, usable, np.zeros((len(value), 0)), np.zeros((0, n))
+        )
+
+    @staticmethod
+    def moved(state: Array, shared: Array, own: Array) -> Array:
+        """The vector after a step."""
+        return state + shared + 0 * own.sum()
+
+    def select(self, runs: Integers) -> Dense:
+        """Some runs only."""
+        return replace(self, runs=self.runs[runs])
+
+
+def minimise_dense(
+    rows: Callable[[Array, Integers], tuple[Array, Array]], start: Array
+) -> Solution:
+    """Batched Levenberg-Marquardt on plain vectors (B, n)."""
+    return minimise(Dense(rows, np.arange(len(start))), start)
+
+
+def points_by(
+    criterion: Callable[[Array, Integers], tuple[Array, Array]],
+    drawing: Array,
+    gauge: Array,
+    n_runs: int,
+) -> Array:
+    """Points (B, n, 3) by a criterion on them, their frame held by the gauge's rows (c, 3 n).
+
+    criterion : function of points (b, n, 3) and the runs' numbers (b,), gives values (b, r) in m
+    (or m^2) and their derivatives (b, r, n, 3). drawing : (n, 3), the start.
+    """
+
+    def rows(x: Array, runs: Integers) -> tuple[Array, Array]:
+        value, jac = criterion(x.reshape(len(x), *drawing.shape), runs)
+        held = (x - drawing.ravel()) @ gauge.T
+        by_gauge = np.broadcast_to(gauge, (len(x), *gauge.shape))
+        jac = np.concatenate([jac.reshape(*value.shape, drawing.size), by_gauge], axis=1)
+        return np.concatenate([value, held], axis=1) / SCALE, jac / SCALE
+
+    start = np.broadcast_to(drawing.ravel(), (n_runs, drawing.size)).copy()
+    return minimise_dense(rows, start).state.reshape(-1, *drawing.shape)

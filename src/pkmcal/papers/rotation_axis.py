@@ -1,0 +1,219 @@
+"""How a board turned between its poses: about any axis, about one, or not at all; [C] III.B, IV.B.
+
+Before any identification, the turns of a board seen by one camera tell how many ways the platform
+turns. The hypothesis of the mechanism file (an H4 turns about one axis, a delta does not) is put to
+a chi2 test by the poses' own noise; the spread of an axis alone proves nothing (errata, [C]).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector, skew
+from pkmcal.identify.pose_rows import turn_jacobian
+from pkmcal.measurements import PoseSet
+from pkmcal.mechanisms.document import MOTIONS
+from pkmcal.papers.measured_platform import taken
+from pkmcal.papers.registration import nearest_rotation
+
+Turning = Literal["none", "one axis", "any"]
+TURNS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}
+"""By how many turns a machine's motion has."""
+LEAST_TURN = np.radians(10.0)
+"""Turns (rad) between two poses below which their axis is left out: noise grows as 1 / turn."""
+DOUBT = 1e-3
+"""Probability below which a hypothesis is dropped: one honest session in a thousand."""
+SLACK = 2.0
+"""chi2 per degree of freedom up to which a hypothesis is kept all the same: the noise of a pose out
+of a photograph is itself known to some 40 % only (lens, print, shading)."""
+STEPS = 10
+MOST_PAIRS = 200_000
+
+
+@dataclass(frozen=True)
+class RotationAxis:
+    """How the boards of one camera and mount turned.
+
+    hypothesis : how the machine should turn it. axis_camera, axis_board : (3,) unit vectors of the
+    one axis in the two frames, NaN where the hypothesis has none.
+    tilt : (N,) rad that each pose is off the hypothesis; expected_tilt : (N,) what noise alone
+    would give, root mean square. spread, expected_spread : rad, root mean square angle of the axes
+    of pairs of poses to their mean, and what noise alone would give; NaN without pairs that turn.
+    pairs : their number. chi2, dof, p_value : of the hypothesis; 0 and 1 where it asks for nothing.
+    """
+
+    hypothesis: Turning
+    axis_camera: Array
+    axis_board: Array
+    tilt: Array
+    expected_tilt: Array
+    spread: float
+    expected_spread: float
+    pairs: int
+    chi2: float
+    dof: int
+    p_value: float
+
+    @property
+    def tenable(self) -> bool:
+        """Whether noise, or noise a little larger than stated, explains what is off."""
+        return self.p_value >= DOUBT or self.chi2 <= SLACK * self.dof
+
+    @property
+    def sentence(self) -> str:
+        """What was found, in words."""
+        if self.hypothesis == "any":
+            return "The platform may turn about any axis, so there is nothing to test."
+        rms, expected = (
+            np.degrees(np.sqrt(np.mean(x**2))) for x in (self.tilt, self.expected_tilt)
+        )
+        facts = (
+            f"the poses are {rms:.3f}° off, noise alone gives {expected:.3f}°"
+            f" (chi2 {self.chi2:.0f} on {self.dof} degrees of freedom)"
+        )
+        one = self.hypothesis == "one axis"
+        if self.tenable:
+            kept = "turn about one axis" if one else "do not turn"
+            return f"The boards {kept}, as far as their noise tells: {facts}."
+        broken = "do not turn about one axis alone" if one else "turn, and the machine should not"
+        return f"The boards {broken}: {facts}. The model leaves something out."
+
+
+def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
+    """The test for poses of one camera and one mount; motion as the mechanism file names it.
+
+    Needs one pose more than the hypothesis has unknowns: three to turn about an axis.
+    """
+    from scipy.stats import chi2 as distribution
+
+    hypothesis = TURNS[int(MOTIONS[motion][:3].any(axis=1).sum())]
+    rot = poses.T_station_target[:, :3, :3]
+    noise = np.linalg.inv(np.swapaxes(poses.whiten, -1, -2) @ poses.whiten)[:, :3, :3]
+    axis_camera = axis_board = np.full(3, np.nan)
+    if hypothesis == "any":
+        unknowns, off, covariance = 0, np.zeros((len(rot), 0)), np.zeros((len(rot), 0, 0))
+    elif hypothesis == "one axis":
+        unknowns = 4
+        off, covariance, frames = _about_one(rot, noise)
+        axis_camera, axis_board = frames.camera[:, 2], frames.board[2]
+    else:
+        unknowns = 3
+        off, covariance = _unturned(rot, noise)
+    chi2 = float(np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0]))
+    dof = max(off.size - unknowns, 0)
+    spread, expected_spread, pairs = _pairwise(rot, noise)
+    return RotationAxis(
+        hypothesis=hypothesis,
+        axis_camera=axis_camera,
+        axis_board=axis_board,
+        tilt=np.linalg.norm(off, axis=-1),
+        expected_tilt=np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)),
+        spread=spread,
+        expected_spread=expected_spread,
+        pairs=pairs,
+        chi2=chi2,
+        dof=dof,
+        p_value=float(distribution.sf(chi2, dof)) if dof else 1.0,
+    )
+
+
+class Frames(NamedTuple):
+    """Rotations with ``seen = camera Rz(angle) board``: their z is the axis, (..., 3, 3) each."""
+
+    camera: Array
+    board: Array
+
+
+def axis_frames(rot: Array) -> Frames:
+    """The one axis of turns (..., N, 3, 3), closed form.
+
+    ``R_k a_board = a_camera`` for all k, so the two are the singular vectors of the mean rotation
+    that belong to its singular value 1.
+    """
+    u, _, vt = np.linalg.svd(rot.mean(axis=-3))
+    camera, board = u[..., :, 0], vt[..., 0, :]
+    return Frames(facing(camera), np.swapaxes(facing(board), -1, -2))
+
+
+def facing(direction: Array) -> Array:
+    """A rotation (..., 3, 3) whose z axis is the unit direction (..., 3)."""
+    least = np.eye(3)[np.argmin(np.abs(direction), axis=-1)]
+    x = cross(direction, least)
+    x = x / np.sqrt(dot(x, x))[..., None]
+    return np.stack([x, cross(direction, x), direction], axis=-1)
+
+
+def _about_one(rot: Array, noise: Array) -> tuple[Array, Array, Frames]:
+    """Tilts (N, 2), their covariance and the frames, by maximum likelihood."""
+    frames = axis_frames(rot)
+    for _ in range(STEPS):
+        off, by, own, covariance = _tilts(rot, noise, frames)
+        # camera turns by its own x, y; the board by the axis' x, y: what they do to the tilts
+        jac = np.concatenate([-by[..., :2], -(by @ own)[..., :2]], axis=-1)
+        weigh = np.linalg.inv(np.linalg.cholesky(covariance))
+        rows, value = (weigh @ jac).reshape(-1, 4), (weigh @ off[..., None]).ravel()
+        step = -np.linalg.lstsq(rows, value, rcond=1e-9)[0]
+        turns = np.concatenate([step.reshape(2, 2), np.zeros((2, 1))], axis=1)
+        frames = Frames(frames.camera @ rotation(turns[0]), rotation(turns[1]) @ frames.board)
+    off, _, _, covariance = _tilts(rot, noise, frames)
+    return off, covariance, frames
+
+
+def _tilts(rot: Array, noise: Array, frames: Frames) -> tuple[Array, Array, Array, Array]:
+    """Tilts (N, 2) of turns told in the frames, their change (N, 2, 3) by the turns (N, 3, 3) in
+    those, the latter themselves, and the tilts' covariance (N, 2, 2).
+    """
+    back = np.swapaxes(frames.camera, -1, -2)
+    own = back @ rot @ np.swapaxes(frames.board, -1, -2)
+    found = taken(MOTIONS["schoenflies"], pose(own, np.zeros((len(rot), 3))))
+    by = found.off_by[..., :3]
+    return found.off, by, own, by @ back @ noise @ frames.camera @ np.swapaxes(by, -1, -2)
+
+
+def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
+    """Turns (N, 3) from the weighted mean orientation, and their covariance."""
+    mean = nearest_rotation(rot.mean(axis=0))
+    weight = np.linalg.inv(noise)
+    for _ in range(STEPS):
+        off = rotation_vector(rot @ mean.T)
+        total = np.sum(weight @ off[..., None], axis=0)
+        mean = rotation(np.linalg.solve(weight.sum(axis=0), total)[:, 0]) @ mean
+    off = rotation_vector(rot @ mean.T)
+    by = turn_jacobian(off)
+    return off, by @ noise @ np.swapaxes(by, -1, -2)
+
+
+def _pairwise(rot: Array, noise: Array) -> tuple[float, float, int]:
+    """Axes of the turns between two poses, in the camera frame: how far they spread (rad), what
+    noise alone would give, and their number.
+
+    A turn phi with noise n of its two poses moves the axis by n / (2 sin(phi / 2)) across.
+    """
+    i, j = np.triu_indices(len(rot), 1)
+    if len(i) > MOST_PAIRS:  # an even choice is as good
+        pick = np.linspace(0, len(i) - 1, MOST_PAIRS).astype(int)
+        i, j = i[pick], j[pick]
+    turn = rotation_vector(rot[j] @ np.swapaxes(rot[i], -1, -2))
+    angle = np.sqrt(dot(turn, turn))
+    used = angle > LEAST_TURN
+    if used.sum() < 2:
+        return np.nan, np.nan, int(used.sum())
+    i, j, turn, angle = i[used], j[used], turn[used], angle[used]
+    axis = turn / angle[:, None]
+    main = np.linalg.eigh(axis.T @ axis)[1][:, -1]
+    axis = axis * np.where(axis @ main < 0, -1.0, 1.0)[:, None]
+    mean = axis.sum(axis=0)
+    mean = mean / np.linalg.norm(mean)
+    apart = np.linalg.norm(skew(mean) @ axis[..., None], axis=(-1, -2))
+    by = turn_jacobian(turn)  # of the later pose; of the earlier one, its other half
+    across = (np.eye(3) - axis[:, :, None] * axis[:, None, :]) @ by / angle[:, None, None]
+    back = across @ rot[j] @ np.swapaxes(rot[i], -1, -2)
+    covariance = across @ noise[j] @ np.swapaxes(across, -1, -2)
+    covariance = covariance + back @ noise[i] @ np.swapaxes(back, -1, -2)
+    expected = np.sqrt(np.mean(np.trace(covariance, axis1=-2, axis2=-1)))
+    found = np.sqrt(np.mean(np.arctan2(apart, dot(axis, mean)) ** 2))
+    return float(found), float(expected), len(axis)

@@ -1,0 +1,297 @@
+"""What a validation found, as an outcome, and what is told of held-out configurations."""
+
+from __future__ import annotations
+
+from pkmcal.judge.comparison import Comparison, WeighedErrors, rms
+from pkmcal.judge.holdouts import HoldOut
+from pkmcal.judge.paths import LinePath, Straightness
+from pkmcal.judge.validate import Validation
+from pkmcal.judge.words import amount, better, factor
+from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
+from pkmcal.report import charts
+from pkmcal.session.load import Session
+from pkmcal.wording import SCALES, brief, count, decimals, number
+
+HOW = (
+    "The machine is held as the calibration left it. Stations, boards and every pose of the"
+    " platform are estimated from the photographs; a configuration's own readings have no part in"
+    " its pose, and where photographs leave open where a camera or a board is, the readings of the"
+    " other configurations tell. The readings are then predictions. The drawing is judged in the"
+    " same way, frames laid over each other, on the poses that suit it best.",
+    "The uncertainty of “times better” is from drawing the configurations again at random"
+    " (bootstrap). Directions count by how well the photographs see them: one photograph tells"
+    " depth poorly, and there any two machines look alike.",
+    "The promise holds the calibration's covariance and the noise of these photographs and"
+    " readings. It is broken where chance explains the residuals less than once in a thousand times"
+    " even if all deviations were half as large again.",
+)
+
+
+def outcome_of(v: Validation) -> Outcome:
+    """Everything that ``pkmcal validate`` tells and writes."""
+    known = [n for n, flag in zip(v.session.configurations, v.known, strict=True) if flag]
+    left_out = f"Left out, for the calibration had seen them: {', '.join(known)}."
+    parts = (
+        v.judged and _readings(v.judged, v.session),
+        Part("paths", "Paths", tables=(paths_table(v.paths),)) if v.paths else None,
+        Part("regions", "Regions", tables=(regions_table(v.regions, v.session),))
+        if v.regions
+        else None,
+        Part("how", "How it was computed", HOW, notes=(left_out,) if known else ()),
+    )
+    return Outcome(
+        command="validate",
+        title=f"Validation of {v.calibration.machine.name}",
+        kicker=f"session {v.session.folder.resolve().name}",
+        verdict=v.verdict,
+        stamp="Confirmed" if v.verdict.usable else "Not confirmed",
+        figures=_cards(v.judged, v.session) if v.judged else (),
+        parts=tuple(part for part in parts if part),
+        findings=tuple(Finding(Level.DOUBTFUL, text) for text in v.session.warnings),
+        document=v.document(),
+    )
+
+
+def _cards(judged: Comparison, session: Session) -> tuple[Figure, ...]:
+    """The main numbers."""
+    new, old = judged.figures(judged.calibrated), judged.figures(judged.drawing)
+    test, gain, unit = judged.promise, judged.ratio, _unit(session)
+    against = (
+        f"; {amount(rms(judged.after), unit)} against {amount(rms(judged.before), unit)}, weighed"
+        " by how well the photographs see each direction"
+        if unit
+        else ""
+    )
+    return (
+        Figure(
+            "How many times better than the drawing?",
+            ((better(gain), ""),),
+            f"in predicting readings, 95 %: {factor(gain.low)} to {factor(gain.high)}{against}",
+        ),
+        Figure(
+            "Where is the tool, by the readings?",
+            tuple(
+                (_size(value, unit), SCALES[unit][1])
+                for value, unit in ((new.position, "m"), (new.orientation, "rad"))
+            ),
+            "root mean square distance from where the photographs see it, their noise included; by"
+            f" the drawing {amount(old.position, 'm')} and {amount(old.orientation, 'rad')}",
+        ),
+        Figure(
+            "Is the promise kept?",
+            ((number(test.factor, 2), "× the deviations"),),
+            f"1 is expected; χ² {number(test.chi2, 0)} for {count(test.dof, 'degree')} of freedom",
+        ),
+        Figure(
+            "What is it based on?",
+            ((str(len(judged.rows)), "configurations"),),
+            "seen by the session, not used by the calibration",
+        ),
+    )
+
+
+def _readings(judged: Comparison, session: Session) -> Part:
+    """New data: charts, the readings' residuals, [C] Table 3, and the tool point's errors."""
+    old, new = judged.figures(judged.drawing), judged.figures(judged.calibrated)
+    test = judged.promise
+    residuals = Table(
+        "Readings: measured less predicted",
+        ("Joint", "Drawing, mean", "rms", "Calibrated, mean", "rms", "promised", "in common", "σ"),
+        tuple(
+            Row(
+                name,
+                (
+                    *_mean_rms(old, k, unit),
+                    *_mean_rms(new, k, unit),
+                    _size(test.joint_rms[k], unit),
+                    _signed(test.common[k], test.common_sigma[k], unit),
+                    _size(test.common_sigma[k], unit),
+                ),
+            )
+            for k, (name, unit) in enumerate(_joints(session))
+        ),
+        "Predicted from poses that the photographs show, without their own readings; weighed by"
+        " how well each was seen. Promised: what the calibration's deviations and the photographs'"
+        " noise let one expect. In common: what all configurations are off alike.",
+    )
+    tool = Table(
+        "Tool point: forward kinematics of the readings against the photographs",
+        ("Machine", "Position, mm", "Orientation, °"),
+        tuple(
+            Row(name, (_size(f.position, "m"), _size(f.orientation, "rad")))
+            for name, f in (("Drawing", old), ("Calibrated", new))
+        ),
+        "Root mean squares, frames laid over each other for the drawing. The photographs' own noise"
+        " is in both.",
+    )
+    pictures = charts.panels(_by_configuration(judged, session), _by_joint(judged, session))
+    return Part("readings", "Readings and tool", html=pictures, tables=(residuals, tool))
+
+
+def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
+    """Regions held out, one a row."""
+    unit = _unit(session)
+
+    def text(value: float) -> str:
+        return amount(value, unit) if unit else "–"
+
+    rows = [
+        Row(
+            item.region.name,
+            (
+                str(len(item.left_out.rows)),
+                text(rms(item.left_out.before)),
+                text(rms(item.left_out.after)),
+                text(rms(item.used.after)),
+                better(item.left_out.ratio),
+                number(item.left_out.promise.factor, 2),
+            ),
+        )
+        for item in items
+    ]
+    return Table(
+        "Regions of the workspace, each left out once and predicted by a calibration of the rest",
+        (
+            "Platform", "Left out", "Drawing", "Calibrated", "Where used", "Times better",
+            "× promise",
+        ),
+        tuple(rows),
+        "Residuals of the readings, root mean square, weighed by how well the photographs see each"
+        " direction. A region far worse than the configurations in use is extrapolated badly.",
+    )  # fmt: skip
+
+
+def paths_table(paths: tuple[LinePath, ...]) -> Table:
+    """Straight paths, [C] Table 4."""
+
+    def text(found: Straightness | None) -> str:
+        return f"{_size(found.rms, 'm')} ({_size(found.largest, 'm')})" if found else "–"
+
+    rows = [
+        Row(path.name, (str(path.n), *map(text, (path.seen, path.drawing, path.calibrated))))
+        for path in paths
+    ]
+    return Table(
+        "Straight paths: distance of the tool points from the line through them, rms (largest), mm",
+        ("Path", "Points", "As seen", "By drawing", "By calibration"),
+        tuple(rows),
+        "As seen: where the photographs show the tool. By drawing and by calibration: forward"
+        " kinematics of the readings, for a tool that was led along a ruler.",
+    )
+
+
+def held_out(item: HoldOut, session: Session) -> Part:
+    """What a calibration's report says of configurations held out of it."""
+    out, used, unit = item.left_out, item.used, _unit(session)
+    against = inside = ""
+    if unit:
+        against = f": {amount(rms(out.after), unit)} against {amount(rms(out.before), unit)}"
+        inside = f" In the configurations in use, {amount(rms(used.after), unit)}."
+    kept = "" if out.promise.kept else " That is more than the deviations promise."
+    sentence = (
+        f"On {count(len(out.rows), 'configuration')} held out, the calibrated machine predicts the"
+        f" readings {better(out.ratio)} times better than the drawing{against}.{inside}{kept}"
+    )
+    in_use, new = used.figures(used.calibrated), out.figures(out.calibrated)
+    drawn = out.figures(out.drawing)
+    rows = [
+        Row(
+            name,
+            (
+                *_mean_rms(in_use, k, unit),
+                *_mean_rms(new, k, unit),
+                _size(drawn.joint_rms[k], unit),
+            ),
+        )
+        for k, (name, unit) in enumerate(_joints(session))
+    ]
+    for name, field, unit in (
+        ("tool position, mm", "position", "m"),
+        ("tool orientation, °", "orientation", "rad"),
+    ):
+        cells = [_size(getattr(f, field), unit) for f in (in_use, new, drawn)]
+        rows.append(Row(name, ("", cells[0], "", cells[1], cells[2])))
+    table = Table(
+        "Residuals of configurations in use and held out",
+        ("Joint", "In use, mean", "rms", "Held out, mean", "rms", "by the drawing, rms"),
+        tuple(rows),
+        "Readings measured less predicted from poses that the photographs show, weighed by how well"
+        " each was seen; their noise is in all columns.",
+        brief=False,
+    )
+    return Part("heldout", "Held out", said=(sentence,), tables=(table,))
+
+
+def _joints(session: Session) -> list[tuple[str, str]]:
+    """Name with unit for a table's row, and m or rad, of each reading."""
+    names, units = session.document["joints"]["columns"], session.machine.joint_units
+    return [(f"{n}, {SCALES[unit][1]}", unit) for n, unit in zip(names, units, strict=True)]
+
+
+def _unit(session: Session) -> str | None:
+    """The unit of all readings, None where they differ."""
+    units = session.machine.joint_units
+    return units[0] if len(set(units)) == 1 else None
+
+
+def _mean_rms(found: WeighedErrors, k: int, unit: str) -> tuple[str, str]:
+    """A joint's mean with the digits of its root mean square, and that."""
+    root = found.joint_rms[k]
+    return _signed(found.joint_mean[k], root, unit), _size(root, unit)
+
+
+def _signed(value: float, sigma: float, unit: str) -> str:
+    """A number with the digits that ``sigma`` deserves."""
+    scale = SCALES[unit][0]
+    return number(value * scale, decimals(sigma * scale), signed=True)
+
+
+def _size(value: float, unit: str) -> str:
+    """A magnitude in the unit that people read, two significant digits."""
+    return brief(value * SCALES[unit][0])
+
+
+def _by_configuration(judged: Comparison, session: Session) -> charts.BarChart | None:
+    """Residuals of the readings by configuration: bars of the calibrated machine, a line of the
+    drawing.
+    """
+    unit = _unit(session)
+    if unit is None:
+        return None
+    scale, name = SCALES[unit]
+    bars = [
+        charts.Bar(
+            session.configurations[row],
+            f"{session.configurations[row]}: {amount(new, unit)}; drawing {amount(old, unit)}",
+            new * scale,
+        )
+        for row, new, old in zip(
+            judged.rows, judged.after.tolist(), judged.before.tolist(), strict=True
+        )
+    ]
+    return charts.bar_chart(
+        "Residuals of the readings by configuration",
+        name,
+        bars,
+        charts.ends_and_middle(bars),
+        f"Residuals of {count(len(bars), 'configuration')}, calibrated and by the drawing",
+        tuple((k + 0.5, old * scale) for k, old in enumerate(judged.before.tolist())),
+        "bars: calibrated; line: by the drawing",
+    )
+
+
+def _by_joint(judged: Comparison, session: Session) -> charts.RowChart | None:
+    """The calibrated machine's residuals in the standard deviations that are promised."""
+    values = judged.calibrated.residuals / judged.promise.expected
+    boxes = [
+        charts.box(name, values[:, k], "σ", 1, k + 1)
+        for k, name in enumerate(session.document["joints"]["columns"])
+    ]
+    return charts.row_chart(
+        "Residuals by joint",
+        "promised standard deviations",
+        [box for box in boxes if box],
+        charts.NORMAL_90,
+        "Residuals of the readings by joint, in the standard deviations that are promised",
+        "shaded: where nine tenths are expected",
+    )

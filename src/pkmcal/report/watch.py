@@ -1,0 +1,309 @@
+"""What a look at a calibrated machine found, as an outcome: its tests as tables and pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.identify.words_names import named
+from pkmcal.judge.changes import POWER, ChiSquare, LegTest, Suspect
+from pkmcal.judge.watch import Watch, cameras_of
+from pkmcal.judge.words import amount, said, signed
+from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
+from pkmcal.report import charts
+from pkmcal.wording import SCALES, brief, count, number
+
+NONE = "–"
+LARGE = 2.0
+"""Standard deviations from which on a configuration's residuals stand out."""
+HOW = (
+    "Nothing is calibrated anew. The machine is held as the calibration left it; every pose of the"
+    " platform, and where cameras and boards stand, are found from the new data. What is left over"
+    " is weighed by the noise of these data and by the calibration's own covariance, as far as"
+    " poses, stations, edge shifts and shading cannot take it up. Each leg is then tested for a"
+    " change of its numbers: a score test, chi-square of as many degrees of freedom as these data"
+    " see.",
+    "A camera's place costs six freedoms, also where it was left in place: what moves all of the"
+    " machine against its camera is not seen, and is no change of the machine. Directions in which"
+    " a change by the drawing's whole tolerance would make less than one standard deviation are"
+    " left out.",
+)
+
+
+def outcome_of(w: Watch) -> Outcome:
+    """Everything that ``pkmcal watch`` tells and writes."""
+    found, bars = _findings_table(w), _by_configuration(w)
+    parts = (
+        Part(
+            "legs",
+            "Tests",
+            html=charts.panels(_statistics(w), _zeros(w)),
+            tables=(legs_table(w), _others_table(w)),
+        ),
+        Part("causes", "Causes", tables=(found,)) if found else None,
+        Part("residuals", "Residuals", html=charts.panels(bars)) if bars else None,
+        _how(w),
+    )
+    return Outcome(
+        command="watch",
+        title=f"Watch of {w.calibration.machine.name}",
+        kicker=f"session {w.session.folder.resolve().name}",
+        verdict=w.verdict,
+        stamp=stamp(w),
+        level=Level.WRONG if w.judged.changed else Level.DOUBTFUL,
+        figures=_cards(w),
+        parts=tuple(part for part in parts if part),
+        findings=tuple(Finding(Level.DOUBTFUL, text) for text in w.session.warnings),
+        document=w.document(),
+    )
+
+
+def _how(w: Watch) -> Part:
+    poses = w.session.board or w.session.trackers
+    allowed = (
+        "Several tests are made, so each chance is adjusted: noise is drawn 20 000 times through"
+        " the same tests, and the share in which any of them comes out as small is told. So"
+        f" {w.judged.alpha:g} of machines that did not change are flagged. The noise is"
+        f" {w.noise_scale:.2f} times the stated one of edges"
+        + (f" and {w.pose_scale:.2f} times that of poses" if poses else "")
+        + ": the larger of the calibration's and these data's."
+    )
+    known = [n for n, k in zip(w.session.configurations, w.known, strict=True) if k]
+    left_out = f"Left out, for the calibration had seen them: {', '.join(known)}."
+    return Part("how", "How it was computed", (*HOW, allowed), notes=(left_out,) if known else ())
+
+
+def stamp(w: Watch) -> str:
+    """The verdict in a word or three."""
+    if w.verdict.usable:
+        return "Still as calibrated"
+    parts = {f.suspect.cause.part for f in w.judged.findings}
+    return "Changed" if w.judged.changed and parts != {"camera"} else "Cannot be told"
+
+
+def _cards(w: Watch) -> tuple[Figure, ...]:
+    """The main numbers."""
+    judged = w.judged
+    named_tests = [(named(leg.legs), leg.chance) for leg in judged.legs]
+    named_tests += [("all legs together", judged.machine.adjusted)]
+    seen = [(name, chance) for name, chance in named_tests if np.isfinite(chance)]
+    who, least = min(seen, key=lambda item: item[1], default=("nothing", 1.0))
+    out = [
+        Figure(
+            "How likely by chance alone?",
+            ((chance_text(least), ""),),
+            f"of {who}, the least of {count(len(judged.tests), 'test')},"
+            f" their number allowed for; below {judged.alpha:g} counts as a change",
+        )
+    ]
+    sizes = [leg for leg in judged.legs if leg.zero and leg.zero.dof]
+    if sizes:
+        unit = SCALES[sizes[0].unit]
+        low, high = (f(leg.detects_zero for leg in sizes) * unit[0] for f in (min, max))
+        out.append(
+            Figure(
+                "What would have been found?",
+                ((brief(low) if low == high else f"{brief(low)} to {brief(high)}", unit[1]),),
+                f"of the zero of a leg's reading, depending on the leg, with {POWER:.0%}"
+                " probability",
+            )
+        )
+    out.append(
+        Figure(
+            "What is it based on?",
+            ((str(int(w.seen.sum())), "configurations"),),
+            "seen by the session, not used by the calibration",
+        )
+    )
+    return tuple(out)
+
+
+def legs_table(w: Watch) -> Table:
+    """One row a leg: statistics, chance, its zero's change, and what would have been found."""
+    rows = [
+        Row(
+            named(leg.legs).capitalize(),
+            (
+                _statistic(leg.whole),
+                _statistic(leg.zero),
+                chance_text(leg.chance),
+                _zero(leg),
+                _size(leg.detects_zero, leg.unit),
+                _span(leg.detects_base),
+                _span(leg.detects_platform),
+            ),
+        )
+        for leg in w.judged.legs
+    ]
+    columns = (
+        "Leg", "χ² / degrees", "of its zero", "chance", "zero off by", "found from",
+        "base joint, mm", "platform joint, mm",
+    )  # fmt: skip
+    return Table(
+        "Legs",
+        columns,
+        tuple(rows),
+        "χ² of all numbers of a leg, and of the zero of its reading alone. Chance: of as much in a"
+        " machine that did not change, all tests allowed for. Zero off by: if nothing else"
+        " changed. Found from: the smallest change of that zero, and of the joints in the direction"
+        f" seen best and worst, that has a {POWER:.0%} probability to be found. A leg that changed"
+        " moves the tests of the others, too.",
+        first=6,
+    )
+
+
+def _others_table(w: Watch) -> Table:
+    """Tests of all legs together."""
+    j = w.judged
+    scale = j.scale_change
+    text = NONE
+    if j.scale.dof:
+        text = (
+            f"{number(scale.value[0] * 1e6, 0, signed=True)} µm/m"
+            f" (±{number(scale.sigma[0] * 1e6, 0)})"
+        )
+    rows = (
+        Row("Every number of all legs", (*_cells(j.machine), "")),
+        Row("All lengths by one factor", (*_cells(j.scale), text)),
+    )
+    return Table(
+        "All legs together",
+        ("Test", "χ²", "degrees", "chance", "change"),
+        rows,
+        "A common factor is seen against the readings: a frame that warmed, or readings of another"
+        " scale.",
+        brief=False,
+    )
+
+
+def _findings_table(w: Watch) -> Table | None:
+    """What explains a change, best first, with what these data cannot tell from it."""
+    rows: list[Row] = []
+    cameras = cameras_of(w.session)
+    for place, finding in enumerate(w.judged.findings, start=1):
+        rows.append(_cause(f"{place}.", finding.suspect, cameras))
+        rows += [_cause("or", other, cameras) for other in finding.others]
+    if not rows:
+        return None
+    return Table(
+        "What explains it",
+        ("Cause", "χ² explained", "numbers"),
+        tuple(rows),
+        "Causes are compared by how likely they make the data, changes of a tolerance's size being"
+        " usual; those that a hundred to one does not separate stand under the best with “or”.",
+        brief=False,
+    )
+
+
+def _cause(mark: str, suspect: Suspect, cameras: tuple[str, ...]) -> Row:
+    text = said(suspect, cameras)
+    return Row(f"{mark} {text}", (number(suspect.chi2, 1), str(len(suspect.cause.sizes))))
+
+
+def chance_text(chance: float) -> str:
+    """A probability with one or two digits, never zero."""
+    if not np.isfinite(chance):
+        return NONE
+    if chance < 1e-4:
+        return "< 0.0001"
+    return f"{chance:.2g}" if chance < 0.995 else "1"
+
+
+def _cells(test: ChiSquare) -> tuple[str, str, str]:
+    told = (number(test.chi2, 1), chance_text(test.adjusted)) if test.dof else (NONE, NONE)
+    return told[0], str(test.dof), told[1]
+
+
+def _statistic(test: ChiSquare | None) -> str:
+    return f"{number(test.chi2, 1)} / {test.dof}" if test is not None and test.dof else NONE
+
+
+def _zero(leg: LegTest) -> str:
+    if leg.change is None or leg.zero is None or not leg.zero.dof:
+        return NONE
+    return signed(float(leg.change.value[0]), float(leg.change.sigma[0]), leg.unit)
+
+
+def _size(value: float, unit: str) -> str:
+    return amount(value, unit) if np.isfinite(value) else NONE
+
+
+def _span(sizes: tuple[float, float]) -> str:
+    texts = [brief(v * 1e3) if np.isfinite(v) and v < 1 else NONE for v in sizes]
+    return NONE if texts == [NONE, NONE] else " to ".join(texts)
+
+
+def _statistics(w: Watch) -> charts.BarChart | None:
+    """Each leg's larger statistic, as a share of its threshold."""
+    bars = [
+        _bar(named(leg.legs), [t for t in (leg.whole, leg.zero) if t and t.dof], w.judged.level)
+        for leg in w.judged.legs
+        if leg.whole.dof
+    ]
+    return charts.bar_chart(
+        "Each leg's χ² over its threshold",
+        "the larger of both tests; 1: threshold",
+        bars,
+        tuple((k + 0.5, bar.label) for k, bar in enumerate(bars)),
+        "Statistic of each leg as a share of its threshold",
+        ((0.0, 1.0), (float(len(bars)), 1.0)),
+    )
+
+
+def _bar(label: str, tests: list[ChiSquare], level: float) -> charts.Bar:
+    from scipy.special import chdtri
+
+    limits = [float(chdtri(t.dof, level)) for t in tests]
+    texts = [
+        f"χ² {number(t.chi2, 1)} for {count(t.dof, 'degree')} of freedom,"
+        f" threshold {number(limit, 1)}"
+        for t, limit in zip(tests, limits, strict=True)
+    ]
+    share = max(t.chi2 / limit for t, limit in zip(tests, limits, strict=True))
+    return charts.Bar(label, f"{label}: {'; '.join(texts)}", share, quiet=share < 1)
+
+
+def _zeros(w: Watch) -> charts.RowChart | None:
+    """Changes of the readings' zeros: middle half and nine tenths of what they may be."""
+    legs = [leg for leg in w.judged.legs if leg.change is not None and leg.zero and leg.zero.dof]
+    if not legs or len({leg.unit for leg in legs}) > 1:
+        return None
+    factor, name = SCALES[legs[0].unit]
+    boxes: list[charts.Box] = []
+    for leg in legs:
+        if leg.change is None or not np.isfinite(leg.change.sigma[0]):
+            continue
+        value, sigma = leg.change.value[0] * factor, leg.change.sigma[0] * factor
+        at = value + sigma * np.array([-charts.NORMAL_90, -0.6745, 0.0, 0.6745, charts.NORMAL_90])
+        q05, q25, q50, q75, q95 = (float(v) for v in at)
+        tip = f"{named(leg.legs)}: {_zero(leg)}"
+        boxes.append(charts.Box(named(leg.legs), tip, leg.legs[0] + 1, (q05, q25, q50, q75, q95)))
+    return charts.row_chart(
+        "The zero of each leg's reading, if nothing else changed",
+        name,
+        boxes,
+        None,
+        "Change of the zero of each leg's reading, middle half and nine tenths",
+    )
+
+
+def _by_configuration(w: Watch) -> charts.BarChart | None:
+    """Residuals of each configuration with the machine held, root mean square."""
+    rows = np.flatnonzero(w.seen)
+    values = [float(w.residuals[k]) for k in rows]
+    names = [w.session.configurations[k] for k in rows]
+    bars = [
+        charts.Bar(
+            name, f"{name}: {number(value, 2)} standard deviations", value, None, value < LARGE
+        )
+        for name, value in zip(names, values, strict=True)
+        if np.isfinite(value)
+    ]
+    return charts.bar_chart(
+        "Residuals by configuration, the machine held as calibrated",
+        "standard deviations",
+        bars,
+        charts.ends_and_middle(bars),
+        f"Residuals of {count(len(bars), 'configuration')}",
+        ((0.0, 1.0), (float(len(bars)), 1.0)),
+        "line: expected of noise alone",
+    )

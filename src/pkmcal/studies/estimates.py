@@ -1,0 +1,114 @@
+"""Estimators on simulated runs, the bound that none can pass, and the tool's errors by a result.
+
+All are batched over runs B. The papers' own methods are in the papers' studies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.bundle import BatchResult, solve_batch
+from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import LimbLayout
+from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
+from pkmcal.papers.hand_eye import Pair, PairProblem
+from pkmcal.solver import FIRST_DAMPING, eliminate, minimise
+from pkmcal.studies.simulated import SimulatedRuns
+
+LOOSE = 1e-9
+"""Singular values of scaled rows below this share of the largest are of what nothing tells."""
+FREE = 1e3
+"""Standard deviation (m) of the tool frame in a registration: free."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """An estimate of B runs. theta : (B, P). T_camera_base, T_mount : (B, 4, 4) of the only ones.
+    told : what the method says of itself, (B,) or (B, n) by name, such as chi2 per degree of
+    freedom. sigma : the standard deviations that it states, by quantity.
+    """
+
+    theta: Array
+    T_camera_base: Array | None = None
+    T_mount: Array | None = None
+    told: dict[str, Array] = field(default_factory=dict[str, Array])
+    sigma: dict[str, Array] = field(default_factory=dict[str, Array])
+
+
+def drawing(machine: Machine, runs: int) -> Fitted:
+    """The drawing's values as an estimate."""
+    values = machine.parameters.drawing
+    return Fitted(np.broadcast_to(values, (runs, len(values))))
+
+
+def joint(problem: Problem, start: BatchState, damping: float = FIRST_DAMPING) -> BatchResult:
+    """The joint maximum-likelihood estimate with the noise as it is, which a simulation knows."""
+    return solve_batch(problem, start, robust=False, scale_noise=False, damping=damping)
+
+
+def freedom(data: SimulatedRuns, layout: LimbLayout, known: int) -> int:
+    """Degrees of freedom of the joint problem. known : the rank of what all configurations share,
+    less what is known of it beforehand.
+    """
+    boards = 0 if data.view.T_platform_board is None else 6
+    rows = 4 * data.axis.shape[2] + boards + layout.n_equations
+    return data.count * (rows - layout.own_motion.shape[1]) - known
+
+
+def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generator) -> Array:
+    """Errors (B, na) of the shared unknowns, drawn with the Cramér-Rao bound's covariance at a
+    state; none along what nothing tells.
+    """
+    reduced = eliminate(problem.linearize(state), np.zeros(len(state.z)))
+    rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
+    scale = np.sqrt(np.sum(rows**2, axis=1))
+    scale = np.where(scale > 0, scale, 1.0)
+    s, vt = np.linalg.svd(np.linalg.qr(rows / scale[:, None], mode="r"))[1:]
+    known: Booleans = s > LOOSE * s[:, :1]
+    draw = rng.normal(size=s.shape) * np.where(known, 1 / np.where(known, s, 1.0), 0.0)
+    return (np.swapaxes(vt, -1, -2) @ draw[..., None])[..., 0] / scale
+
+
+class Places(NamedTuple):
+    """Where machines are held against the truth: poses (B, n, 4, 4) and readings (B, n, m)."""
+
+    poses: Array
+    readings: Array
+
+
+def places(data: SimulatedRuns, wanted: Array) -> Places:
+    """Those near the wanted poses (n, 4, 4) that each true machine can take, and its readings."""
+    layout, theta = data.machine.layout, data.theta[:, None]
+    poses = on_manifold(layout, theta, wanted).T_base_platform if layout.n_internal else wanted
+    readings = inverse(layout, theta, poses)
+    return Places(np.broadcast_to(poses, (*readings.shape[:2], 4, 4)), readings)
+
+
+class ToolErrors(NamedTuple):
+    """Root mean square over places, (B,) m and rad."""
+
+    shift: Array
+    turn: Array
+
+
+def tool_errors(
+    layout: LimbLayout, theta: Array, at: Places, turn: float, shift: float
+) -> ToolErrors:
+    """How far machines (B, P) are from the truth at the same readings.
+
+    Base and tool frames are those that fit best, since a calibration gives them too. turn, shift :
+    rad and m that count alike in that.
+    """
+    found = forward(layout, theta[..., None, :], at.readings, at.poses).T_base_platform
+    still = np.broadcast_to(np.eye(4), (len(found), 4, 4))
+    weight = np.ones(found.shape[:2])
+    problem = PairProblem(found, at.poses, weight, turn, shift, FREE)
+    pair: Pair = minimise(problem, Pair(still, still)).state
+    off = problem.differences(pair) * np.repeat([turn, shift], 3)
+    size = np.sqrt(np.mean(np.square(off).reshape(*off.shape[:2], 2, 3).sum(axis=-1), axis=1))
+    return ToolErrors(size[:, 1], size[:, 0])

@@ -1,0 +1,382 @@
+"""[A] 4.3 as a study: a hexapod, three stations that see four legs each, the legs' axes measured.
+
+A Gough-Stewart platform in fifteen configurations a station with extreme leg lengths; axes measured
+with the noise of Table 1 in degrees, three images averaged; drawing errors uniform. Compared are
+the paper's four steps as printed and corrected, the joint estimate, and the Cramér-Rao bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import apply, inverse, look_at, perturb, register, rotation_vector
+from pkmcal.identify.covariance import information
+from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
+from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.mechanisms.kinematics import forward
+from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
+from pkmcal.papers.four_step import Axes, Form, FourSteps, centres_from_axes, solve
+from pkmcal.solver import RESTART_DAMPING
+from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, Study
+from pkmcal.studies.estimates import Fitted, drawing, freedom, joint
+from pkmcal.studies.simulated import (
+    Noise,
+    SimulatedRuns,
+    View,
+    joint_problem,
+    simulate,
+    spread_evenly,
+)
+
+DRAWING, PRINTED, CORRECTED = "drawing", "four steps as printed", "four steps"
+JOINT, BOUND = "joint", "bound"
+METHODS = (DRAWING, PRINTED, CORRECTED, JOINT, BOUND)
+FORMS: dict[str, Form] = {PRINTED: "printed", CORRECTED: "corrected"}
+
+STATIONS = 3
+PHOTOGRAPHS = 25 * 45
+"""Photographs of all runs that are solved at once; more only leaves the processor's cache."""
+POSES = 10
+"""Poses a run at which the end-effector is compared, [A] 4.3."""
+DRAWS = 4
+"""Draws from each run's bound, so that the bound's end-effector is known twice as well."""
+RIGHT = 1.5
+"""A run whose chi2 per degree of freedom is below has found its minimum; a false one has far
+more than a hundred."""
+OFF = np.array([0.03, -0.02, 0.03, 0.01, -0.01, 0.02])
+"""rad and m by which stations are off where nothing but the drawing is known."""
+EVALUATION, BEGIN, LEAST = 1, 2, 3
+"""Uses of a batch's draws, besides the simulation."""
+
+DEGREE = float(np.degrees(1.0))
+GROUPS = ("base_xy", "base_z", "platform_xy", "platform_z", "offset")
+EFFECTOR = ("displacement", "orientation", "displacement_registered", "orientation_registered")
+"""Mean error of the end-effector at random poses, [A] eq. 20, in frames by the centres 1, 3 and 5;
+then with frames registered on all centres, so that the error of the frames' own definition by three
+joints is left out."""
+QUANTITIES = {
+    **{name: Quantity("rms", 1e3, "mm") for name in (*GROUPS, "parameters")},
+    **{
+        name: Quantity("mean", *((1e3, "mm") if "displacement" in name else (DEGREE, "°")))
+        for name in EFFECTOR
+    },
+    "chi2": Quantity("mean"),
+    "steps": Quantity("mean"),
+}
+"""GROUPS and all thirty parameters; the end-effector; of the joint estimate chi2 per degree of
+freedom and the solver's steps."""
+
+
+@dataclass(frozen=True)
+class HexapodByAxes:
+    """[A] 4.3. poses : per station. drawing_error, joint_noise : m, standard deviations of uniform
+    errors ("variance equal to 2 mm"). distance, height : of the cameras, which look level, m.
+    start_error : start the joint estimate this far off the drawing (m, uniform) instead of from the
+    four steps. batch : runs that are solved at once.
+
+    The paper does not say where the cameras stand. The distance has no influence, since Table 1 is
+    in the camera's frame. The height has: the axis's point with y = 0 lies there, and errors of
+    direction grow away from it. So it is the middle of the legs.
+    """
+
+    poses: int = 15
+    legs_seen: int = 4
+    noise: AxisNoise = field(default_factory=AxisNoise)
+    joint_noise: float = 3e-6
+    drawing_error: float = 0.002
+    distance: float = 0.9
+    height: float = 0.18
+    extreme: bool = True
+    start_error: float | None = None
+    batch: int | None = None
+
+    doing = "Four steps and joint estimate"
+    quantities = QUANTITIES
+
+    def populations(self, runs: int) -> list[Population]:
+        """One hexapod after another."""
+        most = max(1, PHOTOGRAPHS // (STATIONS * self.poses))
+        return [Population("hexapod", runs, self.batch or most)]
+
+    def draw(self, batch: Batch) -> SimulatedRuns:
+        """True machines, told in the study's frames; poses by their readings."""
+        machine, rng = study_machine(), batch.generator(0)
+        table = machine.parameters
+        error = spread_evenly(rng, (batch.runs, len(table)), self.drawing_error)
+        error *= np.array(table.kinds) != "radius"
+        held = ThreeCentres().constraints(machine)
+        error -= error @ np.linalg.pinv(held) @ held
+        theta = table.drawing + error
+        readings = self._readings(machine, batch.runs, rng)
+        start = machine.forward_result(readings.reshape(-1, 6)).T_base_platform
+        start = start.reshape(*readings.shape[:2], 4, 4)
+        poses = forward(machine.layout, theta[:, None], readings, start).T_base_platform
+        noise = Noise(self.joint_noise, even=True, axis=self.noise.sigma())
+        return simulate(machine, theta, readings, poses, self.view(machine), noise, rng)
+
+    def _readings(self, machine: Machine, runs: int, rng: np.random.Generator) -> Array:
+        """Readings (B, K, 6): distinct corners of the legs' ranges per station, or uniform."""
+        low, high = machine.joint_ranges.T
+        if not self.extreme:
+            return rng.uniform(low, high, (runs, STATIONS * self.poses, 6))
+        corners = np.array(list(product(*zip(low, high, strict=True))))
+        order = np.argsort(rng.random((runs, STATIONS, len(corners))), axis=-1)
+        repeats = -(-self.poses // len(corners))
+        pick = np.concatenate([order] * repeats, axis=-1)[..., : self.poses]
+        return corners[pick].reshape(runs, -1, 6)
+
+    def view(self, machine: Machine) -> View:
+        """Cameras on a circle, each between two pairs of base joints, that see the nearest legs."""
+        angles = np.radians([60.0, 180.0, 300.0])
+        up = np.array([0.0, 0.0, self.height])
+        T_camera_base = np.stack(
+            [
+                look_at(
+                    self.distance * np.array([np.cos(a), np.sin(a), 0.0]) + up, up, np.eye(3)[2]
+                )
+                for a in angles
+            ]
+        )
+        depth = apply(T_camera_base[:, None], machine.base_centers())[..., 2]
+        legs = np.sort(np.argsort(depth, axis=1)[:, : self.legs_seen], axis=1)
+        station: Integers = np.repeat(np.arange(STATIONS), self.poses)
+        return View(T_camera_base, station, legs[station])
+
+    def solve(self, batch: Batch, data: SimulatedRuns) -> dict[Key, Fitted]:
+        """The four steps in both forms, and the joint estimate from the corrected ones."""
+        machine = data.machine
+        axes = measured_axes(data)
+        a_camera, centres = centres_from_axes(axes, STATIONS)
+        steps = {
+            method: solve(machine, axes, a_camera, centres, form) for method, form in FORMS.items()
+        }
+        out = {(method,): Fitted(parameters_of(machine, found)) for method, found in steps.items()}
+        start = Start(out[CORRECTED,].theta, steps[CORRECTED].T_camera_base)
+        if self.start_error is not None:
+            draws = batch.generator(BEGIN).uniform(-1, 1, (batch.runs, len(machine.parameters)))
+            start = start_off_drawing(data, draws * self.start_error)
+        return {**out, (JOINT,): joint_estimate(data, start)}
+
+    def judge(
+        self, batch: Batch, data: SimulatedRuns, found: Mapping[Key, Fitted]
+    ) -> dict[Key, Sample]:
+        """Errors of every method, at the same poses; of the bound its standard deviations, and the
+        end-effector's errors by draws from it.
+        """
+        machine, rows = data.machine, thirty(data.machine).rows
+
+        def effector(theta: Array) -> Array:
+            return effector_errors(data, theta, batch.generator(EVALUATION))
+
+        out: dict[Key, Sample] = {}
+        for key, fit in {(DRAWING,): drawing(machine, batch.runs), **found}.items():
+            errors = (fit.theta - data.theta) @ rows.T
+            out[key] = _sample(machine, errors, effector(fit.theta), fit)
+        root = bound(machine, joint_problem(machine, data, ThreeCentres()), data)
+        draws = batch.generator(LEAST).normal(size=(DRAWS, batch.runs, root.shape[-1], 1))
+        moved = np.mean([effector(theta) for theta in data.theta + (root @ draws)[..., 0]], axis=0)
+        out[BOUND,] = _sample(machine, np.linalg.norm(rows @ root, axis=-1), moved)
+        return out
+
+
+def _sample(
+    machine: Machine, errors: Array, effector: Array, fit: Fitted | None = None
+) -> Sample:  # fmt: skip
+    """Errors (B, 30) of the parameters, also by group, and (B, 4) of the end-effector."""
+    values = {name: errors[:, at] for name, at in groups(machine).items()}
+    values |= {"parameters": errors}
+    values |= {name: effector[:, k] for k, name in enumerate(EFFECTOR)}
+    return Sample(values | (fit.told if fit else {}), fit.sigma if fit else {})
+
+
+def converged(study: Study[HexapodByAxes]) -> int:
+    """Runs whose joint estimate ended at the right answer."""
+    return int(np.sum(study.values("chi2", JOINT) < RIGHT))
+
+
+def mean_error(study: Study[HexapodByAxes], method: str) -> Array:
+    """Mean |error| (30,), m; of the bound's standard deviations, that of a normal distribution."""
+    errors = np.abs(study.values("parameters", method)).mean(axis=0)
+    return errors * (np.sqrt(2 / np.pi) if method == BOUND else 1.0)
+
+
+@cache
+def study_machine() -> Machine:
+    """The catalogue's Gough-Stewart platform with its radii held: axes do not need them."""
+    machine = load_mechanism("gough-stewart")
+    table = machine.parameters
+    radii = [n for n, k in zip(table.names, table.kinds, strict=True) if k == "radius"]
+    return replace(machine, parameters=table.with_roles(fixed=tuple(radii)))
+
+
+class Thirty(NamedTuple):
+    """The thirty parameters of [A] Fig. 4: names such as ``A2 x``, rows (30, P) that give them
+    from a machine's parameters, the drawing's values (30,), m.
+    """
+
+    names: tuple[str, ...]
+    rows: Array
+    drawing: Array
+
+
+def thirty(machine: Machine) -> Thirty:
+    """Frames by the centres 1, 3 and 5: origin in the first, x to the third, the fifth in the x-y
+    plane. Six coordinates of each body vanish by that; twelve each are left, then the offsets.
+    """
+    values = machine.parameters.drawing
+    held = {(0, 0), (0, 1), (0, 2), (2, 1), (2, 2), (4, 2)}
+    names: list[str] = []
+    rows: list[Array] = []
+    drawn: list[float] = []
+    for letter, index in zip("AB", centre_index(machine.layout), strict=True):
+        points = values[index]
+        x = points[2] - points[0]
+        x = x / np.linalg.norm(x)
+        z = np.cross(x, points[4] - points[0])
+        z = z / np.linalg.norm(z)
+        frame = np.stack([x, np.cross(z, x), z])
+        for leg, axis in sorted(set(np.ndindex(6, 3)) - held):
+            row = np.zeros(len(values))
+            row[index[leg]] = frame[axis]
+            names.append(f"{letter}{leg + 1} {'xyz'[axis]}")
+            rows.append(row)
+            drawn.append(float(frame[axis] @ (points[leg] - points[0])))
+    names += [f"q{leg + 1}" for leg in range(6)]
+    rows += list(np.eye(len(values))[machine.layout.rod])
+    drawn += values[machine.layout.rod].tolist()
+    return Thirty(tuple(names), np.array(rows), np.array(drawn))
+
+
+def groups(machine: Machine) -> dict[str, Integers]:
+    """Which of the thirty parameters belong to each of GROUPS."""
+    names = thirty(machine).names
+    out: dict[str, Integers] = {}
+    for body, letter in (("base", "A"), ("platform", "B")):
+        own = [k for k, name in enumerate(names) if name.startswith(letter)]
+        out[f"{body}_xy"] = np.array([k for k in own if not names[k].endswith("z")])
+        out[f"{body}_z"] = np.array([k for k in own if names[k].endswith("z")])
+    out["offset"] = np.array([k for k, name in enumerate(names) if name.startswith("q")])
+    return out
+
+
+def measured_axes(data: SimulatedRuns) -> Axes:
+    """The measured axes as [A]'s steps want them."""
+    station, legs = data.view.station, data.view.legs
+    u, point, _, _ = from_coordinates(data.axis)
+    n_runs, n_photos, n_legs = data.joints.shape
+    k = np.arange(n_photos)[:, None]
+    seen = np.zeros((n_photos, n_legs), dtype=bool)
+    seen[k, legs] = True
+    full_u, full_point = np.zeros((2, n_runs, n_photos, n_legs, 3))
+    full_u[:, k, legs], full_point[:, k, legs] = u, point
+    return Axes(station, np.arange(n_photos), seen, full_u, full_point, data.joints)
+
+
+def parameters_of(machine: Machine, steps: FourSteps) -> Array:
+    """All parameters (B, P) with those that the steps found."""
+    base, platform = centre_index(machine.layout)
+    theta = np.tile(machine.parameters.drawing, (len(steps.base), 1))
+    theta[:, base], theta[:, platform] = steps.base, steps.platform
+    theta[:, machine.layout.rod] = steps.offsets
+    return theta
+
+
+class Start(NamedTuple):
+    """Where the joint estimate begins: theta (B, P), T_camera_base (B, S, 4, 4)."""
+
+    theta: Array
+    T_camera_base: Array
+
+
+def start_off_drawing(data: SimulatedRuns, error: Array) -> Start:
+    """A start without the four steps: free parameters error (B, P) off the drawing, stations off
+    by a few degrees and centimetres.
+    """
+    table = data.machine.parameters
+    free = np.any(table.free_matrix() != 0, axis=1)
+    guess = perturb(data.view.T_camera_base, OFF)
+    return Start(
+        table.drawing + np.where(free, error, 0.0),
+        np.broadcast_to(guess, (len(error), *guess.shape)),
+    )
+
+
+def joint_estimate(data: SimulatedRuns, start: Start) -> Fitted:
+    """The joint estimate; poses start by forward kinematics from the readings."""
+    machine = data.machine
+    problem = joint_problem(machine, data, ThreeCentres())
+    home = np.broadcast_to(machine.home(), (1, 1, 4, 4))
+    poses = forward(machine.layout, start.theta[:, None], data.joints, home).T_base_platform
+    z = machine.parameters.to_free(start.theta)
+    state = BatchState(z, start.T_camera_base, poses, np.zeros((len(z), 1, 1)))
+    # the four steps end near the minimum
+    found = joint(problem, state, RESTART_DAMPING)
+    theta, nz = problem.theta(found.solution.state), z.shape[1]
+    dof = freedom(data, machine.layout, known=nz - 12 + 6 * STATIONS)  # the gauge fixes twelve
+    spread = in_frames(machine, problem, theta)
+    stated = spread @ found.info.covariance[:, :nz, :nz] @ np.swapaxes(spread, -1, -2)
+    rows = thirty(machine).rows
+    variance = np.einsum("ip,bpq,iq->bi", rows, stated, rows)
+    return Fitted(
+        theta,
+        told={
+            "chi2": found.solution.cost / dof,
+            "dof": np.full(len(theta), dof),
+            "steps": found.steps.astype(float),
+        },
+        sigma={"parameters": np.sqrt(variance)},
+    )
+
+
+def in_frames(machine: Machine, problem: Problem, theta: Array) -> Array:
+    """Errors of all parameters, in frames by three centres, by those of the free ones at theta
+    (B, P): (B, P, nz).
+    """
+    change = projector(machine, theta, ThreeCentres())
+    return problem.free - generators(machine.layout, theta) @ change @ problem.free
+
+
+def bound(machine: Machine, problem: Problem, data: SimulatedRuns) -> Array:
+    """Square root (B, P, nz) of the Cramér-Rao covariance, frames by three centres, at the truth.
+
+    An efficient estimate's errors are this matrix times independent unit normals.
+    """
+    z = machine.parameters.to_free(data.theta)
+    n, nz = z.shape
+    T = np.broadcast_to(data.view.T_camera_base, (n, STATIONS, 4, 4))
+    state = BatchState(z, T, data.T_base_platform, np.zeros((n, 1, 1)))
+    covariance = information(problem, state).covariance[:, :nz, :nz]
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    root = root @ np.swapaxes(vectors, -1, -2)  # the symmetric root is unique
+    return in_frames(machine, problem, data.theta) @ root
+
+
+def effector_errors(data: SimulatedRuns, theta: Array, rng: np.random.Generator) -> Array:
+    """Errors (B, 4) of the end-effector by machines (B, P), EFFECTOR, m and rad."""
+    machine = data.machine
+    low, high = machine.joint_ranges.T
+    readings = rng.uniform(low, high, (len(theta), POSES, len(low)))
+    home = np.broadcast_to(machine.home(), (1, 1, 4, 4))
+    T, T_true = (
+        forward(machine.layout, p[:, None], readings, home).T_base_platform
+        for p in (theta, data.theta)
+    )
+    base, platform = centre_index(machine.layout)
+    e = register(theta[:, base], data.theta[:, base])[:, None]
+    f = register(theta[:, platform], data.theta[:, platform])[:, None]
+    b1 = data.theta[:, None, platform[0]]  # the frames hold A1 and B1 at the drawing's values
+    columns: list[Array] = []
+    for moved in (T, e @ T @ inverse(f)):
+        columns.append(np.linalg.norm(apply(moved, b1) - apply(T_true, b1), axis=-1).mean(axis=1))
+        turn = moved[..., :3, :3] @ np.swapaxes(T_true[..., :3, :3], -1, -2)
+        columns.append(np.linalg.norm(rotation_vector(turn), axis=-1).mean(axis=1))
+    return np.stack(columns, axis=-1)

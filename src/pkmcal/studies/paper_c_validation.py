@@ -1,0 +1,101 @@
+"""[C] IV.C and IV.D on simulated runs: Tables 3 and 4, the error before, and the square.
+
+All with the machine that the paper identified (Table 2, Model 12) as the truth.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import inverse as inverted
+from pkmcal.geometry.rigid import rotation_vector
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.kinematics import forward, inverse
+from pkmcal.papers.measured_platform import taken
+from pkmcal.studies.estimates import Fitted
+from pkmcal.studies.paper_c_machine import (
+    IDENTIFIED,
+    MIDDLE,
+    model,
+    schoenflies,
+    table_2_values,
+    workspace,
+)
+from pkmcal.studies.simulated import SimulatedRuns
+
+SIDE = 0.1
+"""[C] IV.D: the square's side, m."""
+RULERS = (0.2, 0.4)
+"""The ruled line's length, m; the paper does not tell it, and errors grow as its square."""
+RULES = (np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+POINTS = 21
+
+
+def control_residuals(machine: Machine, fit: Fitted, data: SimulatedRuns) -> Array:
+    """[C] Table 3: what the inverse kinematics wants at the control poses, less the readings,
+    (B, n, 4) rad. At the measured poses; for the drawing, which places neither camera nor board, at
+    the true ones: what a controller would be wrong by.
+    """
+    n = data.count
+    poses = data.T_base_platform[:, n:]
+    if fit.T_camera_base is not None and fit.T_mount is not None:
+        seen = data.T_camera_board[:, n:]
+        poses = inverted(fit.T_camera_base)[:, None] @ seen @ inverted(fit.T_mount)[:, None]
+        poses = taken(machine.layout.motion, poses).pose
+    return inverse(machine.layout, fit.theta[:, None], poses) - data.joints[:, n:]
+
+
+class Before(NamedTuple):
+    """[C] IV.C: mean error of the nacelle with the drawing, m and rad."""
+
+    shift: float
+    turn: float
+
+
+def before(count: int = 400) -> Before:
+    """The drawing's poses against the true ones at the same readings, in the machine's frame."""
+    machine = model("design")
+    poses = workspace(count, np.random.default_rng(0))
+    readings = inverse(machine.layout, table_2_values(machine, IDENTIFIED), poses)
+    found = forward(machine.layout, machine.parameters.drawing, readings, poses).T_base_platform
+    shift = np.linalg.norm(found[:, :3, 3] - poses[:, :3, 3], axis=1)
+    turn = rotation_vector(found[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], -1, -2))
+    return Before(float(shift.mean()), float(np.linalg.norm(turn, axis=1).mean()))
+
+
+def straightness(
+    machine: Machine, theta: Array, data: SimulatedRuns, rng: np.random.Generator
+) -> Array:
+    """[C] Table 4: root mean square distance (B, 4) of poses along a ruler from their best line.
+
+    Two directions of each of RULERS. The tool is led along the true line; poses come from the
+    readings by the machine (B, P).
+    """
+    out: list[Array] = []
+    for way in [length * rule for length in RULERS for rule in RULES]:
+        along = np.linspace(-0.5, 0.5, POINTS)[:, None] * way
+        poses = schoenflies(np.concatenate([MIDDLE + along, np.zeros((POINTS, 1))], axis=1))
+        readings = inverse(data.machine.layout, data.theta[:, None], poses)
+        readings = readings + data.noise.reading * rng.normal(size=readings.shape)
+        found = forward(machine.layout, theta[..., None, :], readings, poses).T_base_platform
+        points = found[..., :3, 3]
+        s = np.linalg.svd(points - points.mean(axis=-2, keepdims=True), compute_uv=False)
+        out.append(np.sqrt(np.sum(s[..., 1:] ** 2, axis=-1) / POINTS))
+    return np.stack(out, axis=-1)
+
+
+def square(machine: Machine, theta: Array, data: SimulatedRuns) -> Array:
+    """[C] IV.D: error (B, 4) of a square's sides, m, where the controller has the machine (B, P).
+
+    It asks for the corners by its inverse kinematics; the true machine goes where that leads.
+    """
+    corners = MIDDLE + SIDE / 2 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    poses = schoenflies(np.concatenate([corners, np.zeros((4, 1))], axis=1))
+    readings = inverse(machine.layout, theta[..., None, :], poses)
+    went = forward(data.machine.layout, data.theta[:, None], readings, poses).T_base_platform
+    points = went[..., :3, 3]
+    sides = np.linalg.norm(np.roll(points, -1, axis=-2) - points, axis=-1)
+    return sides - SIDE

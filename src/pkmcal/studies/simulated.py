@@ -1,0 +1,171 @@
+"""Simulated sessions of many runs: true machines, where they stand, and noisy measurements.
+
+Runs are batched: B of them, K configurations, m readings, S stations. A camera sees legs' axes, as
+[A] measures them, or a board on the platform, as [C] does. A run becomes the same measurements, and
+the same least-squares problem, as a session of photographs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import apply, perturb
+from pkmcal.identify.assembly import assemble
+from pkmcal.identify.gauge import Gauge
+from pkmcal.identify.residuals import Problem
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.papers.axis_measurements import as_edges, to_coordinates
+
+
+@dataclass(frozen=True)
+class View:
+    """What is seen of K configurations, the same in all runs.
+
+    T_camera_base : (S, 4, 4). station : (K,). legs : (K, G) whose axes are seen. T_platform_board :
+    (4, 4) of a board that is seen, None without one.
+    """
+
+    T_camera_base: Array
+    station: Integers
+    legs: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
+    T_platform_board: Array | None = None
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations. reading : m or rad, of errors spread evenly where ``even``, normally
+    else. axis : (4,) of an axis's psi, theta, x and z. pose : (6,) of a board's (omega, tau).
+    """
+
+    reading: float
+    even: bool = False
+    axis: Array = field(default_factory=lambda: np.zeros(4))
+    pose: Array = field(default_factory=lambda: np.zeros(6))
+
+
+@dataclass(frozen=True)
+class SimulatedRuns:
+    """Simulated runs with their truth.
+
+    machine : the truth's document. theta : (B, P). T_base_platform : (B, K, 4, 4) true. joints :
+    (B, K, m) measured. axis : (B, K, G, 4) measured. T_camera_board : (B, K', 4, 4) measured.
+    control : configurations at the end that are held back from the calibration.
+    """
+
+    machine: Machine
+    theta: Array
+    view: View
+    noise: Noise
+    T_base_platform: Array
+    joints: Array
+    axis: Array
+    T_camera_board: Array
+    control: int = 0
+
+    @property
+    def count(self) -> int:
+        """Configurations for the calibration."""
+        return self.joints.shape[1] - self.control
+
+    def first(self, runs: int) -> SimulatedRuns:
+        """The first runs only."""
+        names = ("theta", "T_base_platform", "joints", "axis", "T_camera_board")
+        return replace(self, **{name: getattr(self, name)[:runs] for name in names})
+
+
+def spread_evenly(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Array:
+    """Draws from a uniform distribution of zero mean and standard deviation sigma."""
+    return rng.uniform(-1, 1, shape) * np.sqrt(3) * sigma
+
+
+def simulate(
+    machine: Machine,
+    theta: Array,
+    readings: Array,
+    T_base_platform: Array,
+    view: View,
+    noise: Noise,
+    rng: np.random.Generator,
+    control: int = 0,
+) -> SimulatedRuns:
+    """What is measured of machines (B, P) at exact readings (B, K, m) and poses (B, K, 4, 4)."""
+    runs, count = readings.shape[:2]
+    camera = view.T_camera_base[view.station]
+    axis, board = np.zeros((runs, count, 0, 4)), np.zeros((runs, 0, 4, 4))
+    if view.legs.size:
+        ends = limb_ends(machine.layout, theta[:, None], readings, T_base_platform)
+        k = np.arange(count)[:, None]
+        a, b = (apply(camera[:, None], p[:, k, view.legs]) for p in (ends.a, ends.b))
+        axis = to_coordinates(a, b)
+        axis = axis + noise.axis * rng.normal(size=axis.shape)
+    if view.T_platform_board is not None:
+        off = noise.pose * rng.normal(size=(runs, count, 6))
+        board = perturb(camera @ T_base_platform @ view.T_platform_board, off)
+    if noise.even:
+        joints = readings + spread_evenly(rng, readings.shape, noise.reading)
+    else:
+        joints = readings + noise.reading * rng.normal(size=readings.shape)
+    return SimulatedRuns(machine, theta, view, noise, T_base_platform, joints, axis, board, control)
+
+
+def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
+    """One run's calibration as a session gives it; of an axis the place of one edge alone."""
+    n, view = data.count, data.view
+    none = np.zeros(n, dtype=int)
+    poses, mounts = PoseSet.empty(), ()
+    if view.T_platform_board is not None:
+        whiten = np.broadcast_to(np.diag(1 / data.noise.pose), (n, 6, 6))
+        seen = data.T_camera_board[run, :n]
+        poses = PoseSet(view.station[:n], np.arange(n), none, seen, whiten)
+        mounts = (Mount("board", "platform"),)
+    stations = len(view.T_camera_base)
+    return Measurements(
+        _places_of_axes(view),
+        data.joints[run, :n],
+        data.noise.reading,
+        stations,
+        np.zeros(stations, dtype=int),
+        poses=poses,
+        mounts=mounts,
+    )
+
+
+def _places_of_axes(view: View) -> EdgeSet:
+    """One edge for each axis, with its place and nothing else."""
+    legs = view.legs.reshape(-1)
+    n, each = len(legs), view.legs.shape[1]
+    configuration = np.repeat(np.arange(len(view.legs)), each)
+    none = np.zeros(n, dtype=int)
+    return EdgeSet(
+        np.repeat(view.station[: len(view.legs)], each), configuration, legs, none, none,
+        normal=np.zeros((n, 3)), basis=np.zeros((n, 3, 2)), shift=np.zeros((n, 2)),
+        covariance=np.broadcast_to(np.eye(2), (n, 2, 2)), span=np.zeros((n, 2)),
+    )  # fmt: skip
+
+
+def joint_problem(
+    machine: Machine, data: SimulatedRuns, gauge: Gauge, *, use_drawing: bool = False
+) -> Problem:
+    """The joint problem of all runs with a model: that of a session, with all runs' data.
+
+    An axis stands for two edges that are whitened together, [A] Table 1.
+    """
+    n = data.count
+    one = assemble(machine, measurements(data), gauge, use_drawing=use_drawing).problem
+    blocks, numbers = one.blocks, replace(one.data, joints=data.joints[:, :n])
+    if data.view.legs.size:
+        shape = blocks.leg.shape
+        radius = np.broadcast_to(machine.parameters.drawing[blocks.radius], data.axis.shape[:-1])
+        basis, whiten = as_edges(data.axis, data.noise.axis, radius)
+        blocks = replace(blocks, side=np.broadcast_to([0, 1], (*shape, 2)))
+        none = np.zeros((1, *shape, 4, 1))
+        numbers = replace(numbers, basis=basis, whiten=whiten, optics=none)
+    poses = one.pose_data
+    if data.view.T_platform_board is not None:
+        poses = replace(poses, T_station_target=data.T_camera_board[:, :n, None])
+    return replace(one, blocks=blocks, data=numbers, pose_data=poses)

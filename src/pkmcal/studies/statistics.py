@@ -1,0 +1,63 @@
+"""What errors over simulated runs come to, each figure with its Monte-Carlo standard error.
+
+Standard errors come from the runs' scatter, as coordinates within a run are correlated. Errors are
+arrays (B,) or (B, n), B runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+
+Statistic = Literal["rms", "mean"]
+
+
+class Summary(NamedTuple):
+    """A figure and its Monte-Carlo standard error, in one unit."""
+
+    value: float
+    error: float
+
+    def times(self, factor: float) -> Summary:
+        """The same in another unit."""
+        return Summary(factor * self.value, factor * self.error)
+
+
+def mean(values: Array) -> Summary:
+    """Of values (B,)."""
+    return Summary(float(values.mean()), float(values.std() / np.sqrt(len(values))))
+
+
+def rms(errors: Array) -> Summary:
+    """Root mean square over runs, and over coordinates where a run has several."""
+    squares = np.square(errors).reshape(len(errors), -1).mean(axis=1)
+    value = float(np.sqrt(squares.mean()))
+    error = squares.std() / np.sqrt(len(squares)) / (2 * max(value, 1e-300))
+    return Summary(value, float(error))
+
+
+def each_rms(errors: Array) -> Array:
+    """Root mean square over runs of every coordinate, (B, n) -> (n,)."""
+    return np.sqrt(np.mean(np.square(errors), axis=0))
+
+
+def ratio(found: Summary, bound: Summary) -> Summary:
+    """One figure over another, as if their errors were independent."""
+    value = found.value / bound.value
+    return Summary(value, value * float(np.hypot(found.error / found.value,
+                                                 bound.error / bound.value)))  # fmt: skip
+
+
+def coverage(errors: Array, sigma: Array, share: float = 0.95) -> Summary:
+    """Part of the errors (B, n) that lie in the intervals that their stated sigma promises."""
+    from scipy.stats import norm
+
+    inside = np.abs(errors) <= norm.ppf(0.5 + share / 2) * sigma
+    return mean(inside.reshape(len(errors), -1).mean(axis=1))
+
+
+STATISTICS: Mapping[Statistic, Callable[[Array], Summary]] = {"rms": rms, "mean": mean}

@@ -1,1 +1,0 @@
-"""Whether a calibration holds on data that it did not see: predictions, paths, hold-outs."""

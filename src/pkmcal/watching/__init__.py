@@ -1,1 +1,0 @@
-"""Is a machine still as calibrated: chi-square tests on new data, behind ``pkmcal watch``."""

@@ -1,0 +1,63 @@
+"""Rendered sessions, made once: shared by the workers of a run, and kept for the next run.
+
+A photograph costs a tenth of a second, a session of them seconds. What a session shows is decided
+by its drawing, camera and settings and by the code that renders, so these name the folder that
+keeps it; a change of any of them renders anew.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import shutil
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import pkmcal
+from pkmcal.cameras.files import camera_text
+from pkmcal.mechanisms import mechanism_text
+from pkmcal.simulation import Settings, simulate_session
+
+KEPT = Path(__file__).parents[1] / ".pytest_cache" / "rendered"
+RENDERING = ("simulation", "mechanisms", "geometry", "cameras", "boards")
+"""Packages whose code decides what a photograph shows."""
+
+
+def once(folder: Path, make: Callable[[Path], object]) -> Path:
+    """The folder, filled by ``make`` where nobody has filled it yet; others wait meanwhile."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with (folder.parent / f"{folder.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            part = folder.with_name(f"{folder.name}.new")
+            shutil.rmtree(part, ignore_errors=True)
+            make(part)
+            part.rename(folder)
+    return folder
+
+
+def rendered(folder: Path, machine, camera, settings: Settings, seed: int = 0) -> Path:
+    """A simulated session in ``folder``, as :func:`simulate_session` writes it; with its truth."""
+    cameras = camera if isinstance(camera, tuple) else (camera,)
+    parts = [mechanism_text(machine), *map(camera_text, cameras), repr(settings), str(seed)]
+    key = hashlib.sha256("\n".join([_code(), *parts]).encode()).hexdigest()[:24]
+    kept = once(
+        KEPT / _code() / key,
+        lambda part: simulate_session(part, machine, camera, settings, seed=seed),
+    )
+    shutil.copytree(kept, folder)
+    return folder
+
+
+@cache
+def _code() -> str:
+    """The digest of the code that renders; sessions of older code are let go."""
+    package = Path(pkmcal.__file__).parent
+    files = sorted(path for name in RENDERING for path in (package / name).rglob("*.py"))
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
+    if KEPT.is_dir():
+        for old in KEPT.iterdir():
+            if old.is_dir() and old.name != digest:
+                shutil.rmtree(old, ignore_errors=True)
+    return digest

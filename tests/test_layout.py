@@ -1,0 +1,64 @@
+"""Imports go one way: every module's imports against the table in docs/index.md."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "pkmcal"
+FACES = {"__init__", "__main__"}
+
+
+def rows() -> dict[str, int]:
+    """Row of each package, from the table."""
+    table = re.findall(r"^\| (\d+) \| (.+?) \|", (ROOT / "docs/index.md").read_text(), re.M)
+    return {name: int(row) for row, cell in table for name in re.findall(r"`(\w+)`", cell)}
+
+
+def imports(path: Path) -> set[Path]:
+    """Files of the package that a file imports, at its top or inside its functions."""
+    found: set[Path] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        for name in names:
+            first, *rest = name.split(".")
+            stem = SOURCE.joinpath(*rest)
+            if first == "pkmcal" and rest:
+                found |= {p for p in (stem.with_suffix(".py"), stem / "__init__.py") if p.is_file()}
+    return found
+
+
+ARROWS = {path: imports(path) for path in SOURCE.rglob("*.py")}
+
+
+def package(path: Path) -> str:
+    return path.relative_to(SOURCE).parts[0].removesuffix(".py")
+
+
+def test_the_table_names_every_package():
+    assert {package(path) for path in ARROWS} - FACES == rows().keys()
+    assert len(list(SOURCE.glob("*.py"))) <= 8
+
+
+def test_packages_import_only_from_rows_above():
+    order = rows()
+    wrong = [
+        f"{path.relative_to(SOURCE)} imports {other.relative_to(SOURCE)}"
+        for path, others in ARROWS.items()
+        if package(path) not in FACES
+        for other in others
+        if package(other) != package(path) and order.get(package(other), 99) >= order[package(path)]
+    ]
+    assert wrong == []
+
+
+def test_no_files_import_each_other_in_a_circle():
+    left = {path: set(others) - {path} for path, others in ARROWS.items()}
+    while ends := [path for path, others in left.items() if not others & left.keys()]:
+        for path in ends:
+            del left[path]
+    assert sorted(str(path.relative_to(SOURCE)) for path in left) == []
