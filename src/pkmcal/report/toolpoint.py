@@ -65,12 +65,6 @@ def tool_point(
     )
 
 
-def pose_covariance(machine: Machine, covariance: Array, joints: Array, poses: Array) -> Array:
-    """Covariance (n, 6, 6) of (omega, tau) of T_base_platform from the parameters' (P, P)."""
-    jacobian = pose_by_parameters(machine, joints, poses)
-    return jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
-
-
 def without_frames(machine: Machine, poses: Array, change: Array, *, every: bool = False) -> Array:
     """Changes (n, 6, m) of poses less what only turns or shifts base and platform as wholes.
 
