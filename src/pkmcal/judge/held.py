@@ -26,6 +26,7 @@ from pkmcal.identify.covariance import reduced_rows
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.robust import measured_rows
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -91,12 +92,11 @@ class Held:
         Its own pose takes up as many rows as it has freedoms; NaN where nothing was seen.
         """
         problem, linear = self.problem, self.problem.linearize(self.state)
-        weight = np.repeat(problem.data.weight[0], problem.data.whiten.shape[-1], axis=-1)
-        count = np.sum(weight > 0, axis=1) + problem.layout.n_equations
+        rows = problem.data.whiten.shape[-1] * np.sum(problem.data.weight[0] > 0, axis=1)
+        count = rows + problem.layout.n_equations
         if problem.pose_blocks.present.size:
-            measured = np.any(problem.pose_data.whiten[0] != 0, axis=-1)
-            measured &= problem.pose_data.weight[0, ..., None] > 0
-            count = count + measured.sum(axis=(1, 2))
+            used = problem.pose_data.weight[0] > 0
+            count = count + np.sum(used * measured_rows(problem), axis=1)
         free = np.maximum(count - linear.by_own.shape[-1], 1)
         out = np.full(len(self.seen), np.nan)
         out[self.seen] = np.sqrt(np.sum(linear.value[0] ** 2, axis=1) / free)
