@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pkmcal.judge.comparison import BesideDrawing, WeighedErrors, rms
+from pkmcal.judge.comparison import BesideDrawing, WeighedErrors, finite_rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.judge.paths import LinePath, Straightness
 from pkmcal.judge.validate import Validation
@@ -57,7 +57,7 @@ def _cards(judged: BesideDrawing, session: Session) -> tuple[Figure, ...]:
     new, old = judged.figures(judged.calibrated), judged.figures(judged.drawing)
     test, gain, unit = judged.promise, judged.ratio, _unit(session)
     against = (
-        f"; {amount(rms(judged.after), unit)} against {amount(rms(judged.before), unit)}, weighed"
+        f"; {amount(finite_rms(judged.after), unit)} against {amount(finite_rms(judged.before), unit)}, weighed"
         " by how well the photographs see each direction"
         if unit
         else ""
@@ -140,9 +140,9 @@ def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
             item.region.name,
             (
                 str(len(item.left_out.rows)),
-                text(rms(item.left_out.before)),
-                text(rms(item.left_out.after)),
-                text(rms(item.used.after)),
+                text(finite_rms(item.left_out.before)),
+                text(finite_rms(item.left_out.after)),
+                text(finite_rms(item.used.after)),
                 better(item.left_out.ratio),
                 number(item.left_out.promise.factor, 2),
             ),
@@ -185,8 +185,8 @@ def held_out(item: HoldOut, session: Session) -> Part:
     out, used, unit = item.left_out, item.used, _unit(session)
     against = inside = ""
     if unit:
-        against = f": {amount(rms(out.after), unit)} against {amount(rms(out.before), unit)}"
-        inside = f" In the configurations in use, {amount(rms(used.after), unit)}."
+        against = f": {amount(finite_rms(out.after), unit)} against {amount(finite_rms(out.before), unit)}"
+        inside = f" In the configurations in use, {amount(finite_rms(used.after), unit)}."
     kept = "" if out.promise.kept else " That is more than the deviations promise."
     sentence = (
         f"On {count(len(out.rows), 'configuration')} held out, the calibrated machine predicts the"
