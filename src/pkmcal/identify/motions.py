@@ -375,7 +375,7 @@ def sizes(s: Situation) -> tuple[Size, ...]:
         radius[places[j], j] = outwards[j]
         height[places[j, 2], j] = 1.0
     found = [Size("base radius", "m", radius), Size("base height", "m", height)]
-    free = table.free_matrix().any(axis=1)
+    free = np.any(table.free_matrix(), axis=1)
     for field in dict.fromkeys(field for leg in s.fields for field in leg if field != "tubes"):
         having = [j for j in s.legs if len(s.fields[j].get(field, ())) == 1]
         rows = [int(s.fields[j][field][0]) for j in having]
@@ -396,8 +396,8 @@ def _sizes(s: Situation) -> Iterator[Motion]:
     for group in (group for n in numbers for group in combinations(known, n)):
         columns = np.stack([g.columns for g in group], axis=2)  # (P, L, sizes)
         labels = tuple((f"the {g.label}", g.unit) for g in group)
-        having = columns.any(axis=0)
-        legs = tuple(np.flatnonzero(having.any(axis=1)).tolist())
+        having = np.any(columns, axis=0)  # (L, sizes)
+        legs = tuple(j for j in s.legs if having[j].any())
         whose = "all legs" if len(legs) == len(s.legs) else named(legs)
         what, alike = joined([label for label, _ in labels]), columns.sum(axis=1)
         text = f"{what}, of {whose} alike, "
