@@ -19,11 +19,6 @@ from pkmcal.mechanisms.carriers.contract import (
     Interval,
     NamedMotion,
     Site,
-    direction_by_frame,
-    moved_direction,
-    moved_point,
-    point_by_frame,
-    turned_blocks,
     vectors,
 )
 
@@ -87,8 +82,8 @@ class Slider(BaseCarrier):
         v = axis / np.sqrt(dot(axis, axis))[..., None]
         return parameters[..., :3] + readings[..., None] * v, v
 
-    @staticmethod
-    def by_parameters(parameters: Array, readings: Array) -> Array:
+    @classmethod
+    def by_parameters(cls, parameters: Array, readings: Array) -> Array:
         """Identity for the centre; the axis's length changes nothing."""
         axis = parameters[..., 3:]
         size = np.sqrt(dot(axis, axis))[..., None]
@@ -100,8 +95,8 @@ class Slider(BaseCarrier):
         out[..., 3:] = (q / size)[..., None] * across
         return out
 
-    @staticmethod
-    def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
+    @classmethod
+    def reading(cls, parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
         """``q = d . v -+ sqrt(length^2 - |d|^2 + (d . v)^2)``, d = B - center."""
         axis = parameters[..., 3:]
         v = axis / np.sqrt(dot(axis, axis))[..., None]
@@ -111,27 +106,6 @@ class Slider(BaseCarrier):
         half = np.sqrt(np.where(square >= 0, square, np.nan))
         first, second = middle + half, middle - half
         return np.where(np.abs(first - near) <= np.abs(second - near), first, second)
-
-    @staticmethod
-    def moved(parameters: Array, e: Array, f: Array) -> Array:
-        """Centre and axis move with the base frame."""
-        del f
-        parts = moved_point(parameters[..., :3], e), moved_direction(parameters[..., 3:], e)
-        return np.concatenate(parts, axis=-1)
-
-    @staticmethod
-    def by_frames(parameters: Array) -> Array:
-        """E's columns alone."""
-        own = np.concatenate(
-            [point_by_frame(parameters[..., :3]), direction_by_frame(parameters[..., 3:])], axis=-2
-        )
-        return np.concatenate([own, np.zeros_like(own)], axis=-1)
-
-    @staticmethod
-    def carried(parameters: Array, e: Array, f: Array) -> Array:
-        """Turns."""
-        del parameters, f
-        return turned_blocks(6, (0, e), (3, e))
 
     @staticmethod
     def chain(parameters: Array) -> Chain:
