@@ -166,7 +166,7 @@ def with_boards(
         theta,
         T_camera_base,
         T_base_platform,
-        np.zeros(int(np.max(measurements.camera_of_station)) + 1),
+        np.zeros(measurements.n_cameras),
         T_mount=mounts,
         on_platform=measurements.on_platform,
     )
