@@ -10,10 +10,9 @@ import pytest
 import pkmcal
 from pkmcal.cameras import camera_models
 from pkmcal.commands.comparison import compare
-from pkmcal.geometry import great_circles
 from pkmcal.geometry.cylinders import edge_normals, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
-from pkmcal.papers import linear
+from pkmcal.papers import conics, linear
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.stations import StationPose
 
@@ -43,7 +42,7 @@ def edges_around_a_mirror(rng):
     pixel = camera.project(points) + 0.2 * rng.normal(size=(*points.shape[:-1], 2))
     rays = camera.ray(pixel)
     leg = (a + 0.2 * u)[:, :, None] * np.ones((1, 1, 2, 1))
-    normal, covariance = great_circles.weighted(rays, camera.ray_jacobians(pixel)[0], leg)
+    normal, covariance = conics.weighted(rays, camera.ray_jacobians(pixel)[0], leg)
     basis = tangent_basis(normal, rays.mean(axis=-2))
     spread = basis @ (0.04 * covariance) @ np.swapaxes(basis, -1, -2)
     return normal.reshape(LEGS, -1, 3), spread.reshape(LEGS, -1, 3, 3), centres

@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 
-from pkmcal.calibration.calibrate import results
+from pkmcal.calibration import results
 from pkmcal.calibration.results import base_camera_covariance, check_output, document_of, load
 from pkmcal.errors import InputError
 from pkmcal.files import json_text

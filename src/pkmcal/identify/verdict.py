@@ -11,8 +11,9 @@ from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.problem import Estimate
-from pkmcal.identify.words import Findings, Sentence, explain, only_heights, seen_legs
-from pkmcal.identify.words_effect import platform_by_parameters
+from pkmcal.identify.sentences import Sentence
+from pkmcal.identify.tool import platform_by_parameters
+from pkmcal.identify.unidentified import Findings, explain, only_heights, seen_legs
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold

@@ -16,7 +16,14 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference
+from pkmcal.geometry.rigid import (
+    apply,
+    dot,
+    inverse,
+    nearest_rotation,
+    perturb,
+    pose_difference,
+)
 from pkmcal.identify.problem import State
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
@@ -26,7 +33,6 @@ from pkmcal.papers.registration import (
     fit_body,
     fixes_pose,
     laid,
-    nearest_rotation,
     points_by,
 )
 

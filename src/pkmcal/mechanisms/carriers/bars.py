@@ -71,7 +71,11 @@ class Bar(PlatformCarrier):
     joints: ClassVar = ("bar",)
     schema: ClassVar = BarDocument
     shared: ClassVar = ("hinge",)
-    parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("hinge", "m", "center"))
+    called: ClassVar = "side bars' joints (half a bar's width)"
+    parameters: ClassVar = (
+        *vectors("center", "m", "center"),
+        *vectors("hinge", "m", "center", label="hinge"),
+    )
 
     @classmethod
     def check(cls, node: BarDocument, site: Site) -> None:
@@ -149,9 +153,10 @@ class HingedBar(PlatformCarrier):
     joints: ClassVar = ("hinged-bar",)
     schema: ClassVar = HingedBarDocument
     shared: ClassVar = ("hinge", "axis")
+    called: ClassVar = "side bars' joints"
     parameters: ClassVar = (
         *vectors("center", "m", "center"),
-        *vectors("hinge", "m", "center"),
+        *vectors("hinge", "m", "center", label="hinge"),
         *vectors("axis", "1", "axis"),
     )
 

@@ -73,12 +73,28 @@ class ParameterKind(NamedTuple):
 
     Where the file may leave the field out, ``otherwise`` is its value, and it is no parameter of
     a machine whose file does. Without a tolerance's name it is a constant of the drawing.
+    label : what people call it, where its side and path say too little.
     """
 
     path: str
     unit: str
     tolerance: str
     otherwise: float = 0.0
+    label: str = ""
+
+
+class NamedMotion(NamedTuple):
+    """Changes of one leg's carrier that people can picture, should data leave them open.
+
+    columns : (n, m) changes of the carrier's n parameters. one, several : what is open, of one leg
+    and of several; together : of all legs, where only some combinations are open. Sentences without
+    a full stop, with the places that :class:`pkmcal.identify.motions.Motion` lists.
+    """
+
+    columns: Array
+    one: str
+    several: str
+    together: str = ""
 
 
 class CarriedPoint(NamedTuple):
@@ -129,6 +145,7 @@ class Carrier(ABC):
 
     joints : the words. schema : their fields; the first three parameters are ``center``.
     shared : fields that legs on one motor, or on one body of the platform, have in common.
+    called : the limb's ends on this side, where sentences speak of all of them.
     held_in_plane : fields that are no unknowns on a planar machine, which they would tilt.
     side : of a leg. ways : fields of three lengths that lead from one point to another; others of
     three lengths are points, those without a unit directions.
@@ -143,6 +160,7 @@ class Carrier(ABC):
     schema: ClassVar[type[Schema]]
     parameters: ClassVar[tuple[ParameterKind, ...]]
     shared: ClassVar[tuple[str, ...]] = ()
+    called: ClassVar[str] = ""
     held_in_plane: ClassVar[tuple[str, ...]] = ()
     ways: ClassVar[tuple[str, ...]] = ()
 
@@ -167,6 +185,15 @@ class Carrier(ABC):
         """What the ``axis`` of a part adds to the closure of a spatial machine."""
         del node
         return None
+
+    @staticmethod
+    def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
+        """What of a leg's numbers (n,) data may leave open together, and has a name of its own.
+
+        readings : (K,) of the leg's motor at the poses of a session, NaN on the platform side.
+        """
+        del parameters, readings
+        return ()
 
     @classmethod
     def _vectors(cls) -> tuple[tuple[slice, bool], ...]:
@@ -226,6 +253,7 @@ class BaseCarrier(Carrier):
 
     side: ClassVar = "base"
     driven: ClassVar[bool] = False
+    called: ClassVar[str] = "base joints"
     unit: ClassVar[Literal["m", "rad"]] = "m"
 
     @staticmethod
@@ -300,6 +328,7 @@ class PlatformCarrier(Carrier):
     body: ClassVar[str] = ""
     turns: ClassVar[bool] = False
     floats: ClassVar[bool] = False
+    called: ClassVar[str] = "platform joints"
     most_turn: ClassVar[float] = np.inf
     in_the_way: ClassVar[str] = ""
 
@@ -366,9 +395,12 @@ def by_pose(arm: Array) -> Array:
     return out
 
 
-def vectors(name: str, unit: str, tolerance: str) -> tuple[ParameterKind, ...]:
+def vectors(name: str, unit: str, tolerance: str, label: str = "") -> tuple[ParameterKind, ...]:
     """The three components of a field."""
-    return tuple(ParameterKind(f"{name}.{axis}", unit, tolerance) for axis in "xyz")
+    return tuple(
+        ParameterKind(f"{name}.{axis}", unit, tolerance, label=label and f"{label} {axis}")
+        for axis in "xyz"
+    )
 
 
 def of_part(node: Any, kind: ParameterKind) -> float | None:

@@ -16,6 +16,7 @@ from pkmcal.mechanisms.carriers.contract import (
     Chain,
     Direction,
     Interval,
+    NamedMotion,
     ParameterKind,
     Site,
     direction_by_frame,
@@ -83,10 +84,10 @@ class Crank(BaseCarrier):
     parameters: ClassVar = (
         *vectors("center", "m", "center"),
         *vectors("axis", "1", "axis"),
-        ParameterKind("arm", "m", "arm"),
-        ParameterKind("angle", "rad", "angle"),
-        ParameterKind("along", "m", "center"),
-        ParameterKind("radial", "m", "center"),
+        ParameterKind("arm", "m", "arm", label="arm length"),
+        ParameterKind("angle", "rad", "angle", label="crank angle"),
+        ParameterKind("along", "m", "center", label="place along the crank axis"),
+        ParameterKind("radial", "m", "center", label="crank axis distance"),
         *ZERO,
     )
 
@@ -108,6 +109,24 @@ class Crank(BaseCarrier):
             f"the crank of leg {site.leg} has its zero direction along its axis",
             where=site.where("zero"),
             expected="the arm's direction at angle 0, across the axis",
+        )
+
+    @staticmethod
+    def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
+        """The axis tilts, and its point moves along it."""
+        del readings
+        tilt = np.zeros((parameters.size, 4))
+        tilt[3:6, :3] = np.eye(3)
+        tilt[:3, 3] = parameters[3:6]
+        return (
+            NamedMotion(
+                tilt,
+                one="how the crank's axis of {legs} is tilted, and where its arm is along it, {is}",
+                several="how the crank's axis of each of {legs} is tilted, and where its arm is"
+                " along it, {is}",
+                together="how the cranks' axes of {legs} are tilted to each other, with the arms'"
+                " places along them, {is} {ways}{mostly}",
+            ),
         )
 
     @staticmethod

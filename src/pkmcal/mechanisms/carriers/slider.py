@@ -17,6 +17,7 @@ from pkmcal.mechanisms.carriers.contract import (
     Chain,
     Direction,
     Interval,
+    NamedMotion,
     Site,
     vectors,
 )
@@ -55,6 +56,24 @@ class Slider(BaseCarrier):
                 where=site.where("axis"),
                 expected="[x, y, 0]: a planar machine moves in the base frame's x-y plane",
             )
+
+    @staticmethod
+    def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
+        """The guide leans about the middle of where its carriage was."""
+        del parameters
+        lean = np.zeros((6, 3))
+        lean[3:] = np.eye(3)
+        lean[:3] = -np.nanmean(readings) * np.eye(3)
+        return (
+            NamedMotion(
+                lean,
+                one="how the guide of {legs} leans cannot be told from where it stands{better}",
+                several="how the guides of {legs} lean cannot be told from where they stand"
+                "{better}",
+                together="how the guides of {legs} lean to each other cannot be told from where"
+                " they stand{better} {ways}{mostly}",
+            ),
+        )
 
     @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
