@@ -26,7 +26,7 @@ from pkmcal.identify.bundle import bundle, start_state
 from pkmcal.identify.centres import joint_centres
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.words import explain
+from pkmcal.identify.unidentified import explain
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.carriers.contract import base_carriers
 from pkmcal.mechanisms.carriers.crank import Crank
