@@ -27,7 +27,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from pkmcal.files import Schema
-from pkmcal.geometry.rigid import cross, dot, rotation
+from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier, Chain, Direction, Interval, PlatformCarrier, vectors,
 )
@@ -62,19 +62,7 @@ def unit(v):
     return v / np.sqrt(dot(v, v))[..., None]
 
 
-class NoCalibration:
-    """What only identification asks to the last digit, or at all."""
-
-    moved = by_frames = carried = staticmethod(lambda *of: NotImplemented)
-
-    @classmethod
-    def by_parameters(cls, parameters, *at):
-        steps = 1e-6 * np.eye(parameters.shape[-1])
-        ends = [[cls.place(parameters + d, *at)[0] for d in (h, -h)] for h in steps]
-        return np.stack([(ahead - behind) / 2e-6 for ahead, behind in ends], axis=-1)
-
-
-class Rocker(NoCalibration, BaseCarrier):
+class Rocker(BaseCarrier):
     driven: ClassVar = True
     unit: ClassVar = "rad"
     joints: ClassVar = ("rocker",)
@@ -89,8 +77,11 @@ class Rocker(NoCalibration, BaseCarrier):
     @staticmethod
     def place(parameters, readings):
         center, pivot, v = parameters[..., :3], parameters[..., 3:6], unit(parameters[..., 6:])
-        arm = (rotation(readings[..., None] * v) @ (center - pivot)[..., None])[..., 0]
-        return pivot + arm, cross(v, arm)
+        high = dot(center - pivot, v)[..., None] * v
+        arm = center - pivot - high
+        c, s = np.cos(readings)[..., None], np.sin(readings)[..., None]
+        side = cross(v, arm)
+        return pivot + high + c * arm + s * side, c * side - s * arm
 
     @staticmethod
     def reading(parameters, point_b, length, near):
@@ -109,7 +100,7 @@ class Rocker(NoCalibration, BaseCarrier):
         return Chain("turn", pivot, unit(parameters[..., 6:]), center - pivot)
 
 
-class Ramp(NoCalibration, BaseCarrier):
+class Ramp(BaseCarrier):
     driven: ClassVar = True
     joints: ClassVar = ("ramp",)
     schema: ClassVar = RampDocument
@@ -134,9 +125,10 @@ class Ramp(NoCalibration, BaseCarrier):
         return Chain("slide", center, v, np.zeros_like(center))
 
 
-class Post(NoCalibration, PlatformCarrier):
+class Post(PlatformCarrier):
     joints: ClassVar = ("post",)
     schema: ClassVar = PostDocument
+    ways: ClassVar = ("post",)
     parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("post", "m", "center"))
 
     @staticmethod
