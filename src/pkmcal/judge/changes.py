@@ -43,7 +43,7 @@ MOST_CAUSES = 4
 """Changes that are looked for one after the other; more are a machine that was taken apart."""
 
 
-class Directions(NamedTuple):
+class SeenCause(NamedTuple):
     """What the data see of a cause: q (n, d) orthonormal in w, and gain (d, k) with q^T X D."""
 
     q: Array
@@ -80,12 +80,12 @@ class Change:
         return {"change": self.value, "sigma": self.sigma}
 
 
-def directions(found: Evidence, cause: Cause) -> Directions:
+def directions(found: Evidence, cause: Cause) -> SeenCause:
     """The directions in w of a cause that the data see."""
     scaled = found.along(cause.columns * cause.sizes)
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
     seen = s > SEEN
-    return Directions(u[:, seen], s[seen, None] * vt[seen] / cause.sizes)
+    return SeenCause(u[:, seen], s[seen, None] * vt[seen] / cause.sizes)
 
 
 def chi_square(found: Evidence, cause: Cause) -> ChiSquare:

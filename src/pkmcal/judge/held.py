@@ -20,13 +20,14 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
-from pkmcal.identify.assembly import assemble, batch_of, state_of
+from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import reduced_rows
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.unknowns import BatchState
+from pkmcal.identify.robust import measured_rows
+from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import RANK_TOLERANCE, RESTART_DAMPING, Stop, minimise
@@ -49,6 +50,11 @@ class Trust:
     noise_scale: float = 1.0
     pose_scale: float = 1.0
 
+    @property
+    def weights(self) -> tuple[Array, Array]:
+        """Of the edges and of the poses, by their noise as scaled."""
+        return self.edges / self.noise_scale**2, self.poses / self.pose_scale**2
+
     @classmethod
     def full(cls, measurements: Measurements) -> Trust:
         """All data as they are stated."""
@@ -69,33 +75,28 @@ class Trust:
 class Held:
     """A machine held on new measurements; see the module.
 
-    machine : as held, with tubes' radii where these were found. state : stations, mounts and poses,
-    in its frames. seen : (K,). noise_scale, pose_scale : factors on the stated noise of edges and
-    of boards' poses. problem, batch : at the solution, weights included. magnified : whether each
-    camera's magnification is among the unknowns.
+    machine : as held, with tubes' radii where these were found. seen : (K,). problem, state : with
+    the weights in use, and its solution. asked : names of the unknowns in which a change is looked
+    for: the machine's parameters, and, as intrinsics, the cameras' magnifications.
     """
 
     machine: Machine
-    state: State
     seen: Booleans
-    noise_scale: float
-    pose_scale: float
     problem: Problem
-    batch: BatchState
-    magnified: bool = False
+    state: BatchState
+    asked: tuple[Name, ...]
 
     def residuals(self) -> Array:
         """Root mean squares of each configuration's residuals in standard deviations, (K,).
 
         Its own pose takes up as many rows as it has freedoms; NaN where nothing was seen.
         """
-        problem, linear = self.problem, self.problem.linearize(self.batch)
-        weight = np.repeat(problem.data.weight[0], problem.data.whiten.shape[-1], axis=-1)
-        count = np.sum(weight > 0, axis=1) + problem.layout.n_equations
+        problem, linear = self.problem, self.problem.linearize(self.state)
+        rows = problem.data.whiten.shape[-1] * np.sum(problem.data.weight[0] > 0, axis=1)
+        count = rows + problem.layout.n_equations
         if problem.pose_blocks.present.size:
-            measured = np.any(problem.pose_data.whiten[0] != 0, axis=-1)
-            measured &= problem.pose_data.weight[0, ..., None] > 0
-            count = count + measured.sum(axis=(1, 2))
+            used = problem.pose_data.weight[0] > 0
+            count = count + np.sum(used * measured_rows(problem), axis=1)
         free = np.maximum(count - linear.by_own.shape[-1], 1)
         out = np.full(len(self.seen), np.nan)
         out[self.seen] = np.sqrt(np.sum(linear.value[0] ** 2, axis=1) / free)
@@ -143,32 +144,21 @@ def hold(
         _check_enough(assembled.problem, begin)
         result = solve_batch(assembled.problem, begin)
         problem, found = result.problem, result.solution
-        scales = float(result.noise_scale[0]), float(result.pose_scale[0])
     else:
-        weights = trust.edges / trust.noise_scale**2, trust.poses / trust.pose_scale**2
-        problem = assembled.trusting(*weights)
+        problem = assembled.trusting(*trust.weights)
         found = minimise(problem, begin, damping=RESTART_DAMPING)
-        scales = trust.noise_scale, trust.pose_scale
     if found.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(
             "the platform's poses were not found with the calibrated machine:"
             f" {found.stop[0].value}"
         )
-    state = state_of(assembled, found.state, start)
-    batch: BatchState = found.state
-    if magnified is not None and trust is not None:
-        problem = assemble(still, magnified, default_gauge(still)).trusting(*weights)
-        batch = replace(batch, optics=np.pad(batch.optics, ((0, 0), (0, 0), (0, 1))))
-    return Held(
-        machine=still.with_values(state.theta),
-        state=state,
-        seen=assembled.seen,
-        noise_scale=scales[0],
-        pose_scale=scales[1],
-        problem=problem,
-        batch=batch,
-        magnified=magnified is not None,
-    )
+    state: BatchState = found.state
+    still = still.with_values(problem.theta(state)[0])
+    if trust is None or magnified is None:
+        return Held(still, assembled.seen, problem, state, ("machine",))
+    problem = assemble(still, magnified, default_gauge(still)).trusting(*trust.weights)
+    state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))
+    return Held(still, assembled.seen, problem, state, ("machine", "intrinsics"))
 
 
 def _check_enough(problem: Problem, state: BatchState) -> None:
@@ -210,10 +200,8 @@ def evidence(held: Held, covariance: Array) -> Evidence:
     calibration's: whitened by V = 1 + A C A^T.
     """
     machine, n = held.machine, len(held.machine.parameters)
-    problem, state = held.problem.opened(held.batch)
-    rows, left = reduced_rows(
-        problem, state, ("machine", "intrinsics") if held.magnified else ("machine",)
-    )
+    problem, state = held.problem.opened(held.state)
+    rows, left = reduced_rows(problem, state, held.asked)
     size = np.append(machine.parameters.tolerance, np.full(rows.shape[1] - n, RATIO))
     by = rows * size
     by[:, :n] = rows[:, :n] @ _across_axes(machine) * size[:n]

@@ -98,7 +98,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     are not found, or where nothing but a configuration's own readings tells its pose.
     """
     held = hold(machine, replace(measurements, joint_noise=SOFT), start)
-    linear = held.problem.linearize(held.batch)
+    linear = held.problem.linearize(held.state)
     reduced = eliminate(linear, np.zeros(1))
     own, shared = reduced.q[0], column_space(stacked(linear, reduced)[0][0])
     picks = _picks(held, linear.value.shape[-1])
@@ -133,7 +133,7 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
 
 def _picks(held: Held, n_rows: int) -> Array:
     """E (K', m, r): the rows of readings, one each, out of a configuration's."""
-    problem, state = held.problem, held.batch
+    problem, state = held.problem, held.state
     n_poses, n_equations = state.T_base_platform.shape[1], problem.layout.n_equations
     columns = [
         problem.joint_rows(np.broadcast_to(row, (1, n_poses, n_equations)), state)[0]
@@ -146,7 +146,7 @@ def _picks(held: Held, n_rows: int) -> Array:
 
 def _size(held: Held) -> Array:
     """Reading (K', m) that one standard deviation of its row is, m or rad, with its sign."""
-    layout, c = held.problem.layout, held.problem.closure(held.batch)
+    layout, c = held.problem.layout, held.problem.closure(held.state)
     by_reading = c.by_reading[0]
     pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
     slope = np.sqrt(by_reading**2 @ pick)
@@ -167,12 +167,12 @@ def _without_own(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> 
     own = transposed(reduced.q[0]) @ (moved - linear.by_shared[0] @ others)
     own = np.linalg.solve(reduced.r[0], own)[..., 0]
     shared = np.zeros((1, held.problem.unknowns.count))
-    return held.problem.moved(held.batch, shared, own[None])
+    return held.problem.moved(held.state, shared, own[None])
 
 
 def _by_machine(held: Held, own: Array, shared: Array) -> Array:
     """P A (K' r, P) by all parameters that are held; own : Q (K', r, d), shared : q (K' r, a)."""
-    wide, there = held.problem.opened(held.batch)
+    wide, there = held.problem.opened(held.state)
     by = wide.linearize(there).by_shared[0, ..., wide.unknowns.machine]
     by = np.where(np.any(held.problem.free != 0, axis=1), 0.0, by)
     by = (by - own @ (transposed(own) @ by)).reshape(len(shared), -1)

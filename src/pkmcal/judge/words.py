@@ -11,7 +11,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.judge.changes import POWER, ChangeTests, Explanation, LegTest, Suspect
-from pkmcal.judge.comparison import Comparison, Ratio, ratio, rms
+from pkmcal.judge.comparison import BesideDrawing, Ratio, ratio, rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
@@ -44,7 +44,7 @@ def better(gain: Ratio) -> str:
 
 
 def validation_verdict(
-    judged: Comparison | None, holdouts: Sequence[HoldOut], machine: Machine
+    judged: BesideDrawing | None, holdouts: Sequence[HoldOut], machine: Machine
 ) -> Verdict:
     """The verdict on new data, or, without any, on the regions held out, pooled."""
     units = machine.joint_units
@@ -102,7 +102,7 @@ def _not_better(gain: Ratio) -> list[str]:
     ]
 
 
-def _broken(groups: Sequence[Comparison], units: tuple[str, ...]) -> list[str]:
+def _broken(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[str]:
     """Residuals that the deviations do not promise: the first group's that has such."""
     for group in groups:
         if not group.promise.usual:
@@ -112,7 +112,7 @@ def _broken(groups: Sequence[Comparison], units: tuple[str, ...]) -> list[str]:
     return []
 
 
-def _too_large(group: Comparison, units: tuple[str, ...]) -> str:
+def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> str:
     said = ""
     if len(set(units)) == 1:
         found = rms(group.figures(group.calibrated).joint_rms)
@@ -125,7 +125,7 @@ def _too_large(group: Comparison, units: tuple[str, ...]) -> str:
     )
 
 
-def _in_common(group: Comparison, units: tuple[str, ...]) -> str:
+def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> str:
     test = group.promise
     worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
     off = amount(abs(float(test.common[worst])), units[worst])
