@@ -15,9 +15,10 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
 from pkmcal.export.contract import Difference, Exporter, exact, largest
 from pkmcal.export.limbs import CONSTANT, FLOAT, SLIDE, TURN, Limbs, rods_of
-from pkmcal.export.source import Source, samples
+from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import cross, dot, perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import inverse_result
