@@ -6,11 +6,11 @@ from pkmcal.judge.comparison import Comparison, WeighedErrors, rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.judge.paths import LinePath, Straightness
 from pkmcal.judge.validate import Validation
-from pkmcal.judge.words import amount, better, factor
+from pkmcal.judge.words import better, factor
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
 from pkmcal.report import charts
 from pkmcal.session.load import Session
-from pkmcal.wording import SCALES, brief, count, decimals, number
+from pkmcal.wording import SCALES, amount, brief, count, decimals, number
 
 HOW = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
