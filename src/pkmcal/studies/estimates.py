@@ -70,8 +70,10 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     scale = np.where(scale > 0, scale, 1.0)
     s, vt = np.linalg.svd(np.linalg.qr(rows / scale[:, None], mode="r"))[1:]
     known: Booleans = s > LOOSE * s[:, :1]
-    draw = rng.normal(size=s.shape) * np.where(known, 1 / np.where(known, s, 1.0), 0.0)
-    return (np.swapaxes(vt, -1, -2) @ draw[..., None])[..., 0] / scale
+    spread = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
+    # the symmetric root, as singular vectors' signs are rounding's
+    draw = spread[..., None] * (vt @ rng.normal(size=s.shape)[..., None])
+    return (np.swapaxes(vt, -1, -2) @ draw)[..., 0] / scale
 
 
 class Places(NamedTuple):
