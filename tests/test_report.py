@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from pkmcal import wording
+from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
+from pkmcal.identify.tool import pose_by_parameters, tool_point
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.charts import ticks_between
-from pkmcal.report.provenance import camera_position_covariance
 from pkmcal.report.scene import enlargement
-from pkmcal.report.toolpoint import pose_covariance, tool_point
 from test_report_case import OUTWARD, RADIUS, Case, edges_of, make_case
 
 
@@ -89,9 +89,8 @@ def test_what_stays_the_drawings_is_said_in_words(case):
 
 def test_pose_covariance_agrees_with_forward_kinematics(case):
     machine, state = case.estimate.machine, case.estimate.state
-    got = pose_covariance(
-        machine, case.estimate.covariance, case.session.joints[:1], state.T_base_platform[:1]
-    )[0]
+    by = pose_by_parameters(machine, case.session.joints[:1], state.T_base_platform[:1])[0]
+    got = by @ case.estimate.covariance @ by.T
     sigma = np.sqrt(np.diag(case.estimate.covariance))
     columns = []
     for k in range(sigma.size):  # one parameter at a time by its own standard deviation
@@ -141,7 +140,7 @@ def test_camera_position_sigma(case):
     rng = np.random.default_rng(0)
     moved = perturb(T, sigma * rng.normal(size=(20000, 6)))
     places = -(np.swapaxes(moved[:, :3, :3], 1, 2) @ moved[:, :3, 3:])[..., 0]
-    got = camera_position_covariance(T, np.diag(sigma**2))
+    got = base_camera_covariance(T, np.diag(sigma**2))[3:, 3:]
     # 20 000 draws leave 1 % on a standard deviation
     np.testing.assert_allclose(np.sqrt(np.diag(got)), places.std(axis=0), rtol=0.03)
 

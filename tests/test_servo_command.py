@@ -48,7 +48,7 @@ def test_the_page_is_whole(studied):
         assert text
         figure = json.loads(text[1], parse_constant=pytest.fail)
         assert figure["data"]
-    frames = json.loads(re.search(r'id="frames">(.*?)</script>', page, re.DOTALL)[1])
+    frames = json.loads(re.search(r'id="frames-space">(.*?)</script>', page, re.DOTALL)[1])
     assert len(frames) == 48
     assert frames[0]["traces"] == list(range(7))
     moved = frames[0]["data"][0]["x"] != frames[-1]["data"][0]["x"]

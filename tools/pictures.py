@@ -26,12 +26,13 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.recognise import platform_poses, read_photographs, recognise
 from pkmcal.commands.comparison import compare
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
+from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.observe import legs
-from pkmcal.report import page
-from pkmcal.report import page as templating
+from pkmcal.report import page, pictures, scene
+from pkmcal.report import residuals as shown
 from pkmcal.report.calibration import save
 from pkmcal.session.load import Session, load_session
 from pkmcal.simulation import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
@@ -117,11 +118,15 @@ def whole_page(body: str, width: int, height: int, more_style: str = "") -> Shot
 
 def result(case: Case) -> Shot:
     """README's first picture: a photograph with fitted edges beside the geometry's change."""
-    views = page.report_views(case.session, case.result.observation, case.result.estimate)
-    shots = {(p.station, p.configuration): p for p in views["pictures"]}
+    session, estimate = case.session, case.result.estimate
+    edges = case.result.observation.edges
+    centres = joint_centres(session.machine, estimate.machine, free_of_gauge(estimate))
+    drawn = scene.scene_of(session, estimate, centres)
+    taken = pictures.pictures(session, edges, estimate, outward(case), centres)
+    shots = {(p.station, p.configuration): p for p in taken}
     shot = shots.get(("station2", "0011")) or next(iter(shots.values()))
-    template = templating.environment().from_string(
-        '{% import "charts.html.j2" as draw with context %}'
+    template = page.environment().from_string(
+        '{% import "charts.html.j2" as draw %}'
         '<div class="grid"><div>{{ draw.picture(shot) }}<p>A photograph, the edges fitted in it,'
         " and the joints of the calibrated machine (rings) and of the drawing (crosses)</p></div>"
         '<div class="right">{{ draw.view(view) }}<p>The machine from above, mm: joints by'
@@ -129,7 +134,7 @@ def result(case: Case) -> Shot:
         " differences {{ '{:g}'.format(scene.factor) }} times enlarged, ellipses of 2σ"
         " {{ '{:g}'.format(scene.spread_factor) }} times</p></div></div>"
     )
-    body = template.render(shot=shot, view=views["views"][0], scene=views["scene"])
+    body = template.render(shot=shot, view=scene.views(drawn)[0], scene=drawn)
     style = (
         ".grid { display: grid; grid-template-columns: 640px 500px; gap: 22px; padding: 8px; }"
         ".grid p { font-size: 15px; line-height: 1.35; margin: 8px 4px 0; color: #58626d; }"
@@ -137,6 +142,13 @@ def result(case: Case) -> Shot:
         ".d { color: #0068a8; } .c { color: #c2480c; }"
     )
     return whole_page(body, 1180, 545, style)
+
+
+def outward(case: Case) -> Array:
+    """Pixels by which each edge lies outward."""
+    session, found = case.session, case.result
+    camera = shown.camera_numbers(session)
+    return shown.outward_shift(found.observation.edges, found.estimate, session.joints, camera)
 
 
 def report(case: Case) -> Shot:
@@ -184,14 +196,16 @@ def positions(case: Case) -> Shot:
 
 def residuals(case: Case) -> Shot:
     """The report's histogram of the edges' residuals, and the boxes by leg."""
-    views = page.report_views(case.session, case.result.observation, case.result.estimate)
-    template = templating.environment().from_string(
-        '{% import "charts.html.j2" as draw with context %}<div class="two">'
+    found = shown.residual_charts(
+        case.session, case.result.observation.edges, case.result.estimate, outward(case)
+    )
+    template = page.environment().from_string(
+        '{% import "charts.html.j2" as draw %}<div class="two">'
         "<div><h3>{{ r.histogram.title }}</h3>{{ draw.bars(r.histogram) }}</div>"
         "<div><h3>{{ r.by_leg.title }}</h3>{{ draw.rows(r.by_leg) }}</div></div>"
     )
     style = ".two { display: grid; grid-template-columns: 1fr 1fr; gap: 20px; padding: 0 16px; }"
-    return whole_page(template.render(r=views["residuals"]), 900, 290, style)
+    return whole_page(template.render(r=found), 900, 290, style)
 
 
 def repeats(case: Case) -> Shot:

@@ -14,8 +14,6 @@ from typing import Any, Literal
 from pkmcal.errors import PkmcalError
 
 Source = Literal["paper", "prototype", "ours"]
-Mark = Literal["good", "note", "doubtful", "wrong"]
-"""What to think of something: a level of a finding, or that all is well."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +38,10 @@ class Level(StrEnum):
     WRONG = "wrong"
     DOUBTFUL = "doubtful"
     NOTE = "note"
+
+
+Mark = Literal["good"] | Level
+"""What to think of something: that all is well, or how bad it is."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,7 @@ class Outcome:
     @property
     def mark(self) -> Mark:
         """The sign of the verdict."""
-        return "good" if self.verdict.usable else self.level.value
+        return "good" if self.verdict.usable else self.level
 
     @property
     def exit_code(self) -> int:

@@ -626,7 +626,8 @@ def _stations_table(found: SessionCheck) -> Table:
         levels = {f.level for f in found.findings if f.station == station.name}
         if not station.recognised:
             levels.add(Level.WRONG)
-        mark: Mark = next((level.value for level in Level if level in levels), "good")
+        worst = [level for level in Level if level in levels]
+        mark: Mark = worst[0] if worst else "good"
         moved = f"{station.moved * 1e3:.0f} mm, {math.degrees(station.turned):.1f}°"
         seen = station.recognised and math.isfinite(station.legs)
         cells = (
@@ -673,7 +674,7 @@ def _joints_table(joints: tuple[JointCheck, ...]) -> Table:
                 _number(joint.used, "{:.0%}"),
                 f"{joint.ends[0]} + {joint.ends[1]}" if math.isfinite(joint.used) else "–",
             ),
-            mark="note" if joint.used < LITTLE_USED else "good",
+            mark=Level.NOTE if joint.used < LITTLE_USED else "good",
         )
         for joint in joints
     )

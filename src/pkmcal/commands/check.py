@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import tell
+from pkmcal.commands.finish import answer
 
 
 def check(
@@ -35,4 +35,4 @@ def check(
     if repeat:
         repeats = study and study.as_dict()
         outcome = replace(outcome, document={**outcome.document, "repeats": repeats})
-    return tell(outcome, session, {}, as_json=as_json)
+    return answer(outcome, session, {}, as_json=as_json)

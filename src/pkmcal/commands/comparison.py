@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, rms
 from pkmcal.identify.centres import joint_centres
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.identify.problem import State
+from pkmcal.identify.tool import tool_point
 from pkmcal.mechanisms import Machine
-from pkmcal.report.toolpoint import tool_point
 from pkmcal.simulation import Truth, load_truth
 
 if TYPE_CHECKING:
@@ -75,10 +75,10 @@ def _errors(machine: Machine, truth: Truth) -> Errors:
         machine, truth.machine, nothing, truth.joints, truth.T_base_platform, every, centres
     )
     change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres])
-    offsets = table.of_kind("offset")
+    offsets = (machine.values - truth.machine.values)[table.of_kind("offset")]
     return Errors(
         centre=float(change.mean()),
-        offset=_rms((machine.values - truth.machine.values)[offsets]),
+        offset=rms(offsets) if offsets.size else 0.0,
         position=float(np.nanmean(tool.off_position)),
         orientation=float(np.nanmean(tool.off_orientation)),
     )
@@ -101,7 +101,3 @@ def _in_sigmas(calibration: Calibration, truth: Truth) -> Array:
     sigma = np.sqrt(np.maximum(np.diag(to_free @ estimate.covariance @ to_free.T), 0.0))
     known = sigma > 1e-9  # what defines the frames has no deviation
     return np.abs(error)[known] / sigma[known]
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0

@@ -13,7 +13,7 @@ import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.calibrate import FILES
-from pkmcal.commands.finish import tell, write
+from pkmcal.commands.finish import answer, write
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def demo(
             "comparison": comparison.as_dict(),
         },
     )
-    code = tell(found, result, FILES, as_json=as_json)
+    code = answer(found, result, FILES, as_json=as_json)
     if not as_json:
         _tell_comparison(console.out(), comparison)
         if not no_open and _can_show():

@@ -37,7 +37,7 @@ def finish(
     with console.progress(as_json or quiet) as told:
         told("Writing the report", 0.97)
         write(outcome, folder, files)
-    return tell(outcome, folder, files, as_json=as_json, quiet=quiet)
+    return answer(outcome, folder, files, as_json=as_json, quiet=quiet)
 
 
 def write(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> None:
@@ -47,7 +47,7 @@ def write(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> None:
     write_folder(folder, contents(outcome, files))
 
 
-def tell(
+def answer(
     outcome: Outcome,
     folder: Path,
     files: Mapping[str, str],
@@ -60,7 +60,7 @@ def tell(
         console.print_json(printed(outcome, folder, files))
     elif not quiet:
         out = console.out()
-        tell_people(out, outcome)
+        tell(out, outcome)
         if files:
             out.print()
             console.print_files(out, [(str(folder / name), what) for name, what in files.items()])
@@ -92,7 +92,7 @@ def printed(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> dict[st
     }
 
 
-def tell_people(out: Console, outcome: Outcome) -> None:
+def tell(out: Console, outcome: Outcome) -> None:
     """What a command found, for people: the verdict, numbers, and what to look at."""
     verdict, findings = outcome.verdict, outcome.findings
     if outcome.subject:

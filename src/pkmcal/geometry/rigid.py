@@ -115,6 +115,14 @@ def pose_difference(transform: Array, reference: Array) -> Array:
     )
 
 
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotations R (..., 3, 3) that maximise tr(R^T M); reflections are excluded."""
+    u, _, vt = np.linalg.svd(matrix)
+    u = u.copy()
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return u @ vt
+
+
 def register(source: Array, target: Array, weights: Array | None = None) -> Array:
     """Rigid motions that lay points on points: min sum w |T source - target|^2.
 
@@ -128,10 +136,7 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
     mean_s = np.sum(w[..., None] * source, axis=-2)
     mean_t = np.sum(w[..., None] * target, axis=-2)
     ds, dt = source - mean_s[..., None, :], target - mean_t[..., None, :]
-    u, _, vt = np.linalg.svd(np.swapaxes(dt, -1, -2) @ (w[..., None] * ds))
-    u = u.copy()
-    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    rot = u @ vt
+    rot = nearest_rotation(np.swapaxes(dt, -1, -2) @ (w[..., None] * ds))
     return pose(rot, mean_t - (rot @ mean_s[..., None])[..., 0])
 
 

@@ -51,7 +51,8 @@ def environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update({"count": count})
+    shared: dict[str, Any] = {"count": count}
+    environment.globals.update(shared)
     environment.filters["leg"] = _colour_class
     return environment
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.geometry.rigid import inverse, pose_difference, skew
-from pkmcal.identify.problem import Estimate
+from pkmcal.calibration.results import base_camera_covariance
+from pkmcal.geometry.rigid import inverse, pose_difference
+from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Rejection
 from pkmcal.outcome import Row, Table
 from pkmcal.report.residuals import SIDES
@@ -27,9 +28,9 @@ def stations_table(session: Session, estimate: Estimate, camera: Integers) -> Ta
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
     for s, station in enumerate(session.stations):
-        shift = estimate.state.edge_shift[camera[s]]
-        sigma = estimate.edge_shift_sigma[camera[s]]
-        places = decimals(float(sigma))
+        shift = float(estimate.state.edge_shift[camera[s]])
+        sigma = float(estimate.edge_shift_sigma[camera[s]])
+        places = decimals(sigma)
         cells = (
             *_place(estimate, s),
             *([f"{number(shift, places, signed=True)} ± {number(sigma, places)}"] if edges else []),
@@ -51,24 +52,13 @@ def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
     """A station's place with its deviations (mm), and the deviation of its turn (degrees)."""
     found, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
     place = inverse(found)[:3, 3] * 1e3
-    sigma = np.sqrt(np.diag(camera_position_covariance(found, covariance))) * 1e3
+    sigma = np.sqrt(np.diag(base_camera_covariance(found, covariance))[3:]) * 1e3
     turn = float(np.rad2deg(np.sqrt(np.trace(covariance[:3, :3]) / 3)))
     x, y, z = (
         f"{number(v, decimals(d))} ± {brief(d) if d < OPEN else 'open'}"
         for v, d in zip(place.tolist(), sigma.tolist(), strict=True)
     )
     return x, y, z, f"{brief(turn)}°" if turn < 90 else "open"
-
-
-def camera_position_covariance(T_camera_base: Array, covariance: Array) -> Array:
-    """Covariance (3, 3) of the camera's place in the base frame, m^2.
-
-    covariance : (6, 6) of (omega, tau), left perturbation of T_camera_base. With c = -R^T t,
-    dc = -R^T [t]x omega - R^T tau.
-    """
-    rot_t, t = T_camera_base[:3, :3].T, T_camera_base[:3, 3]
-    jacobian = np.concatenate([-rot_t @ skew(t), -rot_t], axis=-1)
-    return jacobian @ covariance @ jacobian.T
 
 
 def _moved(rough: Array | None, found: Array) -> str:
