@@ -67,8 +67,14 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     """
     reduced = eliminate(problem.linearize(state), np.zeros(len(state.z)))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
-    half = inverse_root(rows, LOOSE, loose=False)
-    return (half @ rng.normal(size=(len(half), half.shape[-1], 1)))[..., 0]
+    scale = np.sqrt(np.sum(rows**2, axis=1))
+    scale = np.where(scale > 0, scale, 1.0)
+    s, vt = np.linalg.svd(np.linalg.qr(rows / scale[:, None], mode="r"))[1:]
+    known: Booleans = s > LOOSE * s[:, :1]
+    spread = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
+    # the symmetric root, as singular vectors' signs are rounding's
+    draw = spread[..., None] * (vt @ rng.normal(size=s.shape)[..., None])
+    return (np.swapaxes(vt, -1, -2) @ draw)[..., 0] / scale
 
 
 class Places(NamedTuple):
