@@ -24,7 +24,7 @@ from pkmcal.geometry.rigid import (
     perturb,
     pose_difference,
 )
-from pkmcal.identify.problem import State
+from pkmcal.identify.estimate import State
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.leg_axes import Axes
@@ -166,7 +166,7 @@ def with_boards(
         theta,
         T_camera_base,
         T_base_platform,
-        np.zeros(int(np.max(measurements.camera_of_station)) + 1),
+        np.zeros(measurements.n_cameras),
         T_mount=mounts,
         on_platform=measurements.on_platform,
     )

@@ -10,14 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array
 from pkmcal.identify.bundle import BatchResult, solve_batch
-from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.papers.hand_eye import Pair, PairProblem
-from pkmcal.solver import FIRST_DAMPING, eliminate, minimise
+from pkmcal.solver import FIRST_DAMPING, eliminate, inverse_root, minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
 LOOSE = 1e-9
@@ -66,12 +67,8 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     """
     reduced = eliminate(problem.linearize(state), np.zeros(len(state.z)))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
-    scale = np.sqrt(np.sum(rows**2, axis=1))
-    scale = np.where(scale > 0, scale, 1.0)
-    s, vt = np.linalg.svd(np.linalg.qr(rows / scale[:, None], mode="r"))[1:]
-    known: Booleans = s > LOOSE * s[:, :1]
-    draw = rng.normal(size=s.shape) * np.where(known, 1 / np.where(known, s, 1.0), 0.0)
-    return (np.swapaxes(vt, -1, -2) @ draw[..., None])[..., 0] / scale
+    half = inverse_root(rows, LOOSE, loose=False)
+    return (half @ rng.normal(size=(len(half), half.shape[-1], 1)))[..., 0]
 
 
 class Places(NamedTuple):
