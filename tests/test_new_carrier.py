@@ -22,10 +22,11 @@ from pkmcal.export.contract import export
 from pkmcal.files import yaml_text
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import joint_centres
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import explain
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.carriers.contract import base_carriers
