@@ -19,10 +19,12 @@ from scipy.optimize import least_squares
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from pkmcal.identify.unknowns import BatchState
+
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import start_state
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.start import start_state
 from pkmcal.solver import minimise
 from test_identify_scene import guess, make_scene
 

@@ -18,7 +18,7 @@ from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, yaml_text
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose, register, rotation
 from pkmcal.identify.gauge import pose_generators, respecting_motion
-from pkmcal.identify.words_effect import pose_by_parameters
+from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.simulation.board import board_from_fields
 
@@ -51,7 +51,7 @@ class Kit:
 
     def calibrated(self):
         """By the program; its detector is replaced by the corners, as there are no pictures."""
-        with patch("pkmcal.boards.detect_in", lambda *_: self.detections):
+        with patch("pkmcal.boards.views.detect_in", lambda *_: self.detections):
             return calibrate(self.folder)
 
 

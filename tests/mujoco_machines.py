@@ -1,4 +1,6 @@
-"""Machines to export: of the catalogue, not built as drawn, and with parts that none there has."""
+"""MuJoCo with an exported model; machines to export: of the catalogue, not built as drawn, and with
+parts that none there has.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +8,10 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from pkmcal.files import parse_yaml, validate
+from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import (
     MechanismDocument,
     catalogue,
@@ -15,6 +19,7 @@ from pkmcal.mechanisms import (
     machine_from_document,
 )
 
+LOUD = "NO MUJOCO: exported models were not loaded in it (pip install mujoco)"
 CATALOGUE = sorted(catalogue())
 # Joints, motions and homes that no machine of the catalogue has, as (change of) mechanism files.
 MADE = {
@@ -134,3 +139,49 @@ def machine_of(name):
     # the H4's axes are drawn to 2 degrees; half of that leaves its home within reach
     error = 0.5 * table.tolerances_free() * rng.normal(size=len(table.free_names()))
     return drawing.with_values(table.drawing + table.free_matrix() @ error)
+
+
+class Simulated:
+    """A model in MuJoCo."""
+
+    def __init__(self, text):
+        self.mj = pytest.importorskip("mujoco", reason=LOUD)
+        self.model = self.mj.MjModel.from_xml_string(text)
+        self.model.opt.jacobian = self.mj.mjtJacobian.mjJAC_DENSE
+        self.data = self.mj.MjData(self.model)
+        joints = self.model.actuator_trnid[:, 0]
+        self.qpos = self.model.jnt_qposadr[joints]
+        self.dofs = self.model.jnt_dofadr[joints]
+        self.platform = self.model.body("platform").id
+        self.home()
+
+    def home(self):
+        self.mj.mj_resetDataKeyframe(self.model, self.data, 0)
+        self.mj.mj_forward(self.model, self.data)
+
+    def closure(self):
+        """Equality constraints (E,), m and rad, and their derivatives (E, nv)."""
+        self.mj.mj_fwdPosition(self.model, self.data)
+        n = self.data.ne
+        return self.data.efc_pos[:n], self.data.efc_J.reshape(-1, self.model.nv)[:n]
+
+    def drive(self, readings, pieces=12):
+        """Forward kinematics without a spring: Gauss-Newton on MuJoCo's own constraints, the
+        driven joints held at readings (m,) that approach the goal; never at our pose.
+        """
+        free = np.setdiff1d(np.arange(self.model.nv), self.dofs)
+        begin = self.data.qpos[self.qpos].copy()
+        for share in np.linspace(0, 1, pieces + 1)[1:]:
+            self.data.qpos[self.qpos] = begin + share * (readings - begin)
+            for _ in range(20):
+                value, by = self.closure()
+                step = np.zeros(self.model.nv)
+                step[free] = -np.linalg.lstsq(by[:, free], value, rcond=1e-10)[0]
+                self.mj.mj_integratePos(self.model, self.data.qpos, step, 1)
+                if np.abs(step).max() < 1e-13:
+                    break
+        return self.pose()
+
+    def pose(self):
+        rot = self.data.xmat[self.platform].reshape(3, 3).copy()
+        return pose(rot, self.data.xpos[self.platform].copy())

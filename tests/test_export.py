@@ -16,7 +16,9 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.export import ros
 from pkmcal.export.contract import Difference, export, exporters, quaternion
 from pkmcal.export.source import load_source, samples
+from pkmcal.geometry.rigid import apply, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
+from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
 
 OURS = ("c", "json", "klipper", "linuxcnc", "reprap", "ros", "yaml")
 MACHINES = sorted(catalogue())
@@ -110,6 +112,45 @@ def test_samples_of_a_machine_without_ranges(tmp_path):
     made = export(source_of(machine), "c")
     assert "-HUGE_VAL" in made.files["pkmcal_kinematics.c"]
     assert "MIN_LIMIT" not in export(source_of(machine), "linuxcnc").files["pkmcal_kinematics.ini"]
+
+
+# Carriers as elementary joints
+
+
+def each(carriers):
+    return sorted(set(carriers.values()), key=lambda carrier: carrier.__name__)
+
+
+def swung(chain, angle):
+    """The arms (n, 3) turned by angles (n,)."""
+    return (rotation(angle[:, None] * chain.axis) @ chain.arm[..., None])[..., 0]
+
+
+@pytest.mark.parametrize("carrier", each(base_carriers()), ids=lambda c: c.__name__)
+def test_every_base_carriers_chain_is_its_place(carrier):
+    rng = np.random.default_rng(0)
+    parameters, q = rng.normal(size=(20, len(carrier.parameters))), rng.normal(size=20)
+    chain = carrier.chain(parameters)
+    moved = {
+        "fixed": lambda: chain.arm,
+        "slide": lambda: chain.arm + q[:, None] * chain.axis,
+        "turn": lambda: swung(chain, q),
+    }
+    found = chain.point + moved[chain.motion]()
+    np.testing.assert_allclose(found, carrier.place(parameters, q)[0], atol=1e-14)
+    assert carrier.driven == (chain.motion != "fixed")
+
+
+@pytest.mark.parametrize("carrier", each(platform_carriers()), ids=lambda c: c.__name__)
+def test_every_platform_carriers_chain_is_its_place(carrier):
+    rng = np.random.default_rng(1)
+    parameters, phi = rng.normal(size=(20, len(carrier.parameters))), rng.normal(size=20)
+    T = pose(rotation(rng.normal(size=(20, 3))), rng.normal(size=(20, 3)))
+    chain = carrier.chain(parameters)
+    still = np.zeros((20, 3))
+    own = {"fixed": chain.arm, "turn": swung(chain, phi), "float": still}[chain.motion]
+    found = apply(T, chain.point + own) + (chain.arm if chain.motion == "float" else still)
+    np.testing.assert_allclose(found, carrier.place(parameters, T, phi)[0], atol=1e-14)
 
 
 # What a calibration gives

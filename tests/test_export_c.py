@@ -13,9 +13,9 @@ import pytest
 
 from export_sources import built, source_of
 from pkmcal.errors import InputError
-from pkmcal.export.c import CSource
+from pkmcal.export.c import END, FOLDER, CSource
 from pkmcal.export.contract import export
-from pkmcal.export.source import samples
+from pkmcal.export.source import load_source, samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
 
@@ -137,6 +137,23 @@ def test_the_self_test_passes(name, library, capfd):
     assert library(name).library.main() == 0
     ctypes.CDLL(None).fflush(None)
     assert f"PASS: 12 reference poses of {name}" in capfd.readouterr().out
+
+
+@needs_compiler
+def test_the_files_of_the_repository_compile_as_they_stand(tmp_path):
+    """They are a built-in machine's export, so that the C is read and compiled where it lies."""
+    program = tmp_path / "selftest"
+    flags = [flag for flag in FLAGS if flag not in ("-shared", "-fPIC")]
+    sources = sorted(FOLDER.glob("*.c"))
+    subprocess.run([COMPILER, *flags, *sources, "-o", program, "-lm"], check=True)
+    done = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert "PASS: 12 reference poses of gough-stewart" in done.stdout
+    # behind the numbers, whose last digits are the processor's, every file is the same text
+    for name, text in CSource().files(load_source("gough-stewart")).items():
+        there = (FOLDER / name).read_text(encoding="utf-8")
+        assert text.partition(END)[2] == there.partition(END)[2]
+        assert text.count("\n") == there.count("\n"), f"write {name} anew: its numbers are old"
 
 
 @needs_compiler

@@ -10,19 +10,18 @@ from xml.etree.ElementTree import fromstring
 import numpy as np
 import pytest
 
-from mujoco_machines import ALL, CATALOGUE, MADE, TURNED, machine_of, made
+from mujoco_machines import ALL, CATALOGUE, LOUD, MADE, TURNED, Simulated, machine_of, made
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.export.contract import exporters
 from pkmcal.export.mujoco_model import home_state
 from pkmcal.export.mujoco_read import read
 from pkmcal.export.source import Source, samples
-from pkmcal.geometry.rigid import pose, pose_difference
+from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import catalogue
 from pkmcal.mechanisms.carriers.crank import Crank
 from pkmcal.mechanisms.carriers.rigid import RigidPlatform
 from pkmcal.mechanisms.kinematics import forward
 
-LOUD = "NO MUJOCO: exported models were not loaded in it (pip install mujoco)"
 PLACE, TURN = 1e-12, 1e-11
 """m, rad: 4e-14 and 3e-13 were the largest of twenty readings a machine."""
 
@@ -58,52 +57,6 @@ def reachable(machine, readings, pieces=12):
 
 
 # ------------------------------------------------------------------ in MuJoCo
-
-
-class Simulated:
-    """A model in MuJoCo."""
-
-    def __init__(self, text):
-        self.mj = pytest.importorskip("mujoco", reason=LOUD)
-        self.model = self.mj.MjModel.from_xml_string(text)
-        self.model.opt.jacobian = self.mj.mjtJacobian.mjJAC_DENSE
-        self.data = self.mj.MjData(self.model)
-        joints = self.model.actuator_trnid[:, 0]
-        self.qpos = self.model.jnt_qposadr[joints]
-        self.dofs = self.model.jnt_dofadr[joints]
-        self.platform = self.model.body("platform").id
-        self.home()
-
-    def home(self):
-        self.mj.mj_resetDataKeyframe(self.model, self.data, 0)
-        self.mj.mj_forward(self.model, self.data)
-
-    def closure(self):
-        """Equality constraints (E,), m and rad, and their derivatives (E, nv)."""
-        self.mj.mj_fwdPosition(self.model, self.data)
-        n = self.data.ne
-        return self.data.efc_pos[:n], self.data.efc_J.reshape(-1, self.model.nv)[:n]
-
-    def drive(self, readings, pieces=12):
-        """Forward kinematics without a spring: Gauss-Newton on MuJoCo's own constraints, the
-        driven joints held at readings (m,) that approach the goal; never at our pose.
-        """
-        free = np.setdiff1d(np.arange(self.model.nv), self.dofs)
-        begin = self.data.qpos[self.qpos].copy()
-        for share in np.linspace(0, 1, pieces + 1)[1:]:
-            self.data.qpos[self.qpos] = begin + share * (readings - begin)
-            for _ in range(20):
-                value, by = self.closure()
-                step = np.zeros(self.model.nv)
-                step[free] = -np.linalg.lstsq(by[:, free], value, rcond=1e-10)[0]
-                self.mj.mj_integratePos(self.model, self.data.qpos, step, 1)
-                if np.abs(step).max() < 1e-13:
-                    break
-        return self.pose()
-
-    def pose(self):
-        rot = self.data.xmat[self.platform].reshape(3, 3).copy()
-        return pose(rot, self.data.xpos[self.platform].copy())
 
 
 @pytest.mark.parametrize("name", ALL)

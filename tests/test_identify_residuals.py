@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pkmcal.identify.unknowns import BatchState
 
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import perturb, pose
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.residuals import BatchState
+from pkmcal.identify.start import start_state
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.studies.engine import Batch
 from pkmcal.studies.paper_a import HexapodByAxes

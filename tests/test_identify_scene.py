@@ -9,13 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pkmcal.identify.estimate import State
+from pkmcal.identify.rows import Data
+from pkmcal.identify.unknowns import BatchState
 
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.identify.assembly import Assembled, assemble
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.problem import State
-from pkmcal.identify.residuals import BatchState, Data
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.closure import limb_ends

@@ -10,12 +10,11 @@ from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
-from pkmcal.identify.words_effect import pose_by_parameters
+from pkmcal.identify.tool import pose_by_parameters, tool_point
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.charts import ticks_between
 from pkmcal.report.scene import enlargement
-from pkmcal.report.toolpoint import tool_point
 from test_report_case import OUTWARD, RADIUS, Case, edges_of, make_case
 
 

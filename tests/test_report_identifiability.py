@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.identify.words import explain, seen_legs
+from pkmcal.identify.unidentified import explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
 from pkmcal.papers.conditions import conditions
@@ -29,7 +29,7 @@ def findings_of(scene, *views):
 
 
 def make_estimate_stub():
-    from pkmcal.identify.problem import Estimate, Statistics
+    from pkmcal.identify.estimate import Estimate, Statistics
 
     none = np.zeros(0)
     statistics = Statistics(0, 0, 0, 0, 0, 0, 0, 0, 0, "", 1.0)

@@ -10,8 +10,9 @@ import pytest
 from pkmcal.calibration.results import identifiability_of
 from pkmcal.files import json_text
 from pkmcal.identify.bundle import bundle, what_data_tell
+from pkmcal.identify.sentences import Sentence
+from pkmcal.identify.unidentified import Findings, explain, seen_legs
 from pkmcal.identify.verdict import LEFT_OPEN, judge
-from pkmcal.identify.words import Findings, Sentence, explain, seen_legs
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.papers.conditions import conditions

@@ -16,7 +16,7 @@ from pkmcal.calibration.results import load
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis
-from pkmcal.identify.bundle import start_state
+from pkmcal.identify.start import start_state
 from pkmcal.judge.causes import magnification, magnified
 from pkmcal.judge.changes import change
 from pkmcal.judge.held import Trust, evidence, hold

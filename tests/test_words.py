@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from string import Formatter
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, generators
-from pkmcal.identify.words import MOST, describe, joined_by_boards, seen_legs, vectors
-from pkmcal.identify.words_effect import platform_by_parameters, pose_by_parameters
-from pkmcal.identify.words_families import circumstances, families, groups, hanging_together
+from pkmcal.identify.motions import Motion, Situation, candidates, groups, hanging_together
+from pkmcal.identify.sentences import MOST
+from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
+from pkmcal.identify.unidentified import describe, joined_by_boards, seen_legs, vectors
 from pkmcal.mechanisms import kinematics, load_mechanism
+from pkmcal.mechanisms.carriers.contract import NamedMotion, base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.slider import Slider
 from pkmcal.mechanisms.closure import limb_ends
 from test_identify_scene import Scene, _edges, _index, stations
 
@@ -76,7 +80,7 @@ def told_of(scene: Scene, *views):
     edges = measurements.edges
     seen = seen_legs(edges, np.ones(len(edges)), measurements.n_stations, machine.n_legs)
     null = vectors(told.unidentified, machine)
-    return told, seen, describe(machine, seen, null, scene.poses[0])
+    return told, seen, describe(Situation(machine, seen, scene.poses[0]), null)
 
 
 # ------------------------------------------------------------------ whole sessions and poor ones
@@ -174,9 +178,7 @@ def test_common_turns_of_parallel_axes_move_nothing():
     poses = moved(machine, np.random.default_rng(1), 15, turn=0.0)
     _, _, sentences = told_of(make("3-upu", poses=poses, errors=0.0))
     turn = sentences[0]
-    assert turn.text.startswith(
-        "The common direction of both universal axes of each of legs 1 to 3 is free"
-    )
+    assert turn.text.startswith("The common direction of both axes of each of legs 1 to 3 is free")
     assert turn.dimensions == 6
     assert not turn.matters
     assert turn.moves_platform < 1e-9
@@ -220,7 +222,7 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
         row = machine.parameters.index(f"legs[{leg + 1}].base.center.x")
         change[row : row + 3] = np.cross(axis, centres[leg] - centres[0])
     seen = seen_from([1, 4, 2, 5], [1, 4, 3, 6])
-    (sentence,) = describe(machine, seen, change[None], poses)
+    (sentence,) = describe(Situation(machine, seen, poses), change[None])
     assert sentence.text.startswith(
         "Of the others, only legs 1 and 4 are ever seen together with legs 2 and 5: the base joints"
         " of legs 2 and 5 can turn about the axis through joints 1 and 4 against the others."
@@ -230,36 +232,40 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"legs[3].length.offset": 1.0}, "The offset of leg 3 is free."),
+        ({"legs[3].length.offset": 1.0}, "The length offset of leg 3 is free."),
         ({"legs[2].base.center.z": 1.0}, "The base joint of leg 2 is free along z."),
         ({"legs[5].tubes[1].radius": 1.0}, "The tubes' radii of leg 5 are free."),
         (
             {f"legs[{j}].length.offset": 1.0 for j in range(1, 7)},
-            "The common part of the offsets of legs 1 to 6 is free.",
+            "The length offset, of all legs alike, is free.",
         ),
         (
             {"legs[1].base.center.z": 1.0, "legs[2].base.center.z": -1.0,
              "legs[3].base.center.z": 0.6, "legs[5].base.center.z": 1.1},
-            "The heights (z) of the base joints are free against each other in one way.",
+            "Of the machine's numbers, one combination is free: +1 mm of leg ",
         ),
         (
             {"legs[1].base.center.x": 1.0, "legs[4].length.offset": 0.7,
              "legs[6].platform.center.y": -0.8},
-            "A combination of x of leg 1's base joint, leg 4's offset, y of leg 6's",
+            "Of the machine's numbers, one combination is free: +1 mm of leg 1 base centre x goes "
+            "with −0.80 mm of leg 6 platform centre y and +0.70 mm of leg 4 length offset.",
         ),
     ],
 )  # fmt: skip
 def test_single_changes_have_their_names(change, text):
     machine, poses = hexapod()
     seen = np.ones((2, 6), bool)
-    (sentence,) = describe(machine, seen, unit(machine, change)[None], poses)
+    (sentence,) = describe(Situation(machine, seen, poses), unit(machine, change)[None])
     assert sentence.text.startswith(text)
 
 
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("6-spu-passive", "Of the values of legs 1 and 7, one combination each is free, mostly of"),
+        (
+            "6-spu-passive",
+            "Of the values of legs 1 and 7, one combination each is free, mostly of leg",
+        ),
         ("constant-legs", "The tubes' radii of legs 1 and 3 are free."),
     ],
 )
@@ -274,17 +280,17 @@ def test_legs_with_different_numbers_share_a_sentence(name, text):
         numbers = np.random.default_rng(2).normal(size=6)
         changes = [{n.format(j): v for n, v in zip(centres, numbers, strict=True)} for j in (1, 7)]
     null = np.array([unit(machine, change) for change in changes])
-    sentences = describe(machine, np.ones((2, machine.n_legs), bool), null, poses)
+    sentences = describe(Situation(machine, np.ones((2, machine.n_legs), bool), poses), null)
     assert [s.text.startswith(text) for s in sentences] == [True]
 
 
 def test_a_leg_growing_into_its_base_is_found():
     machine, poses = hexapod()
-    around = circumstances(machine, np.ones((1, 6), bool), poses[:1])
+    around = Situation(machine, np.ones((1, 6), bool), poses[:1])
     row = machine.parameters.index("legs[3].base.center.x")
     change = unit(machine, {"legs[3].length.offset": 1.0})
-    change[row : row + 3] = -around.along_base[2]
-    (sentence,) = describe(machine, np.ones((1, 6), bool), change[None], poses[:1])
+    change[row : row + 3] = -around.along[0][2]
+    (sentence,) = describe(around, change[None])
     assert "it can grow while its base joint moves back along it" in sentence.text
 
 
@@ -294,7 +300,7 @@ def test_any_basis_of_the_space_gives_the_same_words():
     machine = scene.machine.with_values(scene.theta[0])
     null = vectors(told.unidentified, machine)
     mix = np.random.default_rng(5).normal(size=(len(null), len(null)))
-    again = describe(machine, seen, mix @ null, scene.poses[0])
+    again = describe(Situation(machine, seen, scene.poses[0]), mix @ null)
     assert [s.text for s in again] == [s.text for s in expected]
 
 
@@ -303,16 +309,16 @@ def test_frames_are_no_finding():
     frames = (generators(machine.layout, machine.values) @ freedoms(machine)).T
     change = unit(machine, {"legs[3].length.offset": 1e-3})
     mixed = change + 0.02 * frames[4] - 0.01 * frames[7]
-    (sentence,) = describe(machine, np.ones((1, 6), bool), mixed[None], poses)
-    assert sentence.text.startswith("The offset of leg 3 is free.")
-    assert describe(machine, np.ones((1, 6), bool), frames[:0], poses) == ()
+    (sentence,) = describe(Situation(machine, np.ones((1, 6), bool), poses), mixed[None])
+    assert sentence.text.startswith("The length offset of leg 3 is free.")
+    assert describe(Situation(machine, np.ones((1, 6), bool), poses), frames[:0]) == ()
 
 
 def test_many_open_directions_stay_readable():
     machine, poses = hexapod()
     rng = np.random.default_rng(1)
     null = rng.normal(size=(25, len(machine.parameters))) * machine.parameters.tolerance
-    sentences = describe(machine, np.ones((1, 6), bool), null, poses)
+    sentences = describe(Situation(machine, np.ones((1, 6), bool), poses), null)
     assert 0 < len(sentences) <= MOST
     assert sum(s.dimensions for s in sentences) == 25
 
@@ -321,9 +327,9 @@ def test_what_the_drawing_knows_better_is_not_called_free():
     machine, poses = hexapod()
     null = unit(machine, {"legs[3].length.offset": 1.0})[None]
     seen = np.ones((1, 6), bool)
-    (weak,) = describe(machine, seen, null, poses, information=np.array([0.5]))
-    (open_,) = describe(machine, seen, null, poses)
-    assert weak.text.startswith("The offset of leg 3 is known from the drawing only.")
+    (weak,) = describe(Situation(machine, seen, poses), null, np.array([0.5]))
+    (open_,) = describe(Situation(machine, seen, poses), null)
+    assert weak.text.startswith("The length offset of leg 3 is known from the drawing only.")
     assert "smaller tolerances" in weak.advice
     assert weak.moves_platform == pytest.approx(open_.moves_platform / np.sqrt(1.25))
 
@@ -398,11 +404,45 @@ def test_a_board_on_the_base_joins_stations():
     assert [np.flatnonzero(row).tolist() for row in seen] == [[0, 2], [1], [0, 2]]
 
 
-def test_families_are_changes_of_this_machine():
+@pytest.mark.parametrize("carrier", [*base_carriers().values(), *platform_carriers().values()])
+def test_carriers_name_motions_of_their_own_numbers(carrier):
+    """What a carrier's file says of itself, for every carrier."""
+    assert carrier.called
+    parameters = np.random.default_rng(0).normal(size=len(carrier.parameters))
+    places = set(re.findall(r"``{(\w+)}``", Motion.__doc__ or ""))
+    for motion in carrier.motions(parameters, np.array([0.1, np.nan, 0.3])):
+        assert motion.columns.shape[0] == len(parameters)
+        assert np.isfinite(motion.columns).all()
+        for text in (motion.one, motion.several, motion.together):
+            assert {name for _, name, _, _ in Formatter().parse(text) if name} <= places
+            assert not text or "{legs}" in text
+
+
+def test_what_a_carrier_names_is_said(monkeypatch):
+    """Words come from the carrier's file: nobody else knows its joint."""
+
+    def drift(parameters, readings):
+        del readings
+        columns = np.zeros((parameters.size, 1))
+        columns[[0, 3], 0] = 1.0, -2.0
+        return (NamedMotion(columns, "how {legs} drifts {is}", "how {legs} drift {is}"),)
+
+    monkeypatch.setattr(Slider, "motions", staticmethod(drift))
+    machine = load_mechanism("linear-delta")
+    changes = [{f"legs[{j}].base.center.x": 1.0, f"legs[{j}].base.axis.x": -2.0} for j in (1, 3)]
+    null = np.array([unit(machine, change) for change in changes])
+    poses = moved(machine, np.random.default_rng(1), 5)
+    around = Situation(machine, np.ones((1, 3), bool), poses, photographed=False)
+    (sentence,) = describe(around, null)
+    assert sentence.text.startswith("How legs 1 and 3 drift is free. Within the drawing's")
+    assert sentence.dimensions == 2
+
+
+def test_candidates_are_changes_of_this_machine():
     for name in ("gough-stewart", "3-upu", "3-rpr", "6-spu-passive"):
         machine = load_mechanism(name)
         seen = np.ones((2, machine.n_legs), bool)
         seen[1, 0] = False
-        for family in families(circumstances(machine, seen, machine.home()[None])):
-            assert family.columns.shape[0] == len(machine.parameters)
-            assert np.isfinite(family.columns).all()
+        for motion in candidates(Situation(machine, seen, machine.home()[None])):
+            assert motion.columns.shape[0] == len(machine.parameters)
+            assert np.isfinite(motion.columns).all()

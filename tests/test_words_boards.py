@@ -12,16 +12,15 @@ from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.motions import Situation, sizes
+from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
+from pkmcal.identify.unidentified import conventions_held, explain
 from pkmcal.identify.verdict import judge
-from pkmcal.identify.words import explain
-from pkmcal.identify.words_driven import conventions_held, size_columns
-from pkmcal.identify.words_effect import platform_by_parameters, pose_by_parameters
-from pkmcal.identify.words_families import circumstances
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.report.identifiability import section
-from pkmcal.report.parameters import bound_together, grouped, in_words, tight_pairs
+from pkmcal.report.parameters import bound_together, grouped, tight_pairs
 from pkmcal.solver import Stop
 from pose_sessions import estimated, measured, papers_poses, upright
 
@@ -57,8 +56,8 @@ def of(findings, start):
 def test_the_half_width_is_told_from_the_base_by_nobody():
     told, findings, _ = told_of("h4")
     assert len(told.unidentified) == 2
-    (width,) = of(findings, "Of y of the base joints and of the side bars' joints, only the diff")
-    assert "the bars' half width cannot be told from the base joints' places" in width.text
+    (width,) = of(findings, "Of y of the base joints and of the side bars' joints (half a bar's")
+    assert "only the difference is seen: both can shift alike in one way" in width.text
     assert set(width.parameters) == {
         f"legs[{j}].{side}.center.y" for j in range(1, 5) for side in ("base", "platform")
     }
@@ -95,8 +94,10 @@ def test_what_the_advice_holds_leaves_nothing_open():
 
 def test_parallelism_is_said_to_be_the_boards():
     _, findings, _ = told_of("h4")
-    (tilt,) = of(findings, "How the base joints' axes are tilted to each other")
-    assert tilt.text.count("only the platform's tilt does") == 1
+    (tilt,) = of(findings, "How the cranks' axes of legs 1 to 4 are tilted to each other")
+    assert "is known from the drawing only in one way: +1 mm of leg " in tilt.text
+    assert any(".base.axis." in name for name in tilt.parameters)
+    assert (tilt.weak, tilt.matters) == (True, False)  # readings say nothing of it
 
 
 @pytest.mark.parametrize("name", ["delta", "linear-delta"])
@@ -113,7 +114,7 @@ def test_of_both_radii_only_the_difference_is_seen(name):
 
 def test_poses_on_one_line_confound_sizes():
     _, findings, _ = told_of("delta", None, "straight")
-    (sizes,) = of(findings, "The radius of the base joints and the arms' length, of all legs alike")
+    (sizes,) = of(findings, "The base radius and the arm length, of all legs alike")
     assert sizes.matters
     assert sizes.moves_platform > 0.1 * findings.by_drawing
     assert set(sizes.parameters) >= {"legs[1].base.arm", "legs[1].base.center.y"}
@@ -177,10 +178,12 @@ def test_no_sentence_speaks_of_tubes_or_photographs_of_legs(case):
 
 def test_sizes_are_columns_of_the_machine():
     machine = load_mechanism("linear-delta")
-    around = circumstances(machine, np.ones((1, 3), bool), machine.home()[None])
-    sizes = size_columns(around)
-    assert set(sizes) == {"radius", "height", "rod"}
-    centres = machine.values + 1e-3 * sizes["radius"].sum(axis=1)
+    found = {
+        size.label: size.columns
+        for size in sizes(Situation(machine, np.ones((1, 3), bool), machine.home()[None]))
+    }
+    assert list(found) == ["base radius", "base height", "rod length"]
+    centres = machine.values + 1e-3 * found["base radius"].sum(axis=1)
     moved = np.linalg.norm(machine.with_values(centres).base_centers()[:, :2], axis=1)
     np.testing.assert_allclose(
         moved - np.linalg.norm(machine.base_centers()[:, :2], axis=1), 1e-3, atol=1e-6
@@ -255,10 +258,10 @@ def test_a_held_arm_is_no_convention():
 def test_names_for_people():
     table: ParameterTable = load_mechanism("h4").parameters
     names = tuple(n for n in table.names if n.endswith(("angle", "hinge.y")))
-    assert grouped(names) == ["crank angle of legs 1 to 4", "hinge y of legs 1 to 4"]
-    assert in_words("legs[2].base.arm") == "leg 2 arm length"
-    assert in_words("legs[2].length.constant") == "leg 2 rod length"
-    assert grouped(("legs[1].base.arm", "legs[2].base.arm")) == [
+    assert grouped(table, names) == ["crank angle of legs 1 to 4", "hinge y of legs 1 to 4"]
+    assert table.in_words("legs[2].base.arm") == "leg 2 arm length"
+    assert table.in_words("legs[2].length.constant") == "leg 2 rod length"
+    assert grouped(table, ("legs[1].base.arm", "legs[2].base.arm")) == [
         "leg 1 arm length",
         "leg 2 arm length",
     ]

@@ -11,17 +11,6 @@ SCALES = {"m": (1e3, "mm"), "rad": (180 / math.pi, "°")}
 """Factor and name of the unit that the report shows, by the unit inside."""
 
 LARGEST_DECIMALS = 6
-LABELS = {
-    "base.arm": "arm length",
-    "base.angle": "crank angle",
-    "base.along": "place along the crank axis",
-    "base.radial": "crank axis distance",
-    "platform.hinge.x": "hinge x",
-    "platform.hinge.y": "hinge y",
-    "platform.hinge.z": "hinge z",
-    "length.constant": "rod length",
-}
-"""Names of parameters whose paths say too little."""
 LEG = re.compile(r"legs\[(\d+)\]\.(.+)")
 
 
@@ -62,20 +51,32 @@ def split_name(name: str) -> tuple[int | None, str]:
     return (int(match[1]), match[2]) if match else (None, name)
 
 
-def label(path: str) -> str:
-    """A parameter's path without its leg, in words: ``base centre z``, ``tube 1 radius``."""
-    if path in LABELS:
-        return LABELS[path]
-    words = re.sub(r"tubes\[(\d+)\]", r"tube \1", path).replace("center", "centre")
-    return words.replace(".", " ").replace("_", " ")
-
-
 def legs_named(numbers: Iterable[int], all_legs: int) -> str:
     """``all legs``, ``leg 3``, ``legs 1, 2 and 5``."""
     found = sorted(set(numbers))
     if len(found) == all_legs and all_legs > 1:
         return "all legs"
     return ("leg " if len(found) == 1 else "legs ") + joined([str(n) for n in found])
+
+
+def named(legs: Iterable[int]) -> str:
+    """``leg 3``, ``legs 1, 2 and 5``, ``legs 1 to 6``, from numbers that count from 0."""
+    found = sorted({leg + 1 for leg in legs})
+    if len(found) > 2 and found[-1] - found[0] == len(found) - 1:
+        return f"legs {found[0]} to {found[-1]}"
+    return ("leg " if len(found) == 1 else "legs ") + joined([str(n) for n in found])
+
+
+def in_full(k: int) -> str:
+    """Small numbers as words."""
+    words = ("no", "one", "two", "three", "four", "five", "six")
+    words += ("seven", "eight", "nine", "ten", "eleven", "twelve")
+    return words[k] if k < len(words) else str(k)
+
+
+def ways(k: int) -> str:
+    """``in one way``, ``in six ways``."""
+    return "in one way" if k == 1 else f"in {in_full(k)} ways"
 
 
 def joined(words: Sequence[str]) -> str:

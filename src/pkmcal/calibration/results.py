@@ -38,7 +38,7 @@ from pkmcal.wording import listed
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
-    from pkmcal.identify.words import Findings
+    from pkmcal.identify.unidentified import Findings
 
 MECHANISM, EVERYTHING, REPORT = "mechanism.yaml", "calibration.json", "report.html"
 FILES = (REPORT, MECHANISM, EVERYTHING)

@@ -20,9 +20,9 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.recognise import WORKERS
 from pkmcal.errors import InputError, ResultError
-from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.problem import Estimate, State
-from pkmcal.identify.start import better_start
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, Observation, Rejection, concatenate
 from pkmcal.observe import legs
 from pkmcal.observe.repeats import combined

@@ -75,14 +75,14 @@ class CSource(Exporter):
         poses, joints = samples(machine)
         hinges = inverse_result(machine.layout, machine.values, poses)[1]
         off = closure(files[SOURCE], poses, joints, hinges)
-        home, ranges = (_numbers(files[SOURCE], name) for name in ("HOME", "RANGE"))
+        home, ranges = (numbers_of(files[SOURCE], name) for name in ("HOME", "RANGE"))
         same = np.array_equal(home, _flat(machine.home())) and np.array_equal(
             ranges.reshape(-1, 2), _bounds(machine)
         )
-        pairs = _numbers(files[SELFTEST], "POSES").reshape(-1, 12)
+        pairs = numbers_of(files[SELFTEST], "POSES").reshape(-1, 12)
         transform = np.tile(np.eye(4), (len(pairs), 1, 1))
         transform[:, :3, :3], transform[:, :3, 3] = pairs[:, :9].reshape(-1, 3, 3), pairs[:, 9:]
-        readings = _numbers(files[SELFTEST], "READINGS").reshape(-1, machine.n_joints)
+        readings = numbers_of(files[SELFTEST], "READINGS").reshape(-1, machine.n_joints)
         return [
             Difference(
                 f"closure of the constants read again, at {len(poses)} poses",
@@ -317,7 +317,7 @@ def _body(text: str, name: str) -> str:
     return found.group(1) if found else ""
 
 
-def _numbers(text: str, name: str) -> Array:
+def numbers_of(text: str, name: str) -> Array:
     """A constant's numbers, flat."""
     huge = {"HUGE_VAL": np.inf, "-HUGE_VAL": -np.inf}
     words = _NUMBER.findall(_body(text, name))

@@ -21,6 +21,7 @@ from pkmcal.export.limbs import FIXED, SLIDE, TELESCOPE, TURN, Limbs, limbs_of
 from pkmcal.export.source import Source
 from pkmcal.geometry.rigid import cross, dot, inverse, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.carriers.contract import platform_carriers
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.joints import Equation, equations
 from pkmcal.mechanisms.kinematics import forward, inverse_result, on_manifold
@@ -277,8 +278,9 @@ def _anchors(platform: Element, equality: Element, home: HomeState) -> list[Anch
         if held == FIXED:
             out.append(Anchor(platform, limbs.platform[j]))
             continue
-        number = getattr(home.leg(j).platform, "bar", None)
-        name = f"leg{j + 1}_bar" if number is None else f"bar{number}"
+        node = home.leg(j).platform
+        field = platform_carriers()[node.joint].body
+        name = f"{field}{getattr(node, field)}" if field else f"leg{j + 1}_bar"
         if name not in known:
             known[name] = j, _bar(platform, equality, home, j, name)
         first, bar = known[name]
@@ -605,7 +607,7 @@ def _cylinder(
     if np.linalg.norm(stop - start) < radius / 10:  # MuJoCo takes no cylinder without a length
         return
     shape = {"fromto": numbers(start, stop), "size": numbers(radius), "rgba": COLOURS[look]}
-    geom = SubElement(parent, "geom", type="cylinder", **shape)
+    geom = SubElement(parent, "geom", {"type": "cylinder", **shape})
     if name:
         geom.set("name", name)
 

@@ -8,12 +8,11 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
-from pkmcal.identify.blocks import BatchState, Blocks, Data
-from pkmcal.identify.gauge import Gauge, frame_rows, freedoms
-from pkmcal.identify.hinges import exact_moves
-from pkmcal.identify.pose_rows import PoseBlocks, PoseData
-from pkmcal.identify.problem import State
-from pkmcal.identify.residuals import SHADING_SIGMA, SHIFT_SIGMA, Problem
+from pkmcal.identify.estimate import State
+from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.rows import Blocks, Data, PoseBlocks, PoseData
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 

@@ -15,7 +15,6 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import ResultError
 from pkmcal.identify import robust as robust_weights
 from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
-from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.covariance import (
     Identifiability,
     Information,
@@ -25,11 +24,12 @@ from pkmcal.identify.covariance import (
     information,
     machine_covariance,
 )
+from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
-from pkmcal.identify.mounts import start_mounts
-from pkmcal.identify.problem import Estimate, State, Statistics
-from pkmcal.identify.residuals import Problem
+from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import Both
+from pkmcal.identify.start import start_mounts
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import (

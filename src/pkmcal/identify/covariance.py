@@ -14,20 +14,21 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import skew
-from pkmcal.identify.blocks import BatchState
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
     Gauge,
     alignment,
     carried_errors,
     changed_frames,
+    conventions,
     generators,
     mount_generators,
+    move_generators,
     projector,
     transformation,
 )
-from pkmcal.identify.hinges import conventions, move_generators
-from pkmcal.identify.problem import State
-from pkmcal.identify.residuals import Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.solver import Linear, Reduced, eliminate, reduced_normal, transposed
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
-from pkmcal.identify.problem import State
+from pkmcal.identify.estimate import State
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 

@@ -1,14 +1,14 @@
 """Residuals of the joint estimate and their exact Jacobians, all in standard deviations.
 
 Rows of a configuration are its edges, two each, then its limbs' closures, then its boards' poses
-(:mod:`pkmcal.identify.pose_rows`), six each:
+(:mod:`pkmcal.identify.rows`), six each:
 
 - edge: ``L^-1 (basis^T n_predicted + shift * s)`` with L the Cholesky factor of the edge's
   covariance. The measured normal is the true one moved by ``basis @ (shift * s)`` when all
   edge points lie s px outward, and ``basis^T n_measured = 0``; hence the plus sign.
 - closure: ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5 whitened; what no reading enters (rods
   of constant length, joints' axes) is taken as perfect and held to
-  :data:`pkmcal.identify.closure_noise.PERFECT`.
+  :data:`pkmcal.identify.rows.PERFECT`.
 
 Rows on shared unknowns: ``(theta - drawing) / tolerance``, the edge shift's prior, the gauge.
 
@@ -25,10 +25,19 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import skew
-from pkmcal.identify.blocks import BatchState, Blocks, Data
-from pkmcal.identify.closure_noise import by_noise, joint_rows
-from pkmcal.identify.pose_rows import PoseBlocks, PoseData, PoseRows, no_poses, pose_rows
+from pkmcal.identify.rows import (
+    Blocks,
+    Data,
+    PoseBlocks,
+    PoseData,
+    PoseRows,
+    by_noise,
+    joint_rows,
+    no_poses,
+    pose_rows,
+)
 from pkmcal.identify.steps import moved
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms.closure import Closure, LimbLayout, closure
 from pkmcal.solver import Linear, Values, of_runs
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.identify.blocks import BatchState
-from pkmcal.identify.residuals import Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.solver import FIRST_DAMPING, RESTART_DAMPING, minimise
 
 FULL, NONE = 4.0, 6.5

@@ -6,8 +6,8 @@ import numpy as np
 
 from pkmcal.errors import PkmcalError
 from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import State
 from pkmcal.identify.robust import norms
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine

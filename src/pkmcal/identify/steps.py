@@ -9,19 +9,21 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import inverse, perturb
-from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.gauge import (
     mount_generators,
+    move_generators,
     moved_centres,
     moved_mounts,
     pose_generators,
+    slid,
     station_generators,
+    turned_back,
 )
-from pkmcal.identify.hinges import move_generators, slid, turned_back
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms.closure import on_tangents
 
 if TYPE_CHECKING:
-    from pkmcal.identify.residuals import Problem
+    from pkmcal.identify.problem import Problem
 
 CLOSINGS = 2
 """Newton steps back onto the closures; each squares what is left."""

@@ -23,15 +23,15 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
 from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
-from pkmcal.identify.blocks import BatchState
 from pkmcal.identify.bundle import solve_batch
-from pkmcal.identify.covariance import RANK_TOLERANCE
+from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import Estimate, State
-from pkmcal.identify.residuals import Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import (
+    RANK_TOLERANCE,
     RESTART_DAMPING,
     Linear,
     Reduced,

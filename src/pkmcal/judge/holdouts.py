@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.calibration.aside import Region, by_region, select
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.judge.comparison import Comparison, compare
 from pkmcal.judge.prediction import predict
 from pkmcal.measurements import Measurements

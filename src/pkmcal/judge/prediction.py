@@ -20,10 +20,10 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
-from pkmcal.identify.blocks import BatchState
-from pkmcal.identify.closure_noise import PERFECT
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import pose_generators
-from pkmcal.identify.problem import State
+from pkmcal.identify.rows import PERFECT
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.judge.held import Held, hold, too_little
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.identify.words_names import named
 from pkmcal.judge.changes import POWER, ChangeTests, Explanation, LegTest, Suspect
 from pkmcal.judge.comparison import Comparison, Ratio, ratio, rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
-from pkmcal.wording import SCALES, brief, count, decimals, listed, number
+from pkmcal.wording import SCALES, brief, count, decimals, listed, named, number
 
 MOSTLY_NOISE = 2**0.5
 """Factor on the photographs' noise within which that is more than half of the mean square."""

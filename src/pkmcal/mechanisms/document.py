@@ -76,7 +76,7 @@ Rod = Annotated[
 ]
 
 OFFSET = ParameterKind("offset", "m", "offset")
-CONSTANT = ParameterKind("constant", "m", "offset")
+CONSTANT = ParameterKind("constant", "m", "offset", label="rod length")
 
 
 Motion = Literal["spatial", "planar", "translation", "schoenflies"]

@@ -301,6 +301,7 @@ def machine_from_document(
         names=tuple(names),
         units=tuple(row[1] for row in rows),
         kinds=tuple(row[2] for row in rows),
+        labels=tuple(row[4] for row in rows),
         drawing=np.array([row[3] for row in rows]),
         tolerance=np.array([getattr(document.tolerance, row[2]) for row in rows]),
     ).with_roles((*document.fixed, *built_in_fixed(document)), ties)
@@ -309,7 +310,7 @@ def machine_from_document(
 
 
 def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator of plain rows
-    """Rows (name, unit, tolerance's name, drawing value), leg by leg."""
+    """Rows (name, unit, tolerance's name, drawing value, label), leg by leg."""
     axes = axes_in_use(document)
     for j, leg in enumerate(document.legs):
         path = f"legs[{j + 1}]"
@@ -321,7 +322,7 @@ def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator 
             kind = OFFSET if isinstance(leg.length, ActuatedLength) else CONSTANT
             yield from _rows_of(f"{path}.length", leg.length, (kind,))
         for t, tube in enumerate(leg.tubes, start=1):
-            yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius
+            yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius, f"tube {t} radius"
 
 
 def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]):  # noqa: ANN202 - as above
@@ -329,7 +330,11 @@ def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]):  # noqa: A
     for kind in kinds:
         value = of_part(node, kind)
         if kind.tolerance and value is not None:
-            yield f"{path}.{kind.path}", kind.unit, kind.tolerance, value
+            name = f"{path}.{kind.path}"
+            label = kind.label or name.partition(".")[2].replace(".", " ").replace(
+                "center", "centre"
+            )
+            yield name, kind.unit, kind.tolerance, value, label
 
 
 def _assign(document: dict[str, Any], name: str, value: float) -> None:

@@ -26,7 +26,7 @@ class ParameterTable:
     """Every parameter of a machine, in one order.
 
     names, units, kinds : P entries; ``kinds`` is the tolerance's name: center, offset, radius,
-    axis, arm, angle.
+    axis, arm, angle. labels : what people call them, the leg apart: ``base centre z``.
     drawing, tolerance : (P,) drawing values and their standard deviations.
     fixed : names that keep their drawing value.
     tied : groups of names that change by the same amount. opposed : for each group, the names that
@@ -36,6 +36,7 @@ class ParameterTable:
     names: tuple[str, ...]
     units: tuple[str, ...]
     kinds: tuple[str, ...]
+    labels: tuple[str, ...]
     drawing: Array
     tolerance: Array
     fixed: tuple[str, ...] = ()
@@ -56,6 +57,11 @@ class ParameterTable:
                 expected=f"a name such as {close[0] if close else self.names[0]!r}",
                 next_step="write the parameter as its path in the mechanism file, legs from 1",
             ) from None
+
+    def in_words(self, name: str) -> str:
+        """A parameter's name for people: ``leg 3 base centre z``."""
+        leg = name.partition("]")[0].removeprefix("legs[")
+        return f"leg {leg} {self.labels[self.index(name)]}"
 
     def with_roles(
         self, fixed: tuple[str, ...] = (), tied: tuple[tuple[str, ...], ...] = ()

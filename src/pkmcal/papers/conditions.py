@@ -7,29 +7,13 @@ the Jacobian; these numbers are for comparison with the paper and for a first lo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pkmcal.arrays import Booleans, Integers
+from pkmcal.identify.unidentified import Condition
 from pkmcal.mechanisms import Machine
-from pkmcal.papers.four_step_checks import listed
+from pkmcal.papers.four_step_checks import numbered
 from pkmcal.papers.legs import legs_of
-
-
-@dataclass(frozen=True)
-class Condition:
-    """One condition of [A].
-
-    equation : its number in the paper. needed, available : counts. met : needed <= available.
-    text : what is counted, a sentence for people.
-    """
-
-    equation: str
-    needed: int
-    available: int
-    met: bool
-    text: str
 
 
 def conditions(machine: Machine, seen: Booleans) -> tuple[Condition, ...]:
@@ -46,7 +30,7 @@ def every_leg(seen: Booleans) -> Condition:
     lost = np.flatnonzero(~seen.any(axis=0))
     text = "every leg is seen by a station"
     if lost.size:
-        text += f"; none sees {'leg' if lost.size == 1 else 'legs'} {listed(lost)}"
+        text += f"; none sees {'leg' if lost.size == 1 else 'legs'} {numbered(lost)}"
     return _condition("3.3", seen.shape[1], int(seen.any(axis=0).sum()), text)
 
 

@@ -23,10 +23,10 @@ from typing import Literal
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import dot
+from pkmcal.geometry.rigid import dot, nearest_rotation
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import BestFit, centre_index, default_gauge
 from pkmcal.identify.gauge import apply as in_gauge
-from pkmcal.identify.problem import State
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import four_step_checks as checks
@@ -64,7 +64,7 @@ from pkmcal.papers.leg_axes import (
     through_centres,
 )
 from pkmcal.papers.legs import Legs, base_gauge, legs_of, platform_gauge
-from pkmcal.papers.registration import Body, extent, fixes_pose, laid, nearest_rotation
+from pkmcal.papers.registration import Body, extent, fixes_pose, laid
 
 __all__ = ["Axes", "Form", "FourSteps", "centres_from_axes", "four_step", "solve"]
 

@@ -16,8 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose_difference
-from pkmcal.identify.problem import State
+from pkmcal.geometry.rigid import (
+    apply,
+    dot,
+    inverse,
+    nearest_rotation,
+    perturb,
+    pose_difference,
+)
+from pkmcal.identify.estimate import State
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.leg_axes import Axes
@@ -26,7 +33,6 @@ from pkmcal.papers.registration import (
     fit_body,
     fixes_pose,
     laid,
-    nearest_rotation,
     points_by,
 )
 
@@ -160,7 +166,7 @@ def with_boards(
         theta,
         T_camera_base,
         T_base_platform,
-        np.zeros(int(np.max(measurements.camera_of_station)) + 1),
+        np.zeros(measurements.n_cameras),
         T_mount=mounts,
         on_platform=measurements.on_platform,
     )

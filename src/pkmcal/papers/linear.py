@@ -145,7 +145,7 @@ def errors_in_variables(
     """Minimum of sum w (n.A + R)^2 / (A^T Sigma_n A): A and its covariance, (..., 3, 3).
 
     covariance : (..., n, 3, 3) of the normals. The noise of n.A grows with A; leaving that
-    out, or its derivative, shrinks A towards the camera. Gauss-Newton, five steps.
+    out, or its derivative, shrinks A towards the camera. Gauss-Newton, eight steps.
     """
     a, inverse = start, np.full((*start.shape, 3), np.nan)
     for _ in range(8):
@@ -211,20 +211,16 @@ def solve(
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Array]:
     """One method on many systems: A, weights, covariance (see :func:`centres`)."""
-    plain, inverse = weighted(n, radius, present)
-    if method == "plain":
-        sigma = scale_of(residuals(n, radius, plain), present)
-        return plain, present, inverse * sigma[..., None, None] ** 2
-    if method in ("huber", "tukey"):
-        a, w, inverse = reweighted(n, radius, present, plain, method)
-    elif method == "errors-in-variables":
-        a, covariance = errors_in_variables(n, radius, noise, present, plain)
-        return a, present, covariance
-    else:
+    a, inverse = weighted(n, radius, present)
+    w = present
+    if method in ("least-median", "robust"):
         a = least_median(n, radius, present, rng)
         if method == "least-median":
-            return a, present, np.full((*a.shape, 3), np.nan)
-        a, w, inverse = reweighted(n, radius, present, a, "tukey")
+            return a, w, np.full((*a.shape, 3), np.nan)
+    if method in ("huber", "tukey", "robust"):
+        kind = "huber" if method == "huber" else "tukey"
+        a, w, inverse = reweighted(n, radius, present, a, kind)
+    if method in ("errors-in-variables", "robust"):
         # a clean edge may lose most of its Tukey weight; count it fully, a wrong one not at all
         w = np.where(w > 0.05, 1.0, 0.0) * present
         a, covariance = errors_in_variables(n, radius, noise, w, a)

@@ -18,8 +18,8 @@ from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference, register
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import data_share
+from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import apply, centre_index, default_gauge
-from pkmcal.identify.problem import Estimate, State, Statistics
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers import linear

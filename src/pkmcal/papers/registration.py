@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import dot, perturb, pose, register, rotation, skew
+from pkmcal.geometry.rigid import dot, nearest_rotation, perturb, pose, register, rotation, skew
 from pkmcal.solver import Linear, Solution, Values, minimise
 
 SCALE = 1e-4
@@ -53,20 +53,21 @@ class BodyProblem:
     motion: Array
 
     def residuals(self, state: Body) -> Values:
-        """Weighted differences and the gauge's rows."""
-        linear = self.linearize(state)
-        return Values(linear.value, linear.shared_value)
+        """Weighted differences, (B, K, 3 n), and the gauge's rows."""
+        rot, shift = state.poses[..., None, :3, :3], state.poses[..., None, :3, 3]
+        turned = (rot @ state.points[:, None, :, :, None])[..., 0]
+        w = np.sqrt(self.weight)[..., None] / SCALE
+        value = (turned + self.shifts[:, None] * shift - self.measured) * w
+        value = np.where(w > 0, value, 0.0).reshape(*value.shape[:2], -1)
+        held = (state.points - self.drawing).reshape(len(value), -1) @ self.gauge.T
+        return Values(value, held / SCALE)
 
     def linearize(self, state: Body) -> Linear:
         """Residuals and exact Jacobian."""
-        shape = self.measured.shape
+        shape, n = self.measured.shape, self.measured.shape[2]
         rot = state.poses[..., None, :3, :3]
         turned = (rot @ state.points[:, None, :, :, None])[..., 0]
-        shift = self.shifts[:, None]
-        difference = turned + shift * state.poses[..., None, :3, 3] - self.measured
         w = np.sqrt(self.weight)[..., None] / SCALE
-        value = np.where(w > 0, difference * w, 0.0)
-        n = shape[2]
         by_shared = np.zeros((*shape, n, 3))
         j = np.arange(n)
         by_shared[:, :, j, :, j, :] = np.moveaxis(
@@ -74,15 +75,15 @@ class BodyProblem:
         )
         by_own = np.zeros((*shape, 6))
         by_own[..., :3] = -skew(turned) * w[..., None]
-        by_own[..., 3:] = np.eye(3) * (shift * w)[..., None]
-        held = (state.points - self.drawing).reshape(shape[0], -1) @ self.gauge.T
-        rows = (shape[0], shape[1], 3 * n)
+        by_own[..., 3:] = np.eye(3) * (self.shifts[:, None] * w)[..., None]
+        values = self.residuals(state)
+        rows = values.value.shape
         return Linear(
-            value.reshape(rows),
+            values.value,
             by_shared.reshape(*rows, 3 * n),
             by_own.reshape(*rows, 6) @ self.motion,
             np.ones(rows, dtype=bool),
-            held / SCALE,
+            values.shared_value,
             self.gauge / SCALE,
         )
 
@@ -148,14 +149,6 @@ def laid(
         rot = rotation(omega)
     shift = seen - (rot @ mean[..., None])[..., 0]
     return pose(rot, shift @ motion[3:] @ motion[3:].T)
-
-
-def nearest_rotation(h: Array) -> Array:
-    """The rotations R (..., 3, 3) that maximise tr(R^T H); reflections are excluded."""
-    u, _, vt = np.linalg.svd(h)
-    u = u.copy()
-    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    return u @ vt
 
 
 def extent(points: Array) -> float:

@@ -13,12 +13,19 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector, skew
-from pkmcal.identify.pose_rows import turn_jacobian
+from pkmcal.geometry.rigid import (
+    cross,
+    dot,
+    nearest_rotation,
+    pose,
+    rotation,
+    rotation_vector,
+    skew,
+)
+from pkmcal.identify.rows import turn_jacobian
 from pkmcal.measurements import PoseSet
 from pkmcal.mechanisms.document import MOTIONS
 from pkmcal.papers.measured_platform import taken
-from pkmcal.papers.registration import nearest_rotation
 
 Turning = Literal["none", "one axis", "any"]
 TURNS: dict[int, Turning] = {0: "none", 1: "one axis", 3: "any"}

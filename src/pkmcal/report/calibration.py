@@ -7,14 +7,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from markupsafe import Markup
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.results import REPORT, check_output, texts_of, versions
 from pkmcal.files import write_folder
-from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.centres import Centres
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.tool import centres_and_tool
 from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.outcome import Finding, Level, Outcome, Part, Plot, Verdict
@@ -31,12 +31,11 @@ from pkmcal.report import (
     scene,
     validation,
 )
-from pkmcal.report.toolpoint import ToolPoint, tool_point
 from pkmcal.session.load import Session
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
-    from pkmcal.identify.words import Findings
+    from pkmcal.identify.unidentified import Findings
     from pkmcal.judge.holdouts import HoldOut
 
 MODEL_ERROR = Markup(
@@ -69,14 +68,13 @@ def outcome_of(calibration: Calibration) -> Outcome:
     groups = parameters.parameter_groups(c.session.machine, c.estimate)
     open_ = parameters.unidentified(groups, c.estimate, c.findings)
     numbers = held_out and held_out.document(c.session.configurations)
-    centres, tool = _uncertainty(c.session, c.estimate)
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
         texts=texts_of(c, open_, numbers),
         summary={
             "verdict": asdict(c.verdict),
-            "figures": headline.numbers(c.observation, c.estimate, centres, tool),
+            **(told.summary or {}),
             "session_warnings": c.session.warnings,
             "holdout": numbers,
             "timings": c.timings,
@@ -110,7 +108,7 @@ def report_of(
     edges = observation.edges
     camera = residuals.camera_numbers(session)
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
-    centres, tool = _uncertainty(session, estimate)
+    centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     measured = poses.section(session, observation, estimate)
     # boards and trackers alone have no edges to show; legs without any do have a question
     photographed = len(edges) > 0 or not len(observation.poses)
@@ -134,24 +132,8 @@ def report_of(
         figures=headline.cards(session, observation, estimate, centres, tool),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
+        summary={"figures": headline.numbers(observation, estimate, centres, tool)},
     )
-
-
-def _uncertainty(session: Session, estimate: Estimate) -> tuple[tuple[Centres, ...], ToolPoint]:
-    """Joint centres, and poses of the configurations in use, free of the choice of frames."""
-    covariance = free_of_gauge(estimate)
-    centres = joint_centres(session.machine, estimate.machine, covariance)
-    tool = tool_point(
-        session.machine,
-        estimate.machine,
-        covariance,
-        session.joints,
-        estimate.state.T_base_platform,
-        np.flatnonzero(estimate.configurations),
-        centres,
-        legs_seen=estimate.edge_weights.size > 0,
-    )
-    return centres, tool
 
 
 def _geometry(

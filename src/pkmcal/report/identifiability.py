@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.identify.words import Findings, Sentence
+from pkmcal.identify.sentences import Sentence
+from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import ParameterTable
 from pkmcal.papers.conditions import Condition
 from pkmcal.report.charts import Bar, BarChart
@@ -124,7 +125,7 @@ def _fixed(table: ParameterTable, findings: Findings) -> str:
         return _by_convention(table, findings, told)
     verb = "was" if len(table.fixed) == 1 else "were"
     return (
-        f"{_listed(table.fixed)} {verb} not estimated: the mechanism file lists "
+        f"{_listed(table, table.fixed)} {verb} not estimated: the mechanism file lists "
         f"{'it' if len(table.fixed) == 1 else 'them'} under fixed, so the drawing's value counts "
         "as exact and no direction belongs to it."
     )
@@ -136,9 +137,9 @@ def _by_convention(table: ParameterTable, findings: Findings, told: list[str]) -
     parts: list[str] = []
     if told:
         parts.append(
-            f"{_listed(tuple(told))} {'is' if len(told) == 1 else 'are'} held by convention: any "
-            "other value would only move a frame, or be made good by a value that is estimated, "
-            "and the platform would be where it is."
+            f"{_listed(table, tuple(told))} {'is' if len(told) == 1 else 'are'} held by convention:"
+            " any other value would only move a frame, or be made good by a value that is"
+            " estimated, and the platform would be where it is."
         )
     if any(".platform." in name and name.endswith(".z") for name in told):
         parts.append(
@@ -148,8 +149,8 @@ def _by_convention(table: ParameterTable, findings: Findings, told: list[str]) -
     if others:
         verb = "is" if len(others) == 1 else "are"
         parts.append(
-            f"{_listed(tuple(others))} {verb} held by the model that the mechanism file describes: "
-            "the drawing's value counts as exact and no direction belongs to it."
+            f"{_listed(table, tuple(others))} {verb} held by the model that the mechanism file"
+            " describes: the drawing's value counts as exact and no direction belongs to it."
         )
     if findings.also_conventional:
         parts.append(
@@ -167,7 +168,7 @@ def _tied(table: ParameterTable) -> str:
     against = {name for names in table.opposed for name in names}
     order = [tuple(name for name in table.names if name in names) for names in groups]
     said = [
-        joined(grouped(names)) + (" (by opposite amounts)" if against & set(names) else "")
+        joined(grouped(table, names)) + (" (by opposite amounts)" if against & set(names) else "")
         for names in order[:MOST_NAMES]
     ]
     more = f" and {len(order) - MOST_NAMES} more" if len(order) > MOST_NAMES else ""
@@ -184,8 +185,8 @@ def _together(table: ParameterTable) -> list[set[str]]:
     return out
 
 
-def _listed(names: tuple[str, ...]) -> str:
-    groups = grouped(names)
+def _listed(table: ParameterTable, names: tuple[str, ...]) -> str:
+    groups = grouped(table, names)
     words = groups[:MOST_NAMES]
     if len(groups) > MOST_NAMES:
         words.append(f"{len(groups) - MOST_NAMES} more")

@@ -9,16 +9,15 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.decided import EXACT, Decider, decided_by
-from pkmcal.identify.problem import Estimate
-from pkmcal.identify.words import Findings
-from pkmcal.identify.words_names import named
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.wording import (
     SCALES,
     decimals,
     joined,
-    label,
     legs_named,
+    named,
     number,
     percent,
     split_name,
@@ -36,7 +35,7 @@ SOURCES = {
 
 
 @dataclass(frozen=True)
-class Row:
+class ParameterRow:
     """One parameter as the table shows it; texts carry sensible digits, numbers serve sorting.
 
     leg : from 1, None for a parameter of no leg. source : a key of ``SOURCES``. share : of what
@@ -68,24 +67,26 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Group:
+class ParameterGroup:
     """The rows of one leg (None: of the machine)."""
 
     leg: int | None
-    rows: tuple[Row, ...]
+    rows: tuple[ParameterRow, ...]
 
 
-def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[Group, ...]:
+def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[ParameterGroup, ...]:
     """All parameters, grouped by leg in the order of the file."""
     table = estimate.machine.parameters
     before = drawing.values
     source = decided_by(table, estimate.covariance, estimate.data_share)
     rows = [_row(table, k, float(before[k]), estimate, source[k]) for k in range(len(table))]
     legs = list(dict.fromkeys(row.leg for row in rows))
-    return tuple(Group(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
+    return tuple(ParameterGroup(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
 
 
-def _row(table: ParameterTable, k: int, before: float, estimate: Estimate, source: Decider) -> Row:
+def _row(
+    table: ParameterTable, k: int, before: float, estimate: Estimate, source: Decider
+) -> ParameterRow:
     factor, unit = SCALES.get(table.units[k], (1.0, table.units[k].replace("1", "")))
     after = float(estimate.machine.values[k])
     variance = float(estimate.covariance[k, k])
@@ -93,11 +94,10 @@ def _row(table: ParameterTable, k: int, before: float, estimate: Estimate, sourc
     numbers = (before * factor, after * factor, (after - before) * factor, sigma * factor)
     places = decimals(numbers[3])
     name = table.names[k]
-    leg, path = split_name(name)
-    return Row(
+    return ParameterRow(
         name=name,
-        leg=leg,
-        label=label(path),
+        leg=split_name(name)[0],
+        label=table.labels[k],
         unit=unit,
         drawing=number(numbers[0], places),
         calibrated=number(numbers[1], places),
@@ -116,7 +116,7 @@ def _tie(table: ParameterTable, name: str) -> str:
 
 
 def unidentified(
-    groups: tuple[Group, ...], estimate: Estimate, findings: Findings | None = None
+    groups: tuple[ParameterGroup, ...], estimate: Estimate, findings: Findings | None = None
 ) -> tuple[str, ...]:
     """Sentences: what the data leave open, then pairs that can hardly be told apart.
 
@@ -131,7 +131,8 @@ def unidentified(
 
 def bound_together(estimate: Estimate, findings: Findings | None = None) -> tuple[str, ...]:
     """Sentences on pairs that can hardly be told apart, but those that a finding names together."""
-    names = estimate.machine.parameters.names
+    table = estimate.machine.parameters
+    names = table.names
     found = () if findings is None else findings.unidentified
     said = [{_whole_axis(name) for name in s.parameters} for s in found]
     pairs = [
@@ -140,7 +141,7 @@ def bound_together(estimate: Estimate, findings: Findings | None = None) -> tupl
         for pair in [{_whole_axis(names[i]), _whole_axis(names[j])}]
         if len(pair) == 2 and not any(pair <= s for s in said)
     ]
-    return tuple(_pair_text(*pair) for pair in pairs[:MOST_PAIRS])
+    return tuple(_pair_text(table, *pair) for pair in pairs[:MOST_PAIRS])
 
 
 def _whole_axis(name: str) -> str:
@@ -149,9 +150,9 @@ def _whole_axis(name: str) -> str:
     return whole if whole.endswith("axis") else name
 
 
-def _by_kind(groups: tuple[Group, ...], estimate: Estimate) -> list[str]:
+def _by_kind(groups: tuple[ParameterGroup, ...], estimate: Estimate) -> list[str]:
     """Sentences on the values that stayed the drawing's."""
-    kinds: dict[str, list[Row]] = {}
+    kinds: dict[str, list[ParameterRow]] = {}
     for group in groups:
         for row in group.rows:
             if row.source == "drawing":
@@ -159,7 +160,7 @@ def _by_kind(groups: tuple[Group, ...], estimate: Estimate) -> list[str]:
     return [_kind_text(kind, rows, estimate.machine.n_legs) for kind, rows in kinds.items()]
 
 
-def _kind_text(kind: str, rows: list[Row], all_legs: int) -> str:
+def _kind_text(kind: str, rows: list[ParameterRow], all_legs: int) -> str:
     """One sentence for parameters of one kind."""
     legs = [row.leg for row in rows if row.leg is not None]
     where = f" of {legs_named(legs, all_legs)}" if legs else ""
@@ -172,21 +173,16 @@ def _kind_text(kind: str, rows: list[Row], all_legs: int) -> str:
     )
 
 
-def _pair_text(first: str, second: str, rho: float) -> str:
+def _pair_text(table: ParameterTable, first: str, second: str, rho: float) -> str:
     what = "difference" if rho > 0 else "sum"
+    start = table.in_words(first)
     return (
-        f"{in_words(first).capitalize()} and {in_words(second)} move together (correlation "
+        f"{start[0].upper()}{start[1:]} and {table.in_words(second)} move together (correlation "
         f"{number(rho, 3)}): their {what} is known far better than each alone."
     )
 
 
-def in_words(name: str) -> str:
-    """A parameter's name for people: ``leg 3 base centre z``."""
-    leg, path = split_name(name)
-    return f"leg {leg} {label(path)}" if leg else label(path)
-
-
-def grouped(names: tuple[str, ...]) -> list[str]:
+def grouped(table: ParameterTable, names: tuple[str, ...]) -> list[str]:
     """Names in words, one entry for what three legs or more have: ``hinge y of legs 1 to 4``."""
     legs: dict[str, list[int]] = {}
     for name in names:
@@ -197,9 +193,10 @@ def grouped(names: tuple[str, ...]) -> list[str]:
         leg, path = split_name(name)
         several = len(legs[path]) > 2
         if not several:
-            out.append(in_words(name))
+            out.append(table.in_words(name))
         elif leg == legs[path][0]:
-            out.append(f"{label(path)} of {named(j - 1 for j in legs[path])}")
+            label = table.labels[table.index(name)]
+            out.append(f"{label} of {named(j - 1 for j in legs[path])}")
     return out
 
 

@@ -9,8 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import dot
-from pkmcal.identify.problem import Estimate
-from pkmcal.identify.words_names import named
+from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import legs_in_camera
@@ -25,7 +24,7 @@ from pkmcal.report.charts import (
     row_chart,
 )
 from pkmcal.session.load import Session
-from pkmcal.wording import count, joined, number
+from pkmcal.wording import count, joined, named, number
 
 KEPT = 0.5
 """Robust weight below which an edge counts as put aside; pictures draw it dashed."""

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.identify.words_names import named
 from pkmcal.judge.changes import POWER, ChiSquare, LegTest, Suspect
 from pkmcal.judge.watch import Watch, cameras_of
 from pkmcal.judge.words import amount, said, signed
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
 from pkmcal.report import charts
-from pkmcal.wording import SCALES, brief, count, number
+from pkmcal.wording import SCALES, brief, count, named, number
 
 NONE = "–"
 LARGE = 2.0

@@ -12,7 +12,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.bundle import BatchResult, solve_batch
-from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold

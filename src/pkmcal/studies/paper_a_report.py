@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import Figure, Outcome, Part, Plot, Row, Table
+from pkmcal.outcome import Outcome, Part, Row, Table
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import Study, run
 from pkmcal.studies.expected import Compared
 from pkmcal.studies.paper_a import (
     BOUND,
     CORRECTED,
+    DEGREE,
     DRAWING,
     EFFECTOR,
     GROUPS,
@@ -39,26 +40,13 @@ from pkmcal.studies.paper_a_expected import (
     figures_compared,
 )
 from pkmcal.studies.plots import AXIS, LOOKS, TICKS, bars, log_log, series
-from pkmcal.studies.reproduction import (
-    Column,
-    Options,
-    Publication,
-    accuracy_rows,
-    mm,
-    reproduction,
-)
+from pkmcal.studies.reproduction import Column, Options, Shown, Words, accuracy_rows, deg, mm
 from pkmcal.studies.statistics import Summary, coverage, ratio
-from pkmcal.wording import brief, joined, number
+from pkmcal.wording import joined, number
 
 if TYPE_CHECKING:
     from pkmcal.studies.paper_a_photographs import MeasuredNoise
 
-PAPER = Publication(
-    "a",
-    "Paper A: a hexapod calibrated from its legs' axes, simulated",
-    "P. Renaud, N. Andreff, G. Gogu, P. Martinet: On vision-based kinematic calibration of n-leg"
-    " parallel mechanisms, IFAC, 2002; sections 4.2 and 4.3.",
-)
 NARROW = 0.002 / 3**0.5
 """Standard deviation (m) of drawing errors spread evenly within 2 mm, the other reading of "uniform
 noise with variance equal to 2 mm"."""
@@ -78,6 +66,8 @@ QUANTITIES = {
     "displacement": "displacement",
     "orientation": "orientation",
 }
+REMARKS = ("printed", "before", "agree", "of_drawing", "others")
+"""The last two where there is something to tell."""
 RANGE = (0.005, 5.0)
 """mm that Fig. 4's logarithmic axis of errors holds."""
 
@@ -101,21 +91,20 @@ def reproduce(options: Options) -> Outcome:
         )
     )
     by_poses = _by_poses(options, found, done + 2 * share) if options.long else {}
-    return reproduction(
-        PAPER,
-        headline=_headline(found),
-        figures=_cards(found),
-        parts=(
-            noise_part(measured),
-            figure_part(found),
-            effector_part(found, narrow),
-            group_part(found),
-            *([poses_part(by_poses)] if by_poses else []),
-            how_part(found),
+    figures = figures_compared(found)
+    words = _words(found, narrow, figures, measured)
+    return words.reproduction(
+        (
+            words.part("noise", table_1(measured), more=["measured"] if measured else []),
+            _figure_part(words, found),
+            words.part("effector", _effector_table(found), _readings_table(found, narrow)),
+            words.part("groups", _group_table(found)),
+            *([_poses_part(words, by_poses)] if by_poses else []),
+            words.part("how"),
         ),
         checks=checks(found),
-        remarks=_remarks(found, narrow),
-        numbers={**_numbers(found, narrow, by_poses), **_noise(measured)},
+        remarks=[name for name in REMARKS if words.values.get(name, True)],
+        numbers={**_numbers(found, narrow, figures, by_poses), **_noise(measured)},
     )
 
 
@@ -131,11 +120,6 @@ def _by_poses(options: Options, found: Found, done: float) -> dict[int, Found]:
         out[poses] = found if same else run(setting, options.runs, options.seed, told)
         done = upto
     return out
-
-
-def deg(value: float, places: int = 4) -> str:
-    """Radians as degrees without the sign."""
-    return number(float(np.degrees(value)), places)
 
 
 def _name(method: str) -> str:
@@ -163,95 +147,37 @@ def _depth_as_printed(s: Found) -> float:
     return float(mean_error(s, PRINTED)[z].mean())
 
 
-# ------------------------------------------------------------------ headline, cards, remarks
-
-
-def _headline(s: Found) -> str:
-    joint, printed = s.of(JOINT), s.of(PRINTED)
-    return (
-        f"The joint estimate leaves {mm(joint['displacement'].value)} mm and"
-        f" {deg(joint['orientation'].value)}° at the end-effector, where the paper reports"
-        f" {mm(AFTER[0], 2)} mm and {deg(AFTER[1], 3)}°; its four steps as printed leave"
-        f" {brief(1e3 * printed['displacement'].value)} mm."
-    )
-
-
-def _cards(s: Found) -> tuple[Figure, ...]:
-    joint, least, printed = s.of(JOINT), s.of(BOUND), s.of(PRINTED)
+def _words(
+    s: Found, narrow: Found, figures: list[Compared], measured: MeasuredNoise | None
+) -> Words:
+    """All that is said, with the figures that it names; differences from the prototype too."""
 
     def over(method: str, other: str) -> float:
         return ratio(s.of(method)["parameters"], s.of(other)["parameters"]).value
 
-    return (
-        Figure(
-            "How far is the end-effector off after the joint estimate?",
-            (
-                (mm(joint["displacement"].value), "mm"),
-                (deg(joint["orientation"].value), "°"),
-            ),
-            f"± {mm(joint['displacement'].error)} mm and {deg(joint['orientation'].error)}° of"
-            f" Monte-Carlo error; the paper: {mm(AFTER[0], 2)} mm, {deg(AFTER[1], 3)}°",
-        ),
-        Figure(
-            "Could any method do better?",
-            ((number(joint["parameters"].value / least["parameters"].value, 2), "of the bound"),),
-            "RMSE of all thirty parameters, joint estimate over Cramér-Rao",
-        ),
-        Figure(
-            "What do the four steps lose?",
-            ((number(over(CORRECTED, JOINT), 1), "times"),
-             (number(over(PRINTED, JOINT), 0), "times")),
-            "RMSE over the joint estimate's: corrected, and as printed",
-        ),
-        Figure(
-            "Why as printed?",
-            ((brief(1e3 * printed["base_z"].value), "mm"),),
-            f"in base z, where the drawing was {brief(1e3 * s.of(DRAWING)['base_z'].value)} mm off:"
-            " products of distances between joints in one plane do not tell depth",
-        ),
-        Figure(
-            "Does it always converge?",
-            ((f"{converged(s)} of {s.runs}", "runs"),),
-            f"χ² per degree of freedom {number(joint['chi2'].value, 3)}, 1 expected",
-        ),
-        Figure(
-            "How long does it take?",
-            ((number(s.solving, 1), "s"),),
-            f"four steps in both forms and joint estimate of {s.runs} runs;"
-            f" {number(s.cpu, 1)} s of processor time on {s.threads} threads",
-        ),
-    )  # fmt: skip
-
-
-def _remarks(s: Found, narrow: Found) -> tuple[str, ...]:
-    """Where we differ from the paper and from the prototype, and why."""
-    before = s.of(DRAWING)["displacement"].value
-    out = [
-        f"The paper's {mm(AFTER[0], 2)} mm is not what its four steps give here as printed. They"
-        f" keep the drawing's depth: with drawing errors within ± 2 mm their mean error in z is"
-        f" {mm(_depth_as_printed(narrow), 2)} mm, the paper's “1 mm”, and the end-effector is then"
-        f" {mm(narrow.of(PRINTED)['displacement'].value, 1)} mm off.",
-        f"The paper's 1 mm before calibration asks for drawing errors with a standard deviation of"
-        f" some {2e3 * BEFORE[0] / (1e3 * before):.1f} mm, not 2 mm, on this"
-        " machine.",
-    ]
-    figures = figures_compared(s)
     apart = [f for f in figures if f.differs]
     of_drawing = [f for f in apart if (f.key, f.quantity) in FOLLOWS_DRAWING]
-    others = [f for f in apart if f not in of_drawing]
-    count = f"{len(figures) - len(apart)} of {len(figures)} figures"
-    out.append(f"{count} agree with the independent prototype's within the Monte-Carlo error.")
-    if of_drawing:
-        out.append(
-            f"{_told(of_drawing)}: these follow the drawing's errors, whose size the paper leaves"
-            " open."
-        )
-    if others:
-        out.append(
-            f"{_told(others)}. The cameras' height, which the paper does not tell, moves the bound"
-            " and with it every method."
-        )
-    return tuple(out)
+    joint = s.samples[JOINT,]
+    inside = coverage(joint.values["parameters"], joint.sigma["parameters"]).times(100)
+    return Words.of(
+        "a",
+        s,
+        after=(Shown(1e3 * AFTER[0]), Shown(DEGREE * AFTER[1])),
+        joint_over_bound=over(JOINT, BOUND),
+        corrected_over_joint=over(CORRECTED, JOINT),
+        printed_over_joint=over(PRINTED, JOINT),
+        converged=converged(s),
+        narrow_depth=1e3 * _depth_as_printed(narrow),
+        narrow_displacement=1e3 * narrow.of(PRINTED)["displacement"].value,
+        drawing_error_asked=2 * BEFORE[0] / s.of(DRAWING)["displacement"].value,
+        agree=len(figures) - len(apart),
+        compared=len(figures),
+        of_drawing=_told(of_drawing),
+        others=_told([f for f in apart if f not in of_drawing]),
+        inside=inside.value,
+        inside_error=inside.error,
+        edge=measured.edge if measured else 0.0,
+    )
 
 
 # ------------------------------------------------------------------ parts
@@ -279,30 +205,7 @@ def table_1(measured: MeasuredNoise | None = None) -> Table:
     return Table(title, ("", "ψ", "θ", "x", "z"), tuple(rows))
 
 
-def noise_part(measured: MeasuredNoise | None = None) -> Part:
-    """[A] Table 1 and how it enters. measured : see :func:`table_1`."""
-    text = [
-        "How well one image of a leg tells its axis: ψ and θ are the angles of its direction in"
-        " the image plane and towards the viewer, x and z the point of the axis with y = 0, in"
-        " the camera's frame. The paper prints radians. It must mean degrees: 0.05 rad over a"
-        " leg of 0.4 m would be 20 mm.",
-        "The simulation adds these deviations, divided by √3 since the paper takes three images"
-        " of each pose, to the four coordinates of every axis. The four steps take the axis"
-        " as it is; the joint estimate takes it as the two edges that a leg around this axis"
-        " would show, with the same noise.",
-    ]
-    if measured is not None:
-        text.append(
-            "Measured here: rendered photographs of 1024×768 pixels, six configurations from three"
-            f" places some 1.1 m away, each taken five times. Edges scatter by"
-            f" {brief(measured.edge)} px. Still the axes scatter more than the paper's, towards"
-            " the viewer above all: depth comes from the leg's apparent width alone, some 20 px."
-            " The joint estimate of photographs therefore takes the edges, never the axes."
-        )
-    return Part("noise", "Table 1", tuple(text), tables=(table_1(measured),))
-
-
-def figure_part(s: Found) -> Part:
+def _figure_part(words: Words, s: Found) -> Part:
     """[A] Fig. 4."""
     params = thirty(study_machine())
     errors = {method: mean_error(s, method) for method in METHODS}
@@ -316,45 +219,22 @@ def figure_part(s: Found) -> Part:
         Row(name, (mm(float(value), 1), *(mm(float(errors[m][k])) for m in METHODS)))
         for k, (name, value) in enumerate(zip(params.names, params.drawing, strict=True))
     ]
-    told = s.samples[JOINT,]
-    inside = coverage(told.values["parameters"], told.sigma["parameters"])
-    return Part(
+    heads = ("", "true value", *(_name(m) for m in METHODS))
+    return words.part(
         "figure",
-        "Fig. 4",
-        (
-            "Thirty parameters: the joint centres of base (A) and platform (B) in frames by the"
-            " centres 1, 3 and 5, where six coordinates of each vanish, and the offsets (q).",
-            "The joint estimate states standard deviations, too:"
-            f" {number(100 * inside.value, 1)} ± {number(100 * inside.error, 1)} % of its errors"
-            " lie in the intervals of 95 % that these give.",
+        Table(
+            "Mean |error| of the parameters, mm",
+            ("", "smallest", "mean", "largest", "worst"),
+            tuple(summary),
         ),
-        plots=(
-            Plot(
-                "errors",
-                "True values and mean errors of the thirty parameters",
-                "The scale of errors is logarithmic. As printed, every z keeps the error that the"
-                " drawing had. Corrected, the four steps find all parameters; the joint estimate"
-                " cannot be told from the bound.",
-                "Bars of the mean error of thirty parameters by method, true values as a line",
-                figure_4(params.names, params.drawing, errors),
-                560,
-                860,
-            ),
-        ),
-        tables=(
-            Table(
-                "Mean |error| of the parameters, mm",
-                ("", "smallest", "mean", "largest", "worst"),
-                tuple(summary),
-            ),
-            Table(
-                "All thirty, mm",
-                ("", "true value", *(_name(m) for m in METHODS)),
-                tuple(every),
-                brief=False,
-                folded=True,
-            ),
-        ),
+        Table("All thirty, mm", heads, tuple(every), brief=False, folded=True),
+        plots={
+            "errors": {
+                "figure": figure_4(params.names, params.drawing, errors),
+                "height": 560,
+                "width": 860,
+            }
+        },
     )
 
 
@@ -405,8 +285,8 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
     return {"data": data, "layout": layout, "config": {}}
 
 
-def effector_part(s: Found, narrow: Found) -> Part:
-    """The end-effector, [A] eq. 20. narrow : with the other reading of the drawing's errors."""
+def _effector_table(s: Found) -> Table:
+    """[A] eq. 20."""
     columns = (
         Column("displacement", 3, 3),
         Column("orientation", 4, 4),
@@ -418,60 +298,41 @@ def effector_part(s: Found, narrow: Found) -> Part:
     ]
     for m in METHODS:
         rows += accuracy_rows(s, (m,), _name(m), columns, PROTOTYPE.get((m,)))
+    note = "The paper's angles are printed in rad; degrees are meant, as in Table 1."
+    heads = ("", "mm", "°", "mm, all joints")
+    return Table("Errors of the end-effector", heads, tuple(rows), note)
 
-    def reading(name: str, s: Found) -> Row:
-        drawing, printed, joint = (s.of(m)["displacement"].value for m in (DRAWING, PRINTED, JOINT))
+
+def _readings_table(wide: Found, narrow: Found) -> Table:
+    """What the drawing's errors do, by the two readings of the paper."""
+
+    def row(name: str, s: Found) -> Row:
+        before, printed, joint = (s.of(m)["displacement"].value for m in (DRAWING, PRINTED, JOINT))
         depth = mm(_depth_as_printed(s), 2)
-        return Row(name, (mm(drawing, 2), mm(printed, 2), depth, mm(joint)))
+        return Row(name, (mm(before, 2), mm(printed, 2), depth, mm(joint)))
 
-    return Part(
-        "effector",
-        "End-effector",
+    return Table(
+        "Drawing errors: “uniform noise with variance equal to 2 mm”",
+        ("", "drawing", "as printed", "its mean |z|", "joint"),
         (
-            "Mean displacement and turn of the platform at ten random poses a run, by the"
-            " estimated and by the true machine, equation 20. In frames that three joints define,"
-            " these joints' own errors turn the frame; the last column lays the estimated machine"
-            " on the true one by all its joints first.",
+            Row("The paper", (mm(BEFORE[0], 2), mm(AFTER[0], 2), "up to 1", ""), "paper"),
+            row("Standard deviation 2 mm", wide),
+            row("Within ± 2 mm", narrow),
         ),
-        tables=(
-            Table(
-                "Errors of the end-effector",
-                ("", "mm", "°", "mm, all joints"),
-                tuple(rows),
-                "The paper's angles are printed in rad; degrees are meant, as in Table 1.",
-            ),
-            Table(
-                "Drawing errors: “uniform noise with variance equal to 2 mm”",
-                ("", "drawing", "as printed", "its mean |z|", "joint"),
-                (
-                    Row("The paper", (mm(BEFORE[0], 2), mm(AFTER[0], 2), "up to 1", ""), "paper"),
-                    reading("Standard deviation 2 mm", s),
-                    reading("Within ± 2 mm", narrow),
-                ),
-                "End-effector, and mean |error| in z of the four steps as printed; mm.",
-            ),
-        ),
+        "End-effector, and mean |error| in z of the four steps as printed; mm.",
     )
 
 
-def group_part(s: Found) -> Part:
+def _group_table(s: Found) -> Table:
     """RMSE by kind of parameter, beside the prototype's."""
     columns = [Column(name, 3, 4) for name in GROUPS]
     rows: list[Row] = []
     for m in METHODS:
         rows += accuracy_rows(s, (m,), _name(m), columns, PROTOTYPE.get((m,)))
-    return Part(
-        "groups",
-        "By kind of parameter",
-        (
-            "Root mean square errors over the runs, and their standard errors from the runs'"
-            " scatter. The prototype shares no code with this program.",
-        ),
-        tables=(Table("RMSE, mm", ("", *(QUANTITIES[g] for g in GROUPS)), tuple(rows)),),
-    )
+    return Table("RMSE, mm", ("", *(QUANTITIES[g] for g in GROUPS)), tuple(rows))
 
 
-def poses_part(studies: dict[int, Found]) -> Part:
+def _poses_part(words: Words, studies: dict[int, Found]) -> Part:
     """Accuracy by the number of poses a station."""
     poses = sorted(studies)
     found = {n: studies[n].of(JOINT)["displacement"].times(1e3) for n in poses}
@@ -484,23 +345,13 @@ def poses_part(studies: dict[int, Found]) -> Part:
         )
         for n, bound in zip(poses, least, strict=True)
     ]  # fmt: skip
-    plot = Plot(
-        "poses",
-        "End-effector by the number of poses",
-        "Joint estimate with two Monte-Carlo standard errors. Both axes are logarithmic.",
-        "Displacement of the end-effector against poses a station",
-        _falling(poses, [found[n] for n in poses], least),
-        380,
-    )
-    text = (
-        "The same simulation with other numbers of poses a station. Independent measurements let"
-        " errors fall as N to the power of −½; the first poses gain a little more, since few poses"
-        " leave some combinations of parameters weakly known."
-    )
-    columns = ("poses a station", "found", "± Monte-Carlo", "bound", "prototype")
+    heads = ("poses a station", "found", "± Monte-Carlo", "bound", "prototype")
     title = "Displacement of the end-effector, joint estimate, mm"
-    return Part(
-        "poses", "More poses", (text,), plots=(plot,), tables=(Table(title, columns, tuple(rows)),)
+    drawn = _falling(poses, [found[n] for n in poses], least)
+    return words.part(
+        "poses",
+        Table(title, heads, tuple(rows)),
+        plots={"poses": {"figure": drawn, "height": 380}},
     )
 
 
@@ -522,30 +373,12 @@ def _falling(poses: list[int], found: list[Summary], least: list[float]) -> dict
     return log_log(data, poses, "poses a station, N", "displacement, mm")
 
 
-def how_part(s: Found) -> Part:
-    """The setting, and what was chosen."""
-    c = s.setting
-    return Part(
-        "how",
-        "How it was computed",
-        (
-            f"{s.runs} runs, seed {s.seed}. A Gough-Stewart platform; {c.poses} poses of"
-            f" extreme leg lengths a station; three cameras, {c.distance:g} m from the middle and"
-            f" {c.height:g} m high, the middle of the legs, that look level and see {c.legs_seen}"
-            " legs each; readings with 3 µm of uniform noise. The paper does not tell where the"
-            " cameras stood: the distance has no influence, the height has.",
-            f"The joint estimate begins at the corrected four steps and takes"
-            f" {number(s.of(JOINT)['steps'].value, 1)} steps on average. The bound is the inverse"
-            " of the information at the truth; its end-effector is that of errors drawn from it.",
-            "These errors are of noise alone. Simulation cannot show what the model leaves out.",
-        ),
-    )
-
-
 # ------------------------------------------------------------------ for programs
 
 
-def _numbers(s: Found, narrow: Found, by_poses: dict[int, Found]) -> dict[str, Any]:
+def _numbers(
+    s: Found, narrow: Found, figures: list[Compared], by_poses: dict[int, Found]
+) -> dict[str, Any]:
     """Everything for programs, m and rad."""
     names = thirty(study_machine()).names
     return {
@@ -576,7 +409,7 @@ def _numbers(s: Found, narrow: Found, by_poses: dict[int, Found]) -> dict[str, A
                 "differs": f.differs,
                 "tolerable": f.tolerable,
             }
-            for f in figures_compared(s)
+            for f in figures
         ],
         "by_poses": {n: _accuracy(other, JOINT) for n, other in by_poses.items()},
     }

@@ -1,19 +1,22 @@
 """A paper's figures computed again, as an outcome: what holds for every paper.
 
-A paper's study gives its parts, cards and checks; terminal, page and JSON show the same of them.
+A paper's words stand in ``paper_x.yaml``, with places for figures in braces, as ``str.format`` has
+them; its tables, checks and plots are code. Terminal, page and JSON show the same of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from math import isfinite
+from math import degrees, isfinite
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from pkmcal.outcome import Check, Figure, Finding, Level, Outcome, Part, Row, Verdict
+from pkmcal.files import read_yaml
+from pkmcal.outcome import Check, Figure, Finding, Level, Outcome, Part, Plot, Row, Table, Verdict
 from pkmcal.studies.engine import Key, Setting, Study
-from pkmcal.wording import number
+from pkmcal.wording import brief, number
 
 PAPERS = ("a", "c")
 
@@ -45,47 +48,109 @@ def reproduce(paper: str, options: Options) -> Outcome:
     return import_module(f"pkmcal.studies.paper_{paper}_report").reproduce(options)
 
 
-class Publication(NamedTuple):
-    """What is reproduced. letter : its own, small. cited : where it was printed."""
+class Shown(float):
+    """A number in a text: ``{:3}`` with three decimals, ``{:~}`` with two digits."""
+
+    def __format__(self, spec: str) -> str:
+        """As people read it."""
+        if spec == "~":
+            return brief(self)
+        return number(self, int(spec)) if spec.isdigit() else super().__format__(spec)
+
+
+@dataclass(frozen=True)
+class Words:
+    """A paper's words. document : of its file. values : what its texts name."""
 
     letter: str
-    title: str
-    cited: str
+    document: Mapping[str, Any]
+    values: Mapping[str, Any]
 
+    @classmethod
+    def of(cls, letter: str, study: Study[Any], **values: Any) -> Words:
+        """The words on a study: ``found`` and ``error`` hold each method's figures in their units;
+        values : what else the texts name.
+        """
+        units = study.setting.quantities
+        shown = {
+            ", ".join(key): {
+                name: summary.times(units[name].factor) for name, summary in accuracy.items()
+            }
+            for key, accuracy in study.accuracy.items()
+        }
+        known: dict[str, Any] = {
+            "found": {m: {q: Shown(s.value) for q, s in a.items()} for m, a in shown.items()},
+            "error": {m: {q: Shown(s.error) for q, s in a.items()} for m, a in shown.items()},
+            "setting": study.setting,
+            "runs": study.runs,
+            "seed": study.seed,
+            "threads": study.threads,
+        }
+        times = {"wall": study.wall, "solving": study.solving, "cpu": study.cpu}
+        for name, value in {**times, **values}.items():
+            known[name] = Shown(value) if isinstance(value, float) else value
+        document = read_yaml(Path(__file__).with_name(f"paper_{letter}.yaml")).data
+        return cls(letter, document, known)
 
-def reproduction(
-    paper: Publication,
-    headline: str,
-    figures: Sequence[Figure],
-    parts: Sequence[Part],
-    checks: Sequence[Check],
-    remarks: Sequence[str],
-    numbers: Mapping[str, Any],
-) -> Outcome:
-    """The outcome. remarks : where figures differ from the paper's. numbers : all, for programs."""
-    passed = all(check.passed for check in checks)
-    failed = tuple(check.sentence for check in checks if not check.passed)
-    expectations = Part("checks", "Expectations", checks=tuple(checks))
-    return Outcome(
-        command="reproduce",
-        title=paper.title,
-        kicker=f"reproduction of paper {paper.letter.upper()}",
-        subject=paper.cited,
-        verdict=Verdict(passed, headline, reasons=failed),
-        stamp="Reproduced" if passed else "Not reproduced",
-        figures=tuple(figures),
-        parts=(*parts, expectations),
-        findings=tuple(Finding(Level.NOTE, text) for text in remarks),
-        document={
-            "paper": paper.letter,
-            "title": paper.cited,
-            "passed": passed,
-            "headline": headline,
-            "checks": [vars(check) for check in checks],
-            "remarks": list(remarks),
-            **numbers,
-        },
-    )
+    def say(self, text: str) -> str:
+        """A text with its figures put in."""
+        return text.format_map(self.values)
+
+    def part(
+        self,
+        name: str,
+        *tables: Table,
+        plots: Mapping[str, Mapping[str, Any]] | None = None,
+        more: Iterable[str] = (),
+    ) -> Part:
+        """A section. plots : by name, the ``figure`` and sizes of each. more : names of paragraphs
+        that are there at times only.
+        """
+        own = self.document["parts"][name]
+        texts = [*own["text"], *(own[key] for key in more)]
+        drawn = tuple(Plot(key, **own["plots"][key], **plot) for key, plot in (plots or {}).items())
+        title, text = own["title"], tuple(self.say(t) for t in texts)
+        return Part(name, title, text, plots=drawn, tables=tables)
+
+    def reproduction(
+        self,
+        parts: Sequence[Part],
+        checks: Sequence[Check],
+        remarks: Iterable[str],
+        numbers: Mapping[str, Any],
+    ) -> Outcome:
+        """The outcome. remarks : names of those that hold. numbers : all, for programs."""
+        passed = all(check.passed for check in checks)
+        failed = tuple(check.sentence for check in checks if not check.passed)
+        headline, cited = self.say(self.document["headline"]), self.document["cited"]
+        told = [self.say(self.document["remarks"][name]) for name in remarks]
+        return Outcome(
+            command="reproduce",
+            title=self.document["title"],
+            kicker=f"reproduction of paper {self.letter.upper()}",
+            subject=cited,
+            verdict=Verdict(passed, headline, reasons=failed),
+            stamp="Reproduced" if passed else "Not reproduced",
+            figures=tuple(
+                Figure(
+                    card["question"],
+                    tuple((self.say(value), unit) for value, unit in card["values"]),
+                    self.say(card["note"]),
+                )
+                for card in self.document["cards"]
+            ),
+            parts=(*parts, Part("checks", "Expectations", checks=tuple(checks))),
+            findings=tuple(Finding(Level.NOTE, text) for text in told),
+            document={
+                "paper": self.letter,
+                "title": cited,
+                "passed": passed,
+                "headline": headline,
+                "checks": [vars(check) for check in checks],
+                "remarks": told,
+                **numbers,
+            },
+        )
 
 
 class Column(NamedTuple):
@@ -128,3 +193,8 @@ def accuracy_rows(
 def mm(value: float, places: int = 3) -> str:
     """Metres as millimetres, radians as milliradians, without the unit."""
     return number(1e3 * value, places)
+
+
+def deg(value: float, places: int) -> str:
+    """Radians as degrees without the sign."""
+    return number(degrees(value), places)

@@ -445,7 +445,7 @@ static pkmcal_status own_readings(const state *at, double joints[PKMCAL_JOINTS])
         ++count[rod->joint];
     }
     for (k = 0; k < PKMCAL_JOINTS; ++k) {
-        joints[k] /= count[k];
+        joints[k] = count[k] > 1 ? joints[k] / count[k] : joints[k];
     }
     return PKMCAL_OK;
 }

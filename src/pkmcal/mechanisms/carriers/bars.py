@@ -71,7 +71,11 @@ class Bar(PlatformCarrier):
     joints: ClassVar = ("bar",)
     schema: ClassVar = BarDocument
     shared: ClassVar = ("hinge",)
-    parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("hinge", "m", "center"))
+    called: ClassVar = "side bars' joints (half a bar's width)"
+    parameters: ClassVar = (
+        *vectors("center", "m", "center"),
+        *vectors("hinge", "m", "center", label="hinge"),
+    )
 
     @classmethod
     def check(cls, node: BarDocument, site: Site) -> None:
@@ -95,9 +99,9 @@ class Bar(PlatformCarrier):
         arm = turned(T_base_platform[..., :3, :3], parameters[..., 3:])
         return arm + T_base_platform[..., :3, 3] + parameters[..., :3], arm
 
-    @staticmethod
+    @classmethod
     def by_parameters(
-        parameters: Array, T_base_platform: Array, internal: Array | None = None
+        cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> Array:
         """Identity for the bar, R for the hinge."""
         del internal
@@ -106,14 +110,14 @@ class Bar(PlatformCarrier):
         out[..., :3], out[..., 3:] = np.eye(3), T_base_platform[..., :3, :3]
         return out
 
-    @staticmethod
-    def moved(parameters: Array, e: Array, f: Array) -> Array:
+    @classmethod
+    def moved(cls, parameters: Array, e: Array, f: Array) -> Array:
         """The bar turns with the base frame, the hinge moves with the platform frame."""
         parts = moved_direction(parameters[..., :3], e), moved_point(parameters[..., 3:], f)
         return np.concatenate(parts, axis=-1)
 
-    @staticmethod
-    def by_frames(parameters: Array) -> Array:
+    @classmethod
+    def by_frames(cls, parameters: Array) -> Array:
         """E's columns for the bar, F's for the hinge."""
         bar = direction_by_frame(parameters[..., :3])
         hinge = point_by_frame(parameters[..., 3:])
@@ -122,8 +126,8 @@ class Bar(PlatformCarrier):
             [np.concatenate([bar, none], axis=-1), np.concatenate([none, hinge], axis=-1)], axis=-2
         )
 
-    @staticmethod
-    def carried(parameters: Array, e: Array, f: Array) -> Array:
+    @classmethod
+    def carried(cls, parameters: Array, e: Array, f: Array) -> Array:
         """Turns."""
         del parameters
         return turned_blocks(6, (0, e), (3, f))
@@ -142,15 +146,17 @@ class HingedBar(PlatformCarrier):
     """
 
     body: ClassVar = "bar"
+    ways: ClassVar = ("center",)
     turns: ClassVar = True
     most_turn: ClassVar = np.pi / 2
     in_the_way: ClassVar = FOLDED
     joints: ClassVar = ("hinged-bar",)
     schema: ClassVar = HingedBarDocument
     shared: ClassVar = ("hinge", "axis")
+    called: ClassVar = "side bars' joints"
     parameters: ClassVar = (
         *vectors("center", "m", "center"),
-        *vectors("hinge", "m", "center"),
+        *vectors("hinge", "m", "center", label="hinge"),
         *vectors("axis", "1", "axis"),
     )
 
@@ -177,9 +183,9 @@ class HingedBar(PlatformCarrier):
         arm = turned(T_base_platform[..., :3, :3], parameters[..., 3:6] + swung)
         return arm + T_base_platform[..., :3, 3], arm
 
-    @staticmethod
+    @classmethod
     def by_parameters(
-        parameters: Array, T_base_platform: Array, internal: Array | None = None
+        cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> Array:
         """In the parameters' order."""
         rot = T_base_platform[..., :3, :3]
@@ -226,36 +232,6 @@ class HingedBar(PlatformCarrier):
         side = cross(w, center)
         ahead = cos * side + sin * cross(w, side)
         return turned(T_base_platform[..., :3, :3], ahead)
-
-    @staticmethod
-    def moved(parameters: Array, e: Array, f: Array) -> Array:
-        """All is the platform's."""
-        del e
-        parts = (
-            moved_direction(parameters[..., :3], f),
-            moved_point(parameters[..., 3:6], f),
-            moved_direction(parameters[..., 6:], f),
-        )
-        return np.concatenate(parts, axis=-1)
-
-    @staticmethod
-    def by_frames(parameters: Array) -> Array:
-        """F's columns alone."""
-        own = np.concatenate(
-            [
-                direction_by_frame(parameters[..., :3]),
-                point_by_frame(parameters[..., 3:6]),
-                direction_by_frame(parameters[..., 6:]),
-            ],
-            axis=-2,
-        )
-        return np.concatenate([np.zeros_like(own), own], axis=-1)
-
-    @staticmethod
-    def carried(parameters: Array, e: Array, f: Array) -> Array:
-        """Turns."""
-        del parameters, e
-        return turned_blocks(9, (0, f), (3, f), (6, f))
 
     @staticmethod
     def slid(parameters: Array, shift: Array, turn: Array) -> Array:

@@ -5,7 +5,8 @@ A limb is a rod between a point A on the base side and a point B on the platform
 carrier gives B. A carrier names the joint kinds it serves in mechanism files, the schema of
 its fields, its parameters, and the point with its exact derivatives, for any number of legs
 and configurations at once. Kinematics needs the point and how it moves, ``place``; identification
-also its derivatives by the parameters.
+also its derivatives by the parameters. All but ``place`` has an answer here that any carrier can
+live with; a carrier gives its own where that is faster, or where it knows better.
 """
 
 from __future__ import annotations
@@ -25,10 +26,17 @@ from pydantic import AfterValidator
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import Schema
-from pkmcal.geometry.rigid import apply, skew
+from pkmcal.geometry.rigid import apply, dot, skew
 
 SHORTEST = 1e-6
 """An axis shorter than this is a row of zeros, not a direction."""
+STEPS = 40
+"""Newton's for a reading; from mid-range they take five."""
+ROUNDING = 1e-15
+CLOSED = 1e-9
+"""Of a rod's length, what is left when its reading is found, and what may be at most: where the
+rod stands square to the motion, only half of the digits can be had."""
+TINY = 1e-30
 IN_PLANE = 1e-6
 """Metres out of a plane, and radians off its normal, that rounding in a file explains."""
 
@@ -65,12 +73,28 @@ class ParameterKind(NamedTuple):
 
     Where the file may leave the field out, ``otherwise`` is its value, and it is no parameter of
     a machine whose file does. Without a tolerance's name it is a constant of the drawing.
+    label : what people call it, where its side and path say too little.
     """
 
     path: str
     unit: str
     tolerance: str
     otherwise: float = 0.0
+    label: str = ""
+
+
+class NamedMotion(NamedTuple):
+    """Changes of one leg's carrier that people can picture, should data leave them open.
+
+    columns : (n, m) changes of the carrier's n parameters. one, several : what is open, of one leg
+    and of several; together : of all legs, where only some combinations are open. Sentences without
+    a full stop, with the places that :class:`pkmcal.identify.motions.Motion` lists.
+    """
+
+    columns: Array
+    one: str
+    several: str
+    together: str = ""
 
 
 class CarriedPoint(NamedTuple):
@@ -121,17 +145,24 @@ class Carrier(ABC):
 
     joints : the words. schema : their fields; the first three parameters are ``center``.
     shared : fields that legs on one motor, or on one body of the platform, have in common.
+    called : the limb's ends on this side, where sentences speak of all of them.
     held_in_plane : fields that are no unknowns on a planar machine, which they would tilt.
+    side : of a leg. ways : fields of three lengths that lead from one point to another; others of
+    three lengths are points, those without a unit directions.
 
     Frames change by E on base coordinates and F on platform coordinates, (..., 4, 4), see
     :mod:`pkmcal.identify.gauge`.
     """
 
+    side: ClassVar[Literal["base", "platform"]]
+
     joints: ClassVar[tuple[str, ...]]
     schema: ClassVar[type[Schema]]
     parameters: ClassVar[tuple[ParameterKind, ...]]
     shared: ClassVar[tuple[str, ...]] = ()
+    called: ClassVar[str] = ""
     held_in_plane: ClassVar[tuple[str, ...]] = ()
+    ways: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def check(cls, node: Any, site: Site) -> None:
@@ -156,19 +187,52 @@ class Carrier(ABC):
         return None
 
     @staticmethod
-    @abstractmethod
-    def moved(parameters: Array, e: Array, f: Array) -> Array:
-        """The parameters (..., n) told in the new frames, e and f (..., 4, 4)."""
+    def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
+        """What of a leg's numbers (n,) data may leave open together, and has a name of its own.
 
-    @staticmethod
-    @abstractmethod
-    def by_frames(parameters: Array) -> Array:
+        readings : (K,) of the leg's motor at the poses of a session, NaN on the platform side.
+        """
+        del parameters, readings
+        return ()
+
+    @classmethod
+    def _vectors(cls) -> tuple[tuple[slice, bool], ...]:
+        """Places of the fields with three numbers, and which of them are points."""
+        return tuple(
+            (slice(k, k + 3), p.unit == "m" and p.path.removesuffix(".x") not in cls.ways)
+            for k, p in enumerate(cls.parameters)
+            if p.path.endswith(".x")
+        )
+
+    @classmethod
+    def moved(cls, parameters: Array, e: Array, f: Array) -> Array:
+        """The parameters (..., n) told in the new frames, e and f (..., 4, 4).
+
+        Points and directions of the side's own body, as here, move with its frame.
+        """
+        own = e if cls.side == "base" else f
+        shape = np.broadcast_shapes(parameters.shape[:-1], own.shape[:-2])
+        out = np.array(np.broadcast_to(parameters, (*shape, parameters.shape[-1])))
+        for at, is_point in cls._vectors():
+            move = moved_point if is_point else moved_direction
+            out[..., at] = move(parameters[..., at], own)
+        return out
+
+    @classmethod
+    def by_frames(cls, parameters: Array) -> Array:
         """Their first-order change by E's and F's six numbers, (..., n, 12)."""
+        out = np.zeros((*parameters.shape, 12))
+        own = slice(0, 6) if cls.side == "base" else slice(6, 12)
+        for at, is_point in cls._vectors():
+            change = point_by_frame if is_point else direction_by_frame
+            out[..., at, own] = change(parameters[..., at])
+        return out
 
-    @staticmethod
-    @abstractmethod
-    def carried(parameters: Array, e: Array, f: Array) -> Array:
+    @classmethod
+    def carried(cls, parameters: Array, e: Array, f: Array) -> Array:
         """Derivative (..., n, n) of :meth:`moved` by the parameters."""
+        own = e if cls.side == "base" else f
+        return turned_blocks(parameters.shape[-1], *((at.start, own) for at, _ in cls._vectors()))
 
     @staticmethod
     def chain(parameters: Array) -> Chain | None:
@@ -187,20 +251,26 @@ class BaseCarrier(Carrier):
     its smallest and largest reading.
     """
 
+    side: ClassVar = "base"
     driven: ClassVar[bool] = False
+    called: ClassVar[str] = "base joints"
     unit: ClassVar[Literal["m", "rad"]] = "m"
 
     @staticmethod
     @abstractmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
         """A and its derivative by the reading, (..., 3) each, for parameters (..., n) and readings
-        (...,) (m or rad). What the readings do not change needs not have their shape.
+        (...,) (m or rad). What the readings do not change needs not have their shape. Complex
+        parameters give complex points, unless the carrier has derivatives of its own.
         """
 
-    @staticmethod
-    @abstractmethod
-    def by_parameters(parameters: Array, readings: Array) -> Array:
-        """Derivatives (..., 3, n) of A by the parameters."""
+    @classmethod
+    def by_parameters(cls, parameters: Array, readings: Array) -> Array:
+        """Derivatives (..., 3, n) of A by the parameters: here exactly, by complex steps."""
+        shape = (*np.broadcast_shapes(parameters.shape[:-1], readings.shape), 3)
+        return complex_steps(
+            lambda p: np.broadcast_to(cls.place(p, readings)[0], shape), parameters
+        )
 
     @classmethod
     def point(cls, parameters: Array, readings: Array) -> CarriedPoint:
@@ -209,24 +279,38 @@ class BaseCarrier(Carrier):
         value, by_reading = (np.broadcast_to(x, shape) for x in cls.place(parameters, readings))
         return CarriedPoint(value, by_reading, cls.by_parameters(parameters, readings))
 
-    @staticmethod
-    def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
+    @classmethod
+    def reading(cls, parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
         """Readings (...,) that put A at a distance (...,) from B (..., 3), m.
 
-        Of two the one nearest to ``near`` (...,); NaN where B is out of reach.
+        Of two the one nearest to ``near`` (...,); NaN where B is out of reach. Here the one to
+        which Newton's steps lead from there, ``(|B - A|^2 - length^2) / (2 length) = 0``.
         """
-        del parameters, length, near
-        return np.full(point_b.shape[:-1], np.nan)
+        shape = np.broadcast_shapes(parameters.shape[:-1], point_b.shape[:-1], near.shape)
+        q, off = np.array(np.broadcast_to(near, shape), dtype=float), np.full(shape, np.inf)
+        with np.errstate(all="ignore"):  # what is out of reach goes anywhere
+            for _ in range(STEPS):
+                a, by_reading = cls.place(parameters, q)
+                line = point_b - a
+                off = (dot(line, line) - length**2) / (2 * length)
+                slope = -dot(line, by_reading) / length
+                step = np.where(np.abs(off) > ROUNDING * length, off / slope, 0.0)
+                if not step.any():
+                    break
+                q = q - step
+        return np.where(np.abs(off) <= CLOSED * length, q, np.nan)
 
     @classmethod
     def skeleton(cls, parameters: Array, readings: Array) -> Array:
         """Points (..., k, 3) along the arm that carries A, from where the motor holds it to A
         itself, for pictures; m, base frame.
 
-        A alone, as here, has no arm: it stands still, or runs along a guide, wherever its readings
-        take it.
+        Of a carrier that turns, by its chain, from its axis straight to A. A alone has no arm: it
+        stands still, or runs along a guide, wherever its readings take it.
         """
-        return cls.place(parameters, readings)[0][..., None, :]
+        a, chain = cls.place(parameters, readings)[0], cls.chain(parameters)
+        points = (chain.point, a) if chain is not None and chain.motion == "turn" else (a,)
+        return np.stack(np.broadcast_arrays(*points), axis=-2)
 
 
 class PlatformCarrier(Carrier):
@@ -240,9 +324,11 @@ class PlatformCarrier(Carrier):
     way; ``in_the_way`` says what.
     """
 
+    side: ClassVar = "platform"
     body: ClassVar[str] = ""
     turns: ClassVar[bool] = False
     floats: ClassVar[bool] = False
+    called: ClassVar[str] = "platform joints"
     most_turn: ClassVar[float] = np.inf
     in_the_way: ClassVar[str] = ""
 
@@ -254,15 +340,16 @@ class PlatformCarrier(Carrier):
         """B and the arm that turns with the platform, (..., 3) m each, base frame: by the pose's
         left perturbation B moves by ``omega x arm + tau``.
 
-        For parameters (..., n), poses (..., 4, 4) and internal coordinates (...,), rad.
+        For parameters (..., n), poses (..., 4, 4) and internal coordinates (...,), rad. Complex
+        parameters give complex points, unless the carrier has derivatives of its own.
         """
 
-    @staticmethod
-    @abstractmethod
+    @classmethod
     def by_parameters(
-        parameters: Array, T_base_platform: Array, internal: Array | None = None
+        cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> Array:
-        """Derivatives (..., 3, n) of B by the parameters."""
+        """Derivatives (..., 3, n) of B by the parameters: here exactly, by complex steps."""
+        return complex_steps(lambda p: cls.place(p, T_base_platform, internal)[0], parameters)
 
     @classmethod
     def point(
@@ -291,6 +378,15 @@ class PlatformCarrier(Carrier):
         return np.zeros((*shape, 3))
 
 
+def complex_steps(function: Callable[[Array], Array], parameters: Array) -> Array:
+    """Derivatives (..., m, n) of a function (..., m) of parameters (..., n), exact to rounding."""
+    columns: list[Array] = []
+    for step in np.eye(parameters.shape[-1]):
+        moved: Any = parameters + 1j * TINY * step
+        columns.append(function(moved).imag / TINY)
+    return np.stack(columns, axis=-1)
+
+
 def by_pose(arm: Array) -> Array:
     """Change (..., 3, 6) of a platform's point by the pose, its turned arm (..., 3) given."""
     out = np.zeros((*arm.shape, 6))
@@ -299,9 +395,12 @@ def by_pose(arm: Array) -> Array:
     return out
 
 
-def vectors(name: str, unit: str, tolerance: str) -> tuple[ParameterKind, ...]:
+def vectors(name: str, unit: str, tolerance: str, label: str = "") -> tuple[ParameterKind, ...]:
     """The three components of a field."""
-    return tuple(ParameterKind(f"{name}.{axis}", unit, tolerance) for axis in "xyz")
+    return tuple(
+        ParameterKind(f"{name}.{axis}", unit, tolerance, label=label and f"{label} {axis}")
+        for axis in "xyz"
+    )
 
 
 def of_part(node: Any, kind: ParameterKind) -> float | None:

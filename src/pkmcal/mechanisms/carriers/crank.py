@@ -16,6 +16,7 @@ from pkmcal.mechanisms.carriers.contract import (
     Chain,
     Direction,
     Interval,
+    NamedMotion,
     ParameterKind,
     Site,
     direction_by_frame,
@@ -83,10 +84,10 @@ class Crank(BaseCarrier):
     parameters: ClassVar = (
         *vectors("center", "m", "center"),
         *vectors("axis", "1", "axis"),
-        ParameterKind("arm", "m", "arm"),
-        ParameterKind("angle", "rad", "angle"),
-        ParameterKind("along", "m", "center"),
-        ParameterKind("radial", "m", "center"),
+        ParameterKind("arm", "m", "arm", label="arm length"),
+        ParameterKind("angle", "rad", "angle", label="crank angle"),
+        ParameterKind("along", "m", "center", label="place along the crank axis"),
+        ParameterKind("radial", "m", "center", label="crank axis distance"),
         *ZERO,
     )
 
@@ -111,6 +112,24 @@ class Crank(BaseCarrier):
         )
 
     @staticmethod
+    def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
+        """The axis tilts, and its point moves along it."""
+        del readings
+        tilt = np.zeros((parameters.size, 4))
+        tilt[3:6, :3] = np.eye(3)
+        tilt[:3, 3] = parameters[3:6]
+        return (
+            NamedMotion(
+                tilt,
+                one="how the crank's axis of {legs} is tilted, and where its arm is along it, {is}",
+                several="how the crank's axis of each of {legs} is tilted, and where its arm is"
+                " along it, {is}",
+                together="how the cranks' axes of {legs} are tilted to each other, with the arms'"
+                " places along them, {is} {ways}{mostly}",
+            ),
+        )
+
+    @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
         """A, and the arm's direction ahead times its length."""
         frame = _frame(parameters)
@@ -119,8 +138,8 @@ class Crank(BaseCarrier):
         value = parameters[..., :3] + along * frame.v + radial * frame.e0 + arm * out
         return value, arm * ahead
 
-    @staticmethod
-    def by_parameters(parameters: Array, readings: Array) -> Array:
+    @classmethod
+    def by_parameters(cls, parameters: Array, readings: Array) -> Array:
         """In the parameters' order."""
         frame = _frame(parameters)
         v, e0, side = frame.v, frame.e0, frame.side
@@ -140,8 +159,8 @@ class Crank(BaseCarrier):
         by_parameters[..., 10:] = by_zero
         return by_parameters
 
-    @staticmethod
-    def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
+    @classmethod
+    def reading(cls, parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
         """Errata, Model 31: ``Q = atan2(s, p) -+ acos(g / |(p, s)|)``, d = B - center,
         p = d . e0, s = d . (v x e0), g = (|d|^2 + arm^2 - length^2) / (2 arm).
         """
@@ -159,15 +178,7 @@ class Crank(BaseCarrier):
         return near + np.where(np.abs(first) <= np.abs(second), first, second)
 
     @classmethod
-    def skeleton(cls, parameters: Array, readings: Array) -> Array:
-        """The arm's foot on the crank's axis, and A."""
-        frame = _frame(parameters)
-        along, radial = (parameters[..., k, None] for k in (8, 9))
-        foot = parameters[..., :3] + along * frame.v + radial * frame.e0
-        return np.stack(np.broadcast_arrays(foot, cls.place(parameters, readings)[0]), axis=-2)
-
-    @staticmethod
-    def moved(parameters: Array, e: Array, f: Array) -> Array:
+    def moved(cls, parameters: Array, e: Array, f: Array) -> Array:
         """Centre and axis move with the base frame; ``zero`` and the vertical stay, so that the
         angle takes up what e0 turns against them.
         """
@@ -181,8 +192,8 @@ class Crank(BaseCarrier):
         out[..., 7] += np.arctan2(dot(carried, now.side), dot(carried, now.e0))
         return out
 
-    @staticmethod
-    def by_frames(parameters: Array) -> Array:
+    @classmethod
+    def by_frames(cls, parameters: Array) -> Array:
         """E's columns; the angle turns by ``v - v x twist``."""
         frame = _frame(parameters)
         out = np.zeros((*parameters.shape, 12))
@@ -193,8 +204,8 @@ class Crank(BaseCarrier):
         out[..., :3, :3] += parameters[..., 9, None, None] * _outer(frame.side, turn)
         return out
 
-    @staticmethod
-    def carried(parameters: Array, e: Array, f: Array) -> Array:
+    @classmethod
+    def carried(cls, parameters: Array, e: Array, f: Array) -> Array:
         """Turns, and how much more an error of the axis twists e0 here than there."""
         before, after = _frame(parameters), _frame(Crank.moved(parameters, e, f))
         rot = e[..., :3, :3]

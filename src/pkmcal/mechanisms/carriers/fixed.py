@@ -11,9 +11,6 @@ from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
     Chain,
     Site,
-    moved_point,
-    point_by_frame,
-    turned_blocks,
     vectors,
 )
 from pkmcal.mechanisms.carriers.joint import JointDocument, check_joint, joint_axis_role
@@ -42,29 +39,11 @@ class FixedPoint(BaseCarrier):
         del readings
         return parameters, np.zeros_like(parameters)
 
-    @staticmethod
-    def by_parameters(parameters: Array, readings: Array) -> Array:
+    @classmethod
+    def by_parameters(cls, parameters: Array, readings: Array) -> Array:
         """Identity."""
         shape = np.broadcast_shapes(parameters.shape[:-1], readings.shape)
         return np.broadcast_to(np.eye(3), (*shape, 3, 3))
-
-    @staticmethod
-    def moved(parameters: Array, e: Array, f: Array) -> Array:
-        """The centre moves with the base frame."""
-        del f
-        return moved_point(parameters, e)
-
-    @staticmethod
-    def by_frames(parameters: Array) -> Array:
-        """E's columns alone."""
-        own = point_by_frame(parameters)
-        return np.concatenate([own, np.zeros_like(own)], axis=-1)
-
-    @staticmethod
-    def carried(parameters: Array, e: Array, f: Array) -> Array:
-        """A turn."""
-        del parameters, f
-        return turned_blocks(3, (0, e))
 
     @staticmethod
     def chain(parameters: Array) -> Chain:

@@ -12,9 +12,6 @@ from pkmcal.mechanisms.carriers.contract import (
     Chain,
     PlatformCarrier,
     Site,
-    moved_point,
-    point_by_frame,
-    turned_blocks,
 )
 from pkmcal.mechanisms.carriers.fixed import CENTER
 from pkmcal.mechanisms.carriers.joint import JointDocument, check_joint, joint_axis_role
@@ -44,32 +41,14 @@ class RigidPlatform(PlatformCarrier):
         arm = turned(T_base_platform[..., :3, :3], parameters)
         return arm + T_base_platform[..., :3, 3], arm
 
-    @staticmethod
+    @classmethod
     def by_parameters(
-        parameters: Array, T_base_platform: Array, internal: Array | None = None
+        cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
     ) -> Array:
         """R."""
         del internal
         shape = np.broadcast_shapes(parameters.shape[:-1], T_base_platform.shape[:-2])
         return np.broadcast_to(T_base_platform[..., :3, :3], (*shape, 3, 3))
-
-    @staticmethod
-    def moved(parameters: Array, e: Array, f: Array) -> Array:
-        """The centre moves with the platform frame."""
-        del e
-        return moved_point(parameters, f)
-
-    @staticmethod
-    def by_frames(parameters: Array) -> Array:
-        """F's columns alone."""
-        own = point_by_frame(parameters)
-        return np.concatenate([np.zeros_like(own), own], axis=-1)
-
-    @staticmethod
-    def carried(parameters: Array, e: Array, f: Array) -> Array:
-        """A turn."""
-        del parameters, e
-        return turned_blocks(3, (0, f))
 
     @staticmethod
     def chain(parameters: Array) -> Chain:

@@ -17,12 +17,8 @@ from pkmcal.mechanisms.carriers.contract import (
     Chain,
     Direction,
     Interval,
+    NamedMotion,
     Site,
-    direction_by_frame,
-    moved_direction,
-    moved_point,
-    point_by_frame,
-    turned_blocks,
     vectors,
 )
 
@@ -62,14 +58,32 @@ class Slider(BaseCarrier):
             )
 
     @staticmethod
+    def motions(parameters: Array, readings: Array) -> tuple[NamedMotion, ...]:
+        """The guide leans about the middle of where its carriage was."""
+        del parameters
+        lean = np.zeros((6, 3))
+        lean[3:] = np.eye(3)
+        lean[:3] = -np.nanmean(readings) * np.eye(3)
+        return (
+            NamedMotion(
+                lean,
+                one="how the guide of {legs} leans cannot be told from where it stands{better}",
+                several="how the guides of {legs} lean cannot be told from where they stand"
+                "{better}",
+                together="how the guides of {legs} lean to each other cannot be told from where"
+                " they stand{better} {ways}{mostly}",
+            ),
+        )
+
+    @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
         """A, and v."""
         axis = parameters[..., 3:]
         v = axis / np.sqrt(dot(axis, axis))[..., None]
         return parameters[..., :3] + readings[..., None] * v, v
 
-    @staticmethod
-    def by_parameters(parameters: Array, readings: Array) -> Array:
+    @classmethod
+    def by_parameters(cls, parameters: Array, readings: Array) -> Array:
         """Identity for the centre; the axis's length changes nothing."""
         axis = parameters[..., 3:]
         size = np.sqrt(dot(axis, axis))[..., None]
@@ -81,8 +95,8 @@ class Slider(BaseCarrier):
         out[..., 3:] = (q / size)[..., None] * across
         return out
 
-    @staticmethod
-    def reading(parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
+    @classmethod
+    def reading(cls, parameters: Array, point_b: Array, length: Array, near: Array) -> Array:
         """``q = d . v -+ sqrt(length^2 - |d|^2 + (d . v)^2)``, d = B - center."""
         axis = parameters[..., 3:]
         v = axis / np.sqrt(dot(axis, axis))[..., None]
@@ -92,27 +106,6 @@ class Slider(BaseCarrier):
         half = np.sqrt(np.where(square >= 0, square, np.nan))
         first, second = middle + half, middle - half
         return np.where(np.abs(first - near) <= np.abs(second - near), first, second)
-
-    @staticmethod
-    def moved(parameters: Array, e: Array, f: Array) -> Array:
-        """Centre and axis move with the base frame."""
-        del f
-        parts = moved_point(parameters[..., :3], e), moved_direction(parameters[..., 3:], e)
-        return np.concatenate(parts, axis=-1)
-
-    @staticmethod
-    def by_frames(parameters: Array) -> Array:
-        """E's columns alone."""
-        own = np.concatenate(
-            [point_by_frame(parameters[..., :3]), direction_by_frame(parameters[..., 3:])], axis=-2
-        )
-        return np.concatenate([own, np.zeros_like(own)], axis=-1)
-
-    @staticmethod
-    def carried(parameters: Array, e: Array, f: Array) -> Array:
-        """Turns."""
-        del parameters, f
-        return turned_blocks(6, (0, e), (3, e))
 
     @staticmethod
     def chain(parameters: Array) -> Chain:

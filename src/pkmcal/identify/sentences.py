@@ -1,0 +1,244 @@
+"""Findings in English: what is open, how far that moves the platform, and what to do about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import rotation_vector
+from pkmcal.identify.motions import AXES, Motion, Situation, changes
+from pkmcal.wording import in_full, joined, listed, named, split_name, ways
+
+MOVES = 0.01
+"""Share of a joint centre's tolerance below which a platform counts as not moved: a hundredth
+of what the drawing leaves open disappears beside any calibration's own deviations."""
+MOST = 8
+"""Sentences that people read."""
+MOST_NAMES = 5
+MOST_FIXED = 3
+SHARE = 0.15
+"""Part of the greatest change, in tolerances, from which on a parameter is named."""
+TURNED = 0.02
+"""Turn (rad) of the platform between configurations below which they only shift it."""
+PARALLEL = 1e-9
+"""Component of an axis below which the file can hold it alone."""
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """One thing that the data do not tell.
+
+    text, advice : what, and what to do. parameters : the names that it is about, most first.
+    dimensions : independent changes that it stands for. moves_platform : how far (m, root mean
+    square over its joints and poses) the platform moves when these changes are as large as the
+    drawing's tolerance lets expect. matters : whether that is more than nothing. weak : the data
+    know it, yet less than the drawing does.
+    """
+
+    text: str
+    advice: str
+    parameters: tuple[str, ...]
+    dimensions: int
+    moves_platform: float
+    matters: bool
+    weak: bool = False
+
+
+@dataclass(frozen=True)
+class Found:
+    """A motion that the data leave open, of one or more legs.
+
+    space : (k, P) changes that it explains, in units of the drawing's deviations. numbers : (n, m)
+    the motion's own numbers for them, of one leg. own : (k, P) what these change, in the same units
+    as ``space``, from which it differs by frames. new : how many of the k nobody said before.
+    """
+
+    motion: Motion
+    legs: tuple[int, ...]
+    space: Array
+    numbers: Array
+    own: Array
+    new: int
+
+    def how(self, around: Situation) -> str:
+        """What the motion says of its own numbers."""
+        return self.motion.how(around, self.numbers) if self.motion.how else ""
+
+    def and_of(self, other: Found) -> Found:
+        """The same said of other legs, or of these again."""
+        again = self.legs == other.legs
+        return replace(
+            self,
+            legs=tuple(sorted({*self.legs, *other.legs})),
+            space=np.concatenate([self.space, other.space]),
+            numbers=np.concatenate([self.numbers, other.numbers]) if again else self.numbers,
+            own=np.concatenate([self.own, other.own]),
+            new=self.new + other.new,
+        )
+
+
+def sentence(around: Situation, found: Found, unit: Array, moved: float, weak: bool) -> Sentence:
+    """The sentence of a motion; unit (P,) of the drawing's deviations, moved (m) the platform's
+    joints, weak : whether the data know it, yet less than the drawing does.
+    """
+    table = around.machine.parameters
+    matters = moved > MOVES * float(table.tolerance[table.of_kind("center")].mean())
+    size = np.linalg.norm(found.own, axis=0)
+    order = np.argsort(-np.round(size, 6), kind="stable")
+    rows = order[: int(np.sum(size > SHARE * size.max()))]
+    names = tuple(table.names[k] for k in rows)
+    several = len(found.legs) > 1
+    known, n = "known from the drawing only" if weak else "free", len(found.numbers)
+    open_ = f"{'is' if n == 1 else 'are'} {known}"
+    places = {
+        "legs": named(found.legs),
+        "each": "each of " if several else "",
+        "is": f"is {known}",
+        "are": f"are {known}",
+        "open": "to the drawing" if weak else "free",
+        "better": " better than the drawing does" if weak else "",
+        "limited": ", which only the drawing limits" if weak else "",
+        "n": in_full(n),
+        "combinations": f"{in_full(n)} combination{'' if n == 1 else 's'}"
+        f"{' each' if several and len(found.motion.legs) == 1 else ''} {open_}",
+        "ways": ways(len(found.space)),
+        "mostly": _mostly(around, found, rows, unit),
+        "how": found.how(around),
+    }
+    text = found.motion.words(len(found.legs)).format_map(places)
+    how_far = "This does not move the platform."
+    if matters:
+        how_far = (
+            f"Within the drawing's tolerances this moves the platform by {moved * 1e3:.2g} mm."
+        )
+    return Sentence(
+        f"{text[0].upper()}{text[1:]}. {how_far}",
+        advice_on(around, found, names, matters, weak),
+        names,
+        found.new,
+        moved,
+        matters,
+        weak,
+    )
+
+
+def _mostly(around: Situation, found: Found, rows: Integers, unit: Array) -> str:
+    """``: +1 mm of a goes with −0.7 mm of b`` of a single change; else what changes most."""
+    table, single = around.machine.parameters, len(found.space) == 1
+    if found.motion.labels:
+        if not single:
+            return f" {ways(len(found.numbers))}" if len(found.numbers) > 1 else ""
+        said, _ = changes(found.numbers[0], found.motion.labels)
+    else:
+        if len({table.labels[k] for k in rows}) == 1 and len(rows) > 1:
+            what = [f"leg {split_name(table.names[k])[0]}" for k in rows]
+        else:
+            what = [table.in_words(table.names[k]) for k in rows]
+        if not single:
+            return f", mostly of {listed(what, MOST_NAMES)}"
+        labels = tuple((w, table.units[k]) for w, k in zip(what, rows, strict=True))
+        said, _ = changes((found.own[0] * unit)[rows], labels)
+    return f": {said[0]} goes with {joined(said[1:])}" if len(said) > 1 else ""
+
+
+def few(sentences: list[Sentence]) -> tuple[Sentence, ...]:
+    """At most ``MOST`` sentences, the rest counted in the last."""
+    if len(sentences) <= MOST:
+        return tuple(sentences)
+    ranked = sorted(sentences, key=lambda s: -s.moves_platform)
+    kept = [s for s in sentences if s in ranked[: MOST - 1]]
+    rest = ranked[MOST - 1 :]
+    last = replace(
+        rest[0],
+        text=f"And {len(rest)} more of this kind. {rest[0].text}",
+        parameters=tuple(dict.fromkeys(name for s in rest for name in s.parameters)),
+        dimensions=sum(s.dimensions for s in rest),
+        moves_platform=float(np.sqrt(sum(s.moves_platform**2 for s in rest))),
+    )
+    return (*kept, last)
+
+
+# ------------------------------------------------------------------ what to do
+
+
+def advice_on(
+    around: Situation, found: Found, names: tuple[str, ...], matters: bool, weak: bool
+) -> str:
+    """What to do about a motion that changes these parameters."""
+    held = _fixing(_enough(around, found.motion, names))
+    if not matters:
+        return f"Nothing needs to be done; {held} silences this."
+    legs = found.legs
+    more, take = _more(around, legs), "Photograph" if around.photographed else "Measure"
+    caliper = f"Measure the tubes of {named(legs)} with a caliper"
+    do = {
+        "more": more,
+        "photograph": f"Photograph {named(legs)}, from another station if need be",
+        "tie": _tying(around, legs),
+        "caliper": f"{caliper} and give a small tolerance.radius",
+        "more or caliper": f"{more}; or measure the tubes with a caliper",
+        "turn": f"{take} configurations that turn these joints further, to both sides",
+        "drawing": "Legs look the same however these axes lie: leave them to the drawing",
+    }[found.motion.advice]
+    decide = f"{held} if the drawing is sure of that"
+    if weak:
+        decide = "state smaller tolerances in the mechanism file if the drawing warrants them"
+    return f"{do}; or {decide}."
+
+
+def _tying(around: Situation, legs: tuple[int, ...]) -> str:
+    """How to tie a group of legs to the others."""
+    others = [j for j in around.legs if j not in legs]
+    with_group = np.any(around.seen[around.seen[:, list(legs)].any(axis=1)], axis=0)
+    apart = [j for j in others if not with_group[j]]
+    return (
+        f"Add a station that sees {named(legs)} together with {named(apart or others)}; or let a"
+        " board fixed to the base be seen with the legs (observe: [legs, board], board: {fixed_to:"
+        " base})"
+    )
+
+
+def _more(around: Situation, legs: tuple[int, ...]) -> str:
+    """Which configurations are missing."""
+    if around.heights:  # more heights of the same bed would not help
+        return "Measure x and y too, by a board on the platform (observe: board) or a tracker"
+    take, poses = "Photograph" if around.photographed else "Measure", around.T_base_platform
+    those = named(legs) if len(legs) < len(around.legs) else "all legs"
+    elsewhere = f"{those} {'points' if len(legs) == 1 else 'point'} elsewhere"
+    if len(poses) == 1:
+        return f"{take} more configurations, so that {elsewhere} too"
+    turn = rotation_vector(poses[:, :3, :3] @ poses[0, :3, :3].T)
+    if around.machine.layout.motion[:3].any() and np.abs(turn).max() < TURNED:
+        return f"Turn the platform in some configurations, so that {elsewhere}"
+    what = "lengths" if around.machine.layout.rod_reads.any() else "readings"
+    return f"{take} configurations in which {elsewhere}, with {what} near both ends of their range"
+
+
+def _enough(around: Situation, motion: Motion, names: tuple[str, ...]) -> tuple[str, ...]:
+    """What is enough to hold: of a convention one axis, or one end of legs of which only the
+    difference counts.
+    """
+    if not motion.convention:
+        return names
+    table = around.machine.parameters
+    axes = [n for n in sorted(names) if ".axis." in n]
+    axes = [n for n in axes if abs(table.drawing[table.index(n)]) < PARALLEL]
+    return tuple(axes[:1]) or tuple(n for n in names if ".platform." in n) or names
+
+
+def _fixing(names: tuple[str, ...]) -> str:
+    """The line of the mechanism file that takes parameters out.
+
+    An axis is held as a whole, and a centre is said as a whole where all of it is meant.
+    """
+    entries: dict[str, None] = {}
+    for name in names:
+        whole, _, component = name.rpartition(".")
+        every = component in AXES and all(f"{whole}.{c}" in names for c in AXES)
+        axis = ".axis." in name and len(names) > 1
+        entries[whole if every or axis else name] = None
+    more = ", …" if len(entries) > MOST_FIXED else ""
+    said = ", ".join(f'"{name}"' for name in [*entries][:MOST_FIXED])
+    return f"fixed: [{said}{more}] in the mechanism file"
