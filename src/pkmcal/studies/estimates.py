@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
@@ -18,7 +18,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.papers.hand_eye import Pair, PairProblem
-from pkmcal.solver import FIRST_DAMPING, eliminate, inverse_root, minimise
+from pkmcal.solver import FIRST_DAMPING, eliminate, minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
 LOOSE = 1e-9
