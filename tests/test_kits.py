@@ -74,7 +74,7 @@ def test_heights_do_not_tell_rods_from_radius_and_it_is_said(by_heights):
     assert told.rank == 4
     assert told.rank + len(told.unidentified) == told.n_parameters - told.n_frames
     said = " ".join((*found.verdict.reasons, *found.verdict.warnings))
-    assert "The radius of the base joint and the rod length" in said
+    assert "The base radius and the rod length" in said
     assert "cannot be told apart by heights" in said
     assert "How the guides of legs 1 to 3 lean cannot be told from where they stand" in said
     assert "Measure x and y too, by a board on the platform" in said
@@ -88,7 +88,7 @@ def test_what_looks_as_flat_is_what_the_sentence_says(by_heights):
     _, found = by_heights
     text = next(s.text for s in found.findings.unidentified if "of all legs alike" in s.text)
     numbers = re.search(
-        r"with \+1 mm of the rod length and \+(\S+) mm of the radius of the base joints, the bed "
+        r"with \+1 mm of the rod length and \+(\S+) mm of the base radius, the bed "
         r"looks as flat, and x and y (stretch|shrink) by (\S+)%",
         text,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from string import Formatter
 
 import numpy as np
 import pytest
@@ -11,11 +12,13 @@ from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, generators
-from pkmcal.identify.motions import Situation, candidates, groups, hanging_together
+from pkmcal.identify.motions import Motion, Situation, candidates, groups, hanging_together
 from pkmcal.identify.sentences import MOST
 from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
 from pkmcal.identify.unidentified import describe, joined_by_boards, seen_legs, vectors
 from pkmcal.mechanisms import kinematics, load_mechanism
+from pkmcal.mechanisms.carriers.contract import NamedMotion, base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.slider import Slider
 from pkmcal.mechanisms.closure import limb_ends
 from test_identify_scene import Scene, _edges, _index, stations
 
@@ -239,7 +242,7 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
         (
             {"legs[1].base.center.z": 1.0, "legs[2].base.center.z": -1.0,
              "legs[3].base.center.z": 0.6, "legs[5].base.center.z": 1.1},
-            "The values of base centre z of legs 1 to 6 are free against each other in one way:",
+            "Of the machine's numbers, one combination is free: +1 mm of leg ",
         ),
         (
             {"legs[1].base.center.x": 1.0, "legs[4].length.offset": 0.7,
@@ -401,7 +404,41 @@ def test_a_board_on_the_base_joins_stations():
     assert [np.flatnonzero(row).tolist() for row in seen] == [[0, 2], [1], [0, 2]]
 
 
-def test_families_are_changes_of_this_machine():
+@pytest.mark.parametrize("carrier", [*base_carriers().values(), *platform_carriers().values()])
+def test_carriers_name_motions_of_their_own_numbers(carrier):
+    """What a carrier's file says of itself, for every carrier."""
+    assert carrier.called
+    parameters = np.random.default_rng(0).normal(size=len(carrier.parameters))
+    places = set(re.findall(r"``{(\w+)}``", Motion.__doc__ or ""))
+    for motion in carrier.motions(parameters, np.array([0.1, np.nan, 0.3])):
+        assert motion.columns.shape[0] == len(parameters)
+        assert np.isfinite(motion.columns).all()
+        for text in (motion.one, motion.several, motion.together):
+            assert {name for _, name, _, _ in Formatter().parse(text) if name} <= places
+            assert not text or "{legs}" in text
+
+
+def test_what_a_carrier_names_is_said(monkeypatch):
+    """Words come from the carrier's file: nobody else knows its joint."""
+
+    def drift(parameters, readings):
+        del readings
+        columns = np.zeros((parameters.size, 1))
+        columns[[0, 3], 0] = 1.0, -2.0
+        return (NamedMotion(columns, "how {legs} drifts {is}", "how {legs} drift {is}"),)
+
+    monkeypatch.setattr(Slider, "motions", staticmethod(drift))
+    machine = load_mechanism("linear-delta")
+    changes = [{f"legs[{j}].base.center.x": 1.0, f"legs[{j}].base.axis.x": -2.0} for j in (1, 3)]
+    null = np.array([unit(machine, change) for change in changes])
+    poses = moved(machine, np.random.default_rng(1), 5)
+    around = Situation(machine, np.ones((1, 3), bool), poses, photographed=False)
+    (sentence,) = describe(around, null)
+    assert sentence.text.startswith("How legs 1 and 3 drift is free. Within the drawing's")
+    assert sentence.dimensions == 2
+
+
+def test_candidates_are_changes_of_this_machine():
     for name in ("gough-stewart", "3-upu", "3-rpr", "6-spu-passive"):
         machine = load_mechanism(name)
         seen = np.ones((2, machine.n_legs), bool)

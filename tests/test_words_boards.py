@@ -114,7 +114,7 @@ def test_of_both_radii_only_the_difference_is_seen(name):
 
 def test_poses_on_one_line_confound_sizes():
     _, findings, _ = told_of("delta", None, "straight")
-    (sizes,) = of(findings, "The radius of the base joints and the arm length, of all legs alike")
+    (sizes,) = of(findings, "The base radius and the arm length, of all legs alike")
     assert sizes.matters
     assert sizes.moves_platform > 0.1 * findings.by_drawing
     assert set(sizes.parameters) >= {"legs[1].base.arm", "legs[1].base.center.y"}
@@ -182,8 +182,8 @@ def test_sizes_are_columns_of_the_machine():
         size.label: size.columns
         for size in sizes(Situation(machine, np.ones((1, 3), bool), machine.home()[None]))
     }
-    assert list(found) == ["radius of the base joints", "height of the base joints", "rod length"]
-    centres = machine.values + 1e-3 * found["radius of the base joints"].sum(axis=1)
+    assert list(found) == ["base radius", "base height", "rod length"]
+    centres = machine.values + 1e-3 * found["base radius"].sum(axis=1)
     moved = np.linalg.norm(machine.with_values(centres).base_centers()[:, :2], axis=1)
     np.testing.assert_allclose(
         moved - np.linalg.norm(machine.base_centers()[:, :2], axis=1), 1e-3, atol=1e-6

@@ -153,20 +153,16 @@ def candidates(s: Situation) -> Iterator[Motion]:
     yield from (_unseen(s, j) for j in s.legs if not s.seen[:, j].any())
     yield from _conventions(s)
     carried = [m for j in s.legs for m in _carriers(s, j)]
-    own = [
-        m for of in (_directions_and_tubes, _lengths_and_points) for j in s.legs for m in of(s, j)
-    ]
+    own = [motion for j in s.legs for motion in _of_one_leg(s, j)]
     shared = [*(motion for motion, _ in carried), *_sizes(s)]
     # photographs tell legs one by one; poses leave open what is the same of all
     yield from (*own, *shared) if s.photographed else (*shared, *own)
     for group in groups(s.seen):
         yield from _group(s, group)
-    yield from _same_of_all(s)
     for j in s.legs:
         yield from _whole_leg(s, j)
-    tubes = s.photographed and any("tubes" in fields for fields in s.fields)
-    yield from (_spread(s, group) for group in groups(s.seen) if tubes)
-    yield from (_spread(s, s.legs) for _ in range(tubes))
+    if s.photographed and any("tubes" in fields for fields in s.fields):
+        yield from (_spread(s, group) for group in (*groups(s.seen), s.legs))
     yield Motion(s.legs, _scale(s), "the size of everything {is}: all lengths can grow alike")
     yield from _all_together(s, carried)
     rest = "of the machine's numbers, {combinations}{mostly}"
@@ -177,16 +173,18 @@ def candidates(s: Situation) -> Iterator[Motion]:
 
 
 def _unseen(s: Situation, leg: int) -> Motion:
-    columns = s.one_hot(s.rows(leg, ""))
+    read = "; its readings alone leave {n} of its values {open}"
+    all_read = "; their readings alone leave {n} of each one's values {open}"
     if not s.rows(leg, "length").size:
-        lost = "{legs} is in no photograph, so that nothing tells where its joints are"
-        many = "{legs} are in no photograph, so that nothing tells where their joints are"
-        return Motion((leg,), columns, lost, many, advice="photograph")
-    one = "{legs} is in no photograph; its readings alone leave {n} of its values {open}"
-    several = (
-        "{legs} are in no photograph; their readings alone leave {n} of each one's values {open}"
+        read = ", so that nothing tells where its joints are"
+        all_read = ", so that nothing tells where their joints are"
+    return Motion(
+        (leg,),
+        s.one_hot(s.rows(leg, "")),
+        "{legs} is in no photograph" + read,
+        "{legs} are in no photograph" + all_read,
+        advice="photograph",
     )
-    return Motion((leg,), columns, one, several, advice="photograph")
 
 
 def _conventions(s: Situation) -> Iterator[Motion]:
@@ -237,8 +235,8 @@ def _difference(s: Situation, coefficients: Array) -> str:
 # ------------------------------------------------------------------ of one leg
 
 
-def _directions_and_tubes(s: Situation, leg: int) -> Iterator[Motion]:
-    """Turns of a leg's axes, both together or one alone, and its radii."""
+def _of_one_leg(s: Situation, leg: int) -> Iterator[Motion]:
+    """Its axes, its radii, the leg along itself, then every number and every point by itself."""
     base, platform = s.fields[leg].get("base.axis"), s.fields[leg].get("platform.axis")
     if base is not None and platform is not None:
         values, rot = s.machine.values, s.T_base_platform[0, :3, :3]
@@ -250,29 +248,34 @@ def _directions_and_tubes(s: Situation, leg: int) -> Iterator[Motion]:
             " can be seen"
         )
         yield Motion((leg,), turn, one, advice="drawing")
-    for field, rows in s.fields[leg].items():
-        if field.endswith("axis"):
-            one = f"the direction of the {s.label(rows)} of {{each}}{{legs}} {{is}}"
-            yield Motion((leg,), s.one_hot(rows), one, advice="turn")
-        if field == "tubes":
-            one = "the tubes' radii of {legs} {are}"
-            yield Motion((leg,), s.one_hot(rows), one, advice="caliper")
+    alone = {field: s.one_hot(rows) for field, rows in s.fields[leg].items()}
+    what = {field: s.label(rows) for field, rows in s.fields[leg].items()}
+    axes = [field for field in alone if field.endswith("axis")]
+    points = [f for f, own in alone.items() if own.shape[1] == 3 and f not in (*axes, "tubes")]
+    for field in axes:
+        one = f"the direction of the {what[field]} of {{each}}{{legs}} {{is}}"
+        yield Motion((leg,), alone[field], one, advice="turn")
+    if "tubes" in alone:
+        one = "the tubes' radii of {legs} {are}"
+        yield Motion((leg,), alone["tubes"], one, advice="caliper")
+    yield _along(s, leg)
+    for field in (f for f in alone if f not in (*axes, *points, "tubes")):
+        yield Motion((leg,), alone[field], f"the {what[field]} of {{each}}{{legs}} {{is}}")
+    for field in points:
+        name = what[field].replace("centre", "joint")
+        one = f"the {name} of {{each}}{{legs}} {{is}} {{how}}"
+        yield Motion((leg,), alone[field], one, how=lambda _s, c: directions(c))
 
 
-def _lengths_and_points(s: Situation, leg: int) -> Iterator[Motion]:
-    """The leg growing along itself, then its numbers and its points one by one."""
-    start = "{legs} keeps nearly one direction in the data: it {how}{limited}"
-    starts = "{legs} keep nearly one direction each in the data: each of them {how}{limited}"
-    how = _sliding if s.rows(leg, "length").size else _sliding_passive
-    yield Motion((leg,), _slide(s, leg), start, starts, how)
-    for field, rows in s.fields[leg].items():
-        if len(rows) == 1 and field != "tubes":
-            yield Motion((leg,), s.one_hot(rows), f"the {s.label(rows)} of {{each}}{{legs}} {{is}}")
-    for field, rows in s.fields[leg].items():
-        if len(rows) == 3 and not field.endswith(("axis", "tubes")):
-            what = s.label(rows).replace("centre", "joint")
-            one = f"the {what} of {{each}}{{legs}} {{is}} {{how}}"
-            yield Motion((leg,), s.one_hot(rows), one, how=lambda _s, c: directions(c))
+def _along(s: Situation, leg: int) -> Motion:
+    """A leg that grows, or shifts, along itself."""
+    start = "{legs} keeps nearly one direction in the data: it "
+    starts = "{legs} keep nearly one direction each in the data: each of them "
+    if s.rows(leg, "length").size:
+        end, how = "{how}{limited}", _sliding
+    else:
+        end, how = "can shift along itself, its two joints by themselves{limited}", None
+    return Motion((leg,), _slide(s, leg), start + end, starts + end, how)
 
 
 def _slide(s: Situation, leg: int) -> Array:
@@ -298,11 +301,6 @@ def _sliding(_s: Situation, coefficients: Array) -> str:
     if abs(coefficients[0].sum()) < 0.05 * max(base, platform):
         return "can shift along itself with both joints"
     return "can grow while both of its joints move along it"
-
-
-def _sliding_passive(_s: Situation, coefficients: Array) -> str:
-    del coefficients
-    return "can shift along itself, its two joints by themselves"
 
 
 def directions(vectors: Array) -> str:
@@ -354,18 +352,17 @@ def _whole_leg(s: Situation, leg: int) -> Iterator[Motion]:
 # ------------------------------------------------------------------ sizes that legs share
 
 
-class _Size(NamedTuple):
-    """A number that legs have: what it is called, of all and of one; unit; (P, L) a column each."""
+class Size(NamedTuple):
+    """A number that several legs have: what it is called, its unit, and (P, L) a column a leg."""
 
     label: str
-    of_one: str
     unit: str
     columns: Array
 
 
-def sizes(s: Situation) -> tuple[_Size, ...]:
-    """Radius (outwards from the middle of all) and height (along z) of the base joints, and every
-    other number that several legs have, free ones only.
+def sizes(s: Situation) -> tuple[Size, ...]:
+    """Radius of the base (a joint moves outwards from the middle of all) and height (along z), and
+    every other number that several legs have, free ones only.
     """
     table, n = s.machine.parameters, s.machine.n_legs
     places, _ = centre_index(s.machine.layout)
@@ -373,23 +370,19 @@ def sizes(s: Situation) -> tuple[_Size, ...]:
     outwards = (centres - centres.mean(axis=0)) * [1, 1, 0]
     size = np.linalg.norm(outwards, axis=1, keepdims=True)
     outwards = outwards / np.where(size > 0, size, 1.0)
-    radius, height = np.zeros((2, len(table), n))
+    radius, height = np.zeros((len(table), n)), np.zeros((len(table), n))
     for j in s.legs:
         radius[places[j], j] = outwards[j]
         height[places[j, 2], j] = 1.0
-    found = [
-        _Size(f"{what} of the base joints", f"{what} of the base joint", "m", columns)
-        for what, columns in (("radius", radius), ("height", height))
-    ]
-    free = table.free_matrix().any(axis=1)
+    found = [Size("base radius", "m", radius), Size("base height", "m", height)]
+    free = np.any(table.free_matrix(), axis=1)
     for field in dict.fromkeys(field for leg in s.fields for field in leg if field != "tubes"):
         having = [j for j in s.legs if len(s.fields[j].get(field, ())) == 1]
         rows = [int(s.fields[j][field][0]) for j in having]
         if len(rows) > 1 and free[rows].any():
             columns = np.zeros((len(table), n))
             columns[rows, having] = 1.0
-            label = table.labels[rows[0]]
-            found.append(_Size(label, label, table.units[rows[0]], columns))
+            found.append(Size(table.labels[rows[0]], table.units[rows[0]], columns))
     return tuple(found)
 
 
@@ -398,27 +391,29 @@ def _sizes(s: Situation) -> Iterator[Motion]:
     known = sizes(s)
     numbers = [*range(1, min(MOST_SIZES, len(known)) + 1)]
     numbers += [len(known)] if len(known) > MOST_SIZES else []
-    chosen = [group for n in numbers for group in combinations(known, n)]
     apart = "cannot be told apart" + (" by heights" if s.heights else "") + "{better}"
-    for group in chosen:
-        legs = tuple(np.flatnonzero(np.any([g.columns.any(axis=0) for g in group], axis=0)))
-        columns = np.stack([g.columns.sum(axis=1) for g in group], axis=1)
-        whose = "all legs" if len(legs) == len(s.legs) else named(legs)
-        text = f"{joined([f'the {g.label}' for g in group])}, of {whose} alike, "
+    single: list[Motion] = []
+    for group in (group for n in numbers for group in combinations(known, n)):
+        columns = np.stack([g.columns for g in group], axis=2)  # (P, L, sizes)
         labels = tuple((f"the {g.label}", g.unit) for g in group)
+        having = np.any(columns, axis=0)  # (L, sizes)
+        legs = tuple(j for j in s.legs if having[j].any())
+        whose = "all legs" if len(legs) == len(s.legs) else named(legs)
+        what, alike = joined([label for label, _ in labels]), columns.sum(axis=1)
+        text = f"{what}, of {whose} alike, "
         if len(group) == 1:
-            yield Motion(legs, columns, text + "{is}")
-        elif s.heights:
-            yield Motion(legs, columns, text + apart + "{how}", how=_as_flat(labels, columns))
+            yield Motion(legs, alike, text + "{is}")
+            continue
+        if s.heights:
+            how = _as_flat(labels, alike)
+            yield Motion(legs, alike, text + apart + "{how}", how=how, labels=labels)
         else:
-            yield Motion(legs, columns, text + apart + "{mostly}", labels=labels)
-    for group in (g for g in chosen if len(g) > 1):
-        text = f"{joined([f'the {g.of_one}' for g in group])} of {{each}}{{legs}} {apart}{{mostly}}"
-        labels = tuple((f"the {g.of_one}", g.unit) for g in group)
-        for j in s.legs:
-            columns = np.stack([g.columns[:, j] for g in group], axis=1)
-            if columns.any(axis=0).all():
-                yield Motion((j,), columns, text, labels=labels)
+            yield Motion(legs, alike, text + apart + "{mostly}", labels=labels)
+        text = f"{what} of {{each}}{{legs}} {apart}{{mostly}}"
+        single += [
+            Motion((j,), columns[:, j], text, labels=labels) for j in legs if having[j].all()
+        ]
+    yield from single
 
 
 def _as_flat(labels: tuple[tuple[str, str], ...], columns: Array) -> How:
@@ -521,7 +516,7 @@ def _group(s: Situation, legs: tuple[int, ...]) -> Iterator[Motion]:
 def _relation(s: Situation, legs: tuple[int, ...]) -> str:
     """How the group is seen with the other legs."""
     others = [j for j in s.legs if j not in legs]
-    with_group = s.seen[s.seen[:, list(legs)].any(axis=1)].any(axis=0)
+    with_group = np.any(s.seen[s.seen[:, list(legs)].any(axis=1)], axis=0)
     bridging = [j for j in others if with_group[j]]
     verb = "are" if len(legs) > 1 else "is"
     if not bridging:
@@ -587,25 +582,6 @@ def _line(
 # ------------------------------------------------------------------ all legs
 
 
-def _same_of_all(s: Situation) -> Iterator[Motion]:
-    """One number of all legs, free against each other: on one body, then on both."""
-    table = s.machine.parameters
-    paths: dict[str, list[int]] = {}
-    for k, name in enumerate(table.names):
-        if "tubes" not in name:
-            paths.setdefault(split_name(name)[1], []).append(k)
-    several = {path: rows for path, rows in paths.items() if len(rows) > 1}
-    text = "{} of {{legs}} {{are}} against each other {{ways}}{{mostly}}"
-    for path, rows in several.items():
-        legs = tuple((split_name(table.names[k])[0] or 1) - 1 for k in rows)
-        what = f"the values of {table.labels[rows[0]]}"
-        yield Motion(legs, s.one_hot(np.array(rows)), text.format(what))
-        other = several.get(path.replace("base", "platform", 1), []) if "base" in path else []
-        if other:
-            what += f" and {table.labels[other[0]]}"
-            yield Motion(s.legs, s.one_hot(np.array([*rows, *other])), text.format(what))
-
-
 def _spread(s: Situation, legs: tuple[int, ...]) -> Motion:
     """Legs move apart as they are while their tubes grow thicker by the same share, (P, 1).
 
@@ -639,9 +615,6 @@ def _all_together(s: Situation, carried: list[tuple[Motion, str]]) -> Iterator[M
     slides = np.concatenate([_slide(s, j) for j in s.legs], axis=1)
     text = "legs that grow while their joints move along them {are} {ways}{mostly}"
     yield Motion(s.legs, slides, text)
-    for side, centres in zip(("base", "platform"), centre_index(s.machine.layout), strict=True):
-        text = f"how the {side} joints lie to each other {{is}} {{ways}}{{mostly}}"
-        yield Motion(s.legs, s.one_hot(centres.ravel()), text)
     axes = [rows for leg in s.fields for field, rows in leg.items() if field.endswith("axis")]
     if axes:
         text = "the directions of the joints' axes {are} {ways}{mostly}"

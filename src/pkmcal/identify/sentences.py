@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.motions import AXES, Motion, Situation, changes
 from pkmcal.wording import in_full, joined, listed, named, split_name, ways
@@ -124,7 +124,7 @@ def sentence(around: Situation, found: Found, unit: Array, moved: float, weak: b
     )
 
 
-def _mostly(around: Situation, found: Found, rows: Array, unit: Array) -> str:
+def _mostly(around: Situation, found: Found, rows: Integers, unit: Array) -> str:
     """``: +1 mm of a goes with −0.7 mm of b`` of a single change; else what changes most."""
     table, single = around.machine.parameters, len(found.space) == 1
     if found.motion.labels:
@@ -191,7 +191,7 @@ def advice_on(
 def _tying(around: Situation, legs: tuple[int, ...]) -> str:
     """How to tie a group of legs to the others."""
     others = [j for j in around.legs if j not in legs]
-    with_group = around.seen[around.seen[:, list(legs)].any(axis=1)].any(axis=0)
+    with_group = np.any(around.seen[around.seen[:, list(legs)].any(axis=1)], axis=0)
     apart = [j for j in others if not with_group[j]]
     return (
         f"Add a station that sees {named(legs)} together with {named(apart or others)}; or let a"

@@ -297,10 +297,11 @@ def _coefficients(motion: Motion, space: _Open, found: Array) -> Array:
     m, both = len(scale), np.concatenate([columns / scale, space.frames], axis=1)
     weight = np.ones(both.shape[1])
     few = len(found) == 1 and m > 1 and not (motion.how or motion.convention)
-    for _ in range(FEWEST if few else 1):
-        solved = np.linalg.lstsq(both * weight, found.T, rcond=1e-6)[0] * weight[:, None]
+    solved = np.linalg.lstsq(both, found.T, rcond=1e-6)[0]
+    for _ in range(FEWEST if few else 0):
         weight[:m] = np.sqrt(np.abs(solved[:m, 0]) / max(np.abs(solved[:m, 0]).max(), 1e-300))
         weight[m:] = CHEAP
+        solved = np.linalg.lstsq(both * weight, found.T, rcond=1e-6)[0] * weight[:, None]
     return (solved[:m] / scale[:, None]).T
 
 
@@ -311,7 +312,16 @@ def _alike(around: Situation, parts: list[Found]) -> list[Found]:
         single = len(part.legs) == 1
         key = (part.motion.one, *((part.how(around), len(part.space)) if single else part.legs))
         out[key] = out[key].and_of(part) if key in out else part
-    return list(out.values())
+    return [_with_last_leg(part, parts) for part in out.values()]
+
+
+def _with_last_leg(part: Found, parts: list[Found]) -> Found:
+    """Sizes of all legs but one, of which the common part is said too, are those of all legs."""
+    alike = [p.legs for p in parts if p.motion.labels == part.motion.labels and len(p.legs) > 1]
+    single = bool(part.motion.labels) and len(part.motion.legs) == 1
+    if single and alike and len(part.legs) == len(alike[0]) - 1:
+        return replace(part, legs=alike[0])
+    return part
 
 
 def _moves(part: Found, space: _Open, effect: Array) -> tuple[float, bool]:

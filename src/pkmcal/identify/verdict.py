@@ -9,6 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.covariance import Identifiability
+from pkmcal.identify.decided import decided_by
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import Sentence
@@ -19,6 +20,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.outcome import Verdict
 from pkmcal.solver import Stop
+from pkmcal.wording import listed
 
 FAR = 5.0
 """Tolerances by which a value may leave the drawing before a person should look."""
@@ -26,8 +28,6 @@ TOO_NOISY = 4.0
 """Factor on the edges' stated noise beyond which the model does not explain the photographs."""
 TOO_MANY_LOST = 0.4
 """Share of edges given up as outliers beyond which the rest may be the outliers."""
-DECIDED = 0.5
-"""Share of a value that the data must decide for it to count as calibrated."""
 LEFT_OPEN = 0.05
 """Share of the platform's error by the drawing that may be left undecided. A calibration makes the
 drawing's error twenty to fifty times smaller; what leaves a twentieth of it would be the result's
@@ -74,7 +74,12 @@ def judge(
         seen = seen_legs(observation.edges, estimate.edge_weights, stations, legs)
         findings = explain(told, estimate, seen)
     large, small = _left_open(estimate, findings) if findings else ((), ())
-    left = _undecided_text(estimate) if findings is None else _said(large)
+    left = [f"{s.text} {s.advice}" for s in large]
+    if findings is None and (undecided := _undecided(estimate)):
+        left = [
+            f"The data hardly say more than the drawing about {listed(undecided, 4)}: more"
+            " configurations, with legs that point elsewhere, are needed."
+        ]
     reasons = tuple(_reasons(estimate, method, left) + _poses_against(estimate, richer)) + doubts
     # what is a small part of the deviation that was reached is in that, and in the report
     least = LARGE * _platform_sigma(estimate) if small else 0.0
@@ -82,7 +87,7 @@ def judge(
     warnings = (
         *_warnings(observation, estimate, held_out),
         *_poses_doubted(estimate, richer),
-        *_said(matter),
+        *(f"{s.text} {s.advice}" for s in matter),
     )
     if reasons:
         headline = "This calibration should not be used."
@@ -103,10 +108,14 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
             f"Calibrated: the platform's joints to {_platform_sigma(estimate) * 1e3:.2g} mm at"
             " given readings (standard deviation)."
         )
-    covariance = free_of_gauge(estimate)
+    machine, covariance = estimate.machine, free_of_gauge(estimate)  # medians that favour no frame
+    drawing = machine.with_values(machine.parameters.drawing)
+    bodies = joint_centres(drawing, machine, covariance)
+    centre = float(np.median(np.concatenate([body.sigma for body in bodies])))
+    offsets = np.diag(covariance)[machine.parameters.of_kind("offset")]
+    offset = float(np.sqrt(np.median(offsets))) if offsets.size else 0.0
     return (
-        f"Calibrated: joint centres to {_centre_sigma(estimate, covariance) * 1e3:.2g} mm"
-        f" and offsets to {_offset_sigma(estimate, covariance) * 1e3:.2g} mm"
+        f"Calibrated: joint centres to {centre * 1e3:.2g} mm and offsets to {offset * 1e3:.2g} mm"
         " (standard deviations)."
     )
 
@@ -239,28 +248,12 @@ def _harmless(sentences: tuple[Sentence, ...]) -> list[str]:
     return [f"Open, without effect on the platform: {what[0].lower()}{what[1:]}{more}."]
 
 
-def _said(sentences: tuple[Sentence, ...]) -> list[str]:
-    return [f"{s.text} {s.advice}" for s in sentences]
-
-
-def _undecided_text(estimate: Estimate) -> list[str]:
-    """That values are undecided, where nothing more is known of it."""
-    undecided = _undecided(estimate)
-    if not undecided:
-        return []
-    return [
-        f"The data hardly say more than the drawing about {_names(undecided)}: more"
-        " configurations, with legs that point elsewhere, are needed."
-    ]
-
-
 def _undecided(estimate: Estimate) -> list[str]:
-    """Parameters of free, gauge-free kind that the data do not decide."""
+    """Parameters that the drawing decides; a tube's radius moves nothing."""
     table = estimate.machine.parameters
-    sigma = np.sqrt(np.diag(estimate.covariance))
-    moved = sigma > 1e-9  # what defines the frame has no deviation
-    kinematic = [k for k, kind in enumerate(table.kinds) if kind != "radius" and moved[k]]
-    return [table.names[k] for k in kinematic if estimate.data_share[k] < DECIDED]
+    decided = decided_by(table, estimate.covariance, estimate.data_share)
+    named = zip(table.names, table.kinds, decided, strict=True)
+    return [name for name, kind, by in named if by == "drawing" and kind != "radius"]
 
 
 def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> list[str]:
@@ -270,7 +263,7 @@ def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> li
     far = [table.names[k] for k in np.argsort(-change) if change[k] > FAR]
     if far:
         out.append(
-            f"{_names(far)} differ{'s' if len(far) == 1 else ''} from the drawing by more than"
+            f"{listed(far, 4)} differ{'s' if len(far) == 1 else ''} from the drawing by more than"
             f" {FAR:.0f} tolerances (up to {change.max():.0f}): check the drawing and its frame."
         )
     seen = np.bincount(observation.edges.leg, minlength=estimate.machine.n_legs)
@@ -309,22 +302,3 @@ def _advice(estimate: Estimate) -> list[str]:
             " of their number; extreme leg lengths help most."
         ]
     return []
-
-
-def _centre_sigma(estimate: Estimate, covariance: Array) -> float:
-    """Median standard deviation of a joint centre's coordinate, m; no frame is favoured."""
-    drawing = estimate.machine.with_values(estimate.machine.parameters.drawing)
-    bodies = joint_centres(drawing, estimate.machine, covariance)
-    return float(np.median(np.concatenate([body.sigma for body in bodies])))
-
-
-def _offset_sigma(estimate: Estimate, covariance: Array) -> float:
-    """Median standard deviation of an offset, m; 0 for a machine without any."""
-    variance = np.diag(covariance)[estimate.machine.parameters.of_kind("offset")]
-    return float(np.sqrt(np.median(variance))) if variance.size else 0.0
-
-
-def _names(names: list[str], most: int = 3) -> str:
-    if len(names) > most:
-        return f"{', '.join(names[:most])} and {len(names) - most} more"
-    return " and ".join(names)

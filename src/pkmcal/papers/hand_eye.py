@@ -256,7 +256,7 @@ def start_from_poses(
         machine.values,
         stations,
         found.T_base_platform,
-        np.zeros(int(np.max(measurements.camera_of_station)) + 1),
+        np.zeros(measurements.n_cameras),
         T_mount=np.where(np.isnan(mounts), np.eye(4), mounts),
         on_platform=measurements.on_platform,
         internal=found.internal,

@@ -35,7 +35,7 @@ SOURCES = {
 
 
 @dataclass(frozen=True)
-class Row:
+class ParameterRow:
     """One parameter as the table shows it; texts carry sensible digits, numbers serve sorting.
 
     leg : from 1, None for a parameter of no leg. source : a key of ``SOURCES``. share : of what
@@ -67,24 +67,26 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Group:
+class ParameterGroup:
     """The rows of one leg (None: of the machine)."""
 
     leg: int | None
-    rows: tuple[Row, ...]
+    rows: tuple[ParameterRow, ...]
 
 
-def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[Group, ...]:
+def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[ParameterGroup, ...]:
     """All parameters, grouped by leg in the order of the file."""
     table = estimate.machine.parameters
     before = drawing.values
     source = decided_by(table, estimate.covariance, estimate.data_share)
     rows = [_row(table, k, float(before[k]), estimate, source[k]) for k in range(len(table))]
     legs = list(dict.fromkeys(row.leg for row in rows))
-    return tuple(Group(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
+    return tuple(ParameterGroup(leg, tuple(r for r in rows if r.leg == leg)) for leg in legs)
 
 
-def _row(table: ParameterTable, k: int, before: float, estimate: Estimate, source: Decider) -> Row:
+def _row(
+    table: ParameterTable, k: int, before: float, estimate: Estimate, source: Decider
+) -> ParameterRow:
     factor, unit = SCALES.get(table.units[k], (1.0, table.units[k].replace("1", "")))
     after = float(estimate.machine.values[k])
     variance = float(estimate.covariance[k, k])
@@ -92,7 +94,7 @@ def _row(table: ParameterTable, k: int, before: float, estimate: Estimate, sourc
     numbers = (before * factor, after * factor, (after - before) * factor, sigma * factor)
     places = decimals(numbers[3])
     name = table.names[k]
-    return Row(
+    return ParameterRow(
         name=name,
         leg=split_name(name)[0],
         label=table.labels[k],
@@ -114,7 +116,7 @@ def _tie(table: ParameterTable, name: str) -> str:
 
 
 def unidentified(
-    groups: tuple[Group, ...], estimate: Estimate, findings: Findings | None = None
+    groups: tuple[ParameterGroup, ...], estimate: Estimate, findings: Findings | None = None
 ) -> tuple[str, ...]:
     """Sentences: what the data leave open, then pairs that can hardly be told apart.
 
@@ -148,9 +150,9 @@ def _whole_axis(name: str) -> str:
     return whole if whole.endswith("axis") else name
 
 
-def _by_kind(groups: tuple[Group, ...], estimate: Estimate) -> list[str]:
+def _by_kind(groups: tuple[ParameterGroup, ...], estimate: Estimate) -> list[str]:
     """Sentences on the values that stayed the drawing's."""
-    kinds: dict[str, list[Row]] = {}
+    kinds: dict[str, list[ParameterRow]] = {}
     for group in groups:
         for row in group.rows:
             if row.source == "drawing":
@@ -158,7 +160,7 @@ def _by_kind(groups: tuple[Group, ...], estimate: Estimate) -> list[str]:
     return [_kind_text(kind, rows, estimate.machine.n_legs) for kind, rows in kinds.items()]
 
 
-def _kind_text(kind: str, rows: list[Row], all_legs: int) -> str:
+def _kind_text(kind: str, rows: list[ParameterRow], all_legs: int) -> str:
     """One sentence for parameters of one kind."""
     legs = [row.leg for row in rows if row.leg is not None]
     where = f" of {legs_named(legs, all_legs)}" if legs else ""
