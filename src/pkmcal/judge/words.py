@@ -85,7 +85,12 @@ def _validation_headline(
     if unit is None:
         return core + "."
     sign = "," if not gain.better and gain.high >= 1 else ":"
-    return f"{core}{sign} {amount(finite_rms(after), unit)} against {amount(finite_rms(before), unit)}."
+    return f"{core}{sign} {against(after, before, unit)}."
+
+
+def against(new: Array, old: Array, unit: str) -> str:
+    """Root mean squares of residuals (n,), m or rad: ``0.07 mm against 0.9 mm``."""
+    return f"{amount(finite_rms(new), unit)} against {amount(finite_rms(old), unit)}"
 
 
 def _not_better(gain: Ratio) -> list[str]:
