@@ -8,9 +8,10 @@ import numpy as np
 
 from pkmcal.geometry.rigid import inverse, look_at, perturb, pose, pose_difference, rotation
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.covariance import information
 from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import kinematics
 

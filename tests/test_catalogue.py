@@ -16,9 +16,10 @@ from pkmcal.cameras import camera_models
 from pkmcal.commands.comparison import compare
 from pkmcal.files import parse_yaml, validate
 from pkmcal.geometry.rigid import perturb
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.identify.problem import State
+from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import (
     MechanismDocument,

@@ -10,11 +10,13 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import pkmcal
 from mujoco_machines import Simulated
 from pkmcal.export.c import numbers_of
 
@@ -27,7 +29,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from pkmcal.files import Schema
-from pkmcal.geometry.rigid import cross, dot, rotation
+from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier, Chain, Direction, Interval, PlatformCarrier, vectors,
 )
@@ -62,19 +64,7 @@ def unit(v):
     return v / np.sqrt(dot(v, v))[..., None]
 
 
-class NoCalibration:
-    """What only identification asks to the last digit, or at all."""
-
-    moved = by_frames = carried = staticmethod(lambda *of: NotImplemented)
-
-    @classmethod
-    def by_parameters(cls, parameters, *at):
-        steps = 1e-6 * np.eye(parameters.shape[-1])
-        ends = [[cls.place(parameters + d, *at)[0] for d in (h, -h)] for h in steps]
-        return np.stack([(ahead - behind) / 2e-6 for ahead, behind in ends], axis=-1)
-
-
-class Rocker(NoCalibration, BaseCarrier):
+class Rocker(BaseCarrier):
     driven: ClassVar = True
     unit: ClassVar = "rad"
     joints: ClassVar = ("rocker",)
@@ -89,8 +79,11 @@ class Rocker(NoCalibration, BaseCarrier):
     @staticmethod
     def place(parameters, readings):
         center, pivot, v = parameters[..., :3], parameters[..., 3:6], unit(parameters[..., 6:])
-        arm = (rotation(readings[..., None] * v) @ (center - pivot)[..., None])[..., 0]
-        return pivot + arm, cross(v, arm)
+        high = dot(center - pivot, v)[..., None] * v
+        arm = center - pivot - high
+        c, s = np.cos(readings)[..., None], np.sin(readings)[..., None]
+        side = cross(v, arm)
+        return pivot + high + c * arm + s * side, c * side - s * arm
 
     @staticmethod
     def reading(parameters, point_b, length, near):
@@ -109,7 +102,7 @@ class Rocker(NoCalibration, BaseCarrier):
         return Chain("turn", pivot, unit(parameters[..., 6:]), center - pivot)
 
 
-class Ramp(NoCalibration, BaseCarrier):
+class Ramp(BaseCarrier):
     driven: ClassVar = True
     joints: ClassVar = ("ramp",)
     schema: ClassVar = RampDocument
@@ -134,9 +127,10 @@ class Ramp(NoCalibration, BaseCarrier):
         return Chain("slide", center, v, np.zeros_like(center))
 
 
-class Post(NoCalibration, PlatformCarrier):
+class Post(PlatformCarrier):
     joints: ClassVar = ("post",)
     schema: ClassVar = PostDocument
+    ways: ClassVar = ("post",)
     parameters: ClassVar = (*vectors("center", "m", "center"), *vectors("post", "m", "center"))
 
     @staticmethod
@@ -175,12 +169,11 @@ def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("carrier")
     (folder / "my_carriers.py").write_text(CARRIER)
     (folder / "mixed.yaml").write_text(MACHINE)
-    import pkmcal
-
     paths = (str(Path(pkmcal.__file__).parents[1]), str(folder))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     environment["PKMCAL_CARRIERS"] = "my_carriers"
 
+    @cache
     def of(name):
         words = ("export", str(folder / "mixed.yaml"), "--to", name, "-o", str(folder / name))
         done = subprocess.run(

@@ -11,14 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from pkmcal.calibration.turns import better_start
 from pkmcal.errors import ResultError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import centre_index, default_gauge
-from pkmcal.identify.problem import State
-from pkmcal.identify.start import better_start, misfit
+from pkmcal.identify.start import misfit, start_state
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import (
     Machine,

@@ -14,10 +14,11 @@ import pytest
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.bundle import bundle, start_state, what_data_tell
+from pkmcal.identify.bundle import bundle, what_data_tell
 from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge, freedoms, generators
-from pkmcal.identify.problem import State
+from pkmcal.identify.start import start_state
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism

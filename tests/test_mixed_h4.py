@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pkmcal.geometry.rigid import look_at, perturb
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.simulation import EdgeNoise, simulate_edges, true_machine, with_forearms

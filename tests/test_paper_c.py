@@ -154,10 +154,16 @@ def test_better_methods_are_better(short):
 
 
 def test_another_seed_draws_anew():
-    first, again, other = (study(runs=2, seed=seed).accuracy for seed in (1, 1, 2))
-    key = ("design", "design", JOINT)
-    assert first[key] == again[key]
-    assert first[key] != other[key]
+    """In every batch of every truth; what is drawn is all that chance decides."""
+    setting = H4ByBoard()
+    for first, again, other in zip(
+        *(engine.batches(setting, 2, s) for s in (1, 1, 2)), strict=True
+    ):
+        seen = [setting.draw(batch).T_camera_board for batch in (first, again, other)]
+        np.testing.assert_array_equal(seen[0], seen[1])
+        assert not np.isclose(seen[0], seen[2]).all(axis=(-1, -2)).any()
+        key = first.generator(1).random(), again.generator(1).random(), other.generator(1).random()
+        assert key[0] == key[1] != key[2]
 
 
 # ------------------------------------------------------------------ terminal, JSON and page

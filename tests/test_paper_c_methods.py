@@ -164,7 +164,7 @@ def test_whitened_rows_have_unit_variance():
 
 def replace_start(machine, truth):
     """A state with camera and board where they truly are: to look at rows, not to estimate."""
-    from pkmcal.identify.problem import State
+    from pkmcal.identify.estimate import State
 
     return State(
         machine.parameters.drawing,

@@ -9,7 +9,7 @@ import numpy as np
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.geometry.cylinders import contour_point, edge_normals, tangent_basis
 from pkmcal.geometry.rigid import look_at, perturb
-from pkmcal.identify.problem import Estimate, State, Statistics
+from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.measurements import EdgeSet, Observation, Rejection
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera

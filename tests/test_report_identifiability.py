@@ -29,7 +29,7 @@ def findings_of(scene, *views):
 
 
 def make_estimate_stub():
-    from pkmcal.identify.problem import Estimate, Statistics
+    from pkmcal.identify.estimate import Estimate, Statistics
 
     none = np.zeros(0)
     statistics = Statistics(0, 0, 0, 0, 0, 0, 0, 0, 0, "", 1.0)

@@ -13,7 +13,8 @@ from conftest import run
 from pkmcal.calibration.aside import chosen, clusters, places, regions, select, spread
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.start import start_state
 from pkmcal.judge.comparison import compare, promise, ratio, rms, weighed
 from pkmcal.judge.held import held_machine
 from pkmcal.judge.holdouts import by_regions, hold_out

@@ -10,8 +10,9 @@ import pytest
 
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import freedoms, generators
+from pkmcal.identify.start import start_state
 from pkmcal.judge.causes import (
     Cause,
     arms,

@@ -26,8 +26,9 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.recognise import platform_poses, read_photographs, recognise
 from pkmcal.commands.comparison import compare
-from pkmcal.identify.bundle import bundle, start_state
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
+from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.observe import legs
 from pkmcal.report import page, pictures, scene

@@ -215,6 +215,11 @@ class Measurements:
     shaded: bool = False
 
     @property
+    def n_cameras(self) -> int:
+        """Number of cameras, C."""
+        return int(self.camera_of_station.max()) + 1
+
+    @property
     def on_platform(self) -> Booleans:
         """(M,) which of the mounts move with the platform."""
         return np.array([mount.body == "platform" for mount in self.mounts], dtype=bool)

@@ -15,7 +15,7 @@ from pkmcal.calibration.turns import Turns
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.bundle import bundle
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 

@@ -23,7 +23,7 @@ from pkmcal.calibration.recognise import (
 )
 from pkmcal.calibration.turns import Progress, identify_poses, take_turns
 from pkmcal.identify.bundle import what_data_tell
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation

@@ -12,9 +12,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference, rotation_vector
-from pkmcal.identify.bundle import bundle, start_state
-from pkmcal.identify.mounts import mean_pose
-from pkmcal.identify.problem import Estimate, State
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.start import mean_pose, start_state
 from pkmcal.identify.verdict import POOR, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine

@@ -10,7 +10,7 @@ from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, ResultError
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate_poses
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.session.load import Session

@@ -10,8 +10,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, rms
 from pkmcal.identify.centres import joint_centres
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.identify.problem import State
 from pkmcal.identify.tool import tool_point
 from pkmcal.mechanisms import Machine
 from pkmcal.simulation import Truth, load_truth

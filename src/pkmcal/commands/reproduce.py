@@ -54,20 +54,16 @@ def reproduce(
     with console.progress(as_json) as told:
         options = Options(runs, seed, long, photographs, told)
         found = {paper: computed(paper, options) for paper in wanted}
-    texts: dict[str, str] = {}
-    for paper, outcome in found.items():
-        texts |= contents(outcome, files[paper])
+    texts = {
+        name: text
+        for paper, outcome in found.items()
+        for name, text in contents(outcome, files[paper]).items()
+    }
     write_folder(out, texts)
+    if not as_json:
+        return max(tell(outcome, out, files[paper]) for paper, outcome in found.items())
     code = max(outcome.exit_code for outcome in found.values())
-    if as_json:
-        documents = {paper: outcome.document for paper, outcome in found.items()}
-        written = [str(out / name) for name in texts]
-        console.print_json({"papers": documents, "files": written, "exit_code": code})
-        return code
-    terminal = console.out()
-    for outcome in found.values():
-        tell(terminal, outcome)
-        terminal.print()
-    shown = [(str(out / name), what) for paper in found for name, what in files[paper].items()]
-    console.print_files(terminal, shown)
+    documents = {paper: outcome.document for paper, outcome in found.items()}
+    written = [str(out / name) for name in texts]
+    console.print_json({"papers": documents, "files": written, "exit_code": code})
     return code

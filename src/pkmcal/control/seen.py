@@ -33,7 +33,7 @@ from pkmcal.mechanisms.closure import (
     rod_lengths,
 )
 from pkmcal.mechanisms.kinematics import forward, inverse_result
-from pkmcal.mechanisms.velocities import readings_rows
+from pkmcal.mechanisms.velocities import by_motors
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ def _of_closure(seen: SeenMachine, c: Closure, u: Array, pivot: Array) -> Legs:
         b_by_internal=np.broadcast_to(ends.b_by_internal, (*u.shape, layout.n_internal)),
         rows=c.by_pose,
         hinges=c.by_internal,
-        drives=readings_rows(layout, c),
+        drives=by_motors(layout, c.by_reading),
     )
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, register
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import BestFit, transformation
-from pkmcal.identify.problem import Estimate
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbEnds, limb_ends
 

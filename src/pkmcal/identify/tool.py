@@ -11,8 +11,8 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, pose_generators, respecting_motion
-from pkmcal.identify.problem import Estimate
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure, dense
 from pkmcal.mechanisms.kinematics import on_manifold

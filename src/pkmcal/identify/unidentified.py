@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.motions import Motion, Situation, all_radii, candidates
-from pkmcal.identify.problem import Estimate
 from pkmcal.identify.sentences import Found, Sentence, few, sentence
 from pkmcal.identify.tool import platform_by_parameters
 from pkmcal.mechanisms import Machine

@@ -10,8 +10,8 @@ from pkmcal.arrays import Array
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.decided import decided_by
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
-from pkmcal.identify.problem import Estimate
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_by_parameters
 from pkmcal.identify.unidentified import Findings, explain, only_heights, seen_legs

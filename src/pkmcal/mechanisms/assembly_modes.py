@@ -85,16 +85,11 @@ def assembly_modes(
     poses, internal = _of_coordinates(modes)
     near = np.argsort(np.linalg.norm(pose_difference(poses, home), axis=-1), kind="stable")
     poses, internal, found = poses[near], internal[near], found[near]
-    at_home = assembly_sign(layout, theta, *_closed_at(layout, theta, home))
+    readings_home, internal_home = inverse_result(layout, theta, home)
+    at_home = assembly_sign(layout, theta, readings_home, home, internal_home)
     sign = (assembly_sign(layout, theta, readings, poses, internal) * at_home).astype(int)
     missing = 1 - SURE ** (1 / closed) if closed else 1.0
     return AssemblyModes(poses, internal, found, sign, starts, closed, missing, complete)
-
-
-def _closed_at(layout: LimbLayout, theta: Array, home: Array) -> tuple[Array, Array, Array]:
-    """Readings, pose and hinges' turns of home."""
-    readings, internal = inverse_result(layout, theta, home)
-    return readings, home, internal
 
 
 def _starts(

@@ -21,7 +21,6 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.batches import fresh, moments
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import (
-    ParameterKind,
     base_carriers,
     by_pose,
     of_part,
@@ -33,7 +32,7 @@ from pkmcal.mechanisms.document import (
     MechanismDocument,
     PassiveLength,
 )
-from pkmcal.mechanisms.joints import AngleLayout, angle_layout, angle_rows
+from pkmcal.mechanisms.joints import AXIS, AngleLayout, angle_layout, angle_rows
 from pkmcal.mechanisms.motors import bodies, middles, motor_columns
 
 
@@ -130,6 +129,11 @@ class LimbLayout:
         return np.concatenate([self.actuated[self.closing], angles])
 
     @cached_property
+    def of_motor(self) -> Booleans:
+        """(E, m) which reading enters each row."""
+        return self.row_motor[:, None] == np.arange(self.n_readings)
+
+    @cached_property
     def shares_motors(self) -> bool:
         """Whether a reading enters several rows."""
         return self.driven_rows.size > self.n_readings
@@ -173,7 +177,12 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         n_legs=len(legs),
         base=_groups(document, "base", carriers, positions),
         platform=_groups(document, "platform", platform_carriers(), positions),
-        rod=np.array([_rod_index(j, leg.length, positions) for j, leg in enumerate(legs)]),
+        rod=np.array(
+            [
+                positions.get(f"{rod}.offset", positions.get(f"{rod}.constant", -1))
+                for rod in (f"legs[{j + 1}].length" for j in range(len(legs)))
+            ]
+        ),
         closing=closing,
         actuated=motor_columns(document),
         middle=middles(document),
@@ -182,7 +191,7 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         base_axis=base_axis,
         platform_axis=platform_axis,
         angles=angle_layout(document, base_axis, platform_axis),
-        turning=(_turning("base", positions), _turning("platform", positions)),
+        turning=(_turning(document, "base", positions), _turning(document, "platform", positions)),
         radius=tuple(
             np.array(
                 [positions[f"legs[{j + 1}].tubes[{t + 1}].radius"] for t in range(len(leg.tubes))],
@@ -201,17 +210,17 @@ def _axis_index(document: MechanismDocument, side: str, positions: dict[str, int
     return np.array([[positions.get(name, -1) for name in row] for row in names], dtype=int)
 
 
-def _turning(side: str, positions: dict[str, int]) -> Integers:
+def _turning(document: MechanismDocument, side: str, positions: dict[str, int]) -> Integers:
     """Positions (n, 3) of the directions on one side, whoever has them; three in a row."""
-    first = [k for name, k in positions.items() if f".{side}." in name and name.endswith("axis.x")]
+    carriers = base_carriers() if side == "base" else platform_carriers()
+    names = (
+        f"legs[{j}].{side}.{kind.path}"
+        for j, leg in enumerate(document.legs, start=1)
+        for kind in dict.fromkeys((*carriers[getattr(leg, side).joint].parameters, *AXIS))
+        if kind.unit == "1" and kind.path.endswith(".x")
+    )
+    first = [positions[name] for name in names if name in positions]
     return np.array(first, dtype=int)[:, None] + np.arange(3)
-
-
-def _rod_index(leg: int, length: Any, positions: dict[str, int]) -> int:
-    if isinstance(length, PassiveLength):
-        return -1
-    field = "offset" if isinstance(length, ActuatedLength) else "constant"
-    return positions[f"legs[{leg + 1}].length.{field}"]
 
 
 def _groups(
@@ -224,14 +233,15 @@ def _groups(
         legs = np.flatnonzero([k is kind for k in kinds])
         names = [[f"legs[{j + 1}].{side}.{p.path}" for p in kind.parameters] for j in legs]
         index = np.array([[positions.get(n, len(positions)) for n in row] for row in names])
-        constants = np.array([[_constant(nodes[j], p) for p in kind.parameters] for j in legs])
+        told = [[of_part(nodes[j], p) for p in kind.parameters] for j in legs]
+        constants = np.array(
+            [
+                [p.otherwise if v is None else v for p, v in zip(kind.parameters, row, strict=True)]
+                for row in told
+            ]
+        )
         groups.append(CarrierGroup(kind, legs, index, constants, index == len(positions)))
     return tuple(groups)
-
-
-def _constant(node: Any, kind: ParameterKind) -> float:
-    value = of_part(node, kind)
-    return kind.otherwise if value is None else value
 
 
 def _internal(document: MechanismDocument) -> Integers:

@@ -41,6 +41,13 @@ HOPELESS = 1e3
 """Damping at which a step that does not help is the last."""
 ROUNDING = 16 * float(np.finfo(float).eps)
 """Of the longest rod: where a step does not help, a closure error below it is rounding."""
+SETTLING = 15
+"""Steps for a machine's second rods; a pose that they all allow takes four."""
+SETTLED = 1e-15
+"""A step of readings (rad) and hinges below which nothing changes any more."""
+NEAR_SINGULAR = 0.02
+"""Smallest singular value of the scaled inverse Jacobian below which a warning is due: a
+reading's error then moves the platform fifty times as far."""
 
 
 class Closed(NamedTuple):
@@ -117,7 +124,7 @@ def _close(task: _Task, poses: Array, internal: Array, out: Closed) -> None:
             if not left.size:
                 return
             if left.size < len(done):
-                task, now = _picked_task(task, left), _picked(now, left)
+                task, now = _picked(task, left), _State(*(picked(x, left) for x in now))
                 damping, done = damping[left], done[left]
         step = damped_step(now.jac, now.value, damping)
         trial = _at(task, *_moved(task.layout, now, step))
@@ -159,11 +166,8 @@ def _chosen(better: Booleans, trial: _State, now: _State) -> _State:
     return _State(*out)
 
 
-def _picked(now: _State, rows: Integers) -> _State:
-    return _State(*(picked(x, rows) for x in now))
-
-
-def _picked_task(task: _Task, rows: Integers) -> _Task:
+def _picked(task: _Task, rows: Integers) -> _Task:
+    """The same for some rows of the batch."""
     base = task.base
     a, by_reading = (picked(x, rows) if x.ndim > 2 else x for x in (base.a, base.by_reading))
     length = picked(base.length, rows) if base.length.ndim > 1 else base.length
@@ -177,17 +181,9 @@ def _picked_task(task: _Task, rows: Integers) -> _Task:
 
 
 def _write(task: _Task, now: _State, out: Closed) -> None:
+    """The results of a task's rows, at their places."""
     out.poses[task.number], out.internal[task.number] = now.poses, now.internal
     out.error[task.number] = np.where(np.isfinite(now.cost), now.worst, np.inf)
-
-
-SETTLING = 15
-"""Steps for a machine's second rods; a pose that they all allow takes four."""
-SETTLED = 1e-15
-"""A step of readings (rad) and hinges below which nothing changes any more."""
-NEAR_SINGULAR = 0.02
-"""Smallest singular value of the scaled inverse Jacobian below which a warning is due: a
-reading's error then moves the platform fifty times as far."""
 
 
 @dataclass(frozen=True)
@@ -233,15 +229,11 @@ def inverse_result(layout: LimbLayout, theta: Array, poses: Array) -> tuple[Arra
     internal = _upright(layout, theta, poses, shape)
     legs = _leg_inverse(layout, theta, poses, internal)
     if not layout.shares_motors:
-        return legs[..., np.flatnonzero(layout.actuated >= 0)][..., _in_columns(layout)], internal
+        driven = np.flatnonzero(layout.actuated >= 0)
+        return legs[..., driven[np.argsort(layout.actuated[driven], kind="stable")]], internal
     columns = layout.actuated[None] == np.arange(layout.n_readings)[:, None]
     readings = legs @ (columns / columns.sum(axis=1, keepdims=True)).T
     return _settled(layout, theta, poses, readings, internal)
-
-
-def _in_columns(layout: LimbLayout) -> Integers:
-    """Order of the driven legs that makes their readings' columns rise."""
-    return np.argsort(layout.actuated[layout.actuated >= 0], kind="stable")
 
 
 def _upright(layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, ...]) -> Array:
@@ -277,7 +269,7 @@ def _settled(
     Gauss-Newton with the poses held, from each motor's mean of its rods.
     """
     m = layout.n_readings
-    pick = (layout.row_motor[:, None] == np.arange(m)).astype(float)
+    pick = layout.of_motor.astype(float)
     x = np.concatenate([readings, internal], axis=-1)
     for _ in range(SETTLING):
         c, by_reading = rows_and_drives(layout, theta, x[..., :m], poses, x[..., m:])
@@ -437,8 +429,8 @@ def undriven(layout: LimbLayout, c: Rows, by_reading: Array) -> tuple[Array, Arr
     passive = np.flatnonzero(layout.row_motor < 0)
     blind = np.eye(layout.n_equations)[passive]
     if layout.shares_motors:
-        pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
-        moved = np.concatenate([by_reading[..., None] * pick, c.by_internal], axis=-1)
+        drives = by_reading[..., None] * layout.of_motor
+        moved = np.concatenate([drives, c.by_internal], axis=-1)
         moved = np.nan_to_num(moved)
         q = np.linalg.qr(moved, mode="complete")[0]
         blind = np.swapaxes(q[..., moved.shape[-1] :], -1, -2)

@@ -94,7 +94,17 @@ def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
     Legs on one motor turn about one axis, legs on one body of the platform hang on one hinge. A
     leg of a planar machine stays in its plane, so both of its ends have one height.
     """
-    return (*_heights(document), *_shared(document))
+    shared = tuple(
+        tuple(f"legs[{j + 1}].{side}.{field}" for j in legs)
+        for side, legs, fields in sharing(document)
+        for field in fields
+        if all(getattr(getattr(document.legs[j], side), field) is not None for j in legs)
+    )
+    if document.motion != "planar":
+        return shared
+    numbers = range(1, len(document.legs) + 1)
+    heights = ((f"legs[{j}].base.center.z", f"legs[{j}].platform.center.z") for j in numbers)
+    return (*heights, *shared)
 
 
 def built_in_fixed(document: MechanismDocument) -> tuple[str, ...]:
@@ -123,22 +133,5 @@ def sharing(document: MechanismDocument) -> Iterator[tuple[str, tuple[int, ...],
     for body in dict.fromkeys(on.tolist()):
         legs = tuple(np.flatnonzero(on == body).tolist())
         if body >= 0 and len(legs) > 1:
-            yield (
-                "platform",
-                legs,
-                platform_carriers()[document.legs[legs[0]].platform.joint].shared,
-            )
-
-
-def _shared(document: MechanismDocument) -> Iterator[Group]:
-    for side, legs, fields in sharing(document):
-        for field in fields:
-            if all(getattr(getattr(document.legs[j], side), field) is not None for j in legs):
-                yield tuple(f"legs[{j + 1}].{side}.{field}" for j in legs)
-
-
-def _heights(document: MechanismDocument) -> Iterator[Group]:
-    if document.motion != "planar":
-        return
-    for j in range(1, len(document.legs) + 1):
-        yield f"legs[{j}].base.center.z", f"legs[{j}].platform.center.z"
+            joint = document.legs[legs[0]].platform.joint
+            yield "platform", legs, platform_carriers()[joint].shared

@@ -25,7 +25,6 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.geometry.rigid import dot, skew
 from pkmcal.mechanisms.closure import (
     BaseEnds,
-    Closure,
     LimbLayout,
     Rows,
     base_ends,
@@ -81,19 +80,13 @@ def forward_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     scale = own_scale(layout, theta)
     inverted = _pseudo_inverse(layout.by_own(c.rows) * scale[..., None, :])
     return -layout.own_motion[:6] @ (
-        scale[..., :, None] * (inverted @ _by_motors(layout, c.by_reading))
+        scale[..., :, None] * (inverted @ by_motors(layout, c.by_reading))
     )
 
 
-def readings_rows(layout: LimbLayout, c: Closure) -> Array:
-    """Derivatives of the closure's rows by the readings, (..., E, m)."""
-    return _by_motors(layout, c.by_reading)
-
-
-def _by_motors(layout: LimbLayout, by_reading: Array) -> Array:
-    """Derivatives (..., E) by the legs' own readings in the columns of their motors."""
-    pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
-    return np.where(pick, by_reading[..., None], 0.0)
+def by_motors(layout: LimbLayout, by_reading: Array) -> Array:
+    """The closure's derivatives (..., E) by the legs' own readings as those by all, (..., E, m)."""
+    return np.where(layout.of_motor, by_reading[..., None], 0.0)
 
 
 def _moving(layout: LimbLayout, theta: Array, poses: Array) -> _Moving:
@@ -116,7 +109,7 @@ def _of_shared(layout: LimbLayout, theta: Array, c: _Moving) -> Array:
     shape = np.broadcast_shapes(largest.shape[:-1], hinges.shape[:-1])
     parts = (1 / largest, hinges)
     scale = np.concatenate([np.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=-1)
-    drives = _by_motors(layout, c.by_reading)
+    drives = by_motors(layout, c.by_reading)
     jac = np.concatenate([drives, c.rows.by_internal], axis=-1) * scale[..., None, :]
     rates = -_pseudo_inverse(jac) @ c.rows.by_pose
     return (scale[..., :, None] * rates)[..., :m, :]

@@ -29,9 +29,9 @@ from pkmcal.geometry.rigid import (
     rotation_vector,
     skew,
 )
-from pkmcal.identify.mounts import mean_pose
-from pkmcal.identify.pose_rows import PoseBlocks, PoseData, pose_rows
-from pkmcal.identify.problem import State
+from pkmcal.identify.estimate import State
+from pkmcal.identify.rows import PoseBlocks, PoseData, pose_rows
+from pkmcal.identify.start import mean_pose
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
@@ -256,7 +256,7 @@ def start_from_poses(
         machine.values,
         stations,
         found.T_base_platform,
-        np.zeros(int(np.max(measurements.camera_of_station)) + 1),
+        np.zeros(measurements.n_cameras),
         T_mount=np.where(np.isnan(mounts), np.eye(4), mounts),
         on_platform=measurements.on_platform,
         internal=found.internal,

@@ -24,10 +24,10 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, perturb, pose, rotation
-from pkmcal.identify.closure_noise import PERFECT
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import State
+from pkmcal.identify.rows import PERFECT
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, kinematics
 from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense

@@ -22,7 +22,7 @@ from pkmcal.geometry.rigid import (
     rotation_vector,
     skew,
 )
-from pkmcal.identify.pose_rows import turn_jacobian
+from pkmcal.identify.rows import turn_jacobian
 from pkmcal.measurements import PoseSet
 from pkmcal.mechanisms.document import MOTIONS
 from pkmcal.papers.measured_platform import taken

@@ -13,7 +13,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.results import REPORT, check_output, texts_of, versions
 from pkmcal.files import write_folder
 from pkmcal.identify.centres import Centres
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import EdgeSet, Observation

@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.centres import Centres
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import ToolPoint
 from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure

@@ -9,7 +9,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.decided import EXACT, Decider, decided_by
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.wording import (

@@ -14,7 +14,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, dot, inverse
 from pkmcal.identify.centres import Centres
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode

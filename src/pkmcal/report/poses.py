@@ -9,7 +9,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.doubts import turning
 from pkmcal.geometry.rigid import rotation_vector
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.report.charts import (

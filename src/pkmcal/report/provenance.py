@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.rigid import inverse, pose_difference
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Rejection
 from pkmcal.outcome import Row, Table
 from pkmcal.report.residuals import SIDES

@@ -18,7 +18,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
-from pkmcal.identify.problem import Estimate
+from pkmcal.identify.estimate import Estimate
 from pkmcal.report.charts import WIDTH
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number

@@ -19,7 +19,8 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, inverse, look_at, perturb, register, rotation_vector
 from pkmcal.identify.covariance import information
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
-from pkmcal.identify.residuals import BatchState, Problem
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates

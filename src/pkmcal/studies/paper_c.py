@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.problem import State
-from pkmcal.identify.residuals import BatchState
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.papers.hand_eye import size_of, solve_pairs

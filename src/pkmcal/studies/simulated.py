@@ -15,7 +15,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, perturb
 from pkmcal.identify.assembly import assemble
 from pkmcal.identify.gauge import Gauge
-from pkmcal.identify.residuals import Problem
+from pkmcal.identify.problem import Problem
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
