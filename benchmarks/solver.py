@@ -19,12 +19,11 @@ from scipy.optimize import least_squares
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from pkmcal.identify.unknowns import BatchState
-
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.start import start_state
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.solver import minimise
 from test_identify_scene import guess, make_scene
 
@@ -38,7 +37,7 @@ class Flat:
 
     def state(self, x: np.ndarray) -> BatchState:
         """Rotation vectors and translations added to the start."""
-        na = self.problem.n_shared
+        na = self.problem.unknowns.count
         own = x[na:].reshape(1, self.start.T_base_platform.shape[1], -1)
         return self.problem.moved(self.start, x[None, :na], own)
 
@@ -82,7 +81,7 @@ def main() -> int:
     stations = guess(rng, scene.T_camera_base)
     start = batch_of(scene.machine, assembled, start_state(scene.machine, measurements, stations))
     flat = Flat(assembled.problem, start)
-    x0 = np.zeros(assembled.problem.n_shared + flat.n_own)
+    x0 = np.zeros(assembled.problem.unknowns.count + flat.n_own)
     options = {"x_scale": "jac", "xtol": 1e-10, "ftol": 1e-12, "gtol": 1e-10}
     ours, our_time = timed(lambda: minimise(assembled.problem, start))
     rows = [("pkmcal", our_time, int(ours.steps[0]), float(ours.cost[0]))]

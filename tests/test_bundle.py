@@ -17,7 +17,7 @@ from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.solver import Stop
+from pkmcal.solver import Stop, take
 from test_identify_scene import JOINT_NOISE, guess, make_scene
 
 
@@ -86,7 +86,7 @@ def test_uncertainty_is_what_repeats_show():
     found = result.solution.state
     whitened, single = [], []
     for run in range(runs):
-        before = state_of(assembled, result.problem.take(found, np.array([run])), scene.state(run))
+        before = state_of(assembled, take(found, np.array([run])), scene.state(run))
         shared = result.info.covariance[run]
         c = machine_covariance(assembled.problem, scene.machine, before, shared, ThreeCentres())
         told = [in_gauge(scene.machine, s, ThreeCentres()) for s in (before, scene.state(run))]

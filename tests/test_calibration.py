@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pkmcal.identify.estimate import State
 
 import pkmcal
 from pkmcal.cameras import camera_models
 from pkmcal.commands.comparison import compare
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres, apply
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pkmcal.identify.estimate import State
 
 import pkmcal
 from pkmcal.cameras import camera_models
@@ -18,6 +17,7 @@ from pkmcal.commands.comparison import compare
 from pkmcal.files import parse_yaml, validate
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements

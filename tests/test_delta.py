@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pkmcal.identify.estimate import State
 
 from pkmcal.geometry.rigid import perturb, pose
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import alignment, changed_frames, default_gauge, freedoms
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import closure

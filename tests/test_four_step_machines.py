@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from pkmcal.identify.estimate import State
 
 from pkmcal.calibration.turns import better_start
 from pkmcal.errors import ResultError
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import centre_index, default_gauge
 from pkmcal.identify.start import misfit, start_state

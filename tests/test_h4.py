@@ -379,8 +379,9 @@ def test_where_a_board_sits_is_no_knowledge_of_the_machine():
     machine = load_mechanism("h4", model="calibration")
     case = papers_case(model_31(rng), rng)
     problem = assemble(machine, case.measurements, default_gauge(machine)).problem
-    rows = problem.prior[~problem.prior[:, : problem.mounts_at].any(axis=1)]
+    rows = problem.prior[~problem.prior[:, : problem.unknowns.mounts.start].any(axis=1)]
     assert rows.shape[0] == 3
-    assert np.flatnonzero(rows.any(axis=0)).tolist() == [problem.mounts_at + k for k in (3, 4, 5)]
+    places = np.flatnonzero(rows.any(axis=0)) - problem.unknowns.mounts.start
+    assert places.tolist() == [3, 4, 5]
     told = what_data_tell(case.measurements, estimated(machine, case, rng))
     assert told.rank + len(told.unidentified) == told.n_parameters - told.n_frames

@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pkmcal.identify.estimate import State
 
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import look_at, perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle, what_data_tell
 from pkmcal.identify.covariance import identifiability
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge, freedoms, generators
 from pkmcal.identify.start import start_state
 from pkmcal.identify.verdict import judge

@@ -22,6 +22,7 @@ from pkmcal.identify.gauge import (
     freedoms,
     generators,
     station_generators,
+    told_unknowns,
     transformation,
 )
 from pkmcal.mechanisms.closure import closure
@@ -97,23 +98,39 @@ def test_generators_against_small_motions():
     np.testing.assert_allclose(found, change, atol=1e-11)
 
 
+def with_mounts(state, rng):
+    """The state with a board on the base and one on the platform."""
+    mounts = perturb(np.eye(4), 0.3 * rng.normal(size=(2, 6)))
+    return replace(state, T_mount=mounts, on_platform=np.array([False, True]))
+
+
+def off(state, errors):
+    """The state with errors (n,) of parameters, stations and mounts."""
+    told = told_unknowns(state)
+    return replace(
+        state,
+        theta=state.theta + errors[told.machine],
+        T_camera_base=perturb(state.T_camera_base, errors[told.stations].reshape(-1, 6)),
+        T_mount=perturb(state.T_mount, errors[told.mounts].reshape(-1, 6)),
+    )
+
+
 def test_errors_are_carried_by_a_finite_frame_change():
     rng = np.random.default_rng(4)
     scene = make_scene(rng)
-    machine, state = scene.machine, scene.state()
+    machine, state = scene.machine, with_mounts(scene.state(), rng)
     e, f = (perturb(np.eye(4), 0.4 * rng.normal(size=6)) for _ in range(2))
-    n_par, n_stations = state.theta.size, len(state.T_camera_base)
-    small = 1e-6 * rng.normal(size=n_par + 6 * n_stations)
-    wrong = replace(
-        state,
-        theta=state.theta + small[:n_par],
-        T_camera_base=perturb(state.T_camera_base, small[n_par:].reshape(-1, 6)),
-    )
+    told = told_unknowns(state)
+    small = 1e-6 * rng.normal(size=told.count)
+    wrong = off(state, small)
     right_after, wrong_after = (changed_frames(machine.layout, s, e, f) for s in (state, wrong))
     carried = carried_errors(machine.layout, state, e, f) @ small
-    np.testing.assert_allclose(wrong_after.theta - right_after.theta, carried[:n_par], atol=1e-11)
-    found = pose_difference(wrong_after.T_camera_base, right_after.T_camera_base)
-    np.testing.assert_allclose(found.ravel(), carried[n_par:], atol=1e-11)
+    np.testing.assert_allclose(
+        wrong_after.theta - right_after.theta, carried[told.machine], atol=1e-11
+    )
+    for part, after in ((told.stations, "T_camera_base"), (told.mounts, "T_mount")):
+        found = pose_difference(getattr(wrong_after, after), getattr(right_after, after))
+        np.testing.assert_allclose(found.ravel(), carried[part], atol=1e-11)
 
 
 @pytest.mark.parametrize("gauge", GAUGES)
@@ -122,25 +139,20 @@ def test_transformation_is_the_derivative_of_apply(gauge):
     rng = np.random.default_rng(5)
     scene = make_scene(rng)
     machine = scene.machine
-    state = apply(machine, scene.state(), gauge)
-    n_par = state.theta.size
+    state = apply(machine, with_mounts(scene.state(), rng), gauge)
+    unknowns = told_unknowns(state)
     s = transformation(machine, state, gauge)
     for _ in range(5):
         d = 1e-6 * rng.normal(size=s.shape[1])
-        told = []
-        for sign in (1, -1):
-            wrong = replace(
-                state,
-                theta=state.theta + sign * d[:n_par],
-                T_camera_base=perturb(state.T_camera_base, sign * d[n_par:].reshape(-1, 6)),
-            )
-            told.append(apply(machine, wrong, gauge))
-        numeric = 0.5 * (told[0].theta - told[1].theta)
-        np.testing.assert_allclose(numeric, (s @ d)[:n_par], atol=1e-12)
-        numeric = 0.5 * pose_difference(told[0].T_camera_base, told[1].T_camera_base).ravel()
-        np.testing.assert_allclose(numeric, (s @ d)[n_par:], atol=1e-11)
+        plus, minus = (apply(machine, off(state, sign * d), gauge) for sign in (1, -1))
+        numeric = 0.5 * (plus.theta - minus.theta)
+        np.testing.assert_allclose(numeric, (s @ d)[unknowns.machine], atol=1e-12)
+        numeric = 0.5 * pose_difference(plus.T_camera_base, minus.T_camera_base).ravel()
+        np.testing.assert_allclose(numeric, (s @ d)[unknowns.stations], atol=1e-11)
+        numeric = 0.5 * pose_difference(plus.T_mount, minus.T_mount).ravel()
+        np.testing.assert_allclose(numeric, (s @ d)[unknowns.mounts], atol=1e-11)
     np.testing.assert_allclose(s @ s, s, atol=1e-10)  # told twice is told once
-    np.testing.assert_allclose(gauge.constraints(machine) @ s[:n_par], 0, atol=1e-12)
+    np.testing.assert_allclose(gauge.constraints(machine) @ s[unknowns.machine], 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("first", GAUGES)

@@ -6,15 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pkmcal.identify.unknowns import BatchState
 
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import perturb, pose
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.covariance import reduced_rows
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.start import start_state
+from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.solver import damped_step
 from pkmcal.studies.engine import Batch
 from pkmcal.studies.paper_a import HexapodByAxes
 from pkmcal.studies.simulated import joint_problem
@@ -38,7 +40,7 @@ def check(problem, state, rng, directions=4):
     assert np.isfinite(problem.residuals(state).value).all()
     for _ in range(directions):
         # one hundredth: radii are centimetres, so a unit step would leave the model's domain
-        shared = 0.01 * rng.normal(size=(state.z.shape[0], problem.n_shared))
+        shared = 0.01 * rng.normal(size=(state.z.shape[0], problem.unknowns.count))
         own = 0.01 * rng.normal(size=linear.by_own.shape[:2] + linear.by_own.shape[-1:])
         exact = np.concatenate(
             [
@@ -89,7 +91,7 @@ def test_jacobian_near_a_singular_pose_and_beside_a_leg():
     linear = problem.linearize(near)
     assert np.isfinite(problem.residuals(near).value).all()
     # curvature grows with 1 / gap, so the differences' step has to shrink
-    shared = 1e-5 * rng.normal(size=(1, problem.n_shared))
+    shared = 1e-5 * rng.normal(size=(1, problem.unknowns.count))
     exact = (linear.by_shared @ shared[:, None, :, None]).ravel()
     numeric = derivatives(problem, near, shared, np.zeros((1, 3, 6)), h=1e-2)[: exact.size]
     np.testing.assert_allclose(exact, numeric, atol=1e-6 * np.abs(exact).max())
@@ -134,7 +136,7 @@ def test_whitening_makes_the_noise_standard():
     """Residuals at the truth are the noise itself: unit covariance, [0] by [1] uncorrelated."""
     rng = np.random.default_rng(6)
     assembled, truth = make_scene(rng, runs=40).batch(rng)
-    rows = assembled.problem.block_residuals(truth)[:, assembled.row, assembled.place]
+    rows = assembled.problem.block_residuals(truth)[:, assembled.edges.row, assembled.edges.place]
     rows = rows.reshape(-1, 2)
     bound = 5 / np.sqrt(len(rows))
     np.testing.assert_allclose(rows.T @ rows / len(rows), np.eye(2), atol=2 * bound)
@@ -196,3 +198,53 @@ def test_an_edge_that_cannot_be_predicted_counts_for_nothing():
     for part in (linear.value, linear.by_shared, linear.by_own):
         assert np.isfinite(part).all()
         assert not part[~linear.usable].any()
+
+
+def test_unknowns_stand_one_after_the_other():
+    unknowns = Unknowns(5, n_stations=2, n_cameras=2, n_optics=3, n_lines=4, n_mounts=1)
+    parts = [
+        unknowns.machine,
+        unknowns.stations,
+        unknowns.optics,
+        unknowns.shading,
+        unknowns.mounts,
+    ]
+    assert [part.stop - part.start for part in parts] == [5, 12, 6, 4, 6]
+    columns = np.concatenate([np.arange(part.start, part.stop) for part in parts])
+    np.testing.assert_array_equal(columns, np.arange(unknowns.count))
+    assert unknowns.columns("edge shifts").tolist() == [17, 20]
+    assert unknowns.columns("intrinsics", "machine").tolist() == [*range(5), 18, 19, 21, 22]
+
+
+def test_reduced_rows_are_the_least_squares_of_the_unknowns_kept():
+    """The machine's step by them is its part of the whole problem's step, nothing known of it."""
+    rng = np.random.default_rng(12)
+    assembled, truth = make_scene(rng, configurations=8).batch(rng, use_drawing=False)
+    problem, state = assembled.problem, replace(truth, z=0 * truth.z)
+    machine = problem.unknowns.machine
+    rows, value = reduced_rows(problem, state, ("machine",), silent=())
+    step = -np.linalg.lstsq(rows, value, rcond=None)[0]
+    whole, _ = damped_step(problem.linearize(state), np.zeros(1))
+    np.testing.assert_allclose(step, whole[0, machine], atol=1e-7)
+    asked, _ = reduced_rows(problem, state, ("machine",))
+    assert len(asked) == len(rows) - problem.prior[:, machine].any(axis=1).sum()
+
+
+def test_rows_by_held_parameters():
+    """Opened, every parameter is an unknown; the residuals are what they were."""
+    rng = np.random.default_rng(13)
+    assembled, truth = make_scene(rng, configurations=4).batch(rng)
+    problem = assembled.problem
+    wide, there = problem.opened(truth)
+    before, after = problem.linearize(truth), wide.linearize(there)
+    np.testing.assert_allclose(after.value, before.value, atol=1e-9)
+    np.testing.assert_allclose(after.shared_value, before.shared_value, atol=1e-9)
+    by_free = after.by_shared[..., wide.unknowns.machine] @ problem.free
+    scale = np.abs(by_free).max()
+    np.testing.assert_allclose(
+        by_free, before.by_shared[..., problem.unknowns.machine], atol=1e-12 * scale
+    )
+    np.testing.assert_array_equal(
+        after.by_shared[..., wide.unknowns.stations],
+        before.by_shared[..., problem.unknowns.stations],
+    )

@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pkmcal.identify.estimate import State
-from pkmcal.identify.rows import Data
-from pkmcal.identify.unknowns import BatchState
 
 from pkmcal.geometry.cylinders import edge_normal_jacobians, tangent_basis
 from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.identify.assembly import Assembled, assemble
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres
+from pkmcal.identify.rows import Data
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
@@ -90,7 +90,7 @@ class Scene:
         assembled = assemble(self.machine, self.measurements(rng), ThreeCentres(), **options)
         normal = self.noisy(rng)
         basis = np.zeros((len(normal), *assembled.problem.blocks.leg.shape, 1, 3, 2))
-        basis[:, assembled.row, assembled.place, 0] = tangent_basis(normal, self.middle)
+        basis[:, assembled.edges.row, assembled.edges.place, 0] = tangent_basis(normal, self.middle)
         old = assembled.problem.data
         joints = self.joints + JOINT_NOISE * rng.normal(size=self.joints.shape)
         data = Data(basis, old.whiten, old.optics, joints, old.weight)

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pkmcal.identify.estimate import State
 
 from pkmcal.cameras import camera_models
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements, Mount, PoseSet

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from pkmcal.identify.estimate import Estimate, State, Statistics
 
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.geometry.cylinders import contour_point, edge_normals, tangent_basis
 from pkmcal.geometry.rigid import look_at, perturb
+from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.measurements import EdgeSet, Observation, Rejection
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera

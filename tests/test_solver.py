@@ -12,10 +12,18 @@ from pkmcal.papers.registration import Dense, minimise_dense
 from pkmcal.solver import (
     Linear,
     Stop,
+    column_space,
     damped_step,
     eliminate,
+    final_weights,
+    inverse_root,
     minimise,
+    normal_root,
+    of_runs,
+    put,
     reduced_normal,
+    soft_weights,
+    stacked,
     take,
 )
 from test_identify_scene import guess, make_scene
@@ -186,3 +194,86 @@ def test_a_parameter_without_data_stays_where_it_was(column):
     shared, _ = damped_step(linear, np.full(3, 1e-9))
     np.testing.assert_array_equal(shared[:, column], 0)
     assert np.isfinite(shared).all()
+
+
+def test_states_of_some_runs_are_taken_and_put():
+    rng = np.random.default_rng(7)
+    runs = np.array([2, 0])
+    _, truth = make_scene(rng, runs=3).batch(rng)
+    linear = random_linear(rng)
+    for state in (truth, rng.normal(size=(3, 2)), linear._replace(shared_by=np.zeros((3, 1)))):
+        part = take(state, runs)
+        assert type(part) is type(state)
+        swapped = put(state, runs[::-1], part)
+        for old, new, both in zip(arrays(state), arrays(part), arrays(swapped), strict=True):
+            np.testing.assert_array_equal(new, old[runs])
+            np.testing.assert_array_equal(both, old[[2, 1, 0]])
+
+
+def arrays(state) -> list[np.ndarray]:
+    if isinstance(state, np.ndarray):
+        return [state]
+    return list(state) if isinstance(state, tuple) else list(vars(state).values())
+
+
+def test_what_all_runs_share_stays():
+    shared, own = np.ones((1, 4)), np.arange(6.0).reshape(3, 2)
+    assert of_runs(shared, np.array([1, 2])) is shared
+    np.testing.assert_array_equal(of_runs(own, np.array([1, 2])), own[1:])
+
+
+def test_stacked_rows_are_the_reduced_problem():
+    """Their least squares is the shared part of the whole problem's."""
+    linear = random_linear(np.random.default_rng(8))
+    rows, value = stacked(linear, eliminate(linear, np.zeros(3)))
+    for run in range(3):
+        jac, residual = dense(linear, run)
+        whole = np.linalg.lstsq(jac, residual, rcond=None)[0][:5]
+        np.testing.assert_allclose(
+            np.linalg.lstsq(rows[run], value[run], rcond=None)[0], whole, atol=1e-11
+        )
+
+
+@pytest.mark.parametrize("units", [1.0, 1e-6])
+def test_inverses_do_not_mind_units(units):
+    rows = np.random.default_rng(9).normal(size=(2, 8, 3))
+    scaled = rows * np.array([1.0, units, 1 / units])
+    wanted = np.linalg.inv(np.swapaxes(rows, 1, 2) @ rows)
+    wanted = wanted / np.outer([1.0, units, 1 / units], [1.0, units, 1 / units])
+    normal = np.swapaxes(scaled, 1, 2) @ scaled
+    for loose in (True, False):
+        by_rows = inverse_root(scaled, 1e-9, loose=loose)
+        by_normal = normal_root(normal, 1e-12, loose=loose)
+        for half in (by_rows, by_normal):
+            np.testing.assert_allclose(half @ np.swapaxes(half, 1, 2), wanted, rtol=1e-9)
+
+
+@pytest.mark.parametrize("rows", [8, 2])
+def test_a_direction_that_nothing_knows_is_loose_or_exact(rows):
+    """The first two unknowns enter as their sum alone; with two rows there is none to spare."""
+    jac = np.random.default_rng(10).normal(size=(rows, 3))
+    jac[:, 1] = jac[:, 0]
+    apart = np.array([1.0, -1.0, 0.0])
+    for half in (inverse_root(jac, 1e-9, loose=True), normal_root(jac.T @ jac, 1e-12, loose=True)):
+        assert np.linalg.norm(apart @ half) > 1e5
+    exact = inverse_root(jac, 1e-9, loose=False)
+    np.testing.assert_allclose(apart @ exact, 0, atol=1e-9)
+    np.testing.assert_allclose(exact @ exact.T, np.linalg.pinv(jac.T @ jac), atol=1e-9)
+
+
+def test_column_space_of_columns_in_any_units():
+    columns = np.random.default_rng(11).normal(size=(6, 3)) * np.array([1e-9, 1.0, 1e9])
+    columns = np.column_stack([columns, columns[:, 0] * 3, np.zeros(6)])
+    q = column_space(columns)
+    assert q.shape == (6, 3)
+    np.testing.assert_allclose(
+        (columns - q @ (q.T @ columns)) / [1e-9, 1, 1e9, 1e-9, 1], 0, atol=1e-12
+    )
+
+
+def test_weights_fall_from_one_to_zero():
+    distance = np.array([0.0, 4.0, 5.25, 6.5, 100.0, np.nan])
+    np.testing.assert_allclose(final_weights(distance), [1, 1, 0.5, 0, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(
+        soft_weights(np.array([0.0, 2.0, 6.0, np.nan]), 2.0), [1, 0.25, 0.01, 0]
+    )

@@ -227,7 +227,7 @@ def test_a_cameras_magnification_is_told():
         truth.machine, truth.T_camera_base, camera, truth.T_base_platform, EdgeNoise(),
         np.random.default_rng(4), photographs=truth.photographs,
     )  # fmt: skip
-    cause, got = magnification(drawing, 0, 1), []
+    cause, got = magnification(drawing, 0), []
     for through in (camera, real):
         observed = seen_through(through, camera, edges)
         data = Measurements(observed.edges, readings, 3e-6, 2, np.zeros(2, dtype=int))

@@ -155,11 +155,13 @@ class Reduced(NamedTuple):
     """The problem after elimination of the own unknowns.
 
     rows : (B, K, r', na) reduced Jacobian; the data's rows come first, the damping's after.
+    value : (B, K, r) what of the residuals the own unknowns cannot take up.
     q, r : QR factors of the own Jacobian, q restricted to the data's rows.
     gradient : (B, na) of half the cost, own unknowns eliminated.
     """
 
     rows: Array
+    value: Array
     q: Array
     r: Array
     gradient: Array
@@ -206,7 +208,18 @@ def eliminate(linear: Linear, damping: Array) -> Reduced:
     left = value - top @ (transposed(top) @ value)
     gradient = (transposed(linear.by_shared) @ left)[..., 0].sum(axis=1)
     gradient = gradient + linear.shared_value @ linear.shared_by
-    return Reduced(rows, top, r, gradient)
+    return Reduced(rows, left[..., 0], top, r, gradient)
+
+
+def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
+    """All rows on the shared unknowns, the own ones eliminated without damping: Jacobian (B, n, na)
+    and residuals (B, n). The configurations' rows come first, those on shared unknowns only last.
+    """
+    n_runs, na = reduced.rows.shape[0], reduced.rows.shape[-1]
+    shared = np.broadcast_to(linear.shared_by, (n_runs, *linear.shared_by.shape))
+    rows = np.concatenate([reduced.rows.reshape(n_runs, -1, na), shared], axis=1)
+    value = [reduced.value.reshape(n_runs, -1), linear.shared_value]
+    return rows, np.concatenate(value, axis=1)
 
 
 def reduced_normal(linear: Linear, reduced: Reduced) -> Array:
@@ -218,10 +231,7 @@ def reduced_normal(linear: Linear, reduced: Reduced) -> Array:
 def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
     """Levenberg-Marquardt step: shared (B, na) and own (B, K, d)."""
     reduced = eliminate(linear, damping)
-    normal = reduced_normal(linear, reduced)
-    scale = np.sqrt(np.einsum("bii->bi", normal))
-    scale = np.where(scale > 0, scale, 1.0)
-    scaled = normal / (scale[:, :, None] * scale[:, None, :])
+    scaled, scale = _unit_diagonal(reduced_normal(linear, reduced))
     # at least a few rounding units, so that an unidentified direction gives no step
     ridge = np.maximum(damping, 1e-15)[:, None, None] * np.eye(scale.shape[1])
     shared = -np.linalg.solve(scaled + ridge, (reduced.gradient / scale)[..., None])[..., 0] / scale
@@ -314,3 +324,80 @@ def _cost(values: Values, usable: Booleans) -> Array:
     total = np.sum(np.where(usable, values.value, 0.0) ** 2, axis=(1, 2))
     total = total + np.sum(values.shared_value**2, axis=1)
     return np.where(np.isfinite(total), total, np.inf)
+
+
+def soft_weights(distance: Array, scale: Array | float) -> Array:
+    """Geman-McClure weights ``(c^2 / (c^2 + d^2))^2`` of distances; 0 where nothing can be
+    predicted. A search begins with a scale so wide that everything counts, and narrows it.
+    """
+    square = scale**2
+    weight = (square / (square + np.nan_to_num(distance) ** 2)) ** 2
+    return np.where(np.isfinite(distance), weight, 0.0)
+
+
+def final_weights(distance: Array) -> Array:
+    """Weights of distances in standard deviations: 1 up to FULL, a cosine's way down to 0 at NONE;
+    0 where nothing can be predicted.
+    """
+    x = np.clip((distance - FULL) / (NONE - FULL), 0, 1)
+    return np.where(np.isfinite(distance), 0.5 * (1 + np.cos(np.pi * x)), 0.0)
+
+
+def column_space(columns: Array, least: float = RANK_TOLERANCE) -> Array:
+    """An orthonormal basis (n, k) of what columns (n, m) can make together."""
+    norm = np.linalg.norm(columns, axis=0)
+    u, s, _ = np.linalg.svd(columns[:, norm > 0] / norm[norm > 0], full_matrices=False)
+    return u[:, s > least * s.max(initial=0.0)]
+
+
+class Directions(NamedTuple):
+    """Of rows (..., n, m) with columns of length one: singular values s (..., m), right vectors vt
+    (..., m, m), and the columns' lengths scale (..., m), 1 for those that are zero.
+    """
+
+    s: Array
+    vt: Array
+    scale: Array
+
+
+def directions(rows: Array) -> Directions:
+    """How well rows (..., n, m) know each direction of their unknowns, columns scaled."""
+    scale = np.sqrt(np.sum(rows**2, axis=-2))
+    scale = np.where(scale > 0, scale, 1.0)
+    _, s, vt = np.linalg.svd(np.linalg.qr(rows / scale[..., None, :], mode="r"))
+    spare = [(0, 0)] * (s.ndim - 1) + [(0, vt.shape[-1] - s.shape[-1])]  # fewer rows than unknowns
+    return Directions(np.pad(s, spare), vt, scale)
+
+
+def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:
+    """F (..., m, m) with ``F F^T = (rows^T rows)^-1``, columns of rows (..., n, m) scaled.
+
+    Directions below ``least`` of the largest singular value are not known. loose : they get a huge
+    variance; otherwise none, as in a pseudo-inverse.
+    """
+    s, vt, scale = directions(rows)
+    limit = least * s[..., :1]
+    inverse = 1 / np.maximum(s, limit) if loose else _of_known(s, limit)
+    return np.swapaxes(vt, -1, -2) * inverse[..., None, :] / scale[..., None]
+
+
+def normal_root(normal: Array, least: float, *, loose: bool) -> Array:
+    """The same of a normal matrix (..., m, m), by its eigenvalues; they hold half of the digits."""
+    scaled, scale = _unit_diagonal(normal)
+    values, vectors = np.linalg.eigh(scaled)
+    limit = least * values[..., -1:]
+    inverse = 1 / np.maximum(values, limit) if loose else _of_known(values, limit)
+    return vectors * np.sqrt(inverse)[..., None, :] / scale[..., None]
+
+
+def _of_known(values: Array, limit: Array) -> Array:
+    """1 / values where they are above the limit, else 0."""
+    known = values > limit
+    return np.where(known, 1 / np.where(known, values, 1.0), 0.0)
+
+
+def _unit_diagonal(normal: Array) -> tuple[Array, Array]:
+    """A normal matrix (..., m, m) with its unknowns scaled (..., m) to a diagonal of ones."""
+    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 0.0))
+    scale = np.where(scale > 0, scale, 1.0)
+    return normal / (scale[..., :, None] * scale[..., None, :]), scale

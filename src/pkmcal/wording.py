@@ -39,6 +39,17 @@ def brief(value: float) -> str:
     return number(value, decimals(value))
 
 
+def amount(value: float, unit: str) -> str:
+    """A positive magnitude in m or rad, as ``0.07 mm`` or ``0.3°``."""
+    scale, name = SCALES[unit]
+    return with_unit(brief(value * scale), name)
+
+
+def with_unit(text: str, unit: str) -> str:
+    """``0.07 mm``, ``0.3°``."""
+    return text + unit if unit == "°" else f"{text} {unit}"
+
+
 def count(n: float, thing: str) -> str:
     """``1 edge``, ``12 345 edges``; thousands apart by a narrow space."""
     text = f"{round(n):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")

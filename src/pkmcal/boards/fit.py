@@ -17,10 +17,19 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras.contract import Camera
 from pkmcal.geometry.rigid import apply, dot, perturb, pose, rotation, skew
-from pkmcal.solver import Linear, Values, eliminate, minimise, own_factors, transposed
+from pkmcal.solver import (
+    Linear,
+    Values,
+    eliminate,
+    final_weights,
+    minimise,
+    normal_root,
+    own_factors,
+    transposed,
+)
 
-FULL, NONE = 4.0, 6.5
-"""A corner counts fully up to FULL and not at all from NONE standard deviations on."""
+LEAST_KNOWN = 1e-14
+"""Eigenvalue of the scaled normal matrix, of the largest, below which nothing is known."""
 LEAST_NOISE = 1e-4
 """px; keeps noise-free data finite."""
 ROUNDS = 12
@@ -246,10 +255,8 @@ def reduced_normals(linear: Linear) -> Array:
 
 def inverted(normal: Array) -> Array:
     """Inverse of a normal matrix; what is not determined becomes very uncertain, not an error."""
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    values, vectors = np.linalg.eigh(normal / scale / scale[:, None])
-    values = np.maximum(values, 1e-14)
-    return (vectors / values) @ vectors.T / scale / scale[:, None]
+    half = normal_root(normal, LEAST_KNOWN, loose=True)
+    return half @ transposed(half)
 
 
 def noise_beyond(off: Array, sigma: Array, weight: Array, dof: float) -> float:
@@ -289,10 +296,9 @@ def _robust_scale(off: Array, sigma: Array, seen: Booleans) -> float:
 
 
 def _weights(off: Array, sigma: Array, tau: float, seen: Booleans) -> Array:
-    """1 up to FULL standard deviations, a cosine's way down to 0 at NONE, (V, N)."""
+    """Weights (V, N) of corners that are off by so many px; 0 where not seen."""
     distance = np.sqrt(np.sum(np.nan_to_num(off) ** 2, axis=-1) / (sigma**2 + tau**2))
-    x = np.clip((distance - FULL) / (NONE - FULL), 0, 1)
-    return np.where(seen, 0.5 * (1 + np.cos(np.pi * x)), 0.0)
+    return np.where(seen, final_weights(distance), 0.0)
 
 
 class BoardPoses(NamedTuple):

@@ -19,13 +19,15 @@ from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
 from pkmcal.calibration.recognise import WORKERS
-from pkmcal.errors import InputError, ResultError
+from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
-from pkmcal.identify.start import start_state
+from pkmcal.identify.start import misfit, start_state
 from pkmcal.measurements import EdgeSet, Measurements, Observation, Rejection, concatenate
+from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.repeats import combined
+from pkmcal.papers.four_step import four_step
 from pkmcal.session.load import Session
 from pkmcal.wording import listed
 
@@ -97,6 +99,20 @@ def take_turns(
             break
     observation = observation_of(session, looks, boards, measurements, estimate)
     return Turns(observation, measurements, estimate, cameras)
+
+
+def better_start(machine: Machine, measurements: Measurements, known: State) -> State:
+    """``known``, or [A]'s four steps on the edges where these explain the edges better.
+
+    The four steps need no first guess, so they find the way back when the drawing or an earlier
+    estimate has gone astray. Judged by the median misfit, which wrong edges do not move. Any
+    machine: the steps refuse in words where the data do not allow them, and ``known`` remains.
+    """
+    try:
+        steps = four_step(machine, measurements, T_camera_base_guess=known.T_camera_base)
+    except (PkmcalError, np.linalg.LinAlgError):  # too few legs, directions or configurations
+        return known
+    return min(known, steps, key=lambda state: misfit(machine, measurements, state))
 
 
 def identify_poses(

@@ -25,11 +25,10 @@ from pkmcal.identify.covariance import (
     machine_covariance,
 )
 from pkmcal.identify.estimate import Estimate, State, Statistics
-from pkmcal.identify.gauge import Gauge, apply, default_gauge
+from pkmcal.identify.gauge import Gauge, apply, default_gauge, told_unknowns
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import Both
-from pkmcal.identify.start import start_mounts
-from pkmcal.identify.unknowns import BatchState
+from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import (
@@ -155,24 +154,20 @@ def _noise_scale(fit: _Fit) -> Both:
     problem = fit.problem
     linear = problem.linearize(fit.state)
     reduced = eliminate(linear, np.zeros(len(fit.steps)))
-    count = Both(edge_count(problem, fit.weight.edges), pose_count(problem, fit.weight.poses))
-    rows = slice(0, problem.n_edge_rows), problem.pose_rows
+    rows = problem.edge_rows, problem.pose_rows
     out = []
-    for part, number, scale in zip(rows, count, fit.scale, strict=True):
+    for part, number, scale in zip(rows, counts(problem, fit.weight), fit.scale, strict=True):
         chi2, freedom = group_fit(linear, reduced, part, number)
         new = scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
         out.append(np.where(freedom > 5, np.maximum(new, LEAST_SCALE), scale))
     return Both(*out)
 
 
-def pose_count(problem: Problem, weight: Array) -> Array:
-    """Residuals of poses in use, each counted by its robust weight, (B,)."""
-    return np.sum(weight * robust_weights.measured_rows(problem), axis=(1, 2))
-
-
-def edge_count(problem: Problem, weight: Array) -> Array:
-    """Residuals of edges in use, each counted by its robust weight, (B,)."""
-    return np.sum(weight, axis=(1, 2)) * problem.data.whiten.shape[-1]
+def counts(problem: Problem, weight: Both) -> Both:
+    """Residuals of edges and of poses in use, each counted by its robust weight, (B,) each."""
+    poses = weight.poses * robust_weights.measured_rows(problem)
+    edges = np.sum(weight.edges, axis=(1, 2)) * problem.data.whiten.shape[-1]
+    return Both(edges, np.sum(poses, axis=(1, 2)))
 
 
 def bundle(
@@ -187,7 +182,7 @@ def bundle(
 ) -> Estimate:
     """The joint estimate of one session.
 
-    start : every unknown's first value, see :func:`start_state`.
+    start : every unknown's first value, see :func:`pkmcal.identify.start.start_state`.
     use_drawing : take the drawing's values as measurements with their tolerances; radii
         and edge shifts keep theirs in any case.
     robust : let go of edges and poses that do not fit. scale_noise : where the residuals
@@ -198,41 +193,15 @@ def bundle(
     gauge = gauge or default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing)
     batch = batch_of(machine, assembled, start)
-    problem = _mounts_near(assembled, batch)
+    problem = assembled.problem
+    # mounts are known to be near their start, as far as nothing else tells
+    mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
+    problem = replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
     result = solve_batch(problem, batch, robust=robust, scale_noise=scale_noise)
     stop = result.solution.stop[0]
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(what=f"the joint estimate failed: {stop.value}")
     return _estimate(machine, measurements, start, assembled, result, gauge)
-
-
-def _mounts_near(assembled: Assembled, start: BatchState) -> Problem:
-    """The problem whose mounts are known to be near their start, as far as nothing else tells."""
-    problem = assembled.problem
-    mounts = np.array(assembled.priors) == "mount"
-    there = problem.prior_values(start)[0]
-    return replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
-
-
-def start_state(machine: Machine, measurements: Measurements, T_camera_base_guess: Array) -> State:
-    """A start: the machine's present values, poses by forward kinematics from the readings.
-
-    Readings, not seen directions: the latter lead into local minima (errata, B).
-    T_camera_base_guess : (S, 4, 4).
-    """
-    found = machine.forward_result(measurements.joints)
-    poses = found.T_base_platform
-    n_cameras = int(np.max(measurements.camera_of_station)) + 1
-    stations = np.asarray(T_camera_base_guess)
-    return State(
-        machine.values,
-        stations,
-        poses,
-        np.zeros(n_cameras),
-        T_mount=start_mounts(measurements, stations, poses),
-        on_platform=measurements.on_platform,
-        internal=found.internal,
-    )
 
 
 def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiability:
@@ -243,14 +212,12 @@ def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiab
     """
     machine = estimate.machine
     assembled = assemble(machine, measurements, default_gauge(machine))
-    weight = assembled.problem.data.weight.copy()
-    weight[0, assembled.row, assembled.place] = estimate.edge_weights
-    weight = weight / estimate.statistics.noise_scale**2
-    poses = assembled.problem.pose_data.weight.copy()
-    poses[0, assembled.pose_row, assembled.pose_place] = estimate.pose_weights
-    poses = poses / estimate.statistics.pose_scale**2
+    problem = assembled.trusting(
+        estimate.edge_weights / estimate.statistics.noise_scale**2,
+        estimate.pose_weights / estimate.statistics.pose_scale**2,
+    )
     state = batch_of(machine, assembled, estimate.state)
-    return identifiability(assembled.problem.weighted(weight, poses), machine, state)
+    return identifiability(problem, machine, state)
 
 
 def _estimate(
@@ -262,52 +229,40 @@ def _estimate(
     gauge: Gauge,
 ) -> Estimate:
     """The result in the gauge, with everything that a report asks for."""
-    problem, found = result.problem, result.solution.state
+    found = result.solution.state
     solved = state_of(assembled, found, start)
-    full = machine_covariance(problem, machine, solved, result.info.covariance[0], gauge)
+    full = machine_covariance(result.problem, machine, solved, result.info.covariance[0], gauge)
     state = apply(machine, solved, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     identified = machine.with_values(state.theta)
-    n_par = len(machine.parameters)
-    stations = np.arange(6 * problem.n_stations).reshape(-1, 6) + n_par
-    mounts = np.arange(stations.size + n_par, len(full)).reshape(-1, 6)
-    rows = problem.block_residuals(found)[0] / result.noise_scale[0]
-    covariance = full[:n_par, :n_par]
-    optics = _optics_covariance(result)
+    told = told_unknowns(solved)
+    covariance = full[told.machine, told.machine]
+    problem, u = result.problem, result.problem.unknowns
+    optics = own_blocks(result.info.covariance[0], u.optics, u.n_optics)
     factor = measurements.intrinsics_factor
+    edges = problem.block_residuals(found)[0] / result.noise_scale[0]
+    poses = problem.pose_residuals(found)[0] / result.pose_scale[0]
+    closures = result.info.linear.value[..., problem.closure_rows]
+    joints = np.zeros(measurements.joints.shape)  # where no pose was fitted
+    joints[assembled.seen] = problem.joint_rows(closures, found)[0]
     return Estimate(
         machine=identified,
         state=_with_unseen_poses(identified, measurements, assembled, state),
         covariance=covariance,
-        station_covariance=full[stations[:, :, None], stations[:, None, :]],
+        station_covariance=own_blocks(full, told.stations, 6),
         edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
-        edge_residuals=rows[assembled.row, assembled.place],
-        edge_weights=result.weight[0, assembled.row, assembled.place],
-        joint_residuals=_joint_residuals(result, assembled, measurements),
+        edge_residuals=assembled.edges.taken(edges),
+        edge_weights=assembled.edges.taken(result.weight[0]),
+        joint_residuals=joints,
         data_share=data_share(machine, state.theta, covariance, gauge),
         configurations=assembled.seen,
         statistics=_statistics(result, assembled),
         gauge=gauge.name,
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ np.swapaxes(factor, -1, -2),
-        pose_residuals=_pose_residuals(result, assembled),
-        pose_weights=result.pose_weight[0, assembled.pose_row, assembled.pose_place],
-        mount_covariance=full[mounts[:, :, None], mounts[:, None, :]],
+        pose_residuals=assembled.poses.taken(poses),
+        pose_weights=assembled.poses.taken(result.pose_weight[0]),
+        mount_covariance=own_blocks(full, told.mounts, 6),
     )
-
-
-def _pose_residuals(result: BatchResult, assembled: Assembled) -> Array:
-    """Whitened residuals (N, 6) of the poses, by their noise as scaled."""
-    rows = result.problem.pose_residuals(result.solution.state)[0]
-    return rows[assembled.pose_row, assembled.pose_place] / result.pose_scale[0]
-
-
-def _optics_covariance(result: BatchResult) -> Array:
-    """Covariance (C, w, w) of each camera's own unknowns."""
-    c, w = result.problem.n_cameras, result.problem.n_optics
-    first = result.problem.free.shape[1] + 6 * result.problem.n_stations
-    at = slice(first, first + c * w)
-    own = result.info.covariance[0][at, at].reshape(c, w, c, w)
-    return np.einsum("iaib->iab", own)
 
 
 def _with_unseen_poses(
@@ -323,25 +278,15 @@ def _with_unseen_poses(
     return replace(state, T_base_platform=poses, internal=internal)
 
 
-def _joint_residuals(
-    result: BatchResult, assembled: Assembled, measurements: Measurements
-) -> Array:
-    """Closures in standard deviations of a reading, (K, m); zero where no pose was fitted."""
-    rows = result.info.linear.value[0, :, result.problem.closure_rows]
-    out = np.zeros(measurements.joints.shape)
-    out[assembled.seen] = result.problem.joint_rows(rows[None], result.solution.state)[0]
-    return out
-
-
 def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     problem, linear = result.problem, result.info.linear
     kinds = np.array(assembled.priors)
-    rows = slice(0, problem.n_edge_rows), problem.closure_rows, problem.pose_rows
+    rows = problem.edge_rows, problem.closure_rows, problem.pose_rows
     chi2 = [float(np.sum(linear.value[0, :, part] ** 2)) for part in rows]
     drawn = ~np.isin(kinds, ("gauge", "mount"))
     chi2_drawing = float(np.sum(linear.shared_value[0, drawn] ** 2))
-    n_edges = float(edge_count(problem, result.weight)[0])
-    n_poses = float(pose_count(problem, result.pose_weight)[0])
+    used = counts(problem, Both(result.weight, result.pose_weight))
+    n_edges, n_poses = float(used.edges[0]), float(used.poses[0])
     n_joints = linear.value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))

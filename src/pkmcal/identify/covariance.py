@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.geometry.rigid import skew
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
     Gauge,
@@ -22,19 +21,27 @@ from pkmcal.identify.gauge import (
     changed_frames,
     conventions,
     generators,
-    mount_generators,
     move_generators,
     projector,
+    told_unknowns,
     transformation,
 )
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.unknowns import BatchState
+from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.mechanisms import Machine, ParameterTable
-from pkmcal.solver import Linear, Reduced, eliminate, reduced_normal, transposed
+from pkmcal.solver import (
+    RANK_TOLERANCE,
+    Linear,
+    Reduced,
+    column_space,
+    eliminate,
+    inverse_root,
+    normal_root,
+    reduced_normal,
+    stacked,
+    transposed,
+)
 
-RANK_TOLERANCE = 1e-9
-"""Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14
-there with exact derivatives, and real directions are many orders above."""
 NULL = 1e-12
 """Same, for the scaled rows with drawing and gauge: below it a direction counts as unknown."""
 UNKNOWN = 1e-13
@@ -61,21 +68,41 @@ class Information(NamedTuple):
 def information(problem: Problem, state: BatchState) -> Information:
     """Covariance of the shared unknowns before any gauge is applied."""
     linear = problem.linearize(state)
-    reduced = eliminate(linear, np.zeros(state.z.shape[0]))
-    n_runs, na = reduced.rows.shape[0], reduced.rows.shape[-1]
-    stacked = np.concatenate(
-        [
-            reduced.rows.reshape(n_runs, -1, na),
-            np.broadcast_to(linear.shared_by, (n_runs, *linear.shared_by.shape)),
-        ],
-        axis=1,
-    )
-    scale = np.sqrt(np.sum(stacked**2, axis=1))
-    scale = np.where(scale > 0, scale, 1.0)
-    r = np.linalg.qr(stacked / scale[:, None, :], mode="r")
-    _, s, vt = np.linalg.svd(r)
-    half = transposed(vt) / np.maximum(s, NULL * s[:, :1])[:, None, :] / scale[:, :, None]
+    reduced = eliminate(linear, np.zeros(len(state.z)))
+    half = inverse_root(stacked(linear, reduced)[0], NULL, loose=True)
     return Information(linear, reduced, half @ transposed(half))
+
+
+def reduced_rows(
+    problem: Problem,
+    state: BatchState,
+    keep: tuple[Name, ...],
+    silent: tuple[Name, ...] | None = None,
+) -> tuple[Array, Array]:
+    """What the data say of some unknowns whatever the others are: rows A (n, m) by the named ones,
+    in the order of their columns, and residuals y (n,); the problem's first run.
+
+    Each configuration's own unknowns are eliminated and what all other shared unknowns can take up
+    is projected out, so ``y + A x`` is left of the residuals where the kept ones move by x (their
+    best value is least squares on it). Rows that are known beforehand count too, but for those on
+    the ``silent`` unknowns, by default the kept ones: what is asked is not to be known already.
+
+    For parameters that the problem holds, open it first, as drift tests do::
+
+        wide, there = problem.opened(state)
+        rows, left = reduced_rows(wide, there, ("machine",))
+
+    Frames stay in: their rows are zero along :func:`~pkmcal.identify.gauge.move_generators`.
+    """
+    linear = problem.linearize(state)
+    rows, value = (part[0] for part in stacked(linear, eliminate(linear, np.zeros(len(state.z)))))
+    kept = problem.unknowns.columns(*keep)
+    told = linear.shared_by[:, kept if silent is None else problem.unknowns.columns(*silent)]
+    used = np.append(np.ones(len(rows) - len(told), dtype=bool), ~told.any(axis=1))
+    rows, value = rows[used], value[used]
+    q = column_space(np.delete(rows, kept, axis=1))
+    rows = rows[:, kept]
+    return rows - q @ (q.T @ rows), value - q @ (q.T @ value)
 
 
 def group_fit(linear: Linear, reduced: Reduced, group: slice, count: Array) -> tuple[Array, Array]:
@@ -87,71 +114,37 @@ def group_fit(linear: Linear, reduced: Reduced, group: slice, count: Array) -> t
     """
     own = np.sum(reduced.q[:, :, group] ** 2, axis=(1, 2, 3))
     rows = reduced.rows[:, :, group].reshape(len(count), -1, reduced.rows.shape[-1])
-    normal = reduced_normal(linear, reduced)
-    scale = np.sqrt(np.einsum("bii->bi", normal))
-    scale = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(normal / (scale[:, :, None] * scale[:, None, :]))
-    known = values > UNKNOWN * values[:, -1:]
-    rows = rows / scale[:, None, :] @ vectors
-    variance = np.where(known, 1 / np.where(known, values, 1.0), 0.0)
-    shared = np.sum(rows**2 * variance[:, None], axis=(1, 2))
+    half = normal_root(reduced_normal(linear, reduced), UNKNOWN, loose=False)
+    shared = np.sum((rows @ half) ** 2, axis=(1, 2))
     return np.sum(linear.value[:, :, group] ** 2, axis=(1, 2)), count - own - shared
 
 
 def machine_covariance(
     problem: Problem, machine: Machine, before: State, shared: Array, gauge: Gauge
 ) -> Array:
-    """Covariance (P + 6 S + 6 M) of parameters, stations and mounts, told in the gauge.
+    """Covariance (n, n) of parameters, stations and mounts, told in the gauge; n = P + 6 S + 6 M,
+    in the order of :func:`~pkmcal.identify.gauge.told_unknowns`.
 
     before : the solution as the solver left it. shared : (na, na) covariance there.
     """
-    n_free, n_par = problem.free.shape[1], len(machine.parameters)
-    n_first, n_mount = 6 * problem.n_stations, 6 * problem.pose_blocks.n_mounts
-    kept = np.r_[: n_free + n_first, len(shared) - n_mount : len(shared)]
-    spread = np.zeros((n_par + n_first + n_mount, len(kept)))
-    spread[:n_par, :n_free] = problem.free
-    spread[n_par:, n_free:] = np.eye(n_first + n_mount)
+    solved, told = problem.unknowns, told_unknowns(before)
+    spread = np.zeros((told.count, solved.count))
+    spread[told.machine, solved.machine] = problem.free
+    spread[told.stations, solved.stations] = np.eye(6 * solved.n_stations)
+    spread[told.mounts, solved.mounts] = np.eye(6 * solved.n_mounts)
     e, f = alignment(machine, before, gauge)
     after = changed_frames(machine.layout, before, e, f)
-    first = n_par + n_first
-    spread[:first] = carried_errors(machine.layout, before, e, f) @ spread[:first]
-    spread[first:] = _carried_mounts(before, e, f) @ spread[first:]
-    spread[first:] -= _moved_mounts(machine, after, gauge) @ spread[:n_par]
-    spread[:first] = transformation(machine, after, gauge) @ spread[:first]
-    spread[:n_par] = _along_units(machine, after.theta, spread[:n_par])
-    out = spread @ shared[np.ix_(kept, kept)] @ spread.T
+    spread = carried_errors(machine.layout, before, e, f) @ spread
+    spread = transformation(machine, after, gauge) @ spread
+    for index in np.concatenate(machine.layout.turning):  # an axis' length is one, known exactly
+        axis = after.theta[index] / np.linalg.norm(after.theta[index])
+        spread[index] -= np.outer(axis, axis @ spread[index])
+    out = spread @ shared @ spread.T
     # constrained and fixed coordinates are exactly known; the product leaves rounding there
-    known = np.flatnonzero(np.diag(out)[:n_par] < 1e-18 * machine.parameters.tolerance**2)
+    known = np.diag(out)[told.machine] < 1e-18 * machine.parameters.tolerance**2
+    known = np.flatnonzero(known)
     out[known, :], out[:, known] = 0.0, 0.0
     return 0.5 * (out + out.T)
-
-
-def _carried_mounts(before: State, e: Array, f: Array) -> Array:
-    """Errors (6M, 6M) of mounts before the frame changes to those after: turned with their body,
-    and moved by the turn about its new origin.
-    """
-    n = len(before.T_mount)
-    out = np.zeros((n, 6, n, 6))
-    for m, moving in enumerate(before.on_platform):
-        frame = f if moving else e
-        rot = frame[:3, :3]
-        out[m, :3, m, :3] = out[m, 3:, m, 3:] = rot
-        out[m, 3:, m, :3] = skew(frame[:3, 3]) @ rot
-    return out.reshape(6 * n, 6 * n)
-
-
-def _moved_mounts(machine: Machine, after: State, gauge: Gauge) -> Array:
-    """What restoring the gauge does to mounts, by the parameters' errors, (6M, P)."""
-    moved = mount_generators(after.T_mount, after.on_platform).reshape(-1, 12)
-    return moved @ projector(machine, after.theta, gauge)
-
-
-def _along_units(machine: Machine, theta: Array, rows: Array) -> Array:
-    """Errors (P, n) of parameters, those of axes kept across the axis: their length is one."""
-    for index in np.concatenate(machine.layout.turning):
-        axis = theta[index] / np.linalg.norm(theta[index])
-        rows[index] -= np.outer(axis, axis @ rows[index])
-    return rows
 
 
 def data_share(machine: Machine, theta: Array, covariance: Array, gauge: Gauge) -> Array:
@@ -208,25 +201,18 @@ def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Id
     Poses, stations, edge shifts and shading are eliminated, frames taken out, and the columns are
     scaled by the drawing's tolerances.
     """
-    linear = problem.linearize(state)
-    rows = eliminate(linear, np.zeros(state.z.shape[0])).rows[0]
-    table, nz = machine.parameters, problem.free.shape[1]
+    table, nz = machine.parameters, problem.unknowns.n_free
+    tolerance = table.tolerances_free()
     # what is known beforehand of cameras and shading is no drawing: without it, a shift of every
     # line by itself would hide the tubes' radii
-    other = linear.shared_by[:, :nz].any(axis=1) | linear.shared_by[:, problem.mounts_at :].any(
-        axis=1
-    )
-    beside = linear.shared_by[~other]
-    rows = np.concatenate([rows.reshape(-1, rows.shape[-1]), beside])
-    q = _column_space(rows[:, nz:])
-    tolerance = table.tolerances_free()
-    left = rows[:, :nz] * tolerance
-    left = left - q @ (q.T @ left)
+    left = reduced_rows(problem, state, ("machine",), silent=("machine", "mounts"))[0] * tolerance
     theta, moves = problem.theta(state)[0], conventions(machine)
     moved = move_generators(machine.layout, theta) @ moves
     moved = np.linalg.lstsq(problem.free, moved, rcond=None)[0]
     basis = np.linalg.qr(moved / tolerance[:, None], mode="complete")[0][:, moves.shape[1] :]
-    s, vt = _all_singular(left @ basis)
+    # a square R has all right vectors, however few rows there are
+    _, s, vt = np.linalg.svd(np.linalg.qr(left @ basis, mode="r"), full_matrices=True)
+    s = np.pad(s, (0, len(vt) - len(s)))
     directions = vt @ basis.T
     lost = s < RANK_TOLERANCE * s[0]
     vectors = (directions * tolerance) @ problem.free.T
@@ -241,23 +227,6 @@ def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Id
         weak=tuple(m for m, gone in zip(made, lost, strict=True) if not gone and m.information < 1),
         singular_values=s,
     )
-
-
-def _all_singular(matrix: Array) -> tuple[Array, Array]:
-    """Singular values and all right vectors: as many as columns, however few rows there are."""
-    _, s, vt = np.linalg.svd(np.linalg.qr(matrix, mode="r"), full_matrices=True)
-    return np.pad(s, (0, len(vt) - len(s))), vt
-
-
-def _column_space(columns: Array) -> Array:
-    """An orthonormal basis of what columns can make; a station seen from nowhere spans less."""
-    u, s, _ = np.linalg.svd(_scaled(columns), full_matrices=False)
-    return u[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
-
-
-def _scaled(columns: Array) -> Array:
-    norm = np.linalg.norm(columns, axis=0)
-    return columns[:, norm > 0] / norm[norm > 0]
 
 
 def _direction(table: ParameterTable, weights: Array, vector: Array, value: float) -> Direction:

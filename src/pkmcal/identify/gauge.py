@@ -7,6 +7,16 @@ A gauge is a set of twelve linear constraints on the joint centres that picks on
 Frame changes, by the perturbation of :mod:`pkmcal.geometry.rigid`: E moves base coordinates,
 ``A' = E A``, ``T_camera_base' = T_camera_base E^-1``, and F platform coordinates,
 ``B' = F B``, ``T_base_platform' = E T_base_platform F^-1``. Twelve numbers: E's six, F's six.
+
+Where an articulated platform's numbers begin is a choice as well, and continues the twelve:
+
+- A hinge's point may slide along its axis, with the bar's joints sliding back, and the bar's
+  joints may be told turned about the hinge, with its internal coordinate turned back. Two numbers
+  a bar: shift (m) and turn (rad).
+- The joint of a bar that keeps its direction may move together with its leg's base, by three
+  numbers a leg (m, base frame): [C]'s d with y_BC.
+
+Not all are allowed: fixed and tied parameters leave some combinations, with the frames.
 """
 
 from __future__ import annotations
@@ -19,6 +29,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
 from pkmcal.identify.estimate import State
+from pkmcal.identify.unknowns import Unknowns
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 
@@ -160,17 +171,97 @@ def pose_generators(T_base_platform: Array) -> Array:
     return out
 
 
+def count(layout: LimbLayout) -> int:
+    """Numbers besides the frames'."""
+    return 2 * layout.n_internal + 3 * _floating(layout).size
+
+
+def _floating(layout: LimbLayout) -> Integers:
+    """Legs that end on bars which keep their direction."""
+    legs = [g.legs for g in layout.platform if g.carrier.floats]
+    return np.concatenate(legs) if legs else np.zeros(0, dtype=int)
+
+
+def move_generators(layout: LimbLayout, theta: Array, drawing: Array | None = None) -> Array:
+    """How parameters move with all these changes, (..., P, 12 + n)."""
+    frames = generators(layout, theta, drawing)
+    if not count(layout):
+        return frames
+    hinges = np.zeros((*theta.shape, 2 * layout.n_internal))
+    for group in layout.platform:
+        if group.carrier.turns:
+            by = group.carrier.by_slide(group.of(theta))
+            for leg, own in enumerate(layout.internal[group.legs]):
+                hinges[..., group.index[leg], 2 * own : 2 * own + 2] = by[..., leg, :, :]
+    return np.concatenate([frames, hinges, _shifts(layout, theta)], axis=-1)
+
+
+def _shifts(layout: LimbLayout, theta: Array) -> Array:
+    """Both ends of each floating leg by its three numbers, (..., P, 3 legs)."""
+    legs = _floating(layout)
+    out = np.zeros((theta.shape[-1], 3 * legs.size))
+    columns = np.arange(3 * legs.size).reshape(-1, 3)
+    for index in centre_index(layout):
+        out[index[legs], columns] = 1.0
+    return np.broadcast_to(out, (*theta.shape[:-1], *out.shape))
+
+
+def slid(layout: LimbLayout, theta: Array, y: Array) -> Array:
+    """Parameters (..., P) after the changes y (..., n) that are not the frames'."""
+    if not count(layout):
+        return theta
+    out = theta + (_shifts(layout, theta) @ y[..., 2 * layout.n_internal :, None])[..., 0]
+    for group in layout.platform:
+        if group.carrier.turns:
+            own = 2 * layout.internal[group.legs]
+            moved = group.carrier.slid(group.of(out), y[..., own], y[..., own + 1])
+            out[..., group.index] = moved
+    return out
+
+
+def turned_back(layout: LimbLayout, y: Array) -> Array:
+    """By how much the internal coordinates become less, (..., n_internal)."""
+    return y[..., 1 : 2 * layout.n_internal : 2]
+
+
 def freedoms(machine: Machine) -> Array:
     """Frame changes that the machine's model allows, a basis (12, g), at the drawing's values.
 
     All twelve for a spatial machine without fixed parameters. Fixed or tied parameters take
     some away; a machine that moves in fewer directions keeps those that respect its motion.
     """
-    candidates = respecting_motion(machine.layout.motion)
-    free = machine.parameters.free_matrix()
-    moved = generators(machine.layout, machine.parameters.drawing) @ candidates
+    moved = generators(machine.layout, machine.parameters.drawing)
+    return _allowed(machine, moved, respecting_motion(machine.layout.motion))
+
+
+def conventions(machine: Machine) -> Array:
+    """Frame and hinge changes that the machine's model allows, a basis (12 + n, g), at the
+    drawing's values: what is a choice, not a question to the data.
+    """
+    frames = freedoms(machine)
+    return _with_hinges(machine, frames, 2 * machine.layout.n_internal)
+
+
+def exact_moves(machine: Machine) -> Array:
+    """All changes that leave every prediction as it is, a basis (12 + n, g), at the drawing's."""
+    frames = respecting_motion(machine.layout.motion)
+    return _with_hinges(machine, frames, count(machine.layout))
+
+
+def _with_hinges(machine: Machine, frames: Array, n: int) -> Array:
+    """What the model allows of frame changes (12, g) and of the first n other changes."""
+    moved = move_generators(machine.layout, machine.parameters.drawing)
+    candidates = np.zeros((moved.shape[1], frames.shape[1] + n))
+    candidates[:12, : frames.shape[1]] = frames
+    candidates[12 : 12 + n, frames.shape[1] :] = np.eye(n)
+    return _allowed(machine, moved, candidates)
+
+
+def _allowed(machine: Machine, moved: Array, candidates: Array) -> Array:
+    """Combinations of candidates (c, k) that move free parameters only; moved : (P, c)."""
+    free, moved = machine.parameters.free_matrix(), moved @ candidates
     outside = moved - free @ np.linalg.lstsq(free, moved, rcond=None)[0]
-    _, s, vt = np.linalg.svd(outside, full_matrices=True)
+    _, s, vt = np.linalg.svd(outside)
     size = np.zeros(candidates.shape[1])
     size[: s.size] = s
     return candidates @ vt[size < 1e-9].T
@@ -281,46 +372,54 @@ def moved_centres(layout: LimbLayout, theta: Array, e: Array, f: Array) -> Array
 
 
 def carried_errors(layout: LimbLayout, before: State, e: Array, f: Array) -> Array:
-    """Errors of (theta, stations) before the frame changes to those after, (n, n), n = P + 6 S.
+    """Errors of (theta, stations, mounts) before the frame changes to those after, (n, n),
+    n = P + 6 S + 6 M.
 
     Centres turn with their frame. A station's left perturbation (omega, tau) becomes
-    (omega, tau + [R R_E^T t_E]x omega), as ``(T E^-1)`` keeps the camera's own axes.
+    (omega, tau + [R R_E^T t_E]x omega), as ``(T E^-1)`` keeps the camera's own axes. A mount's
+    are turned with its body.
     """
-    n_par, n_stations = before.theta.size, len(before.T_camera_base)
-    out = np.eye(n_par + 6 * n_stations)
+    told = told_unknowns(before)
+    out = np.eye(told.count)
     for transform, axes in zip((e, f), layout.turning, strict=True):
         out[axes[:, :, None], axes[:, None, :]] = transform[:3, :3]
-    out[:n_par, :n_par] = _carried_parameters(layout, before.theta, e, f, out[:n_par, :n_par])
-    arm = before.T_camera_base[:, :3, :3] @ e[:3, :3].T @ e[:3, 3]
-    for s in range(n_stations):
-        at = n_par + 6 * s
-        out[at + 3 : at + 6, at : at + 3] = skew(arm[s])
+    # the carriers' own; the last takes what the file is silent about
+    own = np.pad(out[told.machine, told.machine], ((0, 1), (0, 1)))
+    for group in (*layout.base, *layout.platform):
+        by = group.carrier.carried(group.of(before.theta), e[None], f[None])
+        own[group.index[:, :, None], group.index[:, None, :]] = by
+    out[told.machine, told.machine] = own[:-1, :-1]
+    for s, station in enumerate(before.T_camera_base):
+        at = told.stations.start + 6 * s
+        out[at + 3 : at + 6, at : at + 3] = skew(station[:3, :3] @ e[:3, :3].T @ e[:3, 3])
+    for m, moving in enumerate(before.on_platform):
+        at, frame = told.mounts.start + 6 * m, f if moving else e
+        out[at : at + 3, at : at + 3] = out[at + 3 : at + 6, at + 3 : at + 6] = frame[:3, :3]
     return out
 
 
-def _carried_parameters(layout: LimbLayout, theta: Array, e: Array, f: Array, out: Array) -> Array:
-    """Errors (P, P) of the carriers' parameters before a frame change to those after."""
-    out = np.pad(out, ((0, 1), (0, 1)))  # the last takes what the file is silent about
-    for group in (*layout.base, *layout.platform):
-        by = group.carrier.carried(group.of(theta), e[None], f[None])
-        out[group.index[:, :, None], group.index[:, None, :]] = by
-    return out[:-1, :-1]
-
-
 def transformation(machine: Machine, state: State, gauge: Gauge) -> Array:
-    """S-transformation (n, n) of the errors of (theta, stations) into the gauge, n = P + 6 S.
+    """S-transformation (n, n) of the errors of (theta, stations, mounts) into the gauge,
+    n = P + 6 S + 6 M.
 
     Errors in the gauge are ``J e``: the frame change that restores the constraints is taken
-    out of parameters and stations alike. Constrained coordinates get zero variance exactly.
+    out of all alike. Constrained coordinates get zero variance exactly.
     """
     change = projector(machine, state.theta, gauge)
     moved = np.concatenate(
         [
             generators(machine.layout, state.theta),
             station_generators(state.T_camera_base).reshape(-1, 12),
+            mount_generators(state.T_mount, state.on_platform).reshape(-1, 12),
         ]
     )
-    n = moved.shape[0]
-    out = np.eye(n)
+    out = np.eye(len(moved))
     out[:, : change.shape[1]] -= moved @ change
     return out
+
+
+def told_unknowns(state: State) -> Unknowns:
+    """The unknowns that results are told of: all parameters, stations and mounts."""
+    return Unknowns(
+        state.theta.size, len(state.T_camera_base), n_cameras=0, n_mounts=len(state.T_mount)
+    )

@@ -1,100 +1,370 @@
-"""What goes into an identification and what comes out of it: plain, frozen, saveable."""
+"""The joint estimation as one least-squares problem: all unknowns, all rows, and a step.
+
+Rows of a configuration are its edges, then its limbs' closures, then its boards' poses
+(:mod:`pkmcal.identify.rows`). Rows on shared unknowns: ``(theta - drawing) / tolerance``, what is
+known beforehand of cameras, shading and mounts, the gauge (:mod:`pkmcal.identify.assembly`).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
-from pkmcal.mechanisms import Machine
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import inverse, perturb
+from pkmcal.identify.gauge import (
+    mount_generators,
+    move_generators,
+    moved_centres,
+    moved_mounts,
+    pose_generators,
+    slid,
+    station_generators,
+    turned_back,
+)
+from pkmcal.identify.rows import (
+    Blocks,
+    Data,
+    EdgeRows,
+    PoseBlocks,
+    PoseData,
+    PoseRows,
+    by_noise,
+    edge_rows,
+    joint_rows,
+    no_poses,
+    pose_rows,
+)
+from pkmcal.identify.unknowns import BatchState, Unknowns
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, on_tangents
+from pkmcal.solver import Linear, Values, of_runs
+
+CLOSINGS = 2
+"""Newton steps back onto the closures; each squares what is left."""
 
 
 @dataclass(frozen=True)
-class State:
-    """One value of every unknown.
+class Problem:
+    """The joint estimation of B runs; a :class:`pkmcal.solver.LeastSquares`.
 
-    theta : (P,) machine parameters. T_camera_base : (S, 4, 4). T_base_platform : (K, 4, 4).
-    edge_shift : (C,) px outward, per camera. intrinsics : (C, r) change of each camera's from
-    ``Measurements.intrinsics_at``, in the same units; r = 0 where they are held.
-    T_mount : (M, 4, 4) boards in the frame of what they are fixed to, T_base_board or
-    T_platform_board by ``on_platform`` (M,). internal : (K, n) hinges of an articulated platform.
+    layout, drawing (P,), free (P, nz) : the machine. unknowns : which there are, and their columns.
+    blocks, data : edges and readings. joint_noise : standard deviation of a reading.
+    prior : (c, na) rows on the shared unknowns and prior_target : (c,).
+    frames : (12 + n, g) changes of frames and hinges' beginnings that no measurement knows.
+    pose_blocks, pose_data : of boards.
     """
 
-    theta: Array
-    T_camera_base: Array
-    T_base_platform: Array
-    edge_shift: Array
-    intrinsics: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    T_mount: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
-    on_platform: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    layout: LimbLayout
+    drawing: Array
+    free: Array
+    unknowns: Unknowns
+    blocks: Blocks
+    data: Data
+    joint_noise: float
+    prior: Array
+    prior_target: Array
+    frames: Array
+    pose_blocks: PoseBlocks = field(default_factory=no_poses)
+    pose_data: PoseData = field(default_factory=PoseData)
+
+    @property
+    def edge_rows(self) -> slice:
+        """Rows of a configuration that are edges'; they come first."""
+        return slice(0, self.blocks.side.size // len(self.blocks.side) * 2)
+
+    @property
+    def closure_rows(self) -> slice:
+        """Rows of a configuration that are the closure's."""
+        return slice(self.edge_rows.stop, self.edge_rows.stop + self.layout.n_equations)
+
+    @property
+    def pose_rows(self) -> slice:
+        """Rows of a configuration that are boards' poses; they come last."""
+        return slice(self.closure_rows.stop, None)
+
+    def select(self, runs: Integers) -> Problem:
+        """The problem of some runs only."""
+        return replace(self, data=of_runs(self.data, runs), pose_data=of_runs(self.pose_data, runs))
+
+    def weighted(self, weight: Array, poses: Array | None = None) -> Problem:
+        """The same problem with other weights of the edges' blocks, and of the boards' poses where
+        given, (B, K, G) each.
+        """
+        changed = replace(self, data=replace(self.data, weight=weight))
+        if poses is None:
+            return changed
+        return replace(changed, pose_data=replace(self.pose_data, weight=poses))
+
+    def opened(self, state: BatchState) -> tuple[Problem, BatchState]:
+        """The same problem and state with every parameter of the machine an unknown of its own.
+
+        For derivatives by parameters that were held; z is then ``theta - drawing``.
+        """
+        n, machine = self.drawing.size, self.unknowns.machine
+        prior = [self.prior[:, machine] @ self.to_free, self.prior[:, machine.stop :]]
+        problem = replace(
+            self,
+            free=np.eye(n),
+            unknowns=replace(self.unknowns, n_free=n),
+            prior=np.concatenate(prior, axis=1),
+        )
+        return problem, replace(state, z=self.theta(state) - self.drawing)
+
+    def theta(self, state: BatchState) -> Array:
+        """Machine parameters (B, P)."""
+        return self.drawing + state.z @ self.free.T
+
+    @cached_property
+    def to_free(self) -> Array:
+        """(nz, P), from changes of the parameters to those of z."""
+        return np.linalg.pinv(self.free)
+
+    def closure(self, state: BatchState) -> Closure:
+        """The closure of all runs and configurations, (B, K, E)."""
+        theta = self.theta(state)[:, None, :]
+        internal = state.internal if self.layout.n_internal else None
+        return closure(self.layout, theta, self.data.joints, state.T_base_platform, internal)
+
+    def residuals(self, state: BatchState) -> Values:
+        """Residuals; NaN where a leg passes through the camera."""
+        c = self.closure(state)
+        value = self._values(state, c, self._edges(state, c), self._poses(state))
+        return Values(value, self.prior_values(state) - self.prior_target)
+
+    def linearize(self, state: BatchState) -> Linear:
+        """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
+        c, u = self.closure(state), self.unknowns
+        edges, poses = self._edges(state, c), self._poses(state)
+        value = self._values(state, c, edges, poses)
+        blocks, boards = self.blocks, self.pose_blocks
+        lines = [(u.shading, blocks.line, edges.by_optics[..., :1])] if u.n_lines else []
+        closures = self._to_free([(c.index[None], c.by_theta[..., None, :])])[..., 0, :]
+        by_shared = (
+            self._columns(
+                self._to_free(edges.by_machine),
+                (u.stations, blocks.station, edges.by_station),
+                (u.optics, blocks.camera, edges.by_optics),
+                *lines,
+            ),
+            self._columns(self._by_noise(c, closures)[..., None, :]),
+            self._columns(
+                np.zeros((*poses.value.shape, u.n_free)),
+                (u.stations, boards.station, poses.by_station),
+                (u.optics, boards.camera, poses.by_optics),
+                (u.mounts, boards.mount, poses.by_mount),
+            ),
+        )
+        by_own = (
+            _in_rows(edges.by_own(self._to_own(c.ends.b_by_pose, c.ends.b_by_internal))),
+            self._by_noise(c, self.layout.by_own(c)),
+            _in_rows(self._to_own(poses.by_platform)),
+        )
+        by_shared = np.concatenate(by_shared, axis=-2)
+        by_own = np.concatenate(by_own, axis=-2)
+        # padding may lie anywhere, so its derivatives need not be finite though its row is zero
+        usable = np.isfinite(value) & self._in_use()
+        lost = ~np.isfinite(value + by_shared.sum(axis=-1))
+        return Linear(
+            np.where(usable, value, 0.0),
+            np.where(lost[..., None], 0.0, by_shared),
+            np.where(lost[..., None], 0.0, by_own),
+            usable,
+            self.prior_values(state) - self.prior_target,
+            self.prior,
+        )
+
+    def block_residuals(self, state: BatchState) -> Array:
+        """Whitened residuals of the blocks without their weights, (B, K, G, 2g)."""
+        plain = self.weighted(self.blocks.present[None].astype(float))
+        edges = plain._edges(state, plain.closure(state))
+        return edges.value(state.optics, state.shading)
+
+    def pose_residuals(self, state: BatchState) -> Array:
+        """Whitened errors of the measured boards' poses without their weights, (B, K, G, 6)."""
+        present = self.pose_blocks.present[None].astype(float)
+        return self.weighted(self.data.weight, present)._poses(state).value
+
+    def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
+        """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""
+        return joint_rows(self.layout, self.closure(state).by_reading, c_rows)
+
+    def prior_values(self, state: BatchState) -> Array:
+        """What the prior's rows (B, c) come to, before their targets are taken off."""
+        u = self.unknowns
+        x = np.zeros((len(state.z), u.count))
+        x[:, u.machine] = state.z
+        x[:, u.optics] = state.optics.reshape(len(x), -1)
+        x[:, u.shading] = state.shading
+        mounts = x[:, u.mounts].reshape(len(x), -1, 6)  # of which only places are known
+        mounts[..., 3:] = state.T_mount[..., :3, 3]
+        return x @ self.prior.T
+
+    def _edges(self, state: BatchState, c: Closure) -> EdgeRows:
+        radius = self.theta(state)[:, self.blocks.radius]
+        return edge_rows(self.blocks, self.data, c.ends, radius, state.T_camera_base)
+
+    def _poses(self, state: BatchState) -> PoseRows:
+        return pose_rows(
+            self.pose_blocks,
+            self.pose_data,
+            state.T_camera_base,
+            state.T_base_platform,
+            state.T_mount,
+            state.optics,
+        )
+
+    def _by_noise(self, c: Closure, rows: Array) -> Array:
+        """Rows (B, K, E, n) of the closure in standard deviations."""
+        return by_noise(self.layout, self.joint_noise, c.by_reading, rows)
+
+    def _values(self, state: BatchState, c: Closure, edges: EdgeRows, poses: PoseRows) -> Array:
+        """All rows of the configurations, (B, K, r)."""
+        parts = (
+            edges.value(state.optics, state.shading),
+            self._by_noise(c, c.value[..., None]),
+            poses.value,
+        )
+        return np.concatenate([part.reshape(*part.shape[:2], -1) for part in parts], axis=-1)
+
+    def _in_use(self) -> Booleans:
+        """Rows that are not padding and not weighted away, (B or 1, K, r)."""
+        edges = np.repeat(self.data.weight > 0, self.data.whiten.shape[-1], axis=-1)
+        poses = np.repeat(self.pose_data.weight > 0, 6, axis=-1)
+        n_rows = edges.shape[-1] + self.layout.n_equations + poses.shape[-1]
+        runs = max(len(edges), len(poses))
+        used = np.ones((runs, edges.shape[1], n_rows), dtype=bool)
+        used[..., self.edge_rows], used[..., self.pose_rows] = edges, poses
+        return used
+
+    def _columns(self, machine: Array, *others: tuple[slice, Integers, Array]) -> Array:
+        """Derivatives put into the columns of the shared unknowns, rows in one, (B, K, G n, na).
+
+        machine : (B, K, G, n, nz). others : which unknowns, whose of them (K, G), and the
+        derivatives (B, K, G, n, w) by that one's.
+        """
+        out = np.zeros((*machine.shape[:-1], self.unknowns.count))
+        out[..., self.unknowns.machine] = machine
+        for part, number, values in others:
+            width = values.shape[-1]
+            columns = part.start + width * number[..., None] + np.arange(width)
+            np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
+        return _in_rows(out)
+
+    def _to_free(self, parts: list[tuple[Integers, Array]]) -> Array:
+        """Derivatives by machine parameters put into the free unknowns' columns.
+
+        parts : positions (K or 1, G, n) and derivatives (B, K, G, rows, n).
+        """
+        shape = np.broadcast_shapes(*(values.shape[:-1] for _, values in parts))
+        n = self.drawing.size
+        full = np.zeros((*shape, n + 1))  # the last column takes what is no parameter's
+        for index, values in parts:
+            np.put_along_axis(full, index[None, :, :, None, :], values, axis=-1)
+        if self._choice is not None:  # no ties, no axes: a choice of columns, far cheaper
+            return full[..., self._choice]
+        return full[..., :n] @ self.free
+
+    @cached_property
+    def _choice(self) -> Integers | None:
+        """The parameter of each free unknown where each moves one parameter alone."""
+        alone = np.all((self.free != 0).sum(axis=0) == 1) and np.all(self.free.sum(axis=0) == 1)
+        return np.argmax(self.free, axis=0) if alone else None
+
+    def _to_own(self, by_pose: Array, by_internal: Array | None = None) -> Array:
+        """Derivatives (..., 6) by the pose, and (..., n) by what is internal, as those by the
+        configuration's own unknowns, (..., d + n).
+        """
+        out = by_pose @ self.layout.motion
+        if not self.layout.n_internal:
+            return out
+        if by_internal is None:
+            by_internal = np.zeros((*out.shape[:-1], self.layout.n_internal))
+        return np.concatenate([out, by_internal], axis=-1)
+
+    def moved(self, state: BatchState, shared: Array, own: Array) -> BatchState:
+        """The state after a step (B, na) and (B, K, d), taken along what bends.
+
+        The part of the step that only turns or shifts the frames is made as an exact frame
+        change. Added up it would bend the sharp closures and edges at second order, and the
+        drawing's soft hold on the frames would be found along a curved valley.
+        """
+        u, layout = self.unknowns, self.layout
+        z = shared[:, u.machine]
+        by_moves = self.to_free @ move_generators(layout, self.theta(state), self.drawing)
+        moves = self.frames @ np.linalg.pinv(by_moves @ self.frames) @ z[..., None]
+        y, slides = moves[:, :12], moves[:, 12:, 0]
+
+        def less_frames(step: Array, by_frames: Array) -> Array:
+            """Steps (B, n, 6) of poses without what the frame change y does to them."""
+            return step - (by_frames @ y[:, None])[..., 0]
+
+        camera = shared[:, u.stations].reshape(-1, u.n_stations, 6)
+        mount = shared[:, u.mounts].reshape(*state.T_mount.shape[:2], 6)
+        motion = own @ layout.own_motion.T
+        on_platform = self.pose_blocks.on_platform
+        inner = BatchState(
+            state.z + (z - (by_moves @ moves)[..., 0]),
+            perturb(
+                state.T_camera_base, less_frames(camera, station_generators(state.T_camera_base))
+            ),
+            perturb(
+                state.T_base_platform,
+                less_frames(motion[..., :6], pose_generators(state.T_base_platform)),
+            ),
+            state.optics + shared[:, u.optics].reshape(state.optics.shape),
+            perturb(
+                state.T_mount, less_frames(mount, mount_generators(state.T_mount, on_platform))
+            ),
+            state.internal + motion[..., 6:] + turned_back(layout, slides)[:, None],
+            state.shading + shared[:, u.shading],
+        )
+        return self._closed(state, self._in_frames(inner, y[..., 0], slides), shared, own)
+
+    def _in_frames(self, state: BatchState, y: Array, slides: Array) -> BatchState:
+        """The state after exact frame changes y (B, 12) and others (B, n)."""
+        layout, e, f = self.layout, perturb(np.eye(4), y[:, :6]), perturb(np.eye(4), y[:, 6:])
+        theta = moved_centres(layout, slid(layout, self.theta(state), slides), e, f)
+        theta = on_tangents(layout, theta, self.drawing)
+        return replace(
+            state,
+            z=(theta - self.drawing) @ self.to_free.T,
+            T_camera_base=state.T_camera_base @ inverse(e)[:, None],
+            T_base_platform=e[:, None] @ state.T_base_platform @ inverse(f)[:, None],
+            T_mount=moved_mounts(state.T_mount, self.pose_blocks.on_platform, e, f),
+            internal=state.internal - turned_back(layout, slides)[:, None],
+        )
+
+    def _closed(
+        self, state: BatchState, trial: BatchState, shared: Array, own: Array
+    ) -> BatchState:
+        """The trial with its poses moved to where the closures are what the step meant them to be.
+
+        For machines with cranks or sliders, whose readings are far sharper than a board's poses:
+        the closures bend over a step by more than they may be wrong, and the search would creep.
+        """
+        layout = self.layout
+        freedoms = layout.own_motion.shape[1]
+        if layout.n_equations != freedoms or not any(g.carrier.driven for g in layout.base):
+            return trial
+        c = self.closure(state)
+        change = shared[:, self.unknowns.machine] @ self.free.T
+        change = np.pad(change, ((0, 0), (0, 1)))[:, c.index][:, None]
+        wanted = c.value + np.sum(c.by_theta * change, axis=-1)
+        wanted = wanted + (layout.by_own(c) @ own[..., None])[..., 0]
+        for _ in range(CLOSINGS):
+            c = self.closure(trial)
+            back = np.linalg.pinv(layout.by_own(c)) @ (wanted - c.value)[..., None]
+            step = back[..., 0] @ layout.own_motion.T
+            trial = replace(
+                trial,
+                T_base_platform=perturb(trial.T_base_platform, step[..., :6]),
+                internal=trial.internal + step[..., 6:],
+            )
+        return trial
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """How well the model explains the data.
-
-    chi2, dof : of all residuals in use (robust weights count as fractions of a datum).
-    chi2_edges, n_edges, chi2_joints, n_joints, chi2_drawing, n_drawing : by kind of residual.
-    steps : solver steps. stopped : reason in words. noise_scale : factor by which the edges'
-    stated standard deviations had to be enlarged (or shrunk) to agree with the residuals;
-    1 when they were taken as they are. chi2_poses, n_poses : of poses, six numbers of a full one;
-    pose_scale : the same factor of theirs. dof_edges, dof_joints, dof_poses : degrees of freedom
-    that each kind of residual has left; their sum and the drawing's is ``dof``.
-    """
-
-    chi2: float
-    dof: float
-    chi2_edges: float
-    n_edges: float
-    chi2_joints: float
-    n_joints: int
-    chi2_drawing: float
-    n_drawing: int
-    steps: int
-    stopped: str
-    noise_scale: float
-    chi2_poses: float = 0.0
-    n_poses: float = 0.0
-    pose_scale: float = 1.0
-    dof_edges: float = 0.0
-    dof_joints: float = 0.0
-    dof_poses: float = 0.0
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """An identification's result, in the frames that ``gauge`` names.
-
-    machine : with the identified values. state : all unknowns.
-    covariance : (P, P) of the machine's parameters in that gauge; zero rows where fixed.
-    station_covariance : (S, 6, 6) of (omega, tau), left perturbation of T_camera_base.
-    edge_shift_sigma : (C,) px. intrinsics_covariance : (C, n, n) of the cameras' intrinsics
-    after refinement; n = 0 where they were held.
-    edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1.
-    joint_residuals : (K, m) in standard deviations.
-    data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
-        data decide; near 0, the value is the drawing's.
-    pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
-    mount_covariance : (M, 6, 6) of (omega, tau), left perturbation of T_mount.
-    configurations : (K,) True where the configuration was seen and its pose estimated.
-    gauge : its name for people.
-    """
-
-    machine: Machine
-    state: State
-    covariance: Array
-    station_covariance: Array
-    edge_shift_sigma: Array
-    edge_residuals: Array
-    edge_weights: Array
-    joint_residuals: Array
-    data_share: Array
-    configurations: Booleans
-    statistics: Statistics
-    gauge: str
-    intrinsics_covariance: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
-    pose_weights: Array = field(default_factory=lambda: np.zeros(0))
-    mount_covariance: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
+def _in_rows(parts: Array) -> Array:
+    """Rows (B, K, G, n, w) of G places one after the other, (B, K, G n, w)."""
+    return parts.reshape(*parts.shape[:2], parts.shape[2] * parts.shape[3], parts.shape[4])

@@ -16,13 +16,17 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.solver import FIRST_DAMPING, RESTART_DAMPING, minimise
+from pkmcal.solver import (
+    FIRST_DAMPING,
+    FULL,
+    RESTART_DAMPING,
+    final_weights,
+    minimise,
+    soft_weights,
+)
 
-FULL, NONE = 4.0, 6.5
-"""Weights are 1 up to FULL and 0 from NONE standard deviations: of clean edges 3 in 10^4 lose
-part of their weight and none all of it, so efficiency on clean data is above 0.999."""
 TAIL = np.exp(-(FULL**2) / 2)
-"""That share: of two residuals' norms beyond FULL."""
+"""Share of two clean residuals' norms beyond FULL, where weights begin to fall."""
 MEDIAN = float(np.sqrt(2 * np.log(2)))
 """Of the norm of two residuals that are noise."""
 POSE_STEPS = 10
@@ -104,16 +108,11 @@ def scales(problem: Problem, d: Both, least: float) -> Both:
     return Both(*(np.maximum(scale, least) for scale in both))
 
 
-def final_weights(d: Array, scale: Array) -> Array:
-    """1 inside FULL, cosine taper to 0 at NONE; 0 where nothing can be predicted."""
-    x = np.clip((d / scale[:, None, None] - FULL) / (NONE - FULL), 0, 1)
-    return np.where(np.isfinite(d), 0.5 * (1 + np.cos(np.pi * x)), 0.0)
-
-
 def settled_weights(problem: Problem, state: BatchState, scale: Both) -> Both:
     """Both kinds' weights at a state."""
     d = distances(problem, state)
-    return Both(final_weights(d.edges, scale.edges), final_weights(d.poses, scale.poses))
+    parts = zip(d, scale, strict=True)
+    return Both(*(final_weights(part / each[:, None, None]) for part, each in parts))
 
 
 def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
@@ -122,7 +121,7 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
     least_scale : the robust scale is not believed below this (1: stated noise is a floor).
     """
     state, steps = start, 0
-    most = POSE_STEPS if problem.pose_blocks.count else 1
+    most = POSE_STEPS if problem.pose_blocks.present.size else 1
     d = distances(problem, state)
     cut = [4 * WIDE * scale for scale in scales(problem, d, least_scale)]
     for _ in range(STAGES):
@@ -130,7 +129,7 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
         new = [np.minimum(c, np.maximum(a, c / 4)) for c, a in zip(cut, aim, strict=True)]
         settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
         cut = new
-        weight = Both(*(_soft(part, c) for part, c in zip(d, cut, strict=True)))
+        weight = Both(*(soft_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True)))
         damping = RESTART_DAMPING if steps else FIRST_DAMPING
         found = minimise(problem.weighted(*weight), state, max_steps=most, damping=damping)
         state, steps = found.state, steps + int(found.steps.max())
@@ -139,9 +138,3 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
             break
     scale = scales(problem, d, least_scale)
     return Anneal(state, settled_weights(problem, state, scale), scale, steps)
-
-
-def _soft(d: Array, cut: Array) -> Array:
-    """Geman-McClure weights (B, K, G) with a scale (B,)."""
-    c2 = cut[:, None, None] ** 2
-    return np.where(np.isfinite(d), (c2 / (c2 + np.nan_to_num(d) ** 2)) ** 2, 0.0)

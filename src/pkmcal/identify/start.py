@@ -1,31 +1,71 @@
-"""Where the joint estimate starts: the better of what is known and the papers' own solution."""
+"""Where the joint estimate starts: from the readings and what the photographs say."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.errors import PkmcalError
+from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import inverse, pose
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.robust import norms
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.papers.four_step import four_step
+
+TURNS = 15
+ALIKE = 1e-4
+"""rad, about; turns that differ by less are one."""
 
 
-def better_start(machine: Machine, measurements: Measurements, known: State) -> State:
-    """``known``, or [A]'s four steps on the edges where these explain the edges better.
+def start_state(machine: Machine, measurements: Measurements, T_camera_base_guess: Array) -> State:
+    """A start: the machine's present values, poses by forward kinematics from the readings.
 
-    The four steps need no first guess, so they find the way back when the drawing or an earlier
-    estimate has gone astray. Judged by the median misfit, which wrong edges do not move. Any
-    machine: the steps refuse in words where the data do not allow them, and ``known`` remains.
+    Readings, not seen directions: the latter lead into local minima (errata, B).
+    T_camera_base_guess : (S, 4, 4).
     """
-    try:
-        steps = four_step(machine, measurements, T_camera_base_guess=known.T_camera_base)
-    except (PkmcalError, np.linalg.LinAlgError):  # too few legs, directions or configurations
-        return known
-    return min(known, steps, key=lambda state: misfit(machine, measurements, state))
+    found = machine.forward_result(measurements.joints)
+    poses = found.T_base_platform
+    n_cameras = int(np.max(measurements.camera_of_station)) + 1
+    stations = np.asarray(T_camera_base_guess)
+    return State(
+        machine.values,
+        stations,
+        poses,
+        np.zeros(n_cameras),
+        T_mount=start_mounts(measurements, stations, poses),
+        on_platform=measurements.on_platform,
+        internal=found.internal,
+    )
+
+
+def start_mounts(measurements: Measurements, T_camera_base: Array, poses: Array) -> Array:
+    """T_mount (M, 4, 4) from the measured poses, the stations' and the platform's.
+
+    T_camera_base : (S, 4, 4). poses : T_base_platform (K, 4, 4).
+    """
+    seen, on_platform = measurements.poses, measurements.on_platform
+    body = T_camera_base[seen.station]
+    body = np.where(on_platform[seen.mount][:, None, None], body @ poses[seen.configuration], body)
+    each = inverse(body) @ seen.T_station_target
+    mounts = [mean_pose(each[seen.mount == m]) for m in range(len(measurements.mounts))]
+    return np.array(mounts).reshape(-1, 4, 4)
+
+
+def mean_pose(poses: Array) -> Array:
+    """The pose (4, 4) nearest to poses (n, 4, 4), a few wrong ones forgiven; the identity of none.
+
+    The turn with the least sum of distances, as the median has it of numbers (Weiszfeld).
+    """
+    if not len(poses):
+        return np.eye(4)
+    weight, rot = np.ones(len(poses)), np.eye(3)
+    for _ in range(TURNS):
+        u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weight, poses[:, :3, :3]))
+        rot = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        apart = np.linalg.norm(poses[:, :3, :3] - rot, axis=(1, 2))
+        weight = 1 / np.maximum(apart, ALIKE)
+    return pose(rot, np.median(poses[:, :3, 3], axis=0))
 
 
 def misfit(machine: Machine, measurements: Measurements, state: State) -> float:

@@ -16,14 +16,14 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.identify.gauge import centre_index
-from pkmcal.judge.held import MAGNIFIED
+from pkmcal.judge.held import RATIO
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import split_name
 
-LegPart = Literal[
-    "zero", "rod", "arm", "base", "platform", "hinge", "all", "pair", "scale", "camera"
-]
+LegPart = Literal["zero", "rod", "arm", "base", "platform", "hinge", "all", "scale", "camera"]
+Side = Literal["base", "platform"]
+SIDES: tuple[Side, Side] = ("base", "platform")
 
 PARTS: dict[str, LegPart] = {
     "length.offset": "zero",
@@ -44,8 +44,8 @@ FOCAL = ("focal.x", "focal.y")
 class Cause:
     """A change that is looked for.
 
-    columns : (P + C, k), the change of the machine's parameters (m, rad), then of the cameras'
-    magnification, by k numbers, each in ``sizes`` (k,): a drawing's tolerance, or MAGNIFIED.
+    columns : (P, k), the change of the machine's parameters (m, rad) by k numbers; or (P + C, k),
+    then of the cameras' magnification. sizes : (k,) usual ones: a drawing's tolerance, or RATIO.
     legs : from 0. unit : of the k numbers: m, rad, or nothing for a ratio.
     """
 
@@ -67,39 +67,39 @@ def arms(machine: Machine) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(legs) for legs in groups.values())
 
 
-def whole_legs(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
+def whole_legs(machine: Machine) -> tuple[Cause, ...]:
     """Everything of each arm but its tubes."""
-    return tuple(_of_names(machine, "all", legs, n_cameras) for legs in arms(machine))
+    return tuple(_of_names(machine, "all", legs) for legs in arms(machine))
 
 
-def zeros(machine: Machine, n_cameras: int = 0) -> tuple[Cause | None, ...]:
+def zeros(machine: Machine) -> tuple[Cause | None, ...]:
     """The zero of each arm's reading, None for one without: what a slipped encoder changes."""
     return tuple(
-        cause if (cause := _of_names(machine, "zero", legs, n_cameras)).sizes.size else None
+        cause if (cause := _of_names(machine, "zero", legs)).sizes.size else None
         for legs in arms(machine)
     )
 
 
-def whole_machine(machine: Machine, n_cameras: int = 0) -> Cause:
+def whole_machine(machine: Machine) -> Cause:
     """Everything but the tubes."""
-    return _of_names(machine, "all", tuple(range(machine.n_legs)), n_cameras)
+    return _of_names(machine, "all", tuple(range(machine.n_legs)))
 
 
-def common_scale(machine: Machine, n_cameras: int = 0) -> Cause:
+def common_scale(machine: Machine) -> Cause:
     """All lengths longer by one factor against the readings, by its excess over 1."""
     table = machine.parameters
     lengths = np.array(
         [u == "m" and k != "axis" for u, k in zip(table.units, table.kinds, strict=True)]
     )
-    column = np.pad(np.where(lengths, machine.values, 0.0), (0, n_cameras))[:, None]
-    return Cause("scale", tuple(range(machine.n_legs)), column, np.array([MAGNIFIED]), "")
+    column = np.where(lengths, machine.values, 0.0)[:, None]
+    return Cause("scale", tuple(range(machine.n_legs)), column, np.array([RATIO]), "")
 
 
-def magnification(machine: Machine, camera: int, n_cameras: int) -> Cause:
+def magnification(machine: Machine, camera: int) -> Cause:
     """A camera's picture larger by a factor, by its excess over 1."""
-    column = np.zeros((len(machine.parameters) + n_cameras, 1))
-    column[len(machine.parameters) + camera] = 1.0
-    return Cause("camera", (), column, np.array([MAGNIFIED]), "", camera)
+    column = np.zeros((len(machine.parameters) + camera + 1, 1))
+    column[-1] = 1.0
+    return Cause("camera", (), column, np.array([RATIO]), "", camera)
 
 
 def single_causes(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
@@ -108,20 +108,22 @@ def single_causes(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
         cause
         for legs in arms(machine)
         for part in dict.fromkeys(PARTS.values())
-        if (cause := _of_names(machine, part, legs, n_cameras)).sizes.size
+        if (cause := _of_names(machine, part, legs)).sizes.size
     ]
-    for side in ("base", "platform"):
-        out += [_together(machine, side, pair, n_cameras) for pair in _neighbours(machine, side)]
-    cameras = [magnification(machine, c, n_cameras) for c in range(n_cameras)]
-    return (*out, common_scale(machine, n_cameras), *cameras)
+    for side in SIDES:
+        out += [_together(machine, side, pair) for pair in _neighbours(machine, side)]
+    cameras = [magnification(machine, c) for c in range(n_cameras)]
+    return (*out, common_scale(machine), *cameras)
 
 
 def joined(causes: Sequence[Cause]) -> Cause:
     """Several causes at once, each by its own numbers."""
+    n = max(len(cause.columns) for cause in causes)
+    columns = [np.pad(c.columns, ((0, n - len(c.columns)), (0, 0))) for c in causes]
     return Cause(
         "all",
         tuple(dict.fromkeys(leg for cause in causes for leg in cause.legs)),
-        np.concatenate([cause.columns for cause in causes], axis=1),
+        np.concatenate(columns, axis=1),
         np.concatenate([cause.sizes for cause in causes]),
         causes[0].unit,
     )
@@ -133,15 +135,14 @@ def part_of(name: str) -> LegPart | None:
     return next((part for start, part in PARTS.items() if path.startswith(start)), None)
 
 
-def joint_of(machine: Machine, side: str, leg: int, n_cameras: int = 0) -> Cause:
+def joint_of(machine: Machine, side: Side, leg: int) -> Cause:
     """A leg's joint on one side, base or platform, moved by a vector."""
     index = centre_index(machine.layout)[side == "platform"][leg]
-    columns = np.eye(len(machine.parameters) + n_cameras)[:, index]
-    part: LegPart = "base" if side == "base" else "platform"
-    return Cause(part, (leg,), columns, machine.parameters.tolerance[index], "m")
+    columns = np.eye(len(machine.parameters))[:, index]
+    return Cause(side, (leg,), columns, machine.parameters.tolerance[index], "m")
 
 
-def _of_names(machine: Machine, part: LegPart, legs: tuple[int, ...], n_cameras: int) -> Cause:
+def _of_names(machine: Machine, part: LegPart, legs: tuple[int, ...]) -> Cause:
     """The parameters of some legs' part, each changed by itself; two rods of an arm as well.
 
     A motor's zero is one number, however many rods hang on it.
@@ -155,14 +156,14 @@ def _of_names(machine: Machine, part: LegPart, legs: tuple[int, ...], n_cameras:
         and part in (own, "all")
     ]
     tolerance = table.tolerance[rows]
-    columns = np.eye(len(table) + n_cameras)[:, rows]
+    columns = np.eye(len(table))[:, rows]
     if part == "zero" and len(legs) > 1 and len(rows) > 1:
         columns, tolerance = columns.sum(axis=1, keepdims=True), tolerance[:1]
     units = {table.units[k] for k in rows}
     return Cause(part, legs, columns, tolerance, units.pop() if len(units) == 1 else "m")
 
 
-def _neighbours(machine: Machine, side: str) -> list[tuple[int, int]]:
+def _neighbours(machine: Machine, side: Side) -> list[tuple[int, int]]:
     """Pairs of legs whose joints on one side are each other's nearest, and not of one arm."""
     index = centre_index(machine.layout)[side == "platform"]
     if machine.n_legs < 4:  # three joints have no sides
@@ -178,14 +179,10 @@ def _neighbours(machine: Machine, side: str) -> list[tuple[int, int]]:
     return sorted(set(close) - own)
 
 
-def _together(machine: Machine, side: str, pair: tuple[int, int], n_cameras: int) -> Cause:
+def _together(machine: Machine, side: Side, pair: tuple[int, int]) -> Cause:
     """Two neighbouring joints moved by the same vector."""
-    index = centre_index(machine.layout)[side == "platform"]
-    columns = np.zeros((len(machine.parameters) + n_cameras, 3))
-    for leg in pair:
-        columns[index[leg], np.arange(3)] = 1.0
-    part: LegPart = "base" if side == "base" else "platform"
-    return Cause(part, pair, columns, machine.parameters.tolerance[index[pair[0]]], "m")
+    one, other = (joint_of(machine, side, leg) for leg in pair)
+    return Cause(side, pair, one.columns + other.columns, one.sizes, "m")
 
 
 def magnified(

@@ -17,6 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.judge.causes import (
+    SIDES,
     Cause,
     common_scale,
     joined,
@@ -42,7 +43,7 @@ MOST_CAUSES = 4
 """Changes that are looked for one after the other; more are a machine that was taken apart."""
 
 
-class Directions(NamedTuple):
+class SeenCause(NamedTuple):
     """What the data see of a cause: q (n, d) orthonormal in w, and gain (d, k) with q^T X D."""
 
     q: Array
@@ -79,12 +80,12 @@ class Change:
         return {"change": self.value, "sigma": self.sigma}
 
 
-def directions(found: Evidence, cause: Cause) -> Directions:
+def directions(found: Evidence, cause: Cause) -> SeenCause:
     """The directions in w of a cause that the data see."""
-    scaled = found.by @ (cause.columns * cause.sizes)
+    scaled = found.along(cause.columns * cause.sizes)
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
     seen = s > SEEN
-    return Directions(u[:, seen], s[seen, None] * vt[seen] / cause.sizes)
+    return SeenCause(u[:, seen], s[seen, None] * vt[seen] / cause.sizes)
 
 
 def chi_square(found: Evidence, cause: Cause) -> ChiSquare:
@@ -172,12 +173,12 @@ def change(found: Evidence, cause: Cause) -> Change:
 def detectable(found: Evidence, tester: Cause, along: Array, level: float) -> float:
     """The smallest change along a direction that a test at a level detects with POWER.
 
-    along : (P + C,) the change of the parameters by one unit (m, rad). inf where it is not seen.
+    along : (P,) the change of the parameters by one unit (m, rad). inf where it is not seen.
     """
     from scipy.special import chdtri, chndtrinc
 
     q = directions(found, tester).q
-    size = float(np.linalg.norm(q.T @ (found.by @ along)))
+    size = float(np.linalg.norm(q.T @ (found.along(along[:, None]))))
     if not q.shape[1] or size == 0.0:
         return float("inf")
     need = float(chndtrinc(chdtri(q.shape[1], level), q.shape[1], 1 - POWER))
@@ -191,7 +192,7 @@ def detectable_range(
     q = directions(found, tester).q
     if not q.shape[1] or not part.sizes.size:
         return float("inf"), float("inf")
-    gain = q.T @ found.by @ part.columns
+    gain = q.T @ found.along(part.columns)
     _, _, vt = np.linalg.svd(gain)
     best, worst = (detectable(found, tester, part.columns @ v, level) for v in (vt[0], vt[-1]))
     return best, worst
@@ -334,10 +335,8 @@ def made_tests(
     First of all legs, of all lengths by one factor, and of each arm's legs; then of each arm's
     zero, None for one without a reading.
     """
-    cameras = found.by.shape[1] - len(machine.parameters)
-    causes = [whole_machine(machine, cameras), common_scale(machine, cameras)]
-    causes += whole_legs(machine, cameras)
-    zero = zeros(machine, cameras)
+    causes = [whole_machine(machine), common_scale(machine), *whole_legs(machine)]
+    zero = zeros(machine)
     level = together(found, [*causes, *(cause for cause in zero if cause)])
 
     def test(cause: Cause) -> ChiSquare:
@@ -352,15 +351,14 @@ def judge(found: Evidence, machine: Machine, alpha: float) -> ChangeTests:
 
     alpha : share of machines that did not change that may be flagged.
     """
-    cameras = found.by.shape[1] - len(machine.parameters)
     (every, scale, *wholes), own, level = made_tests(found, machine)
     single = level.single(alpha)
-    rows = zip(whole_legs(machine, cameras), zeros(machine, cameras), wholes, own, strict=True)
+    rows = zip(whole_legs(machine), zeros(machine), wholes, own, strict=True)
     out = ChangeTests(
         legs=tuple(_leg(found, machine, *row, single) for row in rows),
         machine=every,
         scale=scale,
-        scale_change=change(found, common_scale(machine, cameras)),
+        scale_change=change(found, common_scale(machine)),
         findings=(),
         left=every,
         alpha=alpha,
@@ -368,9 +366,10 @@ def judge(found: Evidence, machine: Machine, alpha: float) -> ChangeTests:
     )
     if not out.changed:
         return out
+    cameras = found.by.shape[1] - len(machine.parameters)
     findings = explained(found, single_causes(machine, cameras), alpha)
     left = _beside(found, [f.suspect.cause for f in findings])
-    left = chi_square(left, whole_machine(machine, cameras))
+    left = chi_square(left, whole_machine(machine))
     return replace(out, findings=findings, left=left)
 
 
@@ -384,10 +383,9 @@ def _leg(
     level: float,
 ) -> LegTest:
     """A leg's tests, of all of it and of its zero, and what they would have found."""
-    cameras = found.by.shape[1] - len(machine.parameters)
     base, platform = (
-        detectable_range(found, whole, joint_of(machine, side, whole.legs[0], cameras), level)
-        for side in ("base", "platform")
+        detectable_range(found, whole, joint_of(machine, side, whole.legs[0]), level)
+        for side in SIDES
     )
     least = float("inf")
     if zero is not None:

@@ -90,7 +90,7 @@ class WeighedErrors:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class BesideDrawing:
     """A calibrated machine beside the drawing on n configurations.
 
     rows : (n,) which. calibrated, drawing : their errors there. before, after : (n,) root mean
@@ -163,7 +163,7 @@ def compare(
     found: Prediction,
     by_drawing: Prediction | None,
     rows: Integers,
-) -> Comparison:
+) -> BesideDrawing:
     """A prediction of the calibrated machine, beside the drawing, on configurations ``rows``.
 
     covariance : (P, P) of the calibrated machine. by_drawing : the drawing's own prediction;
@@ -183,7 +183,7 @@ def compare(
         if rms(weights.of(own.residuals)) < rms(weights.of(old.residuals)):
             old = own
     before, after = weights.of(old.residuals), weights.of(new.residuals)
-    return Comparison(
+    return BesideDrawing(
         rows=rows,
         calibrated=new,
         drawing=old,

@@ -2,16 +2,14 @@
 
 Nothing is calibrated anew. The machine's parameters stay where they are; the platform's poses,
 stations, boards, edge shifts and shading are found. At that point the residuals y, in standard
-deviations, have the derivative A by the machine's parameters, and Q and q are orthonormal bases of
-what the unknowns of each configuration, and those that all share, can make of them. What only the
-machine can explain is seen through the projector
+deviations, have the derivative A by the machine's parameters, and P is the projector that takes out
+what all those other unknowns can explain. The truth is the calibrated values plus the calibration's
+error e, of covariance C, plus a change c; to first order
 
-    P = 1 - Q Q^T - q q^T.
+    -P y = P A (c + e) + P noise,      the noise of unit variance.
 
-The truth is the calibrated values plus the calibration's error e, of covariance C, plus a change c;
-to first order ``-P y = P A (c + e) + P noise``, the noise of unit variance. Two things are read
-from that: what all else predicts of a configuration's readings (:mod:`pkmcal.judge.prediction`),
-and whether there is a change c (:func:`evidence`).
+Two things are read from that: what all else predicts of a configuration's readings
+(:mod:`pkmcal.judge.prediction`), and whether there is a change c (:func:`evidence`).
 """
 
 from __future__ import annotations
@@ -22,27 +20,20 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
-from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
+from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
+from pkmcal.identify.covariance import reduced_rows
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.unknowns import BatchState
+from pkmcal.identify.robust import measured_rows
+from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver import (
-    RANK_TOLERANCE,
-    RESTART_DAMPING,
-    Linear,
-    Reduced,
-    Stop,
-    eliminate,
-    minimise,
-    transposed,
-)
+from pkmcal.solver import RANK_TOLERANCE, RESTART_DAMPING, Stop, minimise
 
-MAGNIFIED = 1e-3
-"""Of a camera's magnification, relative: the size against which it counts as seen."""
+RATIO = 1e-3
+"""Of a magnification, or another ratio: the size against which it counts as seen."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +49,11 @@ class Trust:
     poses: Array
     noise_scale: float = 1.0
     pose_scale: float = 1.0
+
+    @property
+    def weights(self) -> tuple[Array, Array]:
+        """Of the edges and of the poses, by their noise as scaled."""
+        return self.edges / self.noise_scale**2, self.poses / self.pose_scale**2
 
     @classmethod
     def full(cls, measurements: Measurements) -> Trust:
@@ -77,59 +73,33 @@ class Trust:
 
 @dataclass(frozen=True)
 class Held:
-    """A machine held on new measurements; see the module. K' configurations were seen.
+    """A machine held on new measurements; see the module.
 
-    machine : as held, with tubes' radii where these were found. state : stations, mounts and poses,
-    in its frames. seen : (K,). noise_scale, pose_scale : factors on the stated noise of edges and
-    of boards' poses. problem, batch : at the solution, weights included.
-    linear, reduced : rows of all unknowns but the machine, (K', r) a configuration and the priors'
-    after them, and the elimination of each configuration's own. by : (K', r, P + C) derivatives A
-    by the machine's parameters, m and rad, and by the magnification of C cameras where asked for.
-    basis : q (K' r + c, a) of the shared unknowns, own ones taken out. inverse : (u, u), N^+ of
-    their normal matrix; open directions count as exact.
+    machine : as held, with tubes' radii where these were found. seen : (K,). problem, state : with
+    the weights in use, and its solution. asked : names of the unknowns in which a change is looked
+    for: the machine's parameters, and, as intrinsics, the cameras' magnifications.
     """
 
     machine: Machine
-    state: State
     seen: Booleans
-    noise_scale: float
-    pose_scale: float
     problem: Problem
-    batch: BatchState
-    linear: Linear
-    reduced: Reduced
-    by: Array
-    basis: Array
-    inverse: Array
-
-    def projected(self, rows: Array, priors: Array | None = None) -> Array:
-        """P rows: what no pose, station, board or shift explains of rows (K', r, n).
-
-        priors : (c, n) their part in the priors' rows, zero where not given. Returns (K' r + c, n).
-        """
-        n = rows.shape[-1]
-        if priors is None:
-            priors = np.zeros((len(self.linear.shared_by), n))
-        own = self.reduced.q[0]
-        rows = rows - own @ (transposed(own) @ rows)
-        stacked = np.concatenate([rows.reshape(-1, n), priors])
-        return stacked - self.basis @ (self.basis.T @ stacked)
+    state: BatchState
+    asked: tuple[Name, ...]
 
     def residuals(self) -> Array:
         """Root mean squares of each configuration's residuals in standard deviations, (K,).
 
         Its own pose takes up as many rows as it has freedoms; NaN where nothing was seen.
         """
-        problem, value = self.problem, self.linear.value[0]
-        weight = np.repeat(problem.data.weight[0], problem.data.whiten.shape[-1], axis=-1)
-        count = np.sum(weight > 0, axis=1) + problem.layout.n_equations
-        if problem.pose_blocks.count:
-            measured = np.any(problem.pose_data.whiten[0] != 0, axis=-1)
-            measured &= problem.pose_data.weight[0, ..., None] > 0
-            count = count + measured.sum(axis=(1, 2))
-        free = np.maximum(count - self.linear.by_own.shape[-1], 1)
+        problem, linear = self.problem, self.problem.linearize(self.state)
+        rows = problem.data.whiten.shape[-1] * np.sum(problem.data.weight[0] > 0, axis=1)
+        count = rows + problem.layout.n_equations
+        if problem.pose_blocks.present.size:
+            used = problem.pose_data.weight[0] > 0
+            count = count + np.sum(used * measured_rows(problem), axis=1)
+        free = np.maximum(count - linear.by_own.shape[-1], 1)
         out = np.full(len(self.seen), np.nan)
-        out[self.seen] = np.sqrt(np.sum(value**2, axis=1) / free)
+        out[self.seen] = np.sqrt(np.sum(linear.value[0] ** 2, axis=1) / free)
         return out
 
 
@@ -174,48 +144,28 @@ def hold(
         _check_enough(assembled.problem, begin)
         result = solve_batch(assembled.problem, begin)
         problem, found = result.problem, result.solution
-        scales = float(result.noise_scale[0]), float(result.pose_scale[0])
     else:
-        problem = _trusted(assembled, trust)
+        problem = assembled.trusting(*trust.weights)
         found = minimise(problem, begin, damping=RESTART_DAMPING)
-        scales = trust.noise_scale, trust.pose_scale
     if found.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(
             "the platform's poses were not found with the calibrated machine:"
             f" {found.stop[0].value}"
         )
-    state = state_of(assembled, found.state, start)
-    batch: BatchState = found.state
-    if magnified is not None and trust is not None:
-        problem = _trusted(assemble(still, magnified, default_gauge(still)), trust)
-        batch = replace(batch, optics=np.pad(batch.optics, ((0, 0), (0, 0), (0, 1))))
-    linear, by = _split(problem, batch)
-    reduced = eliminate(linear, np.zeros(1))
-    rows = reduced.rows[0]
-    basis, half = _column_space(
-        np.concatenate([rows.reshape(-1, rows.shape[-1]), linear.shared_by])
-    )
-    return Held(
-        machine=still.with_values(state.theta),
-        state=state,
-        seen=assembled.seen,
-        noise_scale=scales[0],
-        pose_scale=scales[1],
-        problem=problem,
-        batch=batch,
-        linear=linear,
-        reduced=reduced,
-        by=by,
-        basis=basis,
-        inverse=half @ half.T,
-    )
+    state: BatchState = found.state
+    still = still.with_values(problem.theta(state)[0])
+    if trust is None or magnified is None:
+        return Held(still, assembled.seen, problem, state, ("machine",))
+    problem = assemble(still, magnified, default_gauge(still)).trusting(*trust.weights)
+    state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))
+    return Held(still, assembled.seen, problem, state, ("machine", "intrinsics"))
 
 
 def _check_enough(problem: Problem, state: BatchState) -> None:
     """Raise ResultError where there are fewer rows than unknowns."""
     linear = problem.linearize(state)
     rows = int(linear.usable.sum()) + len(linear.shared_by)
-    if rows < problem.n_shared + linear.by_own.shape[1] * linear.by_own.shape[-1]:
+    if rows < problem.unknowns.count + linear.by_own.shape[1] * linear.by_own.shape[-1]:
         raise too_little()
 
 
@@ -226,52 +176,6 @@ def too_little() -> ResultError:
         expected="legs, or a board in several more configurations",
         next_step="Photograph more configurations from each station",
     )
-
-
-def _trusted(assembled: Assembled, trust: Trust) -> Problem:
-    """The problem with the weights of :class:`Trust`."""
-    problem = assembled.problem
-    edges, poses = problem.data.weight.copy(), problem.pose_data.weight.copy()
-    edges[0, assembled.row, assembled.place] = trust.edges / trust.noise_scale**2
-    poses[0, assembled.pose_row, assembled.pose_place] = trust.poses / trust.pose_scale**2
-    return problem.weighted(edges, poses)
-
-
-def _split(problem: Problem, state: BatchState) -> tuple[Linear, Array]:
-    """Rows of all unknowns but what is asked for, and A (K', r, P + C) of that: every parameter of
-    the machine that is not free here, and the cameras' magnification.
-    """
-    n = problem.drawing.size
-    opened = replace(problem, free=np.eye(n))
-    opened = replace(opened, prior=np.zeros((len(problem.prior), opened.n_shared)))
-    there = replace(state, z=problem.theta(state) - problem.drawing)
-    machine = opened.linearize(there).by_shared[0, ..., :n].copy()
-    machine[..., np.any(problem.free != 0, axis=1)] = 0.0
-    linear = problem.linearize(state)
-    asked = np.zeros(problem.n_shared, dtype=bool)
-    if problem.n_optics > 1:
-        first = problem.free.shape[1] + 6 * problem.n_stations + 1
-        asked[first + problem.n_optics * np.arange(problem.n_cameras)] = True
-    by = np.concatenate([machine, linear.by_shared[0][..., asked]], axis=-1)
-    # what is known beforehand of a magnification is what is asked
-    kept = ~linear.shared_by[:, asked].any(axis=1)
-    rest = linear._replace(
-        by_shared=linear.by_shared[..., ~asked],
-        shared_value=linear.shared_value[:, kept],
-        shared_by=linear.shared_by[kept][:, ~asked],
-    )
-    return rest, by
-
-
-def _column_space(columns: Array) -> tuple[Array, Array]:
-    """An orthonormal basis of what columns can make, and H with H H^T the inverse of columns^T
-    columns; open directions count as exact.
-    """
-    norm = np.linalg.norm(columns, axis=0)
-    norm = np.where(norm > 0, norm, 1.0)
-    u, s, vt = np.linalg.svd(columns / norm, full_matrices=False)
-    known = s > RANK_TOLERANCE * s.max(initial=0.0)
-    return u[:, known], vt[known].T / s[known] / norm[:, None]
 
 
 @dataclass(frozen=True)
@@ -286,23 +190,27 @@ class Evidence:
     w: Array
     by: Array
 
+    def along(self, columns: Array) -> Array:
+        """X D of changes (P, k) of the parameters, or (P + C, k) with cameras' magnifications."""
+        return self.by[:, : len(columns)] @ columns
+
 
 def evidence(held: Held, covariance: Array) -> Evidence:
     """What the data tell of a change from the held values, whose covariance (P, P) is the
     calibration's: whitened by V = 1 + A C A^T.
     """
     machine, n = held.machine, len(held.machine.parameters)
-    size = np.append(machine.parameters.tolerance, np.full(held.by.shape[-1] - n, MAGNIFIED))
-    by = held.by * size
-    by[..., :n] = held.by[..., :n] @ _across_axes(machine) * size[:n]
-    by = held.projected(by)
-    left = held.projected(held.linear.value[0, ..., None], held.linear.shared_value[0, :, None])
+    problem, state = held.problem.opened(held.state)
+    rows, left = reduced_rows(problem, state, held.asked)
+    size = np.append(machine.parameters.tolerance, np.full(rows.shape[1] - n, RATIO))
+    by = rows * size
+    by[:, :n] = rows[:, :n] @ _across_axes(machine) * size[:n]
     u, s, vt = np.linalg.svd(by, full_matrices=False)
     seen = s > RANK_TOLERANCE * s.max(initial=0.0)
     # noise is drawn in this basis: its signs must not be rounding's choice
     sign = np.sign(vt[np.arange(len(vt)), np.abs(vt).argmax(axis=1)])[seen]
     by = (sign * s[seen])[:, None] * vt[seen] / size
-    told = -sign * (u[:, seen].T @ left[:, 0])
+    told = -sign * (u[:, seen].T @ left)
     known = by[:, : len(covariance)]
     spread = np.eye(len(told)) + known @ covariance @ known.T
     lower = np.linalg.cholesky(0.5 * (spread + spread.T))

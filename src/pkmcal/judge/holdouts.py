@@ -11,7 +11,7 @@ from pkmcal.calibration.aside import Region, by_region, select
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
-from pkmcal.judge.comparison import Comparison, compare
+from pkmcal.judge.comparison import BesideDrawing, compare
 from pkmcal.judge.prediction import predict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -26,8 +26,8 @@ class HoldOut:
 
     region: Region
     estimate: Estimate
-    left_out: Comparison
-    used: Comparison
+    left_out: BesideDrawing
+    used: BesideDrawing
 
     def document(self, names: tuple[str, ...]) -> dict[str, Any]:
         """For programs; names : K, of the configurations."""

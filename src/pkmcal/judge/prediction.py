@@ -7,9 +7,11 @@ closures stand in the estimate with the soft deviation :data:`SOFT`, which gives
 seen, and each configuration's own readings are then taken out again exactly, by their leverage
 (leave-one-out).
 
-With E the rows of readings and P the projector of :mod:`pkmcal.judge.held`, their residuals are
-``E P y``, of which a configuration's own fit leaves the part ``L``, its block of ``E P E^T``: ones
-without their own readings are ``L^-1 E P y``, to first order.
+With E the rows of readings and ``P = 1 - Q Q^T - q q^T`` the projector of
+:mod:`pkmcal.judge.held`, Q and q orthonormal bases of what a configuration's own unknowns and the
+shared ones can explain, their residuals are ``E P y``. Of a reading's own error that leaves the
+part ``L``, a configuration's block of ``E P E^T``: residuals of fits without their own readings are
+``L^-1 E P y``, to first order.
 """
 
 from __future__ import annotations
@@ -29,7 +31,16 @@ from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure
 from pkmcal.mechanisms.kinematics import forward, inverse_result
-from pkmcal.solver import transposed
+from pkmcal.solver import (
+    RANK_TOLERANCE,
+    Linear,
+    Reduced,
+    column_space,
+    eliminate,
+    inverse_root,
+    stacked,
+    transposed,
+)
 
 SOFT = 0.01
 """Deviation (m, rad) given to readings while stations and poses are sought: tens of times what a
@@ -87,21 +98,25 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     are not found, or where nothing but a configuration's own readings tells its pose.
     """
     held = hold(machine, replace(measurements, joint_noise=SOFT), start)
-    picks = _picks(held)
+    linear = held.problem.linearize(held.state)
+    reduced = eliminate(linear, np.zeros(1))
+    own, shared = reduced.q[0], column_space(stacked(linear, reduced)[0][0])
+    picks = _picks(held, linear.value.shape[-1])
     n, m, n_rows = picks.shape
-    along = picks @ held.reduced.q[0]
+
+    along = picks @ own
     along = along @ transposed(along)
-    shared = picks @ held.basis[: n * n_rows].reshape(n, n_rows, -1)
-    kept = np.eye(m) - along - shared @ transposed(shared)  # L
-    if float(np.linalg.eigvalsh(kept).min(initial=1.0)) < ALONE:
+    beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
+    left = np.eye(m) - along - beside @ transposed(beside)  # L
+    if float(np.linalg.eigvalsh(left).min(initial=1.0)) < ALONE:
         raise too_little()
-    alone = np.linalg.inv(kept)
+    alone = np.linalg.inv(left)
     units = _size(held)[..., None] * alone
 
-    found = _without_own(held, transposed(picks) @ alone @ picks)
+    found = _without_own(held, linear, reduced, transposed(picks) @ alone @ picks)
+    by = _by_machine(held, own, shared[: n * n_rows]).reshape(n, n_rows, -1)
     joints = measurements.joints[held.seen]
     errors = _errors(held.machine, joints, found.T_base_platform[0], found.internal[0])
-    answer = picks @ held.projected(held.by)[: n * n_rows].reshape(n, n_rows, -1)
     return Prediction(
         machine=held.machine,
         seen=held.seen,
@@ -111,27 +126,27 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
             _among_all(errors.position, held.seen),
             _among_all(errors.orientation, held.seen),
         ),
-        noise=_noise(along, shared, units, 1 - (measurements.joint_noise / SOFT) ** 2),
-        by_machine=(units @ answer).reshape(n * m, -1),
+        noise=_noise(along, beside, units, 1 - (measurements.joint_noise / SOFT) ** 2),
+        by_machine=(units @ picks @ by).reshape(n * m, -1),
     )
 
 
-def _picks(held: Held) -> Array:
+def _picks(held: Held, n_rows: int) -> Array:
     """E (K', m, r): the rows of readings, one each, out of a configuration's."""
-    problem, state = held.problem, held.batch
+    problem, state = held.problem, held.state
     n_poses, n_equations = state.T_base_platform.shape[1], problem.layout.n_equations
     columns = [
         problem.joint_rows(np.broadcast_to(row, (1, n_poses, n_equations)), state)[0]
         for row in np.eye(n_equations)
     ]
-    out = np.zeros((n_poses, problem.layout.n_readings, held.linear.value.shape[-1]))
+    out = np.zeros((n_poses, problem.layout.n_readings, n_rows))
     out[..., problem.closure_rows] = np.stack(columns, axis=-1)
     return out
 
 
 def _size(held: Held) -> Array:
     """Reading (K', m) that one standard deviation of its row is, m or rad, with its sign."""
-    layout, c = held.problem.layout, held.problem.closure(held.batch)
+    layout, c = held.problem.layout, held.problem.closure(held.state)
     by_reading = c.by_reading[0]
     pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
     slope = np.sqrt(by_reading**2 @ pick)
@@ -139,34 +154,45 @@ def _size(held: Held) -> Array:
     return sign * np.hypot(PERFECT, SOFT * slope) / slope
 
 
-def _without_own(held: Held, alone: Array) -> BatchState:
+def _without_own(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> BatchState:
     """The poses of fits without each configuration's own readings.
 
-    alone : E^T L^-1 E (K', r, r). ``R^-1 Q^T (1 - A N^+ S^T) alone y``: the answer to readings
-    moved to where the others predict them; S the shared unknowns' rows A, own ones taken out.
+    alone : E^T L^-1 E (K', r, r). ``R^-1 Q^T (1 - A N^+ S^T) alone y`` is the answer to readings
+    moved to where the others predict them; S, the rows A of the shared unknowns with own ones taken
+    out, and N their normal matrix, in which open directions count as exact.
     """
-    moved = alone @ held.linear.value[0, ..., None]
-    rows = held.reduced.rows[0]
-    others = held.linear.by_shared[0] @ (held.inverse @ (transposed(rows) @ moved))
-    own = transposed(held.reduced.q[0]) @ (moved - others)
-    own = np.linalg.solve(held.reduced.r[0], own)[..., 0]
-    return held.problem.moved(held.batch, np.zeros((1, held.problem.n_shared)), own[None])
+    half = inverse_root(stacked(linear, reduced)[0][0], RANK_TOLERANCE, loose=False)
+    moved = alone @ linear.value[0, ..., None]
+    others = half @ (half.T @ (transposed(reduced.rows[0]) @ moved))
+    own = transposed(reduced.q[0]) @ (moved - linear.by_shared[0] @ others)
+    own = np.linalg.solve(reduced.r[0], own)[..., 0]
+    shared = np.zeros((1, held.problem.unknowns.count))
+    return held.problem.moved(held.state, shared, own[None])
 
 
-def _noise(along: Array, shared: Array, units: Array, less: float) -> Array:
+def _by_machine(held: Held, own: Array, shared: Array) -> Array:
+    """P A (K' r, P) by all parameters that are held; own : Q (K', r, d), shared : q (K' r, a)."""
+    wide, there = held.problem.opened(held.state)
+    by = wide.linearize(there).by_shared[0, ..., wide.unknowns.machine]
+    by = np.where(np.any(held.problem.free != 0, axis=1), 0.0, by)
+    by = (by - own @ (transposed(own) @ by)).reshape(len(shared), -1)
+    return by - shared @ (shared.T @ by)
+
+
+def _noise(along: Array, beside: Array, units: Array, less: float) -> Array:
     """Covariance (K' m, K' m) of the residuals ``units E P y`` by noise.
 
-    along : D (K', m, m), the readings' rows along their own unknowns; shared : F (K', m, a), along
+    along : D (K', m, m), the readings' rows along their own unknowns; beside : F (K', m, a), along
     those of all: ``H = E P E^T = 1 - D - F F^T``. Rows have unit variance, but readings are sharper
     than SOFT by the share ``less`` of it: the covariance of E P y is ``H - less H H``, written
     without a difference of numbers that are nearly the same.
     """
     n, m = along.shape[:2]
     block = (np.eye(m) - along) @ ((1 - less) * np.eye(m) + less * along)
-    flat = shared.reshape(n * m, -1)
+    flat = beside.reshape(n * m, -1)
     inner = less * (np.eye(flat.shape[1]) - flat.T @ flat) - (1 - less) * np.eye(flat.shape[1])
-    far = (units @ along @ shared).reshape(n * m, -1)
-    flat = (units @ shared).reshape(n * m, -1)
+    far = (units @ along @ beside).reshape(n * m, -1)
+    flat = (units @ beside).reshape(n * m, -1)
     out = flat @ inner @ flat.T - less * (far @ flat.T + flat @ far.T)
     k = np.arange(n)
     out.reshape(n, m, n, m)[k, :, k, :] += units @ block @ transposed(units)

@@ -18,7 +18,7 @@ from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.results import SavedCalibration
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import plain
-from pkmcal.judge.comparison import Comparison, compare
+from pkmcal.judge.comparison import BesideDrawing, compare
 from pkmcal.judge.holdouts import HoldOut, by_regions
 from pkmcal.judge.new_data import known_rows, look, read
 from pkmcal.judge.paths import LinePath, line_path, paths_of
@@ -43,7 +43,7 @@ class Validation:
     calibration: SavedCalibration
     session: Session
     verdict: Verdict
-    judged: Comparison | None
+    judged: BesideDrawing | None
     known: Booleans
     regions: tuple[HoldOut, ...]
     paths: tuple[LinePath, ...]

@@ -11,11 +11,11 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.judge.changes import POWER, ChangeTests, Explanation, LegTest, Suspect
-from pkmcal.judge.comparison import Comparison, Ratio, ratio, rms
+from pkmcal.judge.comparison import BesideDrawing, Ratio, ratio, rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
-from pkmcal.wording import SCALES, brief, count, decimals, listed, named, number
+from pkmcal.wording import SCALES, amount, brief, count, decimals, listed, named, number, with_unit
 
 MOSTLY_NOISE = 2**0.5
 """Factor on the photographs' noise within which that is more than half of the mean square."""
@@ -31,12 +31,6 @@ MOST_OTHERS = 4
 """Causes named beside the best; more are a table's."""
 
 
-def amount(value: float, unit: str) -> str:
-    """``0.07 mm``, ``0.3°``."""
-    scale, name = SCALES[unit]
-    return brief(value * scale) + ("" if name == "°" else " ") + name
-
-
 def factor(value: float) -> str:
     """A factor with the digits that it deserves."""
     if not np.isfinite(value):
@@ -50,7 +44,7 @@ def better(gain: Ratio) -> str:
 
 
 def validation_verdict(
-    judged: Comparison | None, holdouts: Sequence[HoldOut], machine: Machine
+    judged: BesideDrawing | None, holdouts: Sequence[HoldOut], machine: Machine
 ) -> Verdict:
     """The verdict on new data, or, without any, on the regions held out, pooled."""
     units = machine.joint_units
@@ -108,7 +102,7 @@ def _not_better(gain: Ratio) -> list[str]:
     ]
 
 
-def _broken(groups: Sequence[Comparison], units: tuple[str, ...]) -> list[str]:
+def _broken(groups: Sequence[BesideDrawing], units: tuple[str, ...]) -> list[str]:
     """Residuals that the deviations do not promise: the first group's that has such."""
     for group in groups:
         if not group.promise.usual:
@@ -118,7 +112,7 @@ def _broken(groups: Sequence[Comparison], units: tuple[str, ...]) -> list[str]:
     return []
 
 
-def _too_large(group: Comparison, units: tuple[str, ...]) -> str:
+def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> str:
     said = ""
     if len(set(units)) == 1:
         found = rms(group.figures(group.calibrated).joint_rms)
@@ -131,7 +125,7 @@ def _too_large(group: Comparison, units: tuple[str, ...]) -> str:
     )
 
 
-def _in_common(group: Comparison, units: tuple[str, ...]) -> str:
+def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> str:
     test = group.promise
     worst = int(np.argmax(np.abs(test.common) / test.common_sigma))
     off = amount(abs(float(test.common[worst])), units[worst])
@@ -243,13 +237,12 @@ def said(suspect: Suspect, cameras: Sequence[str] = (), short: bool = False) -> 
 
 def signed(value: float, sigma: float, unit: str) -> str:
     """``+0.31 mm (±0.04)``."""
-    factor, name = SCALES[unit]
+    scale, name = SCALES[unit]
     if not np.isfinite(sigma):
         return "an amount that these data do not tell"
-    places = decimals(sigma * factor)
-    gap = "" if name == "°" else " "
-    size = number(value * factor, places, signed=True)
-    return f"{size}{gap}{name} (±{number(sigma * factor, places)})"
+    places = decimals(sigma * scale)
+    size = with_unit(number(value * scale, places, signed=True), name)
+    return f"{size} (±{number(sigma * scale, places)})"
 
 
 def _ratio(value: float, sigma: float) -> str:
@@ -371,19 +364,20 @@ def _next(findings: Sequence[Explanation]) -> tuple[str, ...]:
 def _would_have(judged: ChangeTests) -> str:
     """What would have been found, in words."""
     zeros = [leg for leg in judged.legs if leg.zero is not None and leg.zero.dof]
-    sizes = np.array([leg.detects_zero for leg in zeros])
     if not zeros:
         return "no test of a leg fails"
-    unit = zeros[0].unit
-    factor, name = SCALES[unit]
-    low, high = brief(sizes.min() * factor), brief(sizes.max() * factor)
-    span = low if low == high else f"{low} to {high}"
-    gap = "" if name == "°" else " "
-    what = "leg's length" if unit == "m" else "motor's zero"
+    what = "leg's length" if zeros[0].unit == "m" else "motor's zero"
     return (
-        f"a change of any {what} by {span}{gap}{name}, depending on the leg, would have been"
-        f" found with a probability of {POWER:.0%}"
+        f"a change of any {what} by {with_unit(*found_from(zeros))}, depending on the leg, would"
+        f" have been found with a probability of {POWER:.0%}"
     )
+
+
+def found_from(legs: Sequence[LegTest]) -> tuple[str, str]:
+    """Smallest changes of the legs' zeros that would be found, such as ``0.3 to 0.5``, and unit."""
+    scale, name = SCALES[legs[0].unit]
+    sizes = [brief(f(leg.detects_zero for leg in legs) * scale) for f in (min, max)]
+    return " to ".join(dict.fromkeys(sizes)), name
 
 
 def _blind(legs: Sequence[LegTest]) -> tuple[str, ...]:
@@ -394,12 +388,10 @@ def _blind(legs: Sequence[LegTest]) -> tuple[str, ...]:
     if nothing:
         out.append(f"Of {named(j for leg in nothing for j in leg.legs)} these data tell nothing.")
     if little:
-        factor, name = SCALES[little[0].unit]
-        sizes = [brief(f(leg.detects_zero for leg in little) * factor) for f in (min, max)]
-        span = " to ".join(dict.fromkeys(sizes)) + ("" if name == "°" else " ") + name
         out.append(
             f"In {named(j for leg in little for j in leg.legs)} only a change of the reading's zero"
-            f" by {span} would be found, which is more than the drawing's tolerance."
+            f" by {with_unit(*found_from(little))} would be found, which is more than the drawing's"
+            " tolerance."
         )
     return tuple(out)
 

@@ -137,13 +137,13 @@ def _estimate(
     gauge = default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=False)
     batch = batch_of(machine, assembled, state)
-    edges = assembled.problem.block_residuals(batch)[0][assembled.row, assembled.place]
+    edges = assembled.edges.taken(assembled.problem.block_residuals(batch)[0])
     edges = np.nan_to_num(edges)
     distance = np.sqrt(np.sum(edges**2, axis=-1))
     middle = float(np.median(distance)) if distance.size else 0.0
     scale = max(middle / np.sqrt(2 * np.log(2)), 1.0)
     weight = (distance < NONE * scale).astype(float)
-    poses = assembled.problem.pose_residuals(batch)[0, assembled.pose_row, assembled.pose_place]
+    poses = assembled.poses.taken(assembled.problem.pose_residuals(batch)[0])
     n_poses, n_edges = float(measurements.poses.rows.sum()), float(2 * weight.sum())
     pose_scale = max(float(np.sqrt(np.sum(poses**2) / n_poses)) if n_poses else 1.0, 1.0)
     chi2 = float(np.sum(weight[:, None] * (edges / scale) ** 2))

@@ -198,6 +198,12 @@ def bar_chart(
     return BarChart(title, unit, alt, tuple(bars), high, ticks, labels, curve, note=note)
 
 
+def ends_and_middle(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:
+    """Labels of the first, the middle and the last bar, each under its own."""
+    last = len(bars) - 1
+    return tuple((k + 0.5, bars[k].label) for k in sorted({0, last // 2, last}) if bars)
+
+
 def panels(*charts: BarChart | RowChart | None, remarks: tuple[str, ...] = ()) -> Markup | str:
     """Charts beside each other, under what is remarkable in them; nothing without any."""
     there = [chart for chart in charts if chart]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from pkmcal.judge.comparison import Comparison, WeighedErrors, rms
+from pkmcal.judge.comparison import BesideDrawing, WeighedErrors, rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.judge.paths import LinePath, Straightness
 from pkmcal.judge.validate import Validation
-from pkmcal.judge.words import amount, better, factor
+from pkmcal.judge.words import better, factor
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
 from pkmcal.report import charts
 from pkmcal.session.load import Session
-from pkmcal.wording import SCALES, brief, count, decimals, number
+from pkmcal.wording import SCALES, amount, brief, count, decimals, number
 
 HOW = (
     "The machine is held as the calibration left it. Stations, boards and every pose of the"
@@ -52,7 +52,7 @@ def outcome_of(v: Validation) -> Outcome:
     )
 
 
-def _cards(judged: Comparison, session: Session) -> tuple[Figure, ...]:
+def _cards(judged: BesideDrawing, session: Session) -> tuple[Figure, ...]:
     """The main numbers."""
     new, old = judged.figures(judged.calibrated), judged.figures(judged.drawing)
     test, gain, unit = judged.promise, judged.ratio, _unit(session)
@@ -90,7 +90,7 @@ def _cards(judged: Comparison, session: Session) -> tuple[Figure, ...]:
     )
 
 
-def _readings(judged: Comparison, session: Session) -> Part:
+def _readings(judged: BesideDrawing, session: Session) -> Part:
     """New data: charts, the readings' residuals, [C] Table 3, and the tool point's errors."""
     old, new = judged.figures(judged.drawing), judged.figures(judged.calibrated)
     test = judged.promise
@@ -251,7 +251,7 @@ def _size(value: float, unit: str) -> str:
     return brief(value * SCALES[unit][0])
 
 
-def _by_configuration(judged: Comparison, session: Session) -> charts.BarChart | None:
+def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChart | None:
     """Residuals of the readings by configuration: bars of the calibrated machine, a line of the
     drawing.
     """
@@ -280,7 +280,7 @@ def _by_configuration(judged: Comparison, session: Session) -> charts.BarChart |
     )
 
 
-def _by_joint(judged: Comparison, session: Session) -> charts.RowChart | None:
+def _by_joint(judged: BesideDrawing, session: Session) -> charts.RowChart | None:
     """The calibrated machine's residuals in the standard deviations that are promised."""
     values = judged.calibrated.residuals / judged.promise.expected
     boxes = [

@@ -6,10 +6,10 @@ import numpy as np
 
 from pkmcal.judge.changes import POWER, ChiSquare, LegTest, Suspect
 from pkmcal.judge.watch import Watch, cameras_of
-from pkmcal.judge.words import amount, said, signed
+from pkmcal.judge.words import found_from, said, signed
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
 from pkmcal.report import charts
-from pkmcal.wording import SCALES, brief, count, named, number
+from pkmcal.wording import SCALES, amount, brief, count, named, number
 
 NONE = "–"
 LARGE = 2.0
@@ -96,12 +96,10 @@ def _cards(w: Watch) -> tuple[Figure, ...]:
     ]
     sizes = [leg for leg in judged.legs if leg.zero and leg.zero.dof]
     if sizes:
-        unit = SCALES[sizes[0].unit]
-        low, high = (f(leg.detects_zero for leg in sizes) * unit[0] for f in (min, max))
         out.append(
             Figure(
                 "What would have been found?",
-                ((brief(low) if low == high else f"{brief(low)} to {brief(high)}", unit[1]),),
+                (found_from(sizes),),
                 f"of the zero of a leg's reading, depending on the leg, with {POWER:.0%}"
                 " probability",
             )
@@ -126,7 +124,7 @@ def legs_table(w: Watch) -> Table:
                 _statistic(leg.zero),
                 chance_text(leg.chance),
                 _zero(leg),
-                _size(leg.detects_zero, leg.unit),
+                amount(leg.detects_zero, leg.unit) if np.isfinite(leg.detects_zero) else NONE,
                 _span(leg.detects_base),
                 _span(leg.detects_platform),
             ),
@@ -220,10 +218,6 @@ def _zero(leg: LegTest) -> str:
     if leg.change is None or leg.zero is None or not leg.zero.dof:
         return NONE
     return signed(float(leg.change.value[0]), float(leg.change.sigma[0]), leg.unit)
-
-
-def _size(value: float, unit: str) -> str:
-    return amount(value, unit) if np.isfinite(value) else NONE
 
 
 def _span(sizes: tuple[float, float]) -> str:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
@@ -18,7 +18,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.papers.hand_eye import Pair, PairProblem
-from pkmcal.solver import FIRST_DAMPING, eliminate, minimise
+from pkmcal.solver import FIRST_DAMPING, eliminate, inverse_root, minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
 LOOSE = 1e-9
@@ -71,8 +71,10 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     scale = np.where(scale > 0, scale, 1.0)
     s, vt = np.linalg.svd(np.linalg.qr(rows / scale[:, None], mode="r"))[1:]
     known: Booleans = s > LOOSE * s[:, :1]
-    draw = rng.normal(size=s.shape) * np.where(known, 1 / np.where(known, s, 1.0), 0.0)
-    return (np.swapaxes(vt, -1, -2) @ draw[..., None])[..., 0] / scale
+    spread = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
+    # the symmetric root, as singular vectors' signs are rounding's
+    draw = spread[..., None] * (vt @ rng.normal(size=s.shape)[..., None])
+    return (np.swapaxes(vt, -1, -2) @ draw)[..., 0] / scale
 
 
 class Places(NamedTuple):

@@ -1,0 +1,100 @@
+"""What goes into an identification and what comes out of it: plain, frozen, saveable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.mechanisms import Machine
+
+
+@dataclass(frozen=True)
+class State:
+    """One value of every unknown.
+
+    theta : (P,) machine parameters. T_camera_base : (S, 4, 4). T_base_platform : (K, 4, 4).
+    edge_shift : (C,) px outward, per camera. intrinsics : (C, r) change of each camera's from
+    ``Measurements.intrinsics_at``, in the same units; r = 0 where they are held.
+    T_mount : (M, 4, 4) boards in the frame of what they are fixed to, T_base_board or
+    T_platform_board by ``on_platform`` (M,). internal : (K, n) hinges of an articulated platform.
+    """
+
+    theta: Array
+    T_camera_base: Array
+    T_base_platform: Array
+    edge_shift: Array
+    intrinsics: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    T_mount: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    on_platform: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """How well the model explains the data.
+
+    chi2, dof : of all residuals in use (robust weights count as fractions of a datum).
+    chi2_edges, n_edges, chi2_joints, n_joints, chi2_drawing, n_drawing : by kind of residual.
+    steps : solver steps. stopped : reason in words. noise_scale : factor by which the edges'
+    stated standard deviations had to be enlarged (or shrunk) to agree with the residuals;
+    1 when they were taken as they are. chi2_poses, n_poses : of poses, six numbers of a full one;
+    pose_scale : the same factor of theirs. dof_edges, dof_joints, dof_poses : degrees of freedom
+    that each kind of residual has left; their sum and the drawing's is ``dof``.
+    """
+
+    chi2: float
+    dof: float
+    chi2_edges: float
+    n_edges: float
+    chi2_joints: float
+    n_joints: int
+    chi2_drawing: float
+    n_drawing: int
+    steps: int
+    stopped: str
+    noise_scale: float
+    chi2_poses: float = 0.0
+    n_poses: float = 0.0
+    pose_scale: float = 1.0
+    dof_edges: float = 0.0
+    dof_joints: float = 0.0
+    dof_poses: float = 0.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An identification's result, in the frames that ``gauge`` names.
+
+    machine : with the identified values. state : all unknowns.
+    covariance : (P, P) of the machine's parameters in that gauge; zero rows where fixed.
+    station_covariance : (S, 6, 6) of (omega, tau), left perturbation of T_camera_base.
+    edge_shift_sigma : (C,) px. intrinsics_covariance : (C, n, n) of the cameras' intrinsics
+    after refinement; n = 0 where they were held.
+    edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1.
+    joint_residuals : (K, m) in standard deviations.
+    data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
+        data decide; near 0, the value is the drawing's.
+    pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
+    mount_covariance : (M, 6, 6) of (omega, tau), left perturbation of T_mount.
+    configurations : (K,) True where the configuration was seen and its pose estimated.
+    gauge : its name for people.
+    """
+
+    machine: Machine
+    state: State
+    covariance: Array
+    station_covariance: Array
+    edge_shift_sigma: Array
+    edge_residuals: Array
+    edge_weights: Array
+    joint_residuals: Array
+    data_share: Array
+    configurations: Booleans
+    statistics: Statistics
+    gauge: str
+    intrinsics_covariance: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    pose_weights: Array = field(default_factory=lambda: np.zeros(0))
+    mount_covariance: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))

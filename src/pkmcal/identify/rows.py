@@ -1,0 +1,311 @@
+"""Residuals of all that is measured and their exact Jacobians, in standard deviations.
+
+Three kinds of rows, each in one place here:
+
+- **edges** (:class:`EdgeRows`), two each: ``L^-1 (basis^T n_predicted + shift * s)`` with L the
+  Cholesky factor of the edge's covariance. The measured normal is the true one moved by
+  ``basis @ (shift * s)`` when all edge points lie s px outward, and ``basis^T n_measured = 0``;
+  hence the plus sign.
+- **closures** (:func:`by_noise`), one a limb: ``c / (|dc/dq| sigma_q)``, [B] eq. 4, [C] eq. 5
+  whitened; what no reading enters (rods of constant length, joints' axes) is taken as perfect and
+  held to :data:`PERFECT`.
+- **poses** of boards (:func:`pose_rows`), six each: predicted as
+  ``T_camera_base T_base_platform T_platform_board``, or ``T_camera_base T_base_board`` for a board
+  fixed to the base ([A] 3.3). The error is the left perturbation (omega, tau) that leads from the
+  measured pose to the predicted one, whitened by the measurement's own noise.
+
+Measurements stand in K configurations of G places each, padded to a common count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.cylinders import EdgeNormals, edge_normal_jacobians
+from pkmcal.geometry.rigid import dot, pose_difference, skew
+from pkmcal.mechanisms.closure import LimbEnds, LimbLayout
+
+PERFECT = 1e-6
+"""Standard deviation (m) of closures without a reading: joints and rods without play. A third of
+a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Where the edges are: K configurations of G blocks, padded; the same for all runs.
+
+    Edges that share their noise are whitened together: a *block* is g edges (g = 1 for edges
+    fitted in photographs, g = 2 for the two edges that stand for a measured axis, [A] Table 1)
+    of one tube at one station, with one 2g x 2g whitening matrix and one robust weight.
+
+    leg, station, camera, radius : (K, G) leg, station, camera, position of the tube's radius.
+    side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
+    its station, whose edges are shaded alike in all photographs; empty where nothing is.
+    """
+
+    leg: Integers
+    station: Integers
+    camera: Integers
+    radius: Integers
+    side: Integers
+    present: Booleans
+    line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
+
+
+@dataclass(frozen=True)
+class Data:
+    """Numbers measured in each run; leading axis B, or 1 where all runs share them.
+
+    basis : (B, K, G, g, 3, 2). whiten : (B, K, G, 2g, 2g). optics : (B, K, G, 2g, w) change of
+    the measured normals, less the predicted ones', by the w unknowns of their camera: the edge
+    shift (px), then its intrinsics where they are refined (in units of their prior).
+    joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale squared.
+    """
+
+    basis: Array
+    whiten: Array
+    optics: Array
+    joints: Array
+    weight: Array
+
+
+@dataclass(frozen=True)
+class EdgeRows:
+    """The edges' rows at a state, and how they answer to what they depend on.
+
+    rot, origin : (B, K, G, 3, 3) and (..., 3) of T_camera_base. a, b : (B, K, G, 3) both ends of
+    their limbs in the camera frame. normals : predicted there, [B] eq. 3, with derivatives, last
+    axes (K, G, g).
+    """
+
+    blocks: Blocks
+    data: Data
+    ends: LimbEnds
+    rot: Array
+    origin: Array
+    a: Array
+    b: Array
+    normals: EdgeNormals
+
+    def value(self, optics: Array, shading: Array) -> Array:
+        """Rows (B, K, G, 2g), zero where they do not count, with cameras (B, C, w) and lines (B, n)
+        as they are.
+        """
+        rows = self._whitened(self.normals.n[..., None])
+        rows = (rows + self.by_optics @ optics[:, self.blocks.camera, :, None])[..., 0]
+        if shading.shape[-1]:  # a line's shading moves its edges as the camera's shift moves all
+            rows = rows + self.by_optics[..., 0] * shading[:, self.blocks.line, None]
+        return np.where((self.data.weight == 0)[..., None], 0.0, rows)
+
+    @cached_property
+    def by_optics(self) -> Array:
+        """By their camera's unknowns, (B or 1, K, G, 2g, w); by their line's shading the first."""
+        return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ self.data.optics)
+
+    @property
+    def by_machine(self) -> list[tuple[Integers, Array]]:
+        """By parameters at positions (K, G, n): (B, K, G, 2g, n) of both ends and of the radius."""
+        legs, k = self.blocks.leg, self._row
+        by_a, by_b = self.ends.a_by[:, k, legs], self.ends.b_by[:, k, legs]
+        return [
+            (self.ends.a_index[legs], self._by_a @ (self.rot @ by_a)),
+            (self.ends.b_index[legs], self._by_b @ (self.rot @ by_b)),
+            (self.blocks.radius[..., None], self._whitened(self.normals.dn_dradius[..., None])),
+        ]
+
+    @property
+    def by_station(self) -> Array:
+        """By their station's (omega, tau), (B, K, G, 2g, 6)."""
+        a, b = self.a - self.origin, self.b - self.origin
+        by_turn = -self._by_a @ skew(a) - self._by_b @ skew(b)
+        return np.concatenate([by_turn, self._by_a + self._by_b], axis=-1)
+
+    def by_own(self, ends_by_own: Array) -> Array:
+        """By the configuration's own unknowns, (B, K, G, 2g, d), from those of the limbs' ends on
+        the platform (B, K, L, 3, d).
+        """
+        return self._by_b @ (self.rot @ ends_by_own[:, self._row, self.blocks.leg])
+
+    @property
+    def _row(self) -> Integers:
+        return np.arange(len(self.blocks.leg))[:, None]
+
+    @cached_property
+    def _by_a(self) -> Array:
+        return self._whitened(self.normals.dn_da)
+
+    @cached_property
+    def _by_b(self) -> Array:
+        return self._whitened(self.normals.dn_db)
+
+    def _whitened(self, vectors: Array) -> Array:
+        """basis^T v, whitened and weighted: (B, K, G, g, 3, n) -> (B, K, G, 2g, n)."""
+        flat = np.swapaxes(self.data.basis, -1, -2) @ vectors
+        flat = flat.reshape(*flat.shape[:3], 2 * flat.shape[3], flat.shape[-1])
+        return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ flat)
+
+
+def edge_rows(
+    blocks: Blocks, data: Data, ends: LimbEnds, radius: Array, T_camera_base: Array
+) -> EdgeRows:
+    """Rows of the edges from both ends of the limbs, the blocks' radii (B, K, G) and the stations
+    (B, S, 4, 4).
+    """
+    k = np.arange(len(blocks.leg))[:, None]
+    station = T_camera_base[:, blocks.station]
+    rot, origin = station[..., :3, :3], station[..., :3, 3]
+    a, b = ((rot @ end[:, k, blocks.leg, :, None])[..., 0] + origin for end in (ends.a, ends.b))
+    normals = edge_normal_jacobians(
+        a[..., None, :], b[..., None, :], radius[..., None], blocks.side
+    )
+    return EdgeRows(blocks, data, ends, rot, origin, a, b, normals)
+
+
+def by_noise(layout: LimbLayout, joint_noise: float, by_reading: Array, rows: Array) -> Array:
+    """Rows (..., E, n) of the closure in standard deviations; the noise's own derivative is
+    multiplied by c = 0.
+
+    by_reading : (..., E). Rods on one motor share its reading's noise: with slopes g of the
+    motor's rows their covariance is ``sigma^2 g g^T + PERFECT^2``, whitened in closed form.
+    """
+    if not layout.shares_motors:
+        return rows / closure_sigma(layout, joint_noise, by_reading)[..., None]
+    for motor in range(layout.n_readings):
+        slope = np.where(layout.row_motor == motor, by_reading, 0.0)
+        size = np.sqrt(np.sum(slope**2, axis=-1, keepdims=True))
+        unit = slope / np.where(size > 0, size, 1.0)
+        less = 1 - PERFECT / np.hypot(PERFECT, joint_noise * size)
+        rows = rows - (less * unit)[..., None] * (unit[..., None, :] @ rows)
+    return rows / PERFECT
+
+
+def closure_sigma(layout: LimbLayout, joint_noise: float, by_reading: Array) -> Array:
+    """Standard deviation (..., E) of each closure where every motor moves one rod.
+
+    A crank in line with its rod does not move it, so no closure is sharper than a perfect one; a
+    rod that is read always moves with its reading.
+    """
+    rod = np.append(layout.rod_reads[layout.closing], np.zeros(len(layout.angles), dtype=bool))
+    sigma = np.abs(by_reading) * joint_noise
+    sigma = np.where(rod, sigma, np.maximum(sigma, PERFECT))
+    return np.where(layout.row_motor >= 0, sigma, PERFECT)
+
+
+def joint_rows(layout: LimbLayout, by_reading: Array, rows: Array) -> Array:
+    """Whitened closure rows (..., E) as one a reading, (..., m)."""
+    if not layout.shares_motors:
+        driven = layout.driven_rows
+        order = np.argsort(layout.row_motor[driven], kind="stable")
+        return rows[..., driven[order]]
+    motors = layout.row_motor[:, None] == np.arange(layout.n_readings)
+    slope = by_reading[..., None] * motors
+    size = np.sqrt(np.sum(slope**2, axis=-2, keepdims=True))
+    unit = slope / np.where(size > 0, size, 1.0)
+    return (np.swapaxes(unit, -1, -2) @ rows[..., None])[..., 0]
+
+
+@dataclass(frozen=True)
+class PoseBlocks:
+    """Where the poses are: K configurations of G poses, padded; the same for all runs.
+
+    station, mount, camera : (K, G). present : (K, G) False for padding. on_platform : (M,) of the
+    mounts.
+    """
+
+    station: Integers
+    mount: Integers
+    present: Booleans
+    on_platform: Booleans
+    camera: Integers
+
+
+def no_poses() -> PoseBlocks:
+    """A session without boards."""
+    none = np.zeros((1, 0), dtype=int)
+    return PoseBlocks(none, none, none.astype(bool), np.zeros(0, dtype=bool), none)
+
+
+@dataclass(frozen=True)
+class PoseData:
+    """Numbers measured in each run; leading axis B, or 1 where all runs share them.
+
+    T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). optics :
+    (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'.
+    """
+
+    T_station_target: Array = field(default_factory=lambda: np.zeros((1, 1, 0, 4, 4)))
+    whiten: Array = field(default_factory=lambda: np.zeros((1, 1, 0, 6, 6)))
+    weight: Array = field(default_factory=lambda: np.zeros((1, 1, 0)))
+    optics: Array = field(default_factory=lambda: np.zeros((1, 1, 0, 6, 1)))
+
+
+class PoseRows(NamedTuple):
+    """Rows (B, K, G, 6) and their derivatives, (B, K, G, 6, 6) each: by their station, by the
+    platform's pose and by their mount; by their camera's unknowns (B, K, G, 6, w).
+    """
+
+    value: Array
+    by_station: Array
+    by_platform: Array
+    by_mount: Array
+    by_optics: Array
+
+
+def pose_rows(
+    blocks: PoseBlocks,
+    data: PoseData,
+    T_camera_base: Array,
+    poses: Array,
+    T_mount: Array,
+    optics: Array,
+) -> PoseRows:
+    """Whitened errors of the predicted poses.
+
+    T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), optics
+    (B, C, w).
+    """
+    moving = blocks.on_platform[blocks.mount][..., None, None]
+    camera = T_camera_base[:, blocks.station]
+    body = np.where(moving, poses[:, :, None], np.eye(4))
+    mount = T_mount[:, blocks.mount]
+    rot_c, rot_b = camera[..., :3, :3], body[..., :3, :3]
+    arm = rot_b @ mount[..., :3, 3:]
+    place = rot_c @ (arm + body[..., :3, 3:])
+    predicted = camera @ body @ mount
+    error = pose_difference(predicted, data.T_station_target)
+    weigh = np.sqrt(data.weight)[..., None, None] * data.whiten
+    turn = turn_jacobian(error[..., :3])
+
+    def rows(by_turn: Array, by_shift_turn: Array, by_shift: Array) -> Array:
+        """Derivative by (omega, tau) from those of the pose's turn and place."""
+        out = np.zeros((*np.broadcast_shapes(by_turn.shape, place.shape)[:-2], 6, 6))
+        out[..., :3, :3], out[..., 3:, :3] = turn @ by_turn, by_shift_turn
+        out[..., 3:, 3:] = by_shift
+        return weigh @ out
+
+    eye, by_optics = np.eye(3), weigh @ data.optics
+    return PoseRows(
+        (weigh @ error[..., None] + by_optics @ optics[:, blocks.camera, :, None])[..., 0],
+        rows(eye, -skew(place[..., 0]), eye),
+        np.where(moving, rows(rot_c, -rot_c @ skew(arm[..., 0]), rot_c), 0.0),
+        rows(rot_c @ rot_b, np.zeros((3, 3)), rot_c @ rot_b),
+        by_optics,
+    )
+
+
+def turn_jacobian(phi: Array) -> Array:
+    """Change of a rotation vector (..., 3) by a further turn from the left, (..., 3, 3).
+
+    The inverse left Jacobian of SO(3), with its series near zero.
+    """
+    angle2 = dot(phi, phi)[..., None, None]
+    small = angle2 < 1e-6
+    angle = np.sqrt(np.where(small, 1.0, angle2))
+    exact = (1 - 0.5 * angle * np.cos(angle / 2) / np.sin(angle / 2)) / np.where(small, 1, angle2)
+    k = skew(phi)
+    return np.eye(3) - 0.5 * k + np.where(small, 1 / 12 + angle2 / 720, exact) * (k @ k)

@@ -1,0 +1,119 @@
+"""The unknowns of the joint estimate: their names, their columns, and their values in many runs.
+
+Shared by all configurations, in this order of columns:
+
+- **machine** : free combinations z of its parameters, ``theta = drawing + free z``.
+- **stations** : left perturbation (omega, tau) of each T_camera_base.
+- **optics** : of each camera its edge shift (px), then its intrinsics where they are refined (in
+  units of their prior).
+- **shading** : shift (px) of each tube's side at each station, where light gives it one.
+- **mounts** : left perturbation of each T_mount, of boards and targets.
+
+Each configuration has unknowns of its own besides: the platform's motion (left perturbation of
+T_base_platform, along the directions that the machine has) and, on an articulated platform, its
+hinges; :attr:`~pkmcal.mechanisms.closure.LimbLayout.own_motion` says how.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+
+Name = Literal["machine", "stations", "edge shifts", "intrinsics", "optics", "shading", "mounts"]
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """How many of each there are, and so in which columns each stands.
+
+    n_free : of the machine. n_optics : of each camera, one and the refined intrinsics. n_lines :
+    tubes' sides at stations with a shading of their own.
+    """
+
+    n_free: int
+    n_stations: int
+    n_cameras: int
+    n_optics: int = 1
+    n_lines: int = 0
+    n_mounts: int = 0
+
+    @property
+    def machine(self) -> slice:
+        """The machine's columns."""
+        return slice(0, self.n_free)
+
+    @property
+    def stations(self) -> slice:
+        """The stations' columns, six each."""
+        return slice(self.n_free, self.n_free + 6 * self.n_stations)
+
+    @property
+    def optics(self) -> slice:
+        """The cameras' columns, ``n_optics`` each."""
+        first = self.stations.stop
+        return slice(first, first + self.n_cameras * self.n_optics)
+
+    @property
+    def shading(self) -> slice:
+        """The lines' columns."""
+        return slice(self.optics.stop, self.optics.stop + self.n_lines)
+
+    @property
+    def mounts(self) -> slice:
+        """The mounts' columns, six each."""
+        return slice(self.shading.stop, self.shading.stop + 6 * self.n_mounts)
+
+    @property
+    def count(self) -> int:
+        """Number of shared unknowns, na."""
+        return self.mounts.stop
+
+    def columns(self, *names: Name) -> Integers:
+        """Where the named unknowns stand, in increasing order."""
+        optics = np.arange(self.optics.start, self.optics.stop).reshape(-1, self.n_optics)
+        where: dict[str, Integers] = {
+            "edge shifts": optics[:, 0],
+            "intrinsics": optics[:, 1:].ravel(),
+        }
+        for name in ("machine", "stations", "optics", "shading", "mounts"):
+            part: slice = getattr(self, name)
+            where[name] = np.arange(part.start, part.stop)
+        none = np.zeros(0, dtype=int)
+        return np.unique(np.concatenate([none, *(where[name] for name in names)]))
+
+
+def own_blocks(matrix: Array, part: slice, width: int) -> Array:
+    """Each one's own block of a covariance, (n, width, width), of unknowns ``width`` wide each."""
+    n = (part.stop - part.start) // width
+    own = matrix[part, part].reshape(n, width, n, width)
+    return np.einsum("iaib->iab", own)
+
+
+@dataclass(frozen=True)
+class BatchState:
+    """Values of the unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
+    T_base_platform (B, K, 4, 4), optics (B, C, w), T_mount (B, M, 4, 4) of boards,
+    internal (B, K, n) of articulated platforms, shading (B, n) px, outward, of the lines.
+    """
+
+    z: Array
+    T_camera_base: Array
+    T_base_platform: Array
+    optics: Array
+    T_mount: Array = field(default_factory=lambda: np.zeros((0, 0, 4, 4)))
+    internal: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    shading: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        """Runs without boards or hinges get none each, so that all fields select alike."""
+        if len(self.T_mount) != len(self.z):
+            object.__setattr__(self, "T_mount", np.zeros((len(self.z), 0, 4, 4)))
+        if len(self.internal) != len(self.z):
+            none = np.zeros((*self.T_base_platform.shape[:2], 0))
+            object.__setattr__(self, "internal", none)
+        if len(self.shading) != len(self.z):
+            object.__setattr__(self, "shading", np.zeros((len(self.z), 0)))
