@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pkmcal.calibration.source import load_source
 from pkmcal.export.c import SOURCE, CSource, c_array
-from pkmcal.export.source import load_source, samples
+from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pkmcal.calibration.source import Source
 from pkmcal.cameras.files import save_camera
 from pkmcal.cameras.pinhole import Pinhole
-from pkmcal.export.source import Source
 from pkmcal.files import json_text
 from pkmcal.geometry.rigid import inverse, look_at
 from pkmcal.mechanisms import load_mechanism, mechanism_text

@@ -10,12 +10,13 @@ import yaml
 
 from conftest import run
 from export_sources import CAMERA, built, calibration, source_of
+from pkmcal.calibration.source import load_source
 from pkmcal.cameras.files import read_camera
 from pkmcal.cameras.unified import Unified
 from pkmcal.errors import InputError, ResultError
 from pkmcal.export import ros
 from pkmcal.export.contract import Difference, export, exporters, quaternion
-from pkmcal.export.source import load_source, samples
+from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import apply, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers

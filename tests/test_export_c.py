@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from export_sources import built, source_of
+from pkmcal.calibration.source import load_source
 from pkmcal.errors import InputError
 from pkmcal.export.c import END, FOLDER, CSource
 from pkmcal.export.contract import export
-from pkmcal.export.source import load_source, samples
+from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import catalogue, load_mechanism
 

@@ -13,7 +13,7 @@ from pkmcal.export import klipper, linuxcnc, reprap
 from pkmcal.export.contract import export, exporters
 from pkmcal.export.delta import DEGREE, MM, Freedoms, delta_of, fitted, reach
 from pkmcal.export.linuxcnc import linear_joints, rotary_joints
-from pkmcal.export.source import samples
+from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import perturb, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.outcome import Level

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from mujoco_machines import ALL, CATALOGUE, LOUD, MADE, TURNED, Simulated, machine_of, made
+from pkmcal.calibration.source import Source
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.export.contract import exporters
 from pkmcal.export.mujoco_model import home_state
 from pkmcal.export.mujoco_read import read
-from pkmcal.export.source import Source, samples
+from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import catalogue
 from pkmcal.mechanisms.carriers.crank import Crank

@@ -10,11 +10,13 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import pkmcal
 from mujoco_machines import Simulated
 from pkmcal.export.c import numbers_of
 
@@ -167,12 +169,11 @@ def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("carrier")
     (folder / "my_carriers.py").write_text(CARRIER)
     (folder / "mixed.yaml").write_text(MACHINE)
-    import pkmcal
-
     paths = (str(Path(pkmcal.__file__).parents[1]), str(folder))
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     environment["PKMCAL_CARRIERS"] = "my_carriers"
 
+    @cache
     def of(name):
         words = ("export", str(folder / "mixed.yaml"), "--to", name, "-o", str(folder / name))
         done = subprocess.run(

@@ -58,6 +58,16 @@ def wrong(error: PkmcalError, station: str | None = None) -> Finding:
     return Finding(Level.WRONG, str(error), station)
 
 
+def doubtful(text: str, station: str | None = None) -> Finding:
+    """What costs accuracy."""
+    return Finding(Level.DOUBTFUL, text, station)
+
+
+def note(text: str, station: str | None = None) -> Finding:
+    """What is worth knowing."""
+    return Finding(Level.NOTE, text, station)
+
+
 @dataclass(frozen=True)
 class Figure:
     """A card: one number that answers a question; ``values`` are (number, unit) pairs."""

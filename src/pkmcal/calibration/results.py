@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import ConfigDict, Field
 
 from pkmcal import __version__
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import (
     Document,
@@ -332,23 +332,29 @@ def _configurations(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def _residuals(calibration: Calibration) -> dict[str, Any]:
-    """One row an edge, and one a pose, whitened."""
-    edges, estimate = calibration.observation.edges, calibration.estimate
-    whole = [edges.station, edges.configuration, edges.leg, edges.tube, edges.side]
-    reals = np.column_stack([estimate.edge_weights, estimate.edge_residuals])
-    numbers = np.column_stack(whole) + 1
-    rows = [
-        [*place, *values]
-        for place, values in zip(numbers.tolist(), np.round(reals, 3).tolist(), strict=True)
-    ]
-    found = calibration.measurements.poses
-    reals = np.column_stack([estimate.pose_weights, estimate.pose_residuals])
-    numbers = np.column_stack([found.station, found.configuration, found.mount]) + 1
-    poses = [
-        [*place, *values]
-        for place, values in zip(numbers.tolist(), np.round(reals, 3).tolist(), strict=True)
-    ]
-    return {"columns": EDGE_COLUMNS, "edges": rows, "pose_columns": POSE_COLUMNS, "poses": poses}
+    """One row an edge, and one a pose, whitened; what they are of, by numbers from 1."""
+    estimate = calibration.estimate
+
+    def rows(places: Sequence[Integers], *reals: Array) -> list[list[float]]:
+        numbers = (np.column_stack(places) + 1).tolist()
+        values = np.round(np.column_stack(reals), 3).tolist()
+        return [[*place, *more] for place, more in zip(numbers, values, strict=True)]
+
+    edges, poses = calibration.observation.edges, calibration.measurements.poses
+    return {
+        "columns": EDGE_COLUMNS,
+        "edges": rows(
+            (edges.station, edges.configuration, edges.leg, edges.tube, edges.side),
+            estimate.edge_weights,
+            estimate.edge_residuals,
+        ),
+        "pose_columns": POSE_COLUMNS,
+        "poses": rows(
+            (poses.station, poses.configuration, poses.mount),
+            estimate.pose_weights,
+            estimate.pose_residuals,
+        ),
+    }
 
 
 def _rejected(calibration: Calibration) -> list[dict[str, Any]]:
@@ -426,14 +432,6 @@ class _Part(Schema):
     model_config = ConfigDict(extra="ignore")
 
 
-class _Verdict(_Part):
-    usable: bool
-    headline: str
-    reasons: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
-
-
 class _Parameter(_Part):
     name: str
     drawing: float
@@ -458,7 +456,7 @@ class _Configuration(_Part):
 
 class _Saved(_Part):
     pkmcal_calibration: Literal[1] = Field(description="the file's version, 1")
-    verdict: _Verdict
+    verdict: Verdict
     method: str
     seed: int
     gauge: str
@@ -487,8 +485,17 @@ def load(source: Path | str) -> SavedCalibration:
         gauge=saved.gauge,
         method=saved.method,
         seed=saved.seed,
-        verdict=Verdict(**saved.verdict.model_dump()),
-        stations=tuple(_station(station) for station in saved.stations),
+        verdict=saved.verdict,
+        stations=tuple(
+            SavedStation(
+                station.name,
+                station.camera,
+                np.array(station.T_base_camera),
+                np.array(station.sigma_rotation),
+                np.array(station.sigma_translation),
+            )
+            for station in saved.stations
+        ),
         configurations=tuple(c.name for c in saved.configurations),
         used=np.array([c.used for c in saved.configurations], dtype=bool),
         joints=np.array([c.joints for c in saved.configurations]).reshape(-1, machine.n_joints),
@@ -564,14 +571,4 @@ def _edited(document: Document, field: str, expected: str) -> InputError:
         where=f"{document.label}, {field}",
         expected=expected,
         next_step="Calibrate again; this file was changed after it was written",
-    )
-
-
-def _station(saved: _Station) -> SavedStation:
-    return SavedStation(
-        saved.name,
-        saved.camera,
-        np.array(saved.T_base_camera),
-        np.array(saved.sigma_rotation),
-        np.array(saved.sigma_translation),
     )

@@ -41,7 +41,19 @@ from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.observe import legs
 from pkmcal.observe.images import decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
-from pkmcal.outcome import Finding, Level, Mark, Outcome, Part, Row, Table, Verdict, wrong
+from pkmcal.outcome import (
+    Finding,
+    Level,
+    Mark,
+    Outcome,
+    Part,
+    Row,
+    Table,
+    Verdict,
+    doubtful,
+    note,
+    wrong,
+)
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.session.photographs import label_of
 from pkmcal.session.starter import untouched_files
@@ -124,13 +136,13 @@ class StationCheck:
     name: str
     photographs: int
     recognised: bool
-    mismatch: float
-    moved: float
-    turned: float
-    legs: float
-    saturated: float
-    black: float
-    blur: float
+    mismatch: float = math.nan
+    moved: float = math.nan
+    turned: float = math.nan
+    legs: float = math.nan
+    saturated: float = math.nan
+    black: float = math.nan
+    blur: float = math.nan
     board: BoardCheck | None = None
 
 
@@ -148,7 +160,7 @@ class SessionCheck:
     configurations: int = 0
     stations: tuple[StationCheck, ...] = ()
     joints: tuple[JointCheck, ...] = ()
-    singularity: float = float("nan")
+    singularity: float = math.nan
     assemblies: int = 0
 
     @property
@@ -181,20 +193,21 @@ def check_session(
 def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
     """:func:`check_session`, step by step."""
     told("Reading the session", 0.0)
-    findings = [Finding(Level.DOUBTFUL, text) for text in untouched_files(folder)]
+    findings = [doubtful(text) for text in untouched_files(folder)]
     try:
         session = load_session(folder)
     except PkmcalError as error:
         return SessionCheck(str(folder), (wrong(error), *findings))
-    findings += [Finding(Level.NOTE, text) for text in session.warnings]
+    findings += [note(text) for text in session.warnings]
     told("Reading photographs", 0.1)
     photographs, broken = _decoded(session)
     told("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
-    seen = _observed(session, photographs, motion.poses, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    stations, seen = _observed(session, photographs, motion.poses, rng)
     joints = joint_checks(session)
-    findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
-    for station in seen.stations:
+    findings += [*broken, *motion.findings, *seen, *joint_findings(session, joints)]
+    for station in stations:
         findings += _station_findings(station, session.machine.n_legs)
     return SessionCheck(
         folder=str(folder),
@@ -202,7 +215,7 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
         machine=session.machine.name,
         n_legs=session.machine.n_legs,
         configurations=len(session.configurations),
-        stations=seen.stations,
+        stations=stations,
         joints=joints,
         singularity=motion.singularity,
         assemblies=motion.assemblies,
@@ -250,13 +263,12 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
         found = session.machine.forward_result(session.joints, poses)
         modes = session.machine.assembly_modes(session.joints[0], rng)
     except PkmcalError as error:
-        return _Motion(None, float("nan"), 0, (wrong(error),))
+        return _Motion(None, math.nan, 0, (wrong(error),))
     findings: list[Finding] = []
     weak = [session.configurations[k] for k in np.flatnonzero(found.singularity < NEAR_SINGULAR)]
     if weak:
         findings.append(
-            Finding(
-                Level.DOUBTFUL,
+            doubtful(
                 f"Near a singular pose in configuration {listed(weak)}: there the readings hardly"
                 " say where the platform is. Leave them out.",
             )
@@ -264,8 +276,7 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
     turns = np.linalg.norm(pose_difference(modes, poses[0])[:, :3], axis=-1)
     if np.any((turns > 1e-3) & (turns < OTHER_MODE)):
         findings.append(
-            Finding(
-                Level.DOUBTFUL,
+            doubtful(
                 f"At configuration {session.configurations[0]} the same readings allow another"
                 f" pose, turned by only {np.rad2deg(turns[turns > 1e-3].min()):.0f} degrees."
                 " Give home: {position: ...} in the mechanism file, near the machine's real pose.",
@@ -274,26 +285,29 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
     return _Motion(poses, float(found.singularity.min()), len(modes), tuple(findings))
 
 
-@dataclass(frozen=True)
-class _Seen:
-    stations: tuple[StationCheck, ...]
-    findings: tuple[Finding, ...] = ()
-
-
 def _observed(
     session: Session,
     photographs: list[legs.Photographs | None],
     poses: Array | None,
     rng: np.random.Generator,
-) -> _Seen:
-    """What the photographs of every station show."""
+) -> tuple[tuple[StationCheck, ...], tuple[Finding, ...]]:
+    """What the photographs of every station show, and what is to be said of it."""
     whole = [p for p in photographs if p is not None]
+
+    def unlooked() -> tuple[StationCheck, ...]:
+        """Stations in which the machine could not even be looked for."""
+        n_legs, found = session.machine.n_legs, zip(session.stations, photographs, strict=True)
+        return tuple(
+            _summary(station, unrecognised_quality(p.images if p else [], n_legs), recognised=False)
+            for station, p in found
+        )
+
     try:
         check_observable(session)
     except InputError as error:
-        return _Seen(_unlooked(session, photographs), (wrong(error),))
+        return unlooked(), (wrong(error),)
     if poses is None or len(whole) < len(legs_stations(session)):
-        return _Seen(_unlooked(session, photographs))
+        return unlooked(), ()
     # Of photographs that are broken is told already.
     lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
     boards = BoardsCheck()
@@ -301,47 +315,25 @@ def _observed(
         boards = check_boards(session, board_images(session, whole))
         lost = any(finding.level is Level.WRONG for finding in boards.findings)
     if lost and any(station.T_camera_base is None for station in session.stations):
-        return _Seen(_unlooked(session, photographs), boards.findings)
+        return unlooked(), boards.findings
     told = (*boards.findings, *(() if lost else pose_findings(session, boards.boards)))
     rngs = rng.spawn(len(whole) + 1)
     try:
         starts = None if lost else known_stations(session, boards.boards)
     except PkmcalError as error:
-        return _Seen(_unlooked(session, photographs), (wrong(error), *boards.findings))
+        return unlooked(), (wrong(error), *boards.findings)
     found = recognise(session, whole, poses, rngs[1:], boards.boards, starts)
-    looked = {p.station: _station(session, p, found, poses) for p in whole}
-    stations = tuple(
-        replace(
-            looked.get(k, _board_alone(station, k in boards.checks)), board=boards.checks.get(k)
-        )
+    stations = [  # as it is known of one that observes no legs
+        StationCheck(station.name, len(station.photographs), k in boards.checks)
         for k, station in enumerate(session.stations)
-    )
+    ]
+    for p in whole:
+        stations[p.station] = _station(session, p, found, poses)
+    stations = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
     if found.complete:
-        return _Seen(stations, told)
+        return stations, told
     why = why_unrecognised(session, whole, found, rngs[0])
-    return _Seen(stations, (wrong(why), *told))
-
-
-def _board_alone(station: Station, seen: bool) -> StationCheck:
-    """A station that observes no legs."""
-    nan = float("nan")
-    return StationCheck(
-        station.name, len(station.photographs), seen, nan, nan, nan, nan, nan, nan, nan
-    )
-
-
-def _unlooked(
-    session: Session, photographs: list[legs.Photographs | None]
-) -> tuple[StationCheck, ...]:
-    """Stations in which the machine could not even be looked for."""
-    return tuple(
-        _summary(
-            station,
-            unrecognised_quality(p.images if p else [], session.machine.n_legs),
-            recognised=False,
-        )
-        for station, p in zip(session.stations, photographs, strict=True)
-    )
+    return stations, (wrong(why), *told)
 
 
 def _station(
@@ -368,20 +360,16 @@ def _station(
 
 
 def _summary(station: Station, what: Quality, recognised: bool) -> StationCheck:
-    nan = float("nan")
     some = len(what.saturated) > 0
     blur = what.blur[np.isfinite(what.blur)]
     return StationCheck(
         name=station.name,
         photographs=len(station.photographs),
         recognised=recognised,
-        mismatch=nan,
-        moved=nan,
-        turned=nan,
         legs=float(what.legs.sum(axis=1).mean()) if some else 0.0,
-        saturated=float(what.saturated.mean()) if some else nan,
-        black=float(what.black.mean()) if some else nan,
-        blur=float(np.median(blur)) if blur.size else nan,
+        saturated=float(what.saturated.mean()) if some else math.nan,
+        black=float(what.black.mean()) if some else math.nan,
+        blur=float(np.median(blur)) if blur.size else math.nan,
     )
 
 
@@ -410,7 +398,7 @@ def _station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
             f"Only {station.legs:.1f} of {n_legs} legs are found in a photograph on average."
             " Move the camera back or aside, so that it sees the legs one beside the other."
         )
-    return [Finding(Level.DOUBTFUL, f"{station.name}: {t}", station.name) for t in texts]
+    return [doubtful(f"{station.name}: {t}", station.name) for t in texts]
 
 
 # ------------------------------------------------------------------ boards
@@ -470,34 +458,35 @@ def _board_check(one: StationBoard) -> BoardCheck:
         corners=float(seen.views.seen.sum(axis=1).mean()),
         corners_of=len(seen.board.points),
         rms=float(np.median(seen.rms)),
-        scatter=stood.scatter if stood else float("nan"),
+        scatter=stood.scatter if stood else math.nan,
         distance=float(np.median(np.linalg.norm(seen.poses.T_camera_board[:, :3, 3], axis=-1))),
         unseen=_unseen(one),
     )
 
 
 def _board_findings(session: Session, number: int, check: BoardCheck) -> list[Finding]:
-    station = session.stations[number]
-    texts: list[tuple[Level, str]] = []
+    name = session.stations[number].name
+    found: list[Finding] = []
     if check.rms > POOR_CORNERS:
         text = (
-            f"The board's corners lie {check.rms:.2g} px off their places, rms; a flat board, a"
-            " sharp photograph and the right camera file leave a tenth of a pixel."
+            f"{name}: The board's corners lie {check.rms:.2g} px off their places, rms; a flat"
+            " board, a sharp photograph and the right camera file leave a tenth of a pixel."
         )
-        texts.append((Level.DOUBTFUL, text))
+        found.append(doubtful(text, name))
     if check.unseen:
         text = (
-            f"{check.unseen.capitalize()} of the board's corners is in no photograph: does the"
-            " board have as many squares as its file says?"
+            f"{name}: {check.unseen.capitalize()} of the board's corners is in no photograph: does"
+            " the board have as many squares as its file says?"
         )
-        texts.append((Level.DOUBTFUL, text))
-    if session.board_body == "base" and check.found == 1 and len(station.photographs) > 1:
+        found.append(doubtful(text, name))
+    photographs = len(session.stations[number].photographs)
+    if session.board_body == "base" and check.found == 1 and photographs > 1:
         text = (
-            "Only one photograph shows the board on the base, so nobody can tell whether it, or"
-            " the camera, stood still."
+            f"{name}: Only one photograph shows the board on the base, so nobody can tell whether"
+            " it, or the camera, stood still."
         )
-        texts.append((Level.NOTE, text))
-    return [Finding(level, f"{station.name}: {text}", station.name) for level, text in texts]
+        found.append(note(text, name))
+    return found
 
 
 # ------------------------------------------------------------------ readings and poses
@@ -505,21 +494,14 @@ def _board_findings(session: Session, number: int, check: BoardCheck) -> list[Fi
 
 def joint_checks(session: Session) -> tuple[JointCheck, ...]:
     """All joints' readings."""
-    return tuple(_joint(session, k) for k in range(session.joints.shape[1]))
-
-
-def _joint(session: Session, column: int) -> JointCheck:
-    values = session.joints[:, column]
-    low, high = session.machine.joint_ranges[column]
-    stroke = high - low
-    ends = (int(np.sum(values < low + END * stroke)), int(np.sum(values > high - END * stroke)))
-    return JointCheck(
-        name=session.document["joints"]["columns"][column],
-        low=float(values.min()),
-        high=float(values.max()),
-        used=float(np.ptp(values) / stroke),
-        ends=ends,
-    )
+    found: list[JointCheck] = []
+    for k, name in enumerate(session.document["joints"]["columns"]):
+        values, (low, high) = session.joints[:, k], session.machine.joint_ranges[k]
+        stroke = high - low
+        ends = (int(np.sum(values < low + END * stroke)), int(np.sum(values > high - END * stroke)))
+        used = float(np.ptp(values) / stroke)
+        found.append(JointCheck(name, float(values.min()), float(values.max()), used, ends))
+    return tuple(found)
 
 
 def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Finding]:
@@ -528,8 +510,7 @@ def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Fin
     crowded = [joint for joint in joints if joint.used < LITTLE_USED]
     if crowded:
         findings.append(
-            Finding(
-                Level.NOTE,
+            note(
                 f"{listed([joint.name for joint in crowded])} used little of the range (down to"
                 f" {min(joint.used for joint in crowded):.0%}): readings near both ends of it"
                 " halve the standard deviations of the offsets.",
@@ -538,8 +519,7 @@ def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Fin
     count = len(session.configurations)
     if count < FEW_CONFIGURATIONS:
         findings.append(
-            Finding(
-                Level.NOTE,
+            note(
                 f"There are only {count} configurations: standard deviations will be large and"
                 " mistakes hard to notice. 15 or more are usual.",
             )
@@ -554,14 +534,14 @@ def pose_findings(session: Session, boards: Boards) -> list[Finding]:
     try:
         measurements = measurements_of(session, boards)
         turns = turning(session, measurements.poses, measurements.on_platform)
-        findings = [Finding(Level.DOUBTFUL if bad else Level.NOTE, text) for bad, text in turns]
+        findings = [doubtful(text) if bad else note(text) for bad, text in turns]
         if any("legs" in station.observe for station in session.stations):
             return findings
         return findings + _fit(session, boards)
     except InputError as error:
         return [wrong(error)]
     except PkmcalError as error:
-        return [Finding(Level.DOUBTFUL, str(error))]
+        return [doubtful(str(error))]
 
 
 def _fit(session: Session, boards: Boards) -> list[Finding]:
@@ -577,7 +557,7 @@ def _fit(session: Session, boards: Boards) -> list[Finding]:
     better = min(richer, key=lambda model: model.scale, default=None)
     told = f" With --model {better.name} it is {better.scale:.2f} times." if better else ""
     text = f"The machine explains the measured poses only to {scale:.1f} times their noise.{told}"
-    return [Finding(Level.DOUBTFUL, text)]
+    return [doubtful(text)]
 
 
 # ------------------------------------------------------------------ in words

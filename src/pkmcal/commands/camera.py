@@ -20,7 +20,7 @@ FILES = {
 OTHERS = {"opencv": "camera.opencv.yaml", "ros": "camera.ros.yaml", "kalibr": "camera.kalibr.yaml"}
 
 
-class Model(StrEnum):
+class CameraModel(StrEnum):
     """Which camera model."""
 
     AUTO = "auto"
@@ -50,8 +50,9 @@ def camera(
         typer.Option(metavar="FILE", help="The board's file; board.yaml beside them unless given."),
     ] = None,
     model: Annotated[
-        Model, typer.Option(metavar="NAME", help="auto, pinhole, fisheye, or unified (mirrors).")
-    ] = Model.AUTO,
+        CameraModel,
+        typer.Option(metavar="NAME", help="auto, pinhole, fisheye, or unified (mirrors)."),
+    ] = CameraModel.AUTO,
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="DIR", help="Where the results go.")
     ] = Path("camera"),

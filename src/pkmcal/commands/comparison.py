@@ -38,7 +38,7 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class AgainstTruth:
     """Errors before and after; count : values with a standard deviation, within : of them,
     those nearer to the truth than two of theirs.
     """
@@ -53,12 +53,12 @@ class Comparison:
         return asdict(self)
 
 
-def compare(calibration: Calibration, session_folder: Path) -> Comparison:
+def compare(calibration: Calibration, session_folder: Path) -> AgainstTruth:
     """Compare with ``truth.json`` in the session's folder."""
     drawing = calibration.session.machine
     truth = load_truth(session_folder, drawing)
     off = _in_sigmas(calibration, truth)
-    return Comparison(
+    return AgainstTruth(
         drawing=_errors(drawing, truth),
         calibrated=_errors(calibration.machine, truth),
         count=off.size,

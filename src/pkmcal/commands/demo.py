@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pkmcal.calibration.calibrate import Calibration
-    from pkmcal.commands.comparison import Comparison
+    from pkmcal.commands.comparison import AgainstTruth
 
 HERE = Path("pkmcal-demo")
 SESSION, CALIBRATION = "session", "calibration"
@@ -120,7 +120,7 @@ def _calibrate(session: Path, told: console.Progress) -> Calibration:
     return calibrate(session, progress=lambda text, share: told(text, SIMULATING + rest * share))
 
 
-def _tell_comparison(out: Console, found: Comparison) -> None:
+def _tell_comparison(out: Console, found: AgainstTruth) -> None:
     """Errors before and after, and whether the standard deviations were honest."""
     from pkmcal.outcome import Row, Table
 

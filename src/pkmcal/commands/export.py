@@ -12,8 +12,8 @@ from pkmcal.commands import console
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from pkmcal.calibration.source import Source
     from pkmcal.export.contract import Export
-    from pkmcal.export.source import Source
 
 
 def export(
@@ -46,9 +46,9 @@ def export(
     as_json: console.Json = False,
 ) -> int:
     """Write the machine for a controller, a firmware or a simulator."""
+    from pkmcal.calibration.source import load_source
     from pkmcal.export.contract import export as run
     from pkmcal.export.contract import exporter_of, write
-    from pkmcal.export.source import load_source
 
     exporter_of(to)
     source = load_source(calibration, session)

@@ -46,7 +46,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 
 if TYPE_CHECKING:
-    from pkmcal.export.source import Source
+    from pkmcal.calibration.source import Source
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def calibrated_station(
     calibration that was refused.
     """
     from pkmcal.calibration.results import load
-    from pkmcal.export.source import load_source
+    from pkmcal.calibration.source import load_source
 
     saved = load(folder)
     if not saved.verdict.usable:

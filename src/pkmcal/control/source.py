@@ -9,11 +9,11 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.results import SavedCalibration, SavedStation, load
+from pkmcal.calibration.source import Source, load_source
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.control.seen import seen_machine
 from pkmcal.control.study import Scene, Uncertainty
 from pkmcal.errors import InputError
-from pkmcal.export.source import Source, load_source
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.simulation.demo import demo_camera

@@ -15,9 +15,10 @@ from typing import Any, ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
 from pkmcal.export.contract import Difference, Exporter, exact, largest
 from pkmcal.export.limbs import CONSTANT, FLOAT, SLIDE, TURN, Limbs, rods_of
-from pkmcal.export.source import Source, samples
+from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import cross, dot, perturb
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import inverse_result
@@ -27,6 +28,7 @@ FOLDER = Path(__file__).parent / "c_source"
 HEADER, SOURCE, SELFTEST = "pkmcal_kinematics.h", "pkmcal_kinematics.c", "pkmcal_selftest.c"
 BEGIN = "/* ---- the machine ---- */\n"
 END = "/* ---- what follows is the same for every machine ---- */\n"
+NEXT_LINE = "\n    "
 PAIRS = 12
 ROUNDING = 1e-12
 """m, rad: a thousand times the rounding of a double at 1 m; poses themselves close to it."""
@@ -175,7 +177,7 @@ def _tables(machine: Machine, rods: Limbs) -> str:
             f"/* {note} */\nstatic const int FREE[FREEDOMS] = {{{', '.join(map(str, free))}}};\n",
             _rods(machine, rods),
             _axes(machine, rods),
-            f"static const pkmcal_pose HOME = {_pose(home)};\n",
+            f"static const pkmcal_pose HOME = {_pose(home, between=NEXT_LINE)};\n",
             c_array(
                 "RANGE", "[PKMCAL_JOINTS][2]", _bounds(machine), "m or rad, by the mechanism file"
             ),
@@ -261,8 +263,10 @@ def _pairs(machine: Machine) -> str:
     )
 
 
-def _pose(T: Array) -> str:
-    return f"{{{c_value(T[:3, :3])}, {c_value(T[:3, 3])}}}"
+def _pose(T: Array, between: str = " ") -> str:
+    """A pose as a C value; between : what parts its rows."""
+    rows = f",{between}".join(c_value(row) for row in T[:3, :3])
+    return f"{{{{{rows}}},{between}{c_value(T[:3, 3])}}}"
 
 
 def _flat(T: Array) -> Array:

@@ -1,7 +1,7 @@
 """What a format of other programs offers, and an export from start to end.
 
 A format is one file in this folder: a subclass of :class:`Exporter`, which turns a
-:class:`~pkmcal.export.source.Source` into texts and reads them again by itself, as the other
+:class:`~pkmcal.calibration.source.Source` into texts and reads them again by itself, as the other
 program would: with that program's units, signs and formulas, and with nothing of ours but the text.
 :func:`export` gives out only what agrees with the machine.
 """
@@ -20,8 +20,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
 from pkmcal.errors import InputError, ResultError
-from pkmcal.export.source import Source
 from pkmcal.files import check_own_folder, closest, write_folder
 from pkmcal.outcome import Finding
 from pkmcal.wording import listed

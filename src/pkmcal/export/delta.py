@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.source import Source
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference
 from pkmcal.export.limbs import FLOAT, SLIDE, TURN, Limbs, limbs_of, rods_of
-from pkmcal.export.source import Source
 from pkmcal.geometry.rigid import apply, dot, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Finding, Level

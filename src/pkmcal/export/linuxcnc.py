@@ -20,6 +20,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, exact, largest
 from pkmcal.export.delta import (
@@ -37,7 +38,7 @@ from pkmcal.export.delta import (
     tool_difference,
 )
 from pkmcal.export.limbs import Limbs, rods_of
-from pkmcal.export.source import Source, samples
+from pkmcal.export.samples import samples
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Finding, Level
 

@@ -7,10 +7,11 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
 from pkmcal.export.contract import Difference, Exporter, largest
 from pkmcal.export.mujoco_model import mjcf
 from pkmcal.export.mujoco_read import ReadModel, read
-from pkmcal.export.source import Source, samples
+from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends

@@ -15,10 +15,10 @@ from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.export.contract import quaternion
 from pkmcal.export.limbs import FIXED, SLIDE, TELESCOPE, TURN, Limbs, limbs_of
-from pkmcal.export.source import Source
 from pkmcal.geometry.rigid import cross, dot, inverse, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import platform_carriers

@@ -8,8 +8,8 @@ from typing import Any, ClassVar, final
 import yaml
 
 from pkmcal import __version__
+from pkmcal.calibration.source import Source
 from pkmcal.export.contract import Difference, Exporter, commented, largest
-from pkmcal.export.source import Source
 from pkmcal.files import json_text
 from pkmcal.mechanisms import mechanism_text
 

@@ -14,6 +14,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented
 from pkmcal.export.delta import (
@@ -32,7 +33,6 @@ from pkmcal.export.delta import (
     reach,
     tool_difference,
 )
-from pkmcal.export.source import Source
 from pkmcal.outcome import Finding
 
 FILE = "pkmcal_delta.g"

@@ -16,10 +16,10 @@ import numpy as np
 import yaml
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
 from pkmcal.cameras.files import read_camera, write_camera
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, exact, quaternion, rotation_of
-from pkmcal.export.source import Source
 from pkmcal.outcome import Finding, Level
 from pkmcal.wording import listed
 

@@ -15,7 +15,7 @@ from pkmcal.files.documents import (
     yaml_text,
 )
 from pkmcal.files.schema import Schema, field_path, validate
-from pkmcal.files.tables import Table, csv_text, read_csv
+from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
     check_own_folder,
     check_writable,
@@ -27,10 +27,10 @@ from pkmcal.files.writing import (
 from pkmcal.wording import listed
 
 __all__ = [
+    "CsvTable",
     "Document",
     "Keys",
     "Schema",
-    "Table",
     "check_own_folder",
     "check_writable",
     "closest",

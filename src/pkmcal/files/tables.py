@@ -23,7 +23,7 @@ _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)|#.*", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Table:
+class CsvTable:
     """A CSV file of named rows.
 
     label : the file's name in messages.
@@ -50,7 +50,7 @@ def read_csv(
     key: str = "configuration",
     columns: Sequence[str] | None = None,
     label: str | None = None,
-) -> Table:
+) -> CsvTable:
     """Read a table whose header is `key` and then one name a number column.
 
     columns : the only names allowed, all of them needed, in any order; None takes what is there.
@@ -71,7 +71,7 @@ def read_csv(
     lines = tuple(line for line, _ in body)
     names = tuple(cells[0] for _, cells in body)
     _check_names(names, lines, key, label)
-    return Table(label, tuple(header[1:]), names, np.array(values, dtype=float), lines)
+    return CsvTable(label, tuple(header[1:]), names, np.array(values, dtype=float), lines)
 
 
 def csv_text(

@@ -34,7 +34,7 @@ from pkmcal.papers import linear
 from pkmcal.papers.four_step_base import (
     Base,
     Items,
-    Views,
+    StationViews,
     apart,
     base_by_products,
     base_by_registration,
@@ -63,7 +63,7 @@ from pkmcal.papers.leg_axes import (
     revolute_axes,
     through_centres,
 )
-from pkmcal.papers.legs import Legs, base_gauge, legs_of, platform_gauge
+from pkmcal.papers.legs import DrawnLegs, base_gauge, legs_of, platform_gauge
 from pkmcal.papers.registration import Body, extent, fixes_pose, laid
 
 __all__ = ["Axes", "Form", "FourSteps", "centres_from_axes", "four_step", "solve"]
@@ -99,7 +99,7 @@ class FourSteps:
 
 
 def base_items(
-    machine: Machine, axes: Axes, a_camera: Array, found: Booleans, views: Views
+    machine: Machine, axes: Axes, a_camera: Array, found: Booleans, views: StationViews
 ) -> Items:
     """What the views saw of the base: centres, and revolute axes ([A] 7) with their signs.
 
@@ -125,7 +125,7 @@ def solve(
     a_camera: Array,
     found: Booleans,
     form: Form,
-    views: Views | None = None,
+    views: StationViews | None = None,
 ) -> FourSteps:
     """Steps 2 to 4 from the base centres in the camera frames, all runs at once.
 
@@ -173,7 +173,7 @@ def solve(
     )
 
 
-def _ends(machine: Machine, legs: Legs, merged: Axes, base: Array) -> tuple[Array, Array]:
+def _ends(machine: Machine, legs: DrawnLegs, merged: Axes, base: Array) -> tuple[Array, Array]:
     """Offsets (B, L) and platform centres (B, L, 3), corrected: in the base frame."""
     with_length = replace(merged, seen=merged.seen & legs.closing)
     a = np.broadcast_to(base[:, None], merged.u.shape)
@@ -187,7 +187,9 @@ def _ends(machine: Machine, legs: Legs, merged: Axes, base: Array) -> tuple[Arra
     return q0, platform
 
 
-def _ends_printed(machine: Machine, legs: Legs, axes: Axes, a_photo: Array) -> tuple[Array, Array]:
+def _ends_printed(
+    machine: Machine, legs: DrawnLegs, axes: Axes, a_photo: Array
+) -> tuple[Array, Array]:
     """The same as printed: each photograph in its camera frame, a_photo (B, C, L, 3)."""
     with_length = replace(axes, seen=axes.seen & legs.closing)
     q0 = offsets(with_length, a_photo, legs.rod, "printed")
@@ -200,7 +202,13 @@ def _ends_printed(machine: Machine, legs: Legs, axes: Axes, a_photo: Array) -> t
 
 
 def _axes(
-    machine: Machine, legs: Legs, merged: Axes, posed: Booleans, base: Base, body: Body, form: Form
+    machine: Machine,
+    legs: DrawnLegs,
+    merged: Axes,
+    posed: Booleans,
+    base: Base,
+    body: Body,
+    form: Form,
 ) -> tuple[Array, Array]:
     """Axes on base and platform (B, L, 3): revolute by [A] 7, universal by the torsion.
 
@@ -306,7 +314,7 @@ def _views(
     a_camera: Array,
     found: Booleans,
     guess: Array | None,
-) -> Views:
+) -> StationViews:
     """How the stations are joined: by boards on the base, by the legs they share, or as given."""
     on_base = ~measurements.on_platform
     views = joined_by_boards(measurements.poses, on_base, len(found))

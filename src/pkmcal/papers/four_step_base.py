@@ -37,7 +37,7 @@ from pkmcal.papers.registration import (
 )
 
 
-class Views(NamedTuple):
+class StationViews(NamedTuple):
     """Frames in which joints are gathered: one a station, or one for all that a board joins.
 
     of_station : (S,) view of each station. T_camera_view : (S, 4, 4).
@@ -52,14 +52,14 @@ class Views(NamedTuple):
         return int(self.of_station.max()) + 1
 
 
-def apart(n_stations: int) -> Views:
+def apart(n_stations: int) -> StationViews:
     """Every station a view of its own."""
-    return Views(np.arange(n_stations), np.tile(np.eye(4), (n_stations, 1, 1)))
+    return StationViews(np.arange(n_stations), np.tile(np.eye(4), (n_stations, 1, 1)))
 
 
-def together(T_camera_base: Array) -> Views:
+def together(T_camera_base: Array) -> StationViews:
     """All stations in one view, their poses (S, 4, 4) given: the view is that base frame."""
-    return Views(np.zeros(len(T_camera_base), dtype=int), np.asarray(T_camera_base))
+    return StationViews(np.zeros(len(T_camera_base), dtype=int), np.asarray(T_camera_base))
 
 
 def mean_pose(T: Array, whiten: Array, group: Integers, n_groups: int) -> Array:
@@ -79,7 +79,7 @@ def mean_pose(T: Array, whiten: Array, group: Integers, n_groups: int) -> Array:
     return mean
 
 
-def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> Views:
+def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> StationViews:
     """Views of the stations that boards on the base join; the others stay apart.
 
     on_base : (M,) mounts that are fixed to the base; poses on others are left out. A station
@@ -106,10 +106,10 @@ def joined_by_boards(poses: PoseSet, on_base: Booleans, n_stations: int) -> View
                 elif of_mount[m] == view and of_station[s] < 0:
                     of_station[s] = view
                     T_camera_view[s] = T @ inverse(T_view_mount[m])
-    return Views(of_station, T_camera_view)
+    return StationViews(of_station, T_camera_view)
 
 
-def gathered_points(points: Array, found: Booleans, views: Views) -> tuple[Array, Booleans]:
+def gathered_points(points: Array, found: Booleans, views: StationViews) -> tuple[Array, Booleans]:
     """Points of the stations (B, S, L, 3), found (S, L), as the views have them (B, V, L, 3).
 
     The mean, where several stations of a view know a point.
@@ -118,7 +118,7 @@ def gathered_points(points: Array, found: Booleans, views: Views) -> tuple[Array
     return _mean(np.where(found[..., None], back, 0.0), found, views)
 
 
-def gathered_directions(v: Array, found: Booleans, views: Views) -> tuple[Array, Booleans]:
+def gathered_directions(v: Array, found: Booleans, views: StationViews) -> tuple[Array, Booleans]:
     """Directions of either sign, (B, S, D, 3), as the views have them: unit (B, V, D, 3).
 
     One sign in each view: that of the first station that knows the direction.
@@ -135,7 +135,7 @@ def gathered_directions(v: Array, found: Booleans, views: Views) -> tuple[Array,
     return mean / np.where(size > 0, size, 1.0), known
 
 
-def _mean(values: Array, found: Booleans, views: Views) -> tuple[Array, Booleans]:
+def _mean(values: Array, found: Booleans, views: StationViews) -> tuple[Array, Booleans]:
     member = (views.of_station == np.arange(views.n)[:, None]).astype(float)
     count = member @ found
     total = np.einsum("vs,bsli->bvli", member, values)
@@ -291,7 +291,7 @@ def with_signs(items: Items, rough: Array) -> Items:
     return items._replace(directions=items.directions * sign[..., None])
 
 
-def rough_rotations(machine: Machine, axes: Axes, items: Items, views: Views) -> Array:
+def rough_rotations(machine: Machine, axes: Axes, items: Items, views: StationViews) -> Array:
     """Rotations (B, V, 3, 3) from base to view, good to the drawing's own errors.
 
     By the centres where three of them span a plane; else by the legs' directions that the
@@ -309,7 +309,7 @@ def rough_rotations(machine: Machine, axes: Axes, items: Items, views: Views) ->
     return np.where(enough[:, None, None], by_centres, _by_directions(machine, axes, views))
 
 
-def _by_directions(machine: Machine, axes: Axes, views: Views) -> Array:
+def _by_directions(machine: Machine, axes: Axes, views: StationViews) -> Array:
     """Rotations (B, V, 3, 3) that lay the drawn directions of the legs on the seen ones."""
     joints = axes.readings[..., machine.layout.actuated >= 0]
     drawn = machine.with_values(machine.parameters.drawing)

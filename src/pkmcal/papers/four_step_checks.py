@@ -13,10 +13,10 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
 from pkmcal.mechanisms import Machine
-from pkmcal.papers.four_step_base import Items, Views
+from pkmcal.papers.four_step_base import Items, StationViews
 from pkmcal.papers.four_step_platform import COLLAPSED, deviations
 from pkmcal.papers.leg_axes import Axes, in_base
-from pkmcal.papers.legs import Legs, legs_of
+from pkmcal.papers.legs import DrawnLegs, legs_of
 from pkmcal.papers.registration import fixes_pose, loose, parts_of
 from pkmcal.wording import joined
 
@@ -57,7 +57,7 @@ def every_leg_seen(machine: Machine, found: Booleans) -> None:
         )
 
 
-def stations_are_fixed(items: Items, views: Views, machine: Machine) -> None:
+def stations_are_fixed(items: Items, views: StationViews, machine: Machine) -> None:
     """Every station sees enough of the base to know where it stands."""
     few = np.flatnonzero(~items.fixed()[views.of_station])
     if not few.size:
@@ -73,7 +73,7 @@ def stations_are_fixed(items: Items, views: Views, machine: Machine) -> None:
     )
 
 
-def stations_are_joined(items: Items, views: Views) -> None:
+def stations_are_joined(items: Items, views: StationViews) -> None:
     """The stations share enough legs, or a board, to become one frame ([A] 3.3)."""
     free = free_ways(items)
     if not free.shape[-1]:
@@ -126,7 +126,7 @@ def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: 
     _needs_poses(legs, seen & posed[:, None])
 
 
-def _too_few_at_once(legs: Legs, at_once: Booleans) -> None:
+def _too_few_at_once(legs: DrawnLegs, at_once: Booleans) -> None:
     turns = np.any(legs.motion[:3], axis=1)
     need = "three or more, not on one line" if turns.all() else "one or more"
     if turns.any() and not turns.all():  # about z alone
@@ -140,7 +140,7 @@ def _too_few_at_once(legs: Legs, at_once: Booleans) -> None:
     )
 
 
-def _needs_poses(legs: Legs, seen: Booleans) -> None:
+def _needs_poses(legs: DrawnLegs, seen: Booleans) -> None:
     """Passive legs and revolute axes need the platform's pose and the leg, twice."""
     for which, what in (
         (~legs.closing, "passive leg {}'s platform joint"),
@@ -187,7 +187,7 @@ def lengths_are_fixed(
     )
 
 
-def not_collapsed(legs: Legs, q0: Array) -> None:
+def not_collapsed(legs: DrawnLegs, q0: Array) -> None:
     """No constant length in the false minimum of [A] 14, where both its joints fall together."""
     short = np.flatnonzero(legs.constant & (q0 < COLLAPSED * legs.rod))
     if short.size:

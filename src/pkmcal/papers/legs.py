@@ -15,7 +15,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
-class Legs:
+class DrawnLegs:
     """The joints of a machine as drawn, m; each body in its own frame.
 
     base, platform : (L, 3) centres. base_axes, platform_axes : (L, 3) unit, NaN without one.
@@ -50,7 +50,7 @@ class Legs:
         return self.motion.shape[1] == 6 and bool(self.closing.all())
 
 
-def legs_of(machine: Machine) -> Legs:
+def legs_of(machine: Machine) -> DrawnLegs:
     """The machine's joints as its drawing has them."""
     layout, drawing = machine.layout, machine.parameters.drawing
     base, platform = (drawing[index] for index in centre_index(layout))
@@ -64,7 +64,7 @@ def legs_of(machine: Machine) -> Legs:
         return np.isin(np.arange(len(base)), angles.leg[equation])
 
     closing = layout.rod >= 0
-    return Legs(
+    return DrawnLegs(
         base=base,
         platform=platform,
         base_axes=base_axes,
@@ -80,7 +80,7 @@ def legs_of(machine: Machine) -> Legs:
     )
 
 
-def base_gauge(machine: Machine, legs: Legs) -> Array:
+def base_gauge(machine: Machine, legs: DrawnLegs) -> Array:
     """Rows (6, 3 (L + D)) that hold the base frame on the centres, then the directions.
 
     Three centres for a spatial machine ([A] 3.3, N_d = 3); for a planar one its normal, its
@@ -98,7 +98,7 @@ def base_gauge(machine: Machine, legs: Legs) -> Array:
     return rows.reshape(6, -1)
 
 
-def platform_gauge(machine: Machine, legs: Legs) -> Array:
+def platform_gauge(machine: Machine, legs: DrawnLegs) -> Array:
     """Rows (d, 3 L) that hold the platform frame on the centres of the legs with a length.
 
     As many as the platform's motion has directions: the others are not free, as the base

@@ -287,7 +287,7 @@ def _views_chart(c: CameraCalibration) -> charts.BarChart | None:
     fitted = np.sqrt(squares.sum(axis=1) / np.maximum(c.kept.sum(axis=1), 1))
     middle = float(np.median(c.held_out.by_view))
     bars = [
-        charts.Bar(
+        charts.UprightBar(
             name,
             f"{name}: {brief(float(out))} px held out, {brief(float(own))} px when fitted",
             float(out),
@@ -309,7 +309,7 @@ def _angles_chart(c: CameraCalibration) -> charts.BarChart | None:
     last = int(np.ceil((angle.max() if angle.size else 1.0) / ANGLE_STEP)) + 1
     counts = np.bincount((angle / ANGLE_STEP).astype(int), minlength=last)
     bars = [
-        charts.Bar(
+        charts.UprightBar(
             f"{k * ANGLE_STEP:.0f}",
             f"{k * ANGLE_STEP:.0f} to {(k + 1) * ANGLE_STEP:.0f}°: {count(n, 'corner')}",
             float(n),

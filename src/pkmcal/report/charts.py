@@ -30,7 +30,7 @@ NORMAL_90 = 1.6449
 
 
 @dataclass(frozen=True)
-class Box:
+class Spread:
     """One row: the middle half as a bar, nine tenths as a line, the median as a mark.
 
     leg : number from 1 for its colour, None for none. quantiles : 5, 25, 50, 75, 95 %.
@@ -60,7 +60,7 @@ class RowChart:
     title: str
     unit: str
     alt: str
-    boxes: tuple[Box, ...]
+    boxes: tuple[Spread, ...]
     low: float
     high: float
     ticks: tuple[tuple[float, str], ...]
@@ -84,7 +84,7 @@ class RowChart:
 
 
 @dataclass(frozen=True)
-class Bar:
+class UprightBar:
     """One upright bar; ``expected`` is the range to compare it with, where there is one."""
 
     label: str
@@ -106,7 +106,7 @@ class BarChart:
     title: str
     unit: str
     alt: str
-    bars: tuple[Bar, ...]
+    bars: tuple[UprightBar, ...]
     high: float
     ticks: tuple[tuple[float, str], ...]
     labels: tuple[tuple[float, str], ...]
@@ -146,7 +146,7 @@ def ticks_between(low: float, high: float, about: int = 5) -> tuple[tuple[float,
     return tuple((k * step, number(k * step, places)) for k in range(first, last + 1))
 
 
-def box(label: str, values: Array, unit: str, places: int, leg: int | None = None) -> Box | None:
+def box(label: str, values: Array, unit: str, places: int, leg: int | None = None) -> Spread | None:
     """A box of the finite ones of the values, None without any; its tooltip says what it shows."""
     values = values[np.isfinite(values)]
     if not values.size:
@@ -159,11 +159,11 @@ def box(label: str, values: Array, unit: str, places: int, leg: int | None = Non
         f"{count(values.size, 'value')}"
     )
     q05, q25, q50, q75, q95 = (float(v) for v in q)
-    return Box(label, tip, leg, (q05, q25, q50, q75, q95))
+    return Spread(label, tip, leg, (q05, q25, q50, q75, q95))
 
 
 def row_chart(
-    title: str, unit: str, boxes: list[Box], band: float | None, alt: str, note: str = ""
+    title: str, unit: str, boxes: list[Spread], band: float | None, alt: str, note: str = ""
 ) -> RowChart | None:
     """A chart symmetric about zero that holds the boxes and the band; None without boxes.
 
@@ -182,7 +182,7 @@ def row_chart(
 def bar_chart(
     title: str,
     unit: str,
-    bars: list[Bar],
+    bars: list[UprightBar],
     labels: tuple[tuple[float, str], ...],
     alt: str,
     curve: tuple[tuple[float, float], ...] = (),
@@ -198,7 +198,7 @@ def bar_chart(
     return BarChart(title, unit, alt, tuple(bars), high, ticks, labels, curve, note=note)
 
 
-def ends_and_middle(bars: list[Bar]) -> tuple[tuple[float, str], ...]:
+def ends_and_middle(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:
     """Labels of the first, the middle and the last bar, each under its own."""
     last = len(bars) - 1
     return tuple((k + 0.5, bars[k].label) for k in sorted({0, last // 2, last}) if bars)

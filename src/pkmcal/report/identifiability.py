@@ -11,7 +11,7 @@ from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import ParameterTable
 from pkmcal.papers.conditions import Condition
-from pkmcal.report.charts import Bar, BarChart
+from pkmcal.report.charts import BarChart, UprightBar
 from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, count, joined
 
@@ -82,7 +82,7 @@ def _spectrum(findings: Findings) -> BarChart | None:
     heights = np.maximum(np.log10(np.maximum(values, FLOOR)) + decades, STUB)
     high = 1.06 * max(float(heights.max()), decades + 1)
     bars = tuple(
-        Bar(str(k + 1), _tip(k, value, findings.told.rank), float(height), quiet=value >= 1)
+        UprightBar(str(k + 1), _tip(k, value, findings.told.rank), float(height), quiet=value >= 1)
         for k, (value, height) in enumerate(zip(values, heights, strict=True))
     )
     tops = range(math.floor(high) + 1)

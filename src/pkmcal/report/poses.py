@@ -14,9 +14,9 @@ from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
 from pkmcal.report.charts import (
     NORMAL_90,
-    Bar,
     BarChart,
     RowChart,
+    UprightBar,
     bar_chart,
     box,
     panels,
@@ -134,7 +134,7 @@ def _texts(values: Array, sigma: Array, factor: float) -> list[str]:
 
 def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> BarChart | None:
     """Root mean square of each configuration's poses in standard deviations."""
-    bars: list[Bar] = []
+    bars: list[UprightBar] = []
     for k in np.unique(poses.configuration).tolist():
         mine = poses.configuration == k
         n = float(poses.rows[mine].sum())
@@ -145,7 +145,7 @@ def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> B
             f"configuration {name}: {number(level, 2)} σ, {number(low, 2)} to {number(high, 2)}"
             " expected of noise alone"
         )
-        bars.append(Bar(name, tip, level, (low, high), level <= high))
+        bars.append(UprightBar(name, tip, level, (low, high), level <= high))
     alt = "Bars of the poses' residuals by configuration"
     return bar_chart("Poses, by configuration", SIGMAS, bars, _labels(bars), alt)
 
@@ -155,15 +155,17 @@ def _bars(session: Session, poses: PoseSet, error: Array, unit: str, title: str)
     size = np.linalg.norm(np.nan_to_num(error), axis=-1)
     if not np.isfinite(error).any():
         return None
-    bars: list[Bar] = []
+    bars: list[UprightBar] = []
     for k in np.unique(poses.configuration).tolist():
         value = float(size[poses.configuration == k].max())
         name = session.configurations[k]
-        bars.append(Bar(name, f"configuration {name}: {brief(value)} {unit}", value, None, True))
+        bars.append(
+            UprightBar(name, f"configuration {name}: {brief(value)} {unit}", value, None, True)
+        )
     return bar_chart(title, unit, bars, _labels(bars), f"Bars of the poses' errors in {unit}")
 
 
-def _labels(bars: list[Bar]) -> tuple[tuple[float, str], ...]:
+def _labels(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:
     every = max(1, -(-len(bars) // 6))
     return tuple((i + 0.5, bars[i].label) for i in range(0, len(bars), every))
 

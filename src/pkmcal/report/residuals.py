@@ -15,10 +15,10 @@ from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report.charts import (
     NORMAL_90,
-    Bar,
     BarChart,
-    Box,
     RowChart,
+    Spread,
+    UprightBar,
     bar_chart,
     box,
     row_chart,
@@ -111,12 +111,12 @@ def rms(white: Array, weights: Array) -> float:
     return float(np.sqrt(np.sum(weights[:, None] * white**2) / total)) if total else float("nan")
 
 
-def _edge_boxes(by: str, boxes: list[Box]) -> RowChart | None:
+def _edge_boxes(by: str, boxes: list[Spread]) -> RowChart | None:
     alt = f"Boxes of the whitened edge residuals by {by}"
     return row_chart(f"Edges, by {by}", SIGMAS, boxes, NORMAL_90, alt)
 
 
-def _groups(names: list[str], group: Integers, white: Array, legs: bool = False) -> list[Box]:
+def _groups(names: list[str], group: Integers, white: Array, legs: bool = False) -> list[Spread]:
     """A box for each group that has edges; both numbers of a residual count."""
     found = [
         box(name, white[group == g], "σ", 2, g + 1 if legs else None)
@@ -127,7 +127,7 @@ def _groups(names: list[str], group: Integers, white: Array, legs: bool = False)
 
 def _configurations(session: Session, edges: EdgeSet, estimate: Estimate) -> BarChart | None:
     """Root mean square of each configuration's edges, with the range that noise alone gives."""
-    bars: list[Bar] = []
+    bars: list[UprightBar] = []
     for k, name in enumerate(session.configurations):
         mine = edges.configuration == k
         weights = estimate.edge_weights[mine]
@@ -139,7 +139,7 @@ def _configurations(session: Session, edges: EdgeSet, estimate: Estimate) -> Bar
             f"configuration {name}: {number(level, 2)} σ over {count(len(weights), 'edge')}, "
             f"{number(low, 2)} to {number(high, 2)} expected of noise alone"
         )
-        bars.append(Bar(name, tip, level, (low, high), level <= high))
+        bars.append(UprightBar(name, tip, level, (low, high), level <= high))
     every = max(1, -(-len(bars) // 6))
     labels = tuple((i + 0.5, bars[i].label) for i in range(0, len(bars), every))
     title, unit = "Edges, by configuration", "root mean square, standard deviations"
@@ -163,12 +163,12 @@ def _histogram(white: Array) -> BarChart | None:
         return None
     borders = np.arange(-HISTOGRAM, HISTOGRAM + 0.25, 0.5)
     counts = np.histogram(np.clip(values, -HISTOGRAM, HISTOGRAM), borders)[0]
-    bars: list[Bar] = []
+    bars: list[UprightBar] = []
     for low, high, n in zip(borders[:-1], borders[1:], counts.tolist(), strict=True):
         where = f"{number(low, 1)} to {number(high, 1)} σ"
         if low == -HISTOGRAM or high == HISTOGRAM:
             where += " or beyond"
-        bars.append(Bar(where, f"{where}: {count(n, 'residual')}", float(n), None, True))
+        bars.append(UprightBar(where, f"{where}: {count(n, 'residual')}", float(n), None, True))
     x = np.linspace(-HISTOGRAM, HISTOGRAM, 81)
     density = np.exp(-x * x / 2) / np.sqrt(2 * np.pi) * values.size * 0.5
     curve = tuple(zip(((x + HISTOGRAM) * 2).tolist(), density.tolist(), strict=True))
@@ -179,7 +179,7 @@ def _histogram(white: Array) -> BarChart | None:
 
 def _outward(edges: EdgeSet, shifts: Array) -> RowChart | None:
     """Outward shift of every leg's edges: shading and wrong radii show here."""
-    boxes: list[Box | None] = []
+    boxes: list[Spread | None] = []
     for leg, tube, side in _edge_kinds(edges):
         values = shifts[_is_kind(edges, leg, tube, side)]
         name = f"leg {leg + 1}, tube {tube + 1}, {SIDES[side]}"

@@ -58,7 +58,7 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Scene:
+class BeforeAfter:
     """All joint centres, base and platform in turn.
 
     factor : enlarges the errors. spread_factor : enlarges the ellipses, which would often be
@@ -87,7 +87,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class View:
+class Projection:
     """The scene from one direction. limbs : pairs of ends, drawing then shown.
 
     grid : (horizontal?, place, text). labels : (x, y, text).
@@ -104,7 +104,7 @@ class View:
     labels: tuple[tuple[float, float, str], ...]
 
 
-def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...]) -> Scene:
+def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...]) -> BeforeAfter:
     """Joint centres at home with their errors enlarged by a round factor."""
     home = _home(session, estimate)
     placed = {"base": np.eye(4), "platform": home}
@@ -122,7 +122,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
         for j in range(len(drawing)):
             tip = _tip(j + 1, side, j)
             joints.append(Joint(j + 1, side.side, drawing[j], shown[j], spread[j], tip))
-    return Scene(factor, spread_factor, tuple(joints))
+    return BeforeAfter(factor, spread_factor, tuple(joints))
 
 
 def enlargement(lengths: Array, wanted: float) -> float:
@@ -132,7 +132,7 @@ def enlargement(lengths: Array, wanted: float) -> float:
     return max(m * power for m in (1, 2, 5) if m * power <= ratio * (1 + 1e-9))
 
 
-def views(scene: Scene) -> tuple[View, View]:
+def views(scene: BeforeAfter) -> tuple[Projection, Projection]:
     """From above, and from the side that parts the base joints best."""
     base = np.array([joint.drawing for joint in scene.of_side("base")])
     gaps = [np.diff(np.sort(base[:, axis])).min() for axis in (0, 1)]
@@ -159,7 +159,7 @@ def _tip(leg: int, side: Centres, j: int) -> str:
     )
 
 
-def _view(scene: Scene, title: str, axes: tuple[int, int]) -> View:
+def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
     """Project the scene on two axes, the second one upwards."""
     pick = list(axes)
     drawn = np.array([joint.drawing[pick] for joint in scene.joints])
@@ -181,7 +181,7 @@ def _view(scene: Scene, title: str, axes: tuple[int, int]) -> View:
         )
         for j, d, s in zip(scene.joints, drawn, shown, strict=True)
     )
-    return View(
+    return Projection(
         title=title,
         alt=f"{title}: joint centres by the drawing and as calibrated, errors enlarged "
         f"{scene.factor:g} times",
@@ -247,7 +247,7 @@ def _labels(
 
 
 def figure_of(
-    scene: Scene, places: tuple[Array, Integers] | None = None, names: Sequence[str] = ()
+    scene: BeforeAfter, places: tuple[Array, Integers] | None = None, names: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Traces, layout and configuration for ``Plotly.newPlot``.
 
@@ -350,7 +350,7 @@ def space_layout(eye: dict[str, float]) -> dict[str, Any]:
     }
 
 
-def _ellipsoids(scene: Scene) -> dict[str, Any]:
+def _ellipsoids(scene: BeforeAfter) -> dict[str, Any]:
     """Three rings of every centre's ellipsoid, along its principal planes."""
     angle = np.linspace(0, 2 * np.pi, RING)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -260,7 +260,7 @@ def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChar
         return None
     scale, name = SCALES[unit]
     bars = [
-        charts.Bar(
+        charts.UprightBar(
             session.configurations[row],
             f"{session.configurations[row]}: {amount(new, unit)}; drawing {amount(old, unit)}",
             new * scale,

@@ -242,7 +242,7 @@ def _statistics(w: Watch) -> charts.BarChart | None:
     )
 
 
-def _bar(label: str, tests: list[ChiSquare], level: float) -> charts.Bar:
+def _bar(label: str, tests: list[ChiSquare], level: float) -> charts.UprightBar:
     from scipy.special import chdtri
 
     limits = [float(chdtri(t.dof, level)) for t in tests]
@@ -252,7 +252,7 @@ def _bar(label: str, tests: list[ChiSquare], level: float) -> charts.Bar:
         for t, limit in zip(tests, limits, strict=True)
     ]
     share = max(t.chi2 / limit for t, limit in zip(tests, limits, strict=True))
-    return charts.Bar(label, f"{label}: {'; '.join(texts)}", share, quiet=share < 1)
+    return charts.UprightBar(label, f"{label}: {'; '.join(texts)}", share, quiet=share < 1)
 
 
 def _zeros(w: Watch) -> charts.RowChart | None:
@@ -261,7 +261,7 @@ def _zeros(w: Watch) -> charts.RowChart | None:
     if not legs or len({leg.unit for leg in legs}) > 1:
         return None
     factor, name = SCALES[legs[0].unit]
-    boxes: list[charts.Box] = []
+    boxes: list[charts.Spread] = []
     for leg in legs:
         if leg.change is None or not np.isfinite(leg.change.sigma[0]):
             continue
@@ -269,7 +269,9 @@ def _zeros(w: Watch) -> charts.RowChart | None:
         at = value + sigma * np.array([-charts.NORMAL_90, -0.6745, 0.0, 0.6745, charts.NORMAL_90])
         q05, q25, q50, q75, q95 = (float(v) for v in at)
         tip = f"{named(leg.legs)}: {_zero(leg)}"
-        boxes.append(charts.Box(named(leg.legs), tip, leg.legs[0] + 1, (q05, q25, q50, q75, q95)))
+        boxes.append(
+            charts.Spread(named(leg.legs), tip, leg.legs[0] + 1, (q05, q25, q50, q75, q95))
+        )
     return charts.row_chart(
         "The zero of each leg's reading, if nothing else changed",
         name,
@@ -285,7 +287,7 @@ def _by_configuration(w: Watch) -> charts.BarChart | None:
     values = [float(w.residuals[k]) for k in rows]
     names = [w.session.configurations[k] for k in rows]
     bars = [
-        charts.Bar(
+        charts.UprightBar(
             name, f"{name}: {number(value, 2)} standard deviations", value, None, value < LARGE
         )
         for name, value in zip(names, values, strict=True)

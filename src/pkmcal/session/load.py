@@ -16,7 +16,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
-from pkmcal.files import Document, Keys, Table, read_csv, read_yaml, shown, validate, wanted_file
+from pkmcal.files import CsvTable, Document, Keys, read_csv, read_yaml, shown, validate, wanted_file
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
@@ -345,7 +345,7 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
 
 
 def _unphotographed(
-    table: Table, stations: tuple[Station, ...], trackers: tuple[PoseTable, ...]
+    table: CsvTable, stations: tuple[Station, ...], trackers: tuple[PoseTable, ...]
 ) -> list[str]:
     taken = {photo.configuration for station in stations for photo in station.photographs}
     taken |= {int(k) for tracker in trackers for k in tracker.configuration}
@@ -369,7 +369,7 @@ def _unphotographed(
 
 
 def _resolved(
-    folder: Path, schema: SessionDocument, table: Table, stations: tuple[Station, ...]
+    folder: Path, schema: SessionDocument, table: CsvTable, stations: tuple[Station, ...]
 ) -> dict[str, Any]:
     """session.yaml with everything that was found for it, in plain data."""
     document = schema.model_dump(mode="json")

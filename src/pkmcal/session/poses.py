@@ -16,7 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.files import Table, closest, read_csv
+from pkmcal.files import CsvTable, closest, read_csv
 from pkmcal.geometry.rigid import pose, register, rotation
 from pkmcal.measurements import PoseSet
 from pkmcal.wording import listed
@@ -121,7 +121,7 @@ def read_poses(
     return PoseTable(name, label, kind, rows, T, position, rotation_noise)
 
 
-def _kind(table: Table) -> Kind:
+def _kind(table: CsvTable) -> Kind:
     """Which table it is, by its header."""
     found = set(table.columns)
     for columns, kind in HEADERS.items():
@@ -138,7 +138,7 @@ def _kind(table: Table) -> Kind:
     )
 
 
-def _rows(table: Table, names: tuple[str, ...]) -> Integers:
+def _rows(table: CsvTable, names: tuple[str, ...]) -> Integers:
     """The readings' row of each of the table's."""
     number = {name: k for k, name in enumerate(names)}
     for row, name in enumerate(table.names):
@@ -156,7 +156,7 @@ def _rows(table: Table, names: tuple[str, ...]) -> Integers:
     return np.array([number[name] for name in table.names], dtype=int)
 
 
-def _turn(table: Table, column: dict[str, Array]) -> Array:
+def _turn(table: CsvTable, column: dict[str, Array]) -> Array:
     """Rotations (N, 3, 3); none for points."""
     if "qw" in column:
         q = np.stack([column[name] for name in QUATERNION], axis=-1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Table
+from pkmcal.files import CsvTable
 from pkmcal.wording import listed
 
 # A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
@@ -26,7 +26,7 @@ _UNITS = {
 
 
 def check_readings(
-    table: Table, ranges: Array, noise: float, units: Sequence[str] = ()
+    table: CsvTable, ranges: Array, noise: float, units: Sequence[str] = ()
 ) -> list[str]:
     """Raise `InputError` for readings that cannot be this machine's; return warnings.
 
@@ -48,7 +48,7 @@ def check_readings(
     return _check_ranges(table, ranges) + _check_movement(table, noise)
 
 
-def _check_columns(table: Table, n_joints: int) -> None:
+def _check_columns(table: CsvTable, n_joints: int) -> None:
     found = len(table.columns)
     if found != n_joints:
         raise InputError(
@@ -69,7 +69,7 @@ def _check_columns(table: Table, n_joints: int) -> None:
         )
 
 
-def _check_units(table: Table, ranges: Array, units: Sequence[str]) -> None:
+def _check_units(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
     """Most readings out of range, and in range once scaled: another unit, not so many mistakes."""
     for kind, (factor, unit, expected, next_step) in _UNITS.items():
         known = np.isfinite(ranges).all(axis=1) & (np.array(units) == kind)
@@ -87,7 +87,7 @@ def _check_units(table: Table, ranges: Array, units: Sequence[str]) -> None:
             )
 
 
-def _check_signs(table: Table, ranges: Array) -> None:
+def _check_signs(table: CsvTable, ranges: Array) -> None:
     """A joint whose readings are out of range, and in range with the other sign."""
     here, there = _inside(table.values, ranges), _inside(-table.values, ranges)
     wrong = np.flatnonzero((here.mean(axis=0) < 0.5) & there.all(axis=0))
@@ -106,7 +106,7 @@ def _check_signs(table: Table, ranges: Array) -> None:
     )
 
 
-def _check_ranges(table: Table, ranges: Array) -> list[str]:
+def _check_ranges(table: CsvTable, ranges: Array) -> list[str]:
     far = np.argwhere(~_inside(table.values, ranges))
     if len(far):
         row, column = far[0]
@@ -130,7 +130,7 @@ def _check_ranges(table: Table, ranges: Array) -> list[str]:
     ]
 
 
-def _check_movement(table: Table, noise: float) -> list[str]:
+def _check_movement(table: CsvTable, noise: float) -> list[str]:
     still = np.ptp(table.values, axis=0) <= _ALIKE * noise
     if still.all():
         raise InputError(

@@ -1,6 +1,4 @@
-"""What is exported: a machine, calibrated or drawn, with the cameras that saw it; and poses all
-over its workspace, to compare a text with it.
-"""
+"""A machine to be used: calibrated, drawn or built in, with the cameras that saw it."""
 
 from __future__ import annotations
 
@@ -16,27 +14,18 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.results import EVERYTHING, MECHANISM, SavedCalibration, load
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import load_camera
-from pkmcal.errors import InputError, ResultError
-from pkmcal.geometry.rigid import perturb
+from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
-from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.wording import listed
 
 SESSION_FILE = "session.yaml"
-COUNT = 64
-SEED = 0
-LEAST = 0.05
-"""Least singular value of the scaled inverse Jacobian: nearer to singular, 1e-15 of rounding in a
-length moves a platform by more than comparisons allow."""
-SAME = 1e-9
-"""Readings (m, rad) beyond which inverse kinematics chose another elbow than was put in."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A machine to export, and how far to trust it.
+    """A machine to export or to control, and how far to trust it.
 
-    machine : with the values to export. sigma, covariance : (P,) and (P, P) of its parameters;
+    machine : with the values to use. sigma, covariance : (P,) and (P, P) of its parameters;
     None for a drawing. cameras, T_base_camera : intrinsics and poses (4, 4) m by station; a
     station's camera is missing where its file was not found.
     headline : the calibration's verdict in a sentence. usable : False for a refused one; reasons
@@ -166,34 +155,3 @@ def _camera_file(folder: Path, file: str, session: Path | None) -> Path | None:
         return refined
     given = None if session is None else session / file
     return given if given is not None and given.is_file() else None
-
-
-def samples(machine: Machine, count: int = COUNT, seed: int = SEED) -> tuple[Array, Array]:
-    """Poses (n, 4, 4) and their readings (n, m), n <= count, in the home's assembly.
-
-    Raises ResultError where there are none.
-    """
-    rng = np.random.default_rng(seed)
-    ranges = machine.joint_ranges
-    if np.isfinite(ranges).all():
-        wanted = rng.uniform(ranges[:, 0], ranges[:, 1], (4 * count, machine.n_joints))
-        found = machine.forward_result(wanted)
-    else:
-        away = machine.base_centers() - machine.home()[:3, 3]
-        reach = float(np.linalg.norm(away, axis=1).mean())  # m, of the limbs at home
-        shifts = rng.uniform(-1, 1, (4 * count, 6)) * [0.1, 0.1, 0.1, *[0.05 * reach] * 3]
-        motion = machine.layout.motion
-        moved = perturb(machine.home(), shifts @ motion @ motion.T)
-        found = on_manifold(machine.layout, machine.values, moved)
-        wanted = None
-    poses = found.T_base_platform
-    joints = machine.inverse(poses)
-    good = found.converged & (found.singularity > LEAST) & np.isfinite(joints).all(axis=-1)
-    if wanted is not None:
-        good &= np.abs(joints - wanted).max(axis=-1) < SAME
-    if not good.any():
-        raise ResultError(
-            f"mechanism {machine.name!r} has no poses within its ranges to compare an export at",
-            next_step="Check the ranges in the mechanism file",
-        )
-    return poses[good][:count], joints[good][:count]
