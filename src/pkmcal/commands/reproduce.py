@@ -39,7 +39,7 @@ def reproduce(
     as_json: console.Json = False,
 ) -> int:
     """Compute the papers' tables and figures again."""
-    from pkmcal.commands.finish import NUMBERS, PAGE, contents, tell
+    from pkmcal.commands.finish import NUMBERS, PAGE, answer, contents
     from pkmcal.files import check_own_folder, write_folder
     from pkmcal.studies.reproduction import Options
     from pkmcal.studies.reproduction import reproduce as computed
@@ -61,7 +61,7 @@ def reproduce(
     }
     write_folder(out, texts)
     if not as_json:
-        return max(tell(outcome, out, files[paper]) for paper, outcome in found.items())
+        return max(answer(outcome, out, files[paper]) for paper, outcome in found.items())
     code = max(outcome.exit_code for outcome in found.values())
     documents = {paper: outcome.document for paper, outcome in found.items()}
     written = [str(out / name) for name in texts]
