@@ -17,19 +17,24 @@ def rows() -> dict[str, int]:
     return {name: int(row) for row, cell in table for name in re.findall(r"`(\w+)`", cell)}
 
 
+def file_of(name: str) -> Path | None:
+    """The file of a module or package, by its dotted name."""
+    first, *rest = name.split(".")
+    stem = SOURCE.joinpath(*rest)
+    files = (stem.with_suffix(".py"), stem / "__init__.py") if first == "pkmcal" and rest else ()
+    return next((path for path in files if path.is_file()), None)
+
+
 def imports(path: Path) -> set[Path]:
     """Files of the package that a file imports, at its top or inside its functions."""
-    found: set[Path] = set()
+    found: set[Path | None] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.Import):
+            found |= {file_of(alias.name) for alias in node.names}
         if isinstance(node, ast.ImportFrom) and node.module:
-            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        for name in names:
-            first, *rest = name.split(".")
-            stem = SOURCE.joinpath(*rest)
-            if first == "pkmcal" and rest:
-                found |= {p for p in (stem.with_suffix(".py"), stem / "__init__.py") if p.is_file()}
-    return found
+            whole = file_of(node.module)
+            found |= {file_of(f"{node.module}.{alias.name}") or whole for alias in node.names}
+    return {other for other in found if other is not None}
 
 
 ARROWS = {path: imports(path) for path in SOURCE.rglob("*.py")}

@@ -103,7 +103,7 @@ S = TypeVar("S", bound=Setting)
 
 
 @dataclass(frozen=True)
-class Study(Generic[S]):
+class StudyResult(Generic[S]):
     """What the runs came to.
 
     samples : of every run, by what was estimated how. accuracy : its quantities summed up, each
@@ -138,7 +138,7 @@ class _Done(NamedTuple):
     cpu: float
 
 
-def run(setting: S, runs: int, seed: int, told: Told | None = None) -> Study[S]:
+def run(setting: S, runs: int, seed: int, told: Told | None = None) -> StudyResult[S]:
     """The whole study. told : called with what is done and the share of it."""
     from threadpoolctl import threadpool_limits
 
@@ -152,7 +152,7 @@ def run(setting: S, runs: int, seed: int, told: Told | None = None) -> Study[S]:
             if told:
                 told(setting.doing, len(done) / len(work))
     samples = collected([part.samples for part in done])
-    return Study(
+    return StudyResult(
         setting=setting,
         runs=runs,
         seed=seed,

@@ -18,7 +18,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.papers.hand_eye import Pair, PairProblem
-from pkmcal.solver import FIRST_DAMPING, eliminate, inverse_root, minimise
+from pkmcal.solver import FIRST_DAMPING, directions, eliminate, minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
 LOOSE = 1e-9
@@ -67,29 +67,27 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     """
     reduced = eliminate(problem.linearize(state), np.zeros(len(state.z)))
     rows = reduced.rows.reshape(len(state.z), -1, reduced.rows.shape[-1])
-    scale = np.sqrt(np.sum(rows**2, axis=1))
-    scale = np.where(scale > 0, scale, 1.0)
-    s, vt = np.linalg.svd(np.linalg.qr(rows / scale[:, None], mode="r"))[1:]
-    known: Booleans = s > LOOSE * s[:, :1]
+    s, vt, scale = directions(rows)
+    known = s > LOOSE * s[:, :1]
     spread = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
     # the symmetric root, as singular vectors' signs are rounding's
     draw = spread[..., None] * (vt @ rng.normal(size=s.shape)[..., None])
     return (np.swapaxes(vt, -1, -2) @ draw)[..., 0] / scale
 
 
-class Places(NamedTuple):
+class ToolPlaces(NamedTuple):
     """Where machines are held against the truth: poses (B, n, 4, 4) and readings (B, n, m)."""
 
     poses: Array
     readings: Array
 
 
-def places(data: SimulatedRuns, wanted: Array) -> Places:
+def tool_places(data: SimulatedRuns, wanted: Array) -> ToolPlaces:
     """Those near the wanted poses (n, 4, 4) that each true machine can take, and its readings."""
     layout, theta = data.machine.layout, data.theta[:, None]
     poses = on_manifold(layout, theta, wanted).T_base_platform if layout.n_internal else wanted
     readings = inverse(layout, theta, poses)
-    return Places(np.broadcast_to(poses, (*readings.shape[:2], 4, 4)), readings)
+    return ToolPlaces(np.broadcast_to(poses, (*readings.shape[:2], 4, 4)), readings)
 
 
 class ToolErrors(NamedTuple):
@@ -100,7 +98,7 @@ class ToolErrors(NamedTuple):
 
 
 def tool_errors(
-    layout: LimbLayout, theta: Array, at: Places, turn: float, shift: float
+    layout: LimbLayout, theta: Array, at: ToolPlaces, turn: float, shift: float
 ) -> ToolErrors:
     """How far machines (B, P) are from the truth at the same readings.
 

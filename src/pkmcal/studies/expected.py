@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from pkmcal.outcome import Check
-from pkmcal.studies.engine import Key, Study
+from pkmcal.studies.engine import Key, StudyResult
 from pkmcal.studies.statistics import Summary
 from pkmcal.wording import number
 
-Printed = Mapping[Key, Mapping[str, str]]
+PrintedFigures = Mapping[Key, Mapping[str, str]]
 """A prototype's figures as it prints them, by what was estimated how and by quantity."""
 ASIDE = ", its Monte-Carlo error aside"
 
@@ -43,8 +43,8 @@ class Compared(NamedTuple):
 
 
 def compared(
-    study: Study[Any],
-    prototype: Printed,
+    study: StudyResult[Any],
+    prototype: PrintedFigures,
     tolerance: Callable[[Key, str], float],
     held: Callable[[Key], bool] = lambda _: True,
 ) -> list[Compared]:

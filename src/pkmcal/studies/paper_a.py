@@ -26,12 +26,12 @@ from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
 from pkmcal.papers.four_step import Axes, Form, FourSteps, centres_from_axes, solve
 from pkmcal.solver import RESTART_DAMPING
-from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, Study
+from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, StudyResult
 from pkmcal.studies.estimates import Fitted, drawing, freedom, joint
 from pkmcal.studies.simulated import (
     Noise,
     SimulatedRuns,
-    View,
+    Viewpoints,
     joint_problem,
     simulate,
     spread_evenly,
@@ -134,7 +134,7 @@ class HexapodByAxes:
         pick = np.concatenate([order] * repeats, axis=-1)[..., : self.poses]
         return corners[pick].reshape(runs, -1, 6)
 
-    def view(self, machine: Machine) -> View:
+    def view(self, machine: Machine) -> Viewpoints:
         """Cameras on a circle, each between two pairs of base joints, that see the nearest legs."""
         angles = np.radians([60.0, 180.0, 300.0])
         up = np.array([0.0, 0.0, self.height])
@@ -149,7 +149,7 @@ class HexapodByAxes:
         depth = apply(T_camera_base[:, None], machine.base_centers())[..., 2]
         legs = np.sort(np.argsort(depth, axis=1)[:, : self.legs_seen], axis=1)
         station: Integers = np.repeat(np.arange(STATIONS), self.poses)
-        return View(T_camera_base, station, legs[station])
+        return Viewpoints(T_camera_base, station, legs[station])
 
     def solve(self, batch: Batch, data: SimulatedRuns) -> dict[Key, Fitted]:
         """The four steps in both forms, and the joint estimate from the corrected ones."""
@@ -198,12 +198,12 @@ def _sample(
     return Sample(values | (fit.told if fit else {}), fit.sigma if fit else {})
 
 
-def converged(study: Study[HexapodByAxes]) -> int:
+def converged(study: StudyResult[HexapodByAxes]) -> int:
     """Runs whose joint estimate ended at the right answer."""
     return int(np.sum(study.values("chi2", JOINT) < RIGHT))
 
 
-def mean_error(study: Study[HexapodByAxes], method: str) -> Array:
+def mean_error(study: StudyResult[HexapodByAxes], method: str) -> Array:
     """Mean |error| (30,), m; of the bound's standard deviations, that of a normal distribution."""
     errors = np.abs(study.values("parameters", method)).mean(axis=0)
     return errors * (np.sqrt(2 / np.pi) if method == BOUND else 1.0)

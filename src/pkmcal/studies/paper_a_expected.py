@@ -6,7 +6,7 @@ import numpy as np
 
 from pkmcal.outcome import Check
 from pkmcal.papers.axis_measurements import AxisNoise
-from pkmcal.studies.engine import Key, Study
+from pkmcal.studies.engine import Key, StudyResult
 from pkmcal.studies.expected import ASIDE, Compared, at_most, compared, prototype_check
 from pkmcal.studies.paper_a import (
     BOUND,
@@ -68,13 +68,13 @@ def tolerance(key: Key, quantity: str) -> float:
     return OPEN_TOLERANCE if (key, quantity) in FOLLOWS_DRAWING else TOLERANCE
 
 
-def figures_compared(study: Study[HexapodByAxes]) -> list[Compared]:
+def figures_compared(study: StudyResult[HexapodByAxes]) -> list[Compared]:
     """Every figure that the prototype gives, the end-effector's last."""
     figures = compared(study, PROTOTYPE, tolerance)
     return sorted(figures, key=lambda figure: figure.quantity not in GROUPS)
 
 
-def checks(study: Study[HexapodByAxes]) -> tuple[Check, ...]:
+def checks(study: StudyResult[HexapodByAxes]) -> tuple[Check, ...]:
     """What must hold, or the reproduction has failed."""
     joint, right = study.of(JOINT), converged(study)
     over = ratio(joint["parameters"], study.of(BOUND)["parameters"]).value

@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.outcome import Outcome, Part, Row, Table
 from pkmcal.papers.axis_measurements import AxisNoise
-from pkmcal.studies.engine import Study, run
+from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.expected import Compared
 from pkmcal.studies.paper_a import (
     BOUND,
@@ -71,7 +71,7 @@ REMARKS = ("printed", "before", "agree", "of_drawing", "others")
 RANGE = (0.005, 5.0)
 """mm that Fig. 4's logarithmic axis of errors holds."""
 
-Found = Study[HexapodByAxes]
+Found = StudyResult[HexapodByAxes]
 
 
 def reproduce(options: Options) -> Outcome:

@@ -21,15 +21,15 @@ from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.papers.hand_eye import size_of, solve_pairs
 from pkmcal.papers.inverse_kinematic import Form, PoseFit, fit_poses, pose_problem
 from pkmcal.papers.rotation_axis import rotation_axis
-from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, Study
+from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, StudyResult
 from pkmcal.studies.estimates import (
     Fitted,
     drawing,
     drawn_from_bound,
     freedom,
     joint,
-    places,
     tool_errors,
+    tool_places,
 )
 from pkmcal.studies.paper_c_machine import (
     BOARD,
@@ -46,7 +46,7 @@ from pkmcal.studies.paper_c_validation import control_residuals, square, straigh
 from pkmcal.studies.simulated import (
     Noise,
     SimulatedRuns,
-    View,
+    Viewpoints,
     joint_problem,
     measurements,
     simulate,
@@ -132,7 +132,7 @@ class H4ByBoard:
             poses = on_manifold(machine.layout, theta[:, None], poses).T_base_platform
         readings = inverse(machine.layout, theta[:, None], poses)
         station = np.zeros(len(grid()), dtype=int)
-        view = View(CAMERA[None], station, T_platform_board=BOARD)
+        view = Viewpoints(CAMERA[None], station, T_platform_board=BOARD)
         return simulate(machine, theta, readings, poses, view, self.noise, rng, self.control)
 
     def solve(self, batch: Batch, data: SimulatedRuns) -> dict[Key, Fitted]:
@@ -149,7 +149,7 @@ class H4ByBoard:
     ) -> dict[Key, Sample]:
         """The tool's errors; where the truth is the paper's machine, its validation as well."""
         space, lines = batch.generator(SPACE), batch.generator(LINES)
-        near, far = (places(data, workspace(POSES, space, larger)) for larger in (1.0, LARGER))
+        near, far = (tool_places(data, workspace(POSES, space, larger)) for larger in (1.0, LARGER))
         papers = batch.population == "design"
         out: dict[Key, Sample] = {}
         for (kind, name, method), fit in found.items():
@@ -301,7 +301,7 @@ def axis_of_rotation(data: SimulatedRuns) -> Sample:
     )
 
 
-def ranks(study: Study[H4ByBoard]) -> dict[tuple[Kind, str], tuple[int, int]]:
+def ranks(study: StudyResult[H4ByBoard]) -> dict[tuple[Kind, str], tuple[int, int]]:
     """Rank of the Jacobian with everything free, and how many unknowns are estimated, by model and
     method, each on its own truth.
     """
@@ -313,7 +313,7 @@ def ranks(study: Study[H4ByBoard]) -> dict[tuple[Kind, str], tuple[int, int]]:
     return out
 
 
-def largest_side(study: Study[H4ByBoard], model_and_method: tuple[str, str]) -> float:
+def largest_side(study: StudyResult[H4ByBoard], model_and_method: tuple[str, str]) -> float:
     """Root mean square over runs of the largest of the square's four errors, m."""
     worst: Array = np.abs(study.values("square", "design", *model_and_method)).max(axis=1)
     return float(np.sqrt(np.mean(worst**2)))

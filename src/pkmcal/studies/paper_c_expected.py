@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.outcome import Check
-from pkmcal.studies.engine import Key, Study
+from pkmcal.studies.engine import Key, StudyResult
 from pkmcal.studies.expected import Compared, at_most, compared, prototype_check
 from pkmcal.studies.paper_c import (
     AXIS,
@@ -85,7 +85,7 @@ TOO_POOR = 1.5
 """chi2 per degree of freedom above which a model is too poor for its data."""
 
 
-def figures_compared(study: Study[H4ByBoard]) -> list[Compared]:
+def figures_compared(study: StudyResult[H4ByBoard]) -> list[Compared]:
     """Every figure that the prototype gives; held where the setting leaves it comparable."""
     return compared(
         study,
@@ -95,7 +95,7 @@ def figures_compared(study: Study[H4ByBoard]) -> list[Compared]:
     )
 
 
-def checks(study: Study[H4ByBoard], start: Before) -> tuple[Check, ...]:
+def checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check, ...]:
     """What must hold, or the reproduction has failed."""
     return (
         _before_check(start),
@@ -125,14 +125,14 @@ def _before_check(start: Before) -> Check:
     )
 
 
-def _table_3_check(study: Study[H4ByBoard]) -> Check:
+def _table_3_check(study: StudyResult[H4ByBoard]) -> Check:
     mean = study.values("control_mean", "design", "design", DRAWING).mean(axis=0)
     text = ", ".join(number(100 * float(v), 1) for v in mean)
     good = bool(np.abs(mean - JOINT_MEANS).max() < 1.5e-3)
     return Check("Table 3, means before, 10⁻² rad", text, "9.4, 3.6, 7.6, 8.5", good)
 
 
-def _square_check(study: Study[H4ByBoard]) -> Check:
+def _square_check(study: StudyResult[H4ByBoard]) -> Check:
     old, new = (largest_side(study, ("design", method)) for method in (DRAWING, EQ3))
     return Check(
         "largest error of the square's sides, before and after",
@@ -142,7 +142,7 @@ def _square_check(study: Study[H4ByBoard]) -> Check:
     )
 
 
-def _rank_check(study: Study[H4ByBoard]) -> Check:
+def _rank_check(study: StudyResult[H4ByBoard]) -> Check:
     every = ranks(study)
     found = {key: every[key] for key in RANKS}
     text, wanted = (
@@ -152,7 +152,7 @@ def _rank_check(study: Study[H4ByBoard]) -> Check:
     return Check("ranks, Models 12 and 31 (unknowns estimated)", text, wanted, found == RANKS)
 
 
-def _axis_check(study: Study[H4ByBoard]) -> Check:
+def _axis_check(study: StudyResult[H4ByBoard]) -> Check:
     found, dof = study.of("design", AXIS)["chi2"].value, study.values("dof", "design", AXIS)
     allowed = 0.01 + 3 * float(np.sqrt(2 / dof[0] / len(dof)))
     return Check(
@@ -163,7 +163,7 @@ def _axis_check(study: Study[H4ByBoard]) -> Check:
     )
 
 
-def _bound_check(study: Study[H4ByBoard]) -> Check:
+def _bound_check(study: StudyResult[H4ByBoard]) -> Check:
     ratios = [
         ratio(*(study.of(kind, kind, method)["larger_shift"] for method in (JOINT, BOUND)))
         for kind in KINDS[:2]
@@ -176,7 +176,7 @@ def _bound_check(study: Study[H4ByBoard]) -> Check:
     )
 
 
-def _chi2_check(study: Study[H4ByBoard]) -> Check:
+def _chi2_check(study: StudyResult[H4ByBoard]) -> Check:
     right = [study.of(kind, kind, JOINT)["chi2"].value for kind in KINDS]
     poor = [study.of(*pair, JOINT)["chi2"].value for pair in FOLLOWS_MACHINE]
     return Check(

@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.outcome import Outcome, Row, Table
-from pkmcal.studies.engine import Study, run
+from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_c import (
     AXIS,
     BOUND,
@@ -64,7 +64,7 @@ VALIDATED = (
 )
 """Rows of Tables 3 and 4: their name, model and method, and which of the paper's."""
 
-Found = Study[H4ByBoard]
+Found = StudyResult[H4ByBoard]
 
 
 def reproduce(options: Options) -> Outcome:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from pkmcal.files import read_yaml
 from pkmcal.outcome import Check, Figure, Finding, Level, Outcome, Part, Plot, Row, Table, Verdict
-from pkmcal.studies.engine import Key, Setting, Study
+from pkmcal.studies.engine import Key, Setting, StudyResult
 from pkmcal.wording import brief, number
 
 PAPERS = ("a", "c")
@@ -67,7 +67,7 @@ class Words:
     values: Mapping[str, Any]
 
     @classmethod
-    def of(cls, letter: str, study: Study[Any], **values: Any) -> Words:
+    def of(cls, letter: str, study: StudyResult[Any], **values: Any) -> Words:
         """The words on a study: ``found`` and ``error`` hold each method's figures in their units;
         values : what else the texts name.
         """
@@ -162,7 +162,7 @@ class Column(NamedTuple):
 
 
 def accuracy_rows(
-    study: Study[Any],
+    study: StudyResult[Any],
     key: Key,
     name: str,
     columns: Sequence[Column],

@@ -23,7 +23,7 @@ from pkmcal.papers.axis_measurements import as_edges, to_coordinates
 
 
 @dataclass(frozen=True)
-class View:
+class Viewpoints:
     """What is seen of K configurations, the same in all runs.
 
     T_camera_base : (S, 4, 4). station : (K,). legs : (K, G) whose axes are seen. T_platform_board :
@@ -59,7 +59,7 @@ class SimulatedRuns:
 
     machine: Machine
     theta: Array
-    view: View
+    view: Viewpoints
     noise: Noise
     T_base_platform: Array
     joints: Array
@@ -88,7 +88,7 @@ def simulate(
     theta: Array,
     readings: Array,
     T_base_platform: Array,
-    view: View,
+    view: Viewpoints,
     noise: Noise,
     rng: np.random.Generator,
     control: int = 0,
@@ -135,7 +135,7 @@ def measurements(data: SimulatedRuns, run: int = 0) -> Measurements:
     )
 
 
-def _places_of_axes(view: View) -> EdgeSet:
+def _places_of_axes(view: Viewpoints) -> EdgeSet:
     """One edge for each axis, with its place and nothing else."""
     legs = view.legs.reshape(-1)
     n, each = len(legs), view.legs.shape[1]
