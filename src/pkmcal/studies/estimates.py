@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array
 from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
