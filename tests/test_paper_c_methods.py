@@ -131,7 +131,7 @@ def test_jacobians(name, form):
     problem = replace(problem, weigh=np.eye(rows)[None, None])
     linear = problem.linearize(state)
     n, own = problem.keep.size, state.internal.shape[-1]
-    assert len(unknown_names(drawing, state)) == n
+    assert len(unknown_names(drawing, problem)) == n
     for k in range(n + own):
         step, inner = np.zeros((1, n)), np.zeros((1, 1, own))
         (step[0] if k < n else inner[0, 0])[k if k < n else k - n] = H

@@ -15,7 +15,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.start import start_state
-from pkmcal.judge.comparison import compare, promise, ratio, rms, weighed
+from pkmcal.judge.comparison import compare, finite_rms, promise, ratio, weighed
 from pkmcal.judge.held import held_machine
 from pkmcal.judge.holdouts import by_regions, hold_out
 from pkmcal.judge.paths import straightness
@@ -119,6 +119,23 @@ def test_own_readings_have_no_part_in_a_pose(hexapod):
     assert np.abs(bad.T_base_platform[4] - good.T_base_platform[4]).max() < 2e-5
 
 
+def test_a_refined_camera_is_no_part_of_the_machine(hexapod):
+    """Intrinsics that are refined with the machine are found beside it, and ask for nothing."""
+    _, true, estimate, _ = hexapod
+    _, _, stations, data = legs_case(60, true)
+    start = start_state(estimate.machine, data, stations)
+    wide = replace(
+        data,
+        edges=replace(data.edges, by_intrinsics=np.zeros((len(data.edges), 2, 1))),
+        intrinsics_factor=np.ones((1, 1, 1)),
+        intrinsics_at=np.zeros((1, 1)),
+    )
+    held, refined = (predict(estimate.machine, d, start) for d in (data, wide))
+    assert refined.by_machine.shape == held.by_machine.shape
+    assert np.allclose(refined.errors.residuals, held.errors.residuals, atol=1e-9)
+    assert np.allclose(refined.noise, held.noise, rtol=1e-6, atol=1e-15)
+
+
 def test_own_readings_have_no_part_where_a_board_needs_the_others(h4):
     drawing, _, estimate, case, _ = h4
     few = select(case.measurements, np.arange(71) < 12)
@@ -152,7 +169,7 @@ def test_better_than_the_drawing(hexapod):
     assert verdict.usable
     assert "times better than the drawing: 0." in verdict.headline
     assert judged.ratio.low > 3
-    assert rms(judged.after) < np.sqrt(2) * judged.floor
+    assert finite_rms(judged.after) < np.sqrt(2) * judged.floor
     assert "the photographs' own noise" in verdict.advice[0]
 
 

@@ -242,7 +242,7 @@ def test_a_hinge_is_found_through_the_joints_it_goes_through():
         (
             {"legs[1].base.center.z": 1.0, "legs[2].base.center.z": -1.0,
              "legs[3].base.center.z": 0.6, "legs[5].base.center.z": 1.1},
-            "Of the machine's numbers, one combination is free: +1 mm of leg ",
+            "How the base joints lie to each other is free in one way: +1 mm of leg ",
         ),
         (
             {"legs[1].base.center.x": 1.0, "legs[4].length.offset": 0.7,

@@ -615,6 +615,9 @@ def _all_together(s: Situation, carried: list[tuple[Motion, str]]) -> Iterator[M
     slides = np.concatenate([_slide(s, j) for j in s.legs], axis=1)
     text = "legs that grow while their joints move along them {are} {ways}{mostly}"
     yield Motion(s.legs, slides, text)
+    for side, centres in zip(("base", "platform"), centre_index(s.machine.layout), strict=True):
+        text = f"how the {side} joints lie to each other {{is}} {{ways}}{{mostly}}"
+        yield Motion(s.legs, s.one_hot(centres.ravel()), text)
     axes = [rows for leg in s.fields for field, rows in leg.items() if field.endswith("axis")]
     if axes:
         text = "the directions of the joints' axes {are} {ways}{mostly}"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, rms
 from pkmcal.judge.prediction import Prediction, ReadingErrors, errors_on
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -132,7 +132,7 @@ class BesideDrawing:
             "configurations": [names[row] for row in self.rows],
             **{
                 name: {
-                    "weighed_rms": rms(weighed_by_pose),
+                    "weighed_rms": finite_rms(weighed_by_pose),
                     **asdict(self.figures(errors)),
                     "residuals": errors.residuals,
                     "tool_position": errors.position,
@@ -180,7 +180,7 @@ def compare(
     old = errors_on(drawing, measurements.joints[seen], found.T_base_platform[seen]).of(place)
     if by_drawing is not None:
         own = by_drawing.errors.of(rows)
-        if rms(weights.of(own.residuals)) < rms(weights.of(old.residuals)):
+        if finite_rms(weights.of(own.residuals)) < finite_rms(weights.of(old.residuals)):
             old = own
     before, after = weights.of(old.residuals), weights.of(new.residuals)
     return BesideDrawing(
@@ -195,10 +195,9 @@ def compare(
     )
 
 
-def rms(values: Array) -> float:
+def finite_rms(values: Array) -> float:
     """Root mean square of what is finite; NaN of nothing."""
-    found = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(found**2))) if found.size else float("nan")
+    return rms(values[np.isfinite(values)])
 
 
 def weighed(values: Array, sigma: Array) -> tuple[Array, Array]:

@@ -28,6 +28,7 @@ from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.rows import PERFECT
+from pkmcal.identify.unknowns import Name, Unknowns
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, kinematics
 from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense
@@ -43,6 +44,7 @@ from pkmcal.solver import (
     eliminate,
     minimise,
     of_runs,
+    stacked,
     take,
     transposed,
 )
@@ -98,9 +100,10 @@ class _Rows(NamedTuple):
 class ImplicitProblem:
     """solver.LeastSquares of B runs with N poses each. Stations' unknowns perturb T_base_camera.
 
-    layout, drawing (P,), free (P, nz) : the machine. station, mount : (N,). T_camera_board
-    (B, N, 4, 4) and readings (B, N, m). form : see the module. weigh : (B, N, r, r) of the rows,
-    fixed while the search runs. prior : (c, nz) rows on z. keep : (na,) False for what is held.
+    layout, drawing (P,), free (P, nz) : the machine. station, mount : (N,), of n_stations and
+    n_mounts. T_camera_board (B, N, 4, 4) and readings (B, N, m). form : see the module. weigh :
+    (B, N, r, r) of the rows, fixed while the search runs. prior : (c, nz) rows on z. keep : (na,)
+    False for what is held.
     """
 
     layout: LimbLayout
@@ -108,12 +111,20 @@ class ImplicitProblem:
     free: Array
     station: Integers
     mount: Integers
+    n_stations: int
+    n_mounts: int
     T_camera_board: Array
     readings: Array
     form: Form
     weigh: Array
     prior: Array
     keep: Booleans
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """Which unknown stands in which column, na in all."""
+        n_free = self.free.shape[1]
+        return Unknowns(n_free, self.n_stations, n_cameras=0, n_mounts=self.n_mounts)
 
     def theta(self, state: ImplicitState) -> Array:
         """Machine parameters (B, P)."""
@@ -129,8 +140,7 @@ class ImplicitProblem:
         rows = self._rows(state)
         off = ((0, 0), (0, 0), (0, rows.taken.off.shape[-1]), (0, 0))
         closures = rows.scale[..., None] * (dense(rows.closure, self.drawing.size) @ self.free)
-        stations = np.eye(state.T_camera_base.shape[1])[self.station]
-        mounts = np.eye(state.T_mount.shape[1])[self.mount]
+        stations, mounts = np.eye(self.n_stations)[self.station], np.eye(self.n_mounts)[self.mount]
         by_shared = np.concatenate([
             np.pad(closures, off),
             _placed(rows.by_pose @ rows.seen.by_station, stations),
@@ -202,12 +212,11 @@ class ImplicitProblem:
 
     def moved(self, state: ImplicitState, shared: Array, own: Array) -> ImplicitState:
         """The state after a step."""
-        shared = shared * self.keep
-        nz, s, m = self.free.shape[1], state.T_camera_base.shape[1], state.T_mount.shape[1]
-        camera = shared[:, nz : nz + 6 * s].reshape(-1, s, 6)
-        mount = shared[:, nz + 6 * s :].reshape(-1, m, 6)
+        shared, u = shared * self.keep, self.unknowns
+        camera = shared[:, u.stations].reshape(-1, self.n_stations, 6)
+        mount = shared[:, u.mounts].reshape(-1, self.n_mounts, 6)
         return ImplicitState(
-            state.z + shared[:, :nz],
+            state.z + shared[:, u.machine],
             inverse(perturb(inverse(state.T_camera_base), camera)),
             perturb(state.T_mount, mount),
             state.internal + own,
@@ -320,7 +329,7 @@ def pose_problem(
     z = table.to_free(start.theta)
     camera = np.broadcast_to(start.T_camera_base, (runs, *start.T_camera_base.shape[-3:]))
     mount = np.broadcast_to(start.T_mount, (runs, *start.T_mount.shape[-3:]))
-    n_shared = z.shape[-1] + 6 * camera.shape[1] + 6 * mount.shape[1]
+    n_stations, n_mounts = camera.shape[1], mount.shape[1]
     off = 6 - layout.motion.shape[1]  # rows that do not count as printed
     problem = ImplicitProblem(
         layout=layout,
@@ -328,12 +337,14 @@ def pose_problem(
         free=table.free_matrix(),
         station=measurements.poses.station,
         mount=measurements.poses.mount,
+        n_stations=n_stations,
+        n_mounts=n_mounts,
         T_camera_board=T_camera_board,
         readings=readings,
         form=form,
         weigh=np.diag(np.repeat([1 / PRINTED, 0.0], [layout.n_equations, off]))[None, None],
         prior=np.zeros((0, z.shape[-1])),
-        keep=np.ones(n_shared, dtype=bool),
+        keep=np.ones(z.shape[-1] + 6 * (n_stations + n_mounts), dtype=bool),
     )
     state = ImplicitState(
         np.broadcast_to(z, (runs, z.shape[-1])).copy(),
@@ -374,7 +385,7 @@ def fit_poses(
             problem = replace(problem, weigh=problem.whitening(state, noise, joint_noise))
             solution = minimise(problem, state, MOST_STEPS, RESTART_DAMPING)
             solution = replace(solution, steps=steps + solution.steps)
-    names = np.array(unknown_names(machine, state), dtype=object)
+    names = np.array(unknown_names(machine, problem), dtype=object)
     return PoseFit(problem, solution, tuple(names[~keep]), rank)
 
 
@@ -384,7 +395,7 @@ def on_axis(problem: ImplicitProblem, state: ImplicitState) -> ImplicitState:
     For machines that turn about one axis, where one camera sees one board; others stay as they are.
     The workspace keeps its place before the camera.
     """
-    if not _one_axis(problem, state):
+    if not _one_axis(problem):
         return state
     frames = axis_frames(problem.T_camera_board[..., :3, :3])
     camera, mount = state.T_camera_base[:, 0], state.T_mount[:, 0]
@@ -400,8 +411,8 @@ def on_axis(problem: ImplicitProblem, state: ImplicitState) -> ImplicitState:
     )
 
 
-def _one_axis(problem: ImplicitProblem, state: ImplicitState) -> bool:
-    alone = state.T_camera_base.shape[1] == state.T_mount.shape[1] == 1
+def _one_axis(problem: ImplicitProblem) -> bool:
+    alone = problem.n_stations == problem.n_mounts == 1
     return alone and int(problem.layout.motion[:3].any(axis=1).sum()) == 1
 
 
@@ -422,15 +433,14 @@ def unknowns_kept(
     second-order influence ([C] III.C) and are held.
     """
     first, begin = problem.select(np.array([0])), take(state, np.array([0]))
-    jac = reduced_jacobian(first.ideal(begin), begin)
-    sizes = np.concatenate([
-        machine.parameters.tolerances_free(),
-        np.full(6 * (state.T_camera_base.shape[1] + state.T_mount.shape[1]), PLACED),
-    ])  # fmt: skip
+    linear = first.ideal(begin).linearize(begin)
+    jac = stacked(linear, eliminate(linear, np.zeros(1)))[0][0]
+    sizes = np.full(problem.unknowns.count, PLACED)
+    sizes[problem.unknowns.machine] = machine.parameters.tolerances_free()
     keep = np.ones(len(sizes), dtype=bool)
     rank, _ = _loose(jac, sizes)
     if not whitened:
-        keep[_tilts(problem, state)] = False
+        keep[_tilts(problem)] = False
     loose = _loose(jac[:, keep], sizes[keep])[1]
     keep[np.flatnonzero(keep)[_pivots(loose)]] = False
     return keep, rank
@@ -447,21 +457,13 @@ def _loose(jac: Array, sizes: Array) -> tuple[int, Array]:
     return rank, vt[rank:] / (extreme * sizes)
 
 
-def reduced_jacobian(problem: ImplicitProblem, state: ImplicitState) -> Array:
-    """Jacobian (rows, na) of one run with hinges eliminated and the drawing's rows, unscaled."""
-    linear = problem.linearize(state)
-    rows = eliminate(linear, np.zeros(1)).rows if linear.by_own.shape[-1] else linear.by_shared
-    return np.concatenate([rows.reshape(-1, rows.shape[-1]), linear.shared_by])
-
-
-def _tilts(problem: ImplicitProblem, state: ImplicitState) -> Integers:
+def _tilts(problem: ImplicitProblem) -> Integers:
     """Columns of what the axis found beforehand tells: the mounts' turns that the machine itself
     cannot make and, where there is one axis and one camera, the camera's.
     """
-    off = np.flatnonzero(~problem.layout.motion[:3].any(axis=1))
-    stations, mounts = state.T_camera_base.shape[1], state.T_mount.shape[1]
-    bodies = np.arange(0 if _one_axis(problem, state) else stations, stations + mounts)
-    return (problem.free.shape[1] + 6 * bodies[:, None] + off).ravel()
+    names: tuple[Name, ...] = ("stations", "mounts") if _one_axis(problem) else ("mounts",)
+    bodies = problem.unknowns.columns(*names).reshape(-1, 6)
+    return bodies[:, :3][:, ~problem.layout.motion[:3].any(axis=1)].ravel()
 
 
 def _pivots(loose: Array) -> list[int]:
@@ -476,11 +478,11 @@ def _pivots(loose: Array) -> list[int]:
     return chosen
 
 
-def unknown_names(machine: Machine, state: ImplicitState) -> tuple[str, ...]:
+def unknown_names(machine: Machine, problem: ImplicitProblem) -> tuple[str, ...]:
     """Names of all unknowns, in the order of the Jacobian's columns."""
     parts = ("turn x", "turn y", "turn z", "x", "y", "z")
-    stations = [f"station {s + 1}, {p}" for s in range(state.T_camera_base.shape[1]) for p in parts]
-    mounts = [f"board {m + 1}, {p}" for m in range(state.T_mount.shape[1]) for p in parts]
+    stations = [f"station {s + 1}, {p}" for s in range(problem.n_stations) for p in parts]
+    mounts = [f"board {m + 1}, {p}" for m in range(problem.n_mounts) for p in parts]
     return (*machine.parameters.free_names(), *stations, *mounts)
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from pkmcal.judge.comparison import BesideDrawing, WeighedErrors, rms
+from pkmcal.judge.comparison import BesideDrawing, WeighedErrors, finite_rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.judge.paths import LinePath, Straightness
 from pkmcal.judge.validate import Validation
-from pkmcal.judge.words import better, factor
+from pkmcal.judge.words import against, better, factor
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
 from pkmcal.report import charts
 from pkmcal.session.load import Session
@@ -56,17 +56,17 @@ def _cards(judged: BesideDrawing, session: Session) -> tuple[Figure, ...]:
     """The main numbers."""
     new, old = judged.figures(judged.calibrated), judged.figures(judged.drawing)
     test, gain, unit = judged.promise, judged.ratio, _unit(session)
-    against = (
-        f"; {amount(rms(judged.after), unit)} against {amount(rms(judged.before), unit)}, weighed"
-        " by how well the photographs see each direction"
-        if unit
-        else ""
-    )
+    weighed = ""
+    if unit:
+        weighed = (
+            f"; {against(judged.after, judged.before, unit)}, weighed by how well the photographs"
+            " see each direction"
+        )
     return (
         Figure(
             "How many times better than the drawing?",
             ((better(gain), ""),),
-            f"in predicting readings, 95 %: {factor(gain.low)} to {factor(gain.high)}{against}",
+            f"in predicting readings, 95 %: {factor(gain.low)} to {factor(gain.high)}{weighed}",
         ),
         Figure(
             "Where is the tool, by the readings?",
@@ -140,9 +140,9 @@ def regions_table(items: tuple[HoldOut, ...], session: Session) -> Table:
             item.region.name,
             (
                 str(len(item.left_out.rows)),
-                text(rms(item.left_out.before)),
-                text(rms(item.left_out.after)),
-                text(rms(item.used.after)),
+                text(finite_rms(item.left_out.before)),
+                text(finite_rms(item.left_out.after)),
+                text(finite_rms(item.used.after)),
                 better(item.left_out.ratio),
                 number(item.left_out.promise.factor, 2),
             ),
@@ -183,14 +183,14 @@ def paths_table(paths: tuple[LinePath, ...]) -> Table:
 def held_out(item: HoldOut, session: Session) -> Part:
     """What a calibration's report says of configurations held out of it."""
     out, used, unit = item.left_out, item.used, _unit(session)
-    against = inside = ""
+    amounts = inside = ""
     if unit:
-        against = f": {amount(rms(out.after), unit)} against {amount(rms(out.before), unit)}"
-        inside = f" In the configurations in use, {amount(rms(used.after), unit)}."
+        amounts = f": {against(out.after, out.before, unit)}"
+        inside = f" In the configurations in use, {amount(finite_rms(used.after), unit)}."
     kept = "" if out.promise.kept else " That is more than the deviations promise."
     sentence = (
         f"On {count(len(out.rows), 'configuration')} held out, the calibrated machine predicts the"
-        f" readings {better(out.ratio)} times better than the drawing{against}.{inside}{kept}"
+        f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{kept}"
     )
     in_use, new = used.figures(used.calibrated), out.figures(out.calibrated)
     drawn = out.figures(out.drawing)
