@@ -228,13 +228,8 @@ def said(suspect: Suspect, cameras: Sequence[str] = (), short: bool = False) -> 
         joint = f"the {cause.part} joint{'s' if len(cause.legs) > 1 else ''} of {who}"
         together = " together" if len(cause.legs) > 1 else ""
         return f"{joint}{together}{_vector(suspect, short)}"
-    names = {
-        "zero": "the zero of {}'s reading",
-        "rod": "the rod length of {}",
-        "arm": "the arm of {}",
-        "hinge": "the hinge of {}",
-    }
-    what = names[cause.part].format(who)
+    names = {"zero": f"the zero of {who}'s reading", "rod": f"the rod length of {who}"}
+    what = names.get(cause.part, f"the {cause.part} of {who}")
     if len(value) > 1:
         return f"{what}{_vector(suspect, short)}"
     return f"{what} by {signed(value[0], sigma[0], cause.unit)}"
