@@ -71,7 +71,7 @@ class Assembled:
         :meth:`~pkmcal.identify.problem.Problem.weighted`.
         """
         placed = zip(self.places, weights, strict=True)
-        return self.problem.weighted(*(at.filled(weight)[None] for at, weight in placed))
+        return self.problem.weighted(Kinds(*(at.filled(weight)[None] for at, weight in placed)))
 
 
 def assemble(

@@ -77,7 +77,7 @@ def solve_batch(
     damping : the search's first; less where the start is near, as after the four steps.
     """
     n_runs = start.z.shape[0]
-    ones = Kinds(np.ones(n_runs), np.ones(n_runs))
+    ones: Kinds[Array] = Kinds(np.ones(n_runs), np.ones(n_runs))
     present = (kind.present.astype(float) for kind in problem.kinds)
     every = Kinds(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
     fit = _Fit(problem, start, every, ones, np.zeros(n_runs, dtype=int), ())
@@ -125,7 +125,7 @@ def _settled(
 def _solved(problem: Problem, fit: _Fit, damping: float) -> _Fit:
     """The problem solved with the fit's weights, from its state."""
     parts = zip(fit.weight, fit.scale, strict=True)
-    used = problem.weighted(*(weight / scale[:, None, None] ** 2 for weight, scale in parts))
+    used = problem.weighted(Kinds(*(weight / scale[:, None, None] ** 2 for weight, scale in parts)))
     found = minimise(used, fit.state, damping=damping)
     steps = fit.steps + found.steps
     return fit._replace(problem=used, state=found.state, steps=steps, stop=found.stop)

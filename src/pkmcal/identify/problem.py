@@ -90,14 +90,12 @@ class Problem:
         """The problem of some runs only."""
         return replace(self, data=of_runs(self.data, runs), pose_data=of_runs(self.pose_data, runs))
 
-    def weighted(self, edges: Array, poses: Array) -> Problem:
-        """The same problem with other weights of the edges' blocks and of the boards' poses,
-        (B, K, G) each.
-        """
+    def weighted(self, weight: Kinds[Array]) -> Problem:
+        """The same problem with other weights (B, K, G) of each kind's measurements."""
         return replace(
             self,
-            data=replace(self.data, weight=edges),
-            pose_data=replace(self.pose_data, weight=poses),
+            data=replace(self.data, weight=weight.edges),
+            pose_data=replace(self.pose_data, weight=weight.poses),
         )
 
     def opened(self, state: BatchState) -> tuple[Problem, BatchState]:
@@ -180,7 +178,7 @@ class Problem:
 
     def unweighted(self, state: BatchState) -> Kinds[Array]:
         """Whitened residuals of each kind of measurement without their weights, (B, K, G, n)."""
-        plain = self.weighted(*(kind.present[None].astype(float) for kind in self.kinds))
+        plain = self.weighted(Kinds(*(kind.present[None].astype(float) for kind in self.kinds)))
         edges = plain._edges(state, plain.closure(state))
         return Kinds(edges.value(state.optics, state.shading), plain._poses(state).value)
 

@@ -112,7 +112,7 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
         cut = new
         weight = Kinds(*(soft_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True)))
         damping = RESTART_DAMPING if steps else FIRST_DAMPING
-        found = minimise(problem.weighted(*weight), state, max_steps=most, damping=damping)
+        found = minimise(problem.weighted(weight), state, max_steps=most, damping=damping)
         state, steps = found.state, steps + int(found.steps.max())
         d = distances(problem, state)
         if settled:

@@ -34,7 +34,7 @@ PERFECT = 1e-6
 """Standard deviation (m) of closures without a reading: joints and rods without play. A third of
 a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
 
-Item = TypeVar("Item")
+Item = TypeVar("Item", covariant=True)
 
 
 class Kinds(NamedTuple, Generic[Item]):

@@ -99,7 +99,9 @@ def single_causes(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
         if (cause := _of_names(machine, part, legs)).sizes.size
     ]
     for side in SIDES:
-        out += [_together(machine, side, pair) for pair in _neighbours(machine, side)]
+        for pair in _neighbours(machine, side):  # a mount that both share
+            one, other = (joint_of(machine, side, leg) for leg in pair)
+            out.append(Cause(side, pair, one.columns + other.columns, one.sizes, "m"))
     cameras = [magnification(machine, c) for c in range(n_cameras)]
     return (*out, common_scale(machine), *cameras)
 
@@ -157,12 +159,6 @@ def _neighbours(machine: Machine, side: Side) -> list[tuple[int, int]]:
     # a mount that two joints share is shorter than the way to the next one
     close = [p for p in pairs if apart[p] < 0.7 * np.sort(apart[p[0]])[1]]
     return sorted(set(close) - own)
-
-
-def _together(machine: Machine, side: Side, pair: tuple[int, int]) -> Cause:
-    """Two neighbouring joints moved by the same vector."""
-    one, other = (joint_of(machine, side, leg) for leg in pair)
-    return Cause(side, pair, one.columns + other.columns, one.sizes, "m")
 
 
 def magnified(
