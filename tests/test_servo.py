@@ -28,10 +28,9 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
-from pkmcal.simulation.configurations import draw_configurations
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
-from pkmcal.simulation.stations import default_stations
+from pkmcal.simulation.placement import default_stations, draw_configurations
 
 QUIET = EdgeNoise(0.0, 0.0)
 CLEAN = Loop(noise=QUIET, joint_noise=0.0, rate=10.0, delay=0, duration=8.0)

@@ -17,7 +17,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.simulation.demo import demo_camera
-from pkmcal.simulation.stations import default_stations
+from pkmcal.simulation.placement import default_stations
 from pkmcal.simulation.truth import stream, true_machine
 
 CALIBRATED = 1 / 30

@@ -32,7 +32,7 @@ from pkmcal.geometry.rigid import apply, inverse, perturb, pose, register, rotat
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.simulation.configurations import draw_configurations
+from pkmcal.simulation.placement import draw_configurations
 
 HAND_POSITION = 0.03
 HAND_ROTATION = float(np.deg2rad(3))
