@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from pkmcal.cameras import camera_models
-from pkmcal.control.analysis import equilibria, matrix_at, of_legs, subsets, visibility
+from pkmcal.control.analysis import equilibria, matrix_at, subsets, visibility
 from pkmcal.control.image import Eye, responses
 from pkmcal.control.laws import limited, task_of
 from pkmcal.control.seen import legs_at, seen_machine, true_edges
 from pkmcal.control.simulation import (
     End,
     Loop,
-    assembly_sign,
+    aspect_at,
     loop_factor,
     one_image,
     outside,
@@ -261,7 +261,7 @@ def test_coming_to_a_singular_pose():
     weak = machine.forward_result(machine.inverse(turned), turned).singularity
     first = int(np.argmax(weak < NEAR_SINGULAR / 2))
     goal = turned[first : first + 1]
-    assert assembly_sign(machine, goal) == assembly_sign(machine, start)
+    assert aspect_at(machine, goal) == aspect_at(machine, start)
     runs = simulate(eye, eye.true, start, goal, CLEAN, np.random.default_rng(0))
     assert runs.end == (End.SINGULAR,)
     assert runs.last[0] > 3
@@ -274,9 +274,7 @@ def test_wrong_assembly_as_start():
     goal = turned_home(machine, 0.0)
     readings = machine.inverse(goal)[0]
     modes = machine.assembly_modes(readings, np.random.default_rng(0))
-    start = next(
-        m for m in modes if assembly_sign(machine, m[None]) != assembly_sign(machine, goal)
-    )
+    start = next(m for m in modes if aspect_at(machine, m[None]) != aspect_at(machine, goal))
     runs = simulate(eye, eye.true, start[None], goal, CLEAN, np.random.default_rng(0))
     assert runs.end == (End.WRONG_ASSEMBLY,)
     assert runs.last[0] == 0
@@ -301,7 +299,7 @@ def test_losing_a_leg(eye):
 
 
 def test_noise_that_keeps_the_goal_away(eye):
-    eye = Eye.of(of_legs(eye.true, [0, 2, 4]), eye.camera)
+    eye = Eye.of(eye.true.only(np.array([0, 2, 4])), eye.camera)
     starts, goals = ways_of(eye, 6)
     loop = Loop(law="directions", rate=10.0, duration=6.0, noise=EdgeNoise(0.3, 0.3))
     runs = simulate(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
@@ -349,7 +347,7 @@ def test_three_legs_leave_other_poses(eye):
     """Legs 1, 2 and 3: poses in the workspace with the same directions, to the last digit."""
     poses = draw_configurations(eye.true.machine, 60, 0.2, np.random.default_rng(8))[0]
     goals, starts = poses[:4], poses[4:40]
-    three = of_legs(eye.true, [0, 1, 2])
+    three = eye.true.only(np.array([0, 1, 2]))
     found = equilibria(three, "directions", goals, starts)
     assert found.alike > 0.05
     assert found.looks_alike.any()
@@ -366,7 +364,7 @@ def test_three_legs_leave_other_poses(eye):
 def test_an_equilibrium_is_one(eye):
     """N^T e vanishes where the search says that the control rests."""
     poses = draw_configurations(eye.true.machine, 60, 0.2, np.random.default_rng(8))[0]
-    three = of_legs(eye.true, [0, 1, 2])
+    three = eye.true.only(np.array([0, 1, 2]))
     found = equilibria(three, "directions", poses[:3], poses[3:40])
     for pose, goal in zip(found.T_base_platform, found.goal, strict=True):
         wanted = true_edges(three, poses[goal][None])

@@ -1,4 +1,9 @@
-"""Why the machine is not seen where its readings put it: asked once, while it stands still."""
+"""Tracking of the legs from photograph to photograph: edges, lines with covariances, the pose.
+
+A photograph is looked at about the pose that the readings give. Its edges become the legs' lines,
+which the law needs, and correct the pose for the next look. Where the machine is not seen where
+its readings put it, other assemblies are asked: once, while it stands still.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +28,24 @@ FITS = float(np.deg2rad(5.0))
 """Angle between a leg as seen and as predicted, median over the legs, up to which it is the
 assembly that was expected: a camera placed by hand is right to a few degrees, other assemblies
 lie tens of degrees away."""
+SHADING = 0.1
+"""Pixels by which a whole edge may lie off, whatever its own sigma: shading that the edge model
+leaves out (docs/observation.md measures 0.14 and 0.22 px a place)."""
+ASIDE = 0.1
+"""Metres by which a leg's ends are believed to lie beside the prediction: no knowledge at all, but
+it keeps the line of a leg with one edge finite until that leg is found to be lost."""
+LAG = 0.001
+"""Metres by which a reading may lie beside the photograph: 50 mm/s for 20 ms between the two. Edges
+tell some motions of the platform a hundred times worse than others, and there readings decide."""
+AGREE = 16.0
+"""Mean squared misfit, in variances, beyond which a leg's edges are not one leg's."""
+SIDES = np.array([0, 1])
+HIDDEN = "hidden behind another leg or outside the photograph"
+FAR = 0.7
+"""Median distance (px) of edges from their prediction from which none is believed: of legs that
+turned away more than that, the ends that still lie within reach pass for whole edges."""
+SEARCH_ROUNDS = 3
+"""Gauss-Newton steps of the pose after a search: ten pixels are far enough to bend the way."""
 
 
 def misfit(seen: SeenMachine, normals: Array, T_base_platform: Array, readings: Array) -> float:
@@ -64,20 +87,6 @@ def assembly_sentence(seen: SeenMachine, normals: Array, expected: Array, readin
         f" turned by {turn:.0f} degrees against it: give that pose as start, or bring the machine"
         " back to the other assembly"
     )
-
-
-SHADING = 0.1
-"""Pixels by which a whole edge may lie off, whatever its own sigma: shading that the edge model
-leaves out (docs/observation.md measures 0.14 and 0.22 px a place)."""
-ASIDE = 0.1
-"""Metres by which a leg's ends are believed to lie beside the prediction: no knowledge at all, but
-it keeps the line of a leg with one edge finite until that leg is found to be lost."""
-LAG = 0.001
-"""Metres by which a reading may lie beside the photograph: 50 mm/s for 20 ms between the two. Edges
-tell some motions of the platform a hundred times worse than others, and there readings decide."""
-AGREE = 16.0
-"""Mean squared misfit, in variances, beyond which a leg's edges are not one leg's."""
-SIDES = np.array([0, 1])
 
 
 @dataclass(frozen=True)
@@ -149,7 +158,11 @@ def edge_rows(
     own = edges.leg[:, None] == seen.legs
     edges = edges.select(own.any(axis=1))
     leg = own[own.any(axis=1)].argmax(axis=1)
-    at = edge_normal_jacobians(a[leg], b[leg], _radii(seen, edges.leg, edges.tube), edges.side)
+    radii = machine.radii()
+    radius = np.array(
+        [radii[j][k] for j, k in zip(edges.leg, edges.tube, strict=True)], dtype=float
+    )
+    at = edge_normal_jacobians(a[leg], b[leg], radius, edges.side)
     to_tangent = np.swapaxes(edges.basis, -1, -2)
     off = SHADING * edges.shift
     covariance = edges.covariance + off[:, :, None] * off[:, None, :]
@@ -164,12 +177,6 @@ def edge_rows(
         a=a,
         b=b,
     )
-
-
-def _radii(seen: SeenMachine, leg: Integers, tube: Integers) -> Array:
-    """Radii (M,) of tubes, m."""
-    radii = seen.machine.radii()
-    return np.array([radii[j][t] for j, t in zip(leg, tube, strict=True)], dtype=float)
 
 
 def leg_lines(seen: SeenMachine, rows: EdgeRows) -> LegLines:
@@ -282,14 +289,6 @@ def corrected_pose(
     normal = np.sum(to_right @ jac, axis=0) + closing.T @ closing
     right = np.sum(to_right @ misfit[..., None], axis=0)[:, 0] - closing.T @ c.value / LAG
     return perturb(T_base_platform, motion @ np.linalg.solve(normal, right))
-
-
-HIDDEN = "hidden behind another leg or outside the photograph"
-FAR = 0.7
-"""Median distance (px) of edges from their prediction from which none is believed: of legs that
-turned away more than that, the ends that still lie within reach pass for whole edges."""
-SEARCH_ROUNDS = 3
-"""Gauss-Newton steps of the pose after a search: ten pixels are far enough to bend the way."""
 
 
 @dataclass(frozen=True)
