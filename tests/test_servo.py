@@ -9,12 +9,12 @@ import pytest
 
 from pkmcal.cameras import camera_models
 from pkmcal.control.analysis import equilibria, matrix_at, subsets, visibility
-from pkmcal.control.image import Eye, responses
+from pkmcal.control.image import Eye, edge_responses
 from pkmcal.control.laws import limited, task_of
 from pkmcal.control.seen import legs_at, seen_machine, true_edges
 from pkmcal.control.simulation import (
     End,
-    Loop,
+    LoopSettings,
     aspect_at,
     loop_factor,
     one_image,
@@ -22,7 +22,7 @@ from pkmcal.control.simulation import (
     platform_joints,
     simulate,
 )
-from pkmcal.control.study import Plan, Scene, Uncertainty, check_loop, check_pose, estimates, study
+from pkmcal.control.study import Plan, Plant, Uncertainty, check_loop, check_pose, estimates, study
 from pkmcal.control.words import judgement
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb
@@ -33,7 +33,7 @@ from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.placement import default_stations, draw_configurations
 
 QUIET = EdgeNoise(0.0, 0.0)
-CLEAN = Loop(noise=QUIET, joint_noise=0.0, rate=10.0, delay=0, duration=8.0)
+CLEAN = LoopSettings(noise=QUIET, joint_noise=0.0, rate=10.0, delay=0, duration=8.0)
 
 
 def mirror():
@@ -83,7 +83,7 @@ def test_noise_is_that_of_simulated_edges(camera):
         eye.true.machine, T[None], camera, poses, EdgeNoise(0.1, 0.1), np.random.default_rng(0)
     )
     points = eye.points(poses, joints, 24)
-    by_shift, by_tilt, _ = responses(points)
+    by_shift, by_tilt, _ = edge_responses(points)
     parts = 0.1 * np.stack([by_shift, by_tilt], axis=-1)
     own = np.linalg.det(parts @ np.swapaxes(parts, -1, -2))[0]
     checked = 0
@@ -186,7 +186,9 @@ def test_limits_keep_the_direction():
 def test_predicted_stillness_is_what_the_loop_does(eye, delay):
     goals = np.repeat(ways_of(eye, 1)[1], 32, axis=0)
     noise = EdgeNoise(0.05, 0.05)
-    loop = Loop(noise=noise, joint_noise=0.0, rate=10.0, gain=2.0, delay=delay, duration=25.0)
+    loop = LoopSettings(
+        noise=noise, joint_noise=0.0, rate=10.0, gain=2.0, delay=delay, duration=25.0
+    )
     runs = simulate(eye, eye.true, goals, goals, loop, np.random.default_rng(0))
     measured = np.sqrt(np.mean(runs.way[:, 30:] ** 2))
     joints = eye.true.machine.inverse(goals)
@@ -214,9 +216,9 @@ def test_edges_hold_steadier_than_directions(eye):
 
 
 def test_unstable_loops_are_refused():
-    check_loop(Loop(gain=5.0, rate=25.0, delay=3))
+    check_loop(LoopSettings(gain=5.0, rate=25.0, delay=3))
     with pytest.raises(InputError, match=r"unstable.*less than 11\.1/s"):
-        check_loop(Loop(gain=12.0, rate=25.0, delay=3))
+        check_loop(LoopSettings(gain=12.0, rate=25.0, delay=3))
 
 
 # ------------------------------------------------------------------ runs that fail
@@ -301,7 +303,7 @@ def test_losing_a_leg(eye):
 def test_noise_that_keeps_the_goal_away(eye):
     eye = Eye.of(eye.true.only(np.array([0, 2, 4])), eye.camera)
     starts, goals = ways_of(eye, 6)
-    loop = Loop(law="directions", rate=10.0, duration=6.0, noise=EdgeNoise(0.3, 0.3))
+    loop = LoopSettings(law="directions", rate=10.0, duration=6.0, noise=EdgeNoise(0.3, 0.3))
     runs = simulate(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
     assert not runs.reached.any()
 
@@ -404,11 +406,11 @@ def test_estimates_have_the_errors_asked_for(eye):
     np.testing.assert_allclose(np.arccos(cosine), 0.1, atol=1e-6)
 
 
-def scene_of(eye: Eye, legs=None) -> Scene:
+def scene_of(eye: Eye, legs=None) -> Plant:
     n = len(eye.true.theta)
     unsure = Uncertainty(1e-9 * np.eye(n), np.full(3, 3e-4), np.full(3, 2e-4))
     machine = eye.true.machine
-    return Scene(machine, machine.values, unsure, eye.camera, eye.true.T_camera_base, legs)
+    return Plant(machine, machine.values, unsure, eye.camera, eye.true.T_camera_base, legs)
 
 
 SHORT = replace(CLEAN, rate=4.0, duration=8.0)

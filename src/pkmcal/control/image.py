@@ -83,7 +83,14 @@ class Eye:
         shape = (*points.normal.shape[:-2], -1, 2, 3)
         if not (noise.shift or noise.tilt or noise.outward):
             return points.normal.reshape(shape)
-        middle = points.point[..., points.point.shape[-2] // 2, :]
-        basis = tangent_basis(points.normal, middle / np.sqrt(dot(middle, middle))[..., None])
-        by_shift, by_tilt = responses(points.by_normal() @ basis, points.pixel)
+        by_shift, by_tilt, basis = edge_responses(points)
         return disturbed(points.normal, basis, by_shift, by_tilt, noise, rng).reshape(shape)
+
+
+def edge_responses(points: EdgePoints) -> tuple[Array, Array, Array]:
+    """Turns (R, E, 2) of the normals by a pixel's shift and by a pixel's tilt, see
+    :func:`pkmcal.simulation.edges.responses`; and the bases (R, E, 3, 2) that they are told in.
+    """
+    middle = points.point[..., points.point.shape[-2] // 2, :]
+    basis = tangent_basis(points.normal, middle / np.sqrt(dot(middle, middle))[..., None])
+    return *responses(points.by_normal() @ basis, points.pixel), basis

@@ -188,7 +188,7 @@ def one_image(
 
 
 @dataclass(frozen=True)
-class Loop:
+class LoopSettings:
     """A controller's settings.
 
     gain : 1/s. rate : samples a second. delay : samples from the exposure to the drives' answer.
@@ -243,7 +243,7 @@ def simulate(
     believed: SeenMachine,
     starts: Array,
     goals: Array,
-    loop: Loop,
+    loop: LoopSettings,
     rng: np.random.Generator,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Runs:
@@ -398,7 +398,7 @@ class _Record:
         self.past[:, sample] = -ahead / np.where(whole > 0, whole, np.inf)
         self.poses[:, sample], self.readings[:, sample] = now.poses, now.readings
 
-    def runs(self, now: _Now, goals: Array, loop: Loop, floor: Array) -> Runs:
+    def runs(self, now: _Now, goals: Array, loop: LoopSettings, floor: Array) -> Runs:
         """What the runs were, with their ends judged."""
         last = np.where(now.active, loop.samples - 1, now.last)
         judged = _judged(self.error, self.way, loop, floor)
@@ -410,14 +410,16 @@ class _Record:
         )  # fmt: skip
 
 
-def _floor(eye: Eye, goals: Array, readings: Array, loop: Loop, rng: np.random.Generator) -> Array:
+def _floor(
+    eye: Eye, goals: Array, readings: Array, loop: LoopSettings, rng: np.random.Generator
+) -> Array:
     """Distance (R,) m of the platform's joints from the goal that the noise alone explains."""
     still = one_image(eye, eye.true, loop.law, goals, readings, loop.noise, rng, draws=8)
     part = loop_factor(loop.gain / loop.rate, loop.delay)
     return np.nan_to_num(NOISY * still.joints * (part if np.isfinite(part) else 0.0))
 
 
-def _judged(error: Array, way: Array, loop: Loop, floor: Array) -> list[End]:
+def _judged(error: Array, way: Array, loop: LoopSettings, floor: Array) -> list[End]:
     """Where runs (R, K) that used all their time ended, by the means over their last part.
 
     floor : (R,) m, what noise alone explains.

@@ -12,7 +12,7 @@ from pkmcal.calibration.results import SavedCalibration, SavedStation, load
 from pkmcal.calibration.source import Source, load_source
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.control.seen import seen_machine
-from pkmcal.control.study import Scene, Uncertainty
+from pkmcal.control.study import Plant, Uncertainty
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.mechanisms import Machine
@@ -35,7 +35,7 @@ class Controlled:
     name : of the machine. origin : a sentence. station : the camera's, None for a drawing.
     """
 
-    scene: Scene
+    scene: Plant
     name: str
     origin: str
     station: str | None = None
@@ -82,7 +82,7 @@ def _of_calibration(
     """
     place = _station(saved, source, station, eye)
     eye = source.cameras[place.name] if eye is None else eye
-    scene = Scene(
+    scene = Plant(
         machine=saved.machine,
         drawing=saved.drawing,
         uncertainty=Uncertainty(saved.covariance, place.sigma_rotation, place.sigma_translation),
@@ -131,7 +131,7 @@ def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed:
     rng = np.random.default_rng(stream(seed, "stations"))
     place = default_stations(machine, (eye,), rng)[0]
     truth = true_machine(machine, 1.0, np.random.default_rng(stream(seed, "machine")))
-    scene = Scene(
+    scene = Plant(
         machine=truth,
         drawing=np.array(machine.values),
         uncertainty=_expected(machine),

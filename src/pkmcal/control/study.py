@@ -22,7 +22,7 @@ from pkmcal.control.seen import SeenMachine, seen_machine
 from pkmcal.control.simulation import (
     SETTLED,
     End,
-    Loop,
+    LoopSettings,
     Runs,
     Stillness,
     loop_factor,
@@ -66,7 +66,7 @@ class Uncertainty:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Belief:
     """One estimate of the geometry. seen : values (R, P) and camera's places (R, 4, 4)."""
 
     name: str
@@ -82,7 +82,7 @@ def estimates(
     rng: np.random.Generator,
     hand_position: float = HAND_POSITION,
     hand_rotation: float = HAND_ROTATION,
-) -> tuple[Estimate, ...]:
+) -> tuple[Belief, ...]:
     """The truth, the identified geometry, the drawing fitted to it, and the drawing by hand.
 
     true : the machine that is controlled. drawing : (P,) values. Every run has its own error of
@@ -98,10 +98,10 @@ def estimates(
     exact = _fitted(drawn, replace(true, T_camera_base=T_camera_base))
     by_hand = _moved_by_hand(exact, hand_position, hand_rotation, rng)
     return (
-        Estimate("true", "True geometry", repeated),
-        Estimate("identified", "Identified", identified),
-        Estimate("cad", "Drawing, fitted", fitted),
-        Estimate("hand", "By hand", by_hand),
+        Belief("true", "True geometry", repeated),
+        Belief("identified", "Identified", identified),
+        Belief("cad", "Drawing, fitted", fitted),
+        Belief("hand", "By hand", by_hand),
     )
 
 
@@ -147,7 +147,7 @@ class Plan:
     by hand is off. start, goal : (4, 4) of every run; drawn unless given.
     """
 
-    loop: Loop = field(default_factory=Loop)
+    loop: LoopSettings = field(default_factory=LoopSettings)
     runs: int = 60
     seed: int = 0
     hand_position: float = HAND_POSITION
@@ -157,7 +157,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Plant:
     """What is controlled. drawing : (P,) values. uncertainty : of its calibration. legs : numbers
     from 0 of those seen, all with tubes unless given.
     """
@@ -184,7 +184,7 @@ class Trials:
     s after which the platform is within SETTLED of its way, NaN where it never is.
     """
 
-    estimate: Estimate
+    estimate: Belief
     runs: Runs
     overshoot: Array
     rise: Array
@@ -209,7 +209,7 @@ class Study:
     with tubes.
     """
 
-    scene: Scene
+    scene: Plant
     plan: Plan
     eye: Eye
     outcomes: tuple[Trials, ...]
@@ -231,7 +231,7 @@ class Study:
 
 
 def study(
-    scene: Scene, plan: Plan, progress: Callable[[str, float], None] = lambda _text, _share: None
+    scene: Plant, plan: Plan, progress: Callable[[str, float], None] = lambda _text, _share: None
 ) -> Study:
     """Simulate the loop with every estimate, and analyse what the legs show.
 
@@ -277,7 +277,7 @@ def study(
     )
 
 
-def check_loop(loop: Loop) -> None:
+def check_loop(loop: LoopSettings) -> None:
     """Raise InputError where the loop is unstable even with perfect knowledge."""
     if np.isfinite(loop_factor(loop.gain / loop.rate, loop.delay)):
         return
@@ -294,7 +294,7 @@ def check_loop(loop: Loop) -> None:
     )
 
 
-def outcome(estimate: Estimate, runs: Runs) -> Trials:
+def outcome(estimate: Belief, runs: Runs) -> Trials:
     """The figures of an estimate's runs."""
     last = np.arange(len(runs.time)) <= runs.last[:, None]
     past = np.where(last, runs.past, 0.0)
