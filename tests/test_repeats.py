@@ -35,8 +35,8 @@ from pkmcal.observe.repeats import (
 from pkmcal.papers.axis_measurements import to_coordinates
 from pkmcal.session.load import load_session
 from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges
-from pkmcal.simulation.configurations import draw_configurations
 from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.placement import draw_configurations
 from rendered import rendered
 
 CAMERA = camera_of_size((640, 480))

@@ -25,9 +25,9 @@ from pkmcal.simulation import (
     with_forearms,
 )
 from pkmcal.simulation.board import board_from_fields
-from pkmcal.simulation.configurations import FARTHEST_TURN, unfolded
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.drives import drives_of, reaches, side_bars
+from pkmcal.simulation.placement import FARTHEST_TURN, unfolded
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Cylinder
 from pkmcal.simulation.surfaces import SmoothNoise

@@ -172,7 +172,7 @@ class Law(ABC):
 
 
 @final
-class Directions(Law):
+class DirectionLaw(Law):
     """[B] 8-9: e = u x u*, N = -[u*]x L."""
 
     name: ClassVar = "directions"
@@ -192,7 +192,7 @@ class Directions(Law):
 
 
 @final
-class Edges(Law):
+class EdgeLaw(Law):
     """Errata: e = n x n*, N = -[n*]x J L."""
 
     name: ClassVar = "edges"
@@ -209,7 +209,7 @@ class Edges(Law):
         return -skew(goal) @ edge_interaction(seen, legs, normals, rate)
 
 
-LAWS: dict[str, type[Law]] = {law.name: law for law in (Edges, Directions)}
+LAWS: dict[str, type[Law]] = {law.name: law for law in (EdgeLaw, DirectionLaw)}
 """By name; edges first, which hold the platform an order of magnitude steadier."""
 
 

@@ -12,6 +12,8 @@ from pkmcal.arrays import Array
 from pkmcal.simulation.shapes import Cylinder, Shape, inner
 
 NOISE_SIZE = 256
+BRUSH_ACROSS, BRUSH_ALONG = 0.13, 0.75
+"""Ward roughness of turned steel across and along the axis."""
 
 
 @dataclass(frozen=True)
@@ -193,10 +195,6 @@ class Lighting:
     ground: float
 
 
-_BRUSH_ACROSS, _BRUSH_ALONG = 0.13, 0.75
-"""Ward roughness of turned steel across and along the axis."""
-
-
 def radiance(
     shape: Shape, material: Material, points: Array, to_camera: Array, lit: Array, light: Lighting
 ) -> Array:
@@ -238,7 +236,7 @@ def _highlight(
         return hn**material.sharpness
     along = inner(h, axis)
     across2 = np.maximum(1 - along**2 - hn**2, 0.0)
-    return np.exp(-(across2 / _BRUSH_ACROSS**2 + along**2 / _BRUSH_ALONG**2) / hn**2)
+    return np.exp(-(across2 / BRUSH_ACROSS**2 + along**2 / BRUSH_ALONG**2) / hn**2)
 
 
 def _surroundings(n: Array, to_camera: Array, light: Lighting) -> Array:
