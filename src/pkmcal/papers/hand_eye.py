@@ -21,12 +21,13 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import (
     dot,
+    from_quaternion,
     inverse,
     perturb,
     pose,
     pose_difference,
+    quaternion,
     register,
-    rotation_vector,
     skew,
 )
 from pkmcal.identify.estimate import State
@@ -181,7 +182,7 @@ def _turns(body: Array, seen: Array) -> list[tuple[Array, Array]]:
     for rank in RANKS:
         kept = along * (np.arange(4) < rank)[:, None]
         camera, mount = u @ kept, np.swapaxes(vt, -1, -2) @ kept
-        out.append((matrix(camera[..., 0]), matrix(mount[..., 0])))
+        out.append((from_quaternion(camera[..., 0]), from_quaternion(mount[..., 0])))
     return out
 
 
@@ -198,22 +199,6 @@ def _right(q: Array) -> Array:
     out = _left(q)
     out[..., 1:, 1:] -= 2 * skew(q[..., 1:])
     return out
-
-
-def quaternion(rot: Array) -> Array:
-    """Unit quaternions (..., 4), scalar first, of rotations (..., 3, 3)."""
-    omega = rotation_vector(rot)
-    angle = np.sqrt(dot(omega, omega))[..., None]
-    axis = omega / np.where(angle > 0, angle, 1.0)
-    return np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], axis=-1)
-
-
-def matrix(q: Array) -> Array:
-    """Rotations (..., 3, 3) of quaternions (..., 4) of any length but zero."""
-    q = q / np.sqrt(dot(q, q))[..., None]
-    w, v = q[..., :1, None], q[..., 1:]
-    k = skew(v)
-    return np.eye(3) + 2 * (w * k + k @ k)
 
 
 def _placed(body: Array, seen: Array, camera: Array, mount: Array) -> Pair:

@@ -95,7 +95,7 @@ def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
 
     Needs one pose more than the hypothesis has unknowns: three to turn about an axis.
     """
-    from scipy.stats import chi2 as distribution
+    from scipy.special import chdtrc
 
     hypothesis = TURNS[int(MOTIONS[motion][:3].any(axis=1).sum())]
     rot = poses.T_station_target[:, :3, :3]
@@ -124,7 +124,7 @@ def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
         pairs=pairs,
         chi2=chi2,
         dof=dof,
-        p_value=float(distribution.sf(chi2, dof)) if dof else 1.0,
+        p_value=float(chdtrc(dof, chi2)) if dof else 1.0,
     )
 
 
