@@ -31,8 +31,8 @@ from pkmcal.judge.changes import (
     detectable,
     explained,
     likelihood,
+    look_for_changes,
     made_tests,
-    tested,
     together,
 )
 from pkmcal.judge.held import Evidence, Trust, evidence, hold
@@ -228,7 +228,7 @@ def test_the_regression_predicts_what_a_change_does(watched, by):
 
 def test_a_changed_offset_is_found_and_named(watched):
     rng = np.random.default_rng(21)
-    judged = tested(
+    judged = look_for_changes(
         watched.evidence(moved(watched.true, leg3_length__offset=1e-3), rng), watched.true, ALPHA
     )
     verdict = watch_verdict(judged, looked())
@@ -247,7 +247,7 @@ def test_a_joint_that_moved(watched):
     rng = np.random.default_rng(22)
     now = moved(watched.true, leg2_base__center__x=2e-3, leg2_base__center__y=-1e-3)
     found = watched.evidence(now, rng, few=8)
-    judged = tested(found, watched.true, ALPHA)
+    judged = look_for_changes(found, watched.true, ALPHA)
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("base", (1,))
     off = first.change.value - [2e-3, -1e-3, 0]
@@ -261,7 +261,7 @@ def test_two_changes_are_both_named(watched):
     """The first single cause that is found resembles both; all pairs tell."""
     rng = np.random.default_rng(23)
     now = moved(watched.true, leg3_length__offset=1.5e-3, leg5_length__offset=-1.5e-3)
-    judged = tested(watched.evidence(now, rng, few=8), watched.true, ALPHA)
+    judged = look_for_changes(watched.evidence(now, rng, few=8), watched.true, ALPHA)
     causes = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
     assert causes == {("zero", (2,)), ("zero", (4,))}
     verdict = watch_verdict(judged, looked(8))
@@ -273,7 +273,7 @@ def test_warming_is_told_from_a_leg(watched):
     machine = watched.true
     lengths = np.array([k != "radius" for k in machine.parameters.kinds])
     warm = machine.with_values(machine.values * np.where(lengths, 1 + 2e-3, 1.0))
-    judged = tested(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
+    judged = look_for_changes(watched.evidence(warm, np.random.default_rng(24)), machine, ALPHA)
     assert judged.findings[0].suspect.cause.part == "scale"
     assert abs(judged.scale_change.value[0] - 2e-3) < 4 * judged.scale_change.sigma[0]
     verdict = watch_verdict(judged, looked())
@@ -285,7 +285,7 @@ def test_causes_that_look_alike_are_all_named(watched):
     """Three configurations hardly tell a leg's zero from its joints."""
     rng = np.random.default_rng(26)
     now = moved(watched.true, leg4_platform__center__z=1.2e-3)
-    judged = tested(watched.evidence(now, rng, few=3), watched.true, ALPHA)
+    judged = look_for_changes(watched.evidence(now, rng, few=3), watched.true, ALPHA)
     finding = judged.findings[0]
     alike = {(s.cause.part, s.cause.legs) for s in (finding.suspect, *finding.others)}
     assert ("platform", (3,)) in alike
@@ -387,13 +387,13 @@ def test_passive_legs_have_no_zero():
 def test_an_h4_by_its_board(h4):
     true, estimate, rng = h4
     poses = papers_poses()[rng.permutation(81)]
-    same = tested(by_board(estimate, true, poses[:5], rng), estimate.machine, ALPHA)
+    same = look_for_changes(by_board(estimate, true, poses[:5], rng), estimate.machine, ALPHA)
     verdict = watch_verdict(same, looked(5))
     assert verdict.usable, verdict
     assert "motor's zero by 0." in verdict.headline
     assert "°" in verdict.headline
     now = moved(true, leg2_base__angle=0.02)
-    judged = tested(by_board(estimate, now, poses[5:10], rng), estimate.machine, ALPHA)
+    judged = look_for_changes(by_board(estimate, now, poses[5:10], rng), estimate.machine, ALPHA)
     first = judged.findings[0].suspect
     assert (first.cause.part, first.cause.legs) == ("zero", (1,))
     assert abs(first.change.value[0] - 0.02) < 4 * first.change.sigma[0]
@@ -402,7 +402,9 @@ def test_an_h4_by_its_board(h4):
 def test_too_few_poses_of_a_board(h4):
     """One pose of a board tells no more than where camera and board are."""
     true, estimate, rng = h4
-    judged = tested(by_board(estimate, true, papers_poses()[:1], rng), estimate.machine, ALPHA)
+    judged = look_for_changes(
+        by_board(estimate, true, papers_poses()[:1], rng), estimate.machine, ALPHA
+    )
     verdict = watch_verdict(judged, looked(1))
     assert not verdict.usable
     assert "too few to tell" in verdict.headline
@@ -421,10 +423,10 @@ def test_a_planar_machine_by_its_board():
     case = measured(true, poses[:50], rng)
     start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
     estimate = bundle(drawing, case.measurements, start)
-    same = tested(by_board(estimate, true, poses[50:58], rng), estimate.machine, ALPHA)
+    same = look_for_changes(by_board(estimate, true, poses[50:58], rng), estimate.machine, ALPHA)
     assert not same.changed
     now = moved(true, leg2_length__offset=3e-3)
-    judged = tested(by_board(estimate, now, poses[50:58], rng), estimate.machine, ALPHA)
+    judged = look_for_changes(by_board(estimate, now, poses[50:58], rng), estimate.machine, ALPHA)
     first = judged.findings[0]
     alike = {(s.cause.part, s.cause.legs) for s in (first.suspect, *first.others)}
     assert ("zero", (1,)) in alike
@@ -440,7 +442,7 @@ def test_three_poses_of_a_board_tell_too_little_of_a_hexapod():
     case = measured(true, poses[:40], rng)
     start = start_state(drawing, case.measurements, T_CAMERA_BASE[None])
     estimate = bundle(drawing, case.measurements, start)
-    judged = tested(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
+    judged = look_for_changes(by_board(estimate, true, poses[40:], rng), estimate.machine, ALPHA)
     verdict = watch_verdict(judged, looked(3))
     assert not verdict.usable
     assert not judged.changed
@@ -460,7 +462,7 @@ def test_poses_that_cannot_be_found(watched, monkeypatch):
 def test_a_family_that_sees_nothing():
     machine = load_mechanism("gough-stewart")
     blind = Evidence(np.zeros(3), np.zeros((3, 54)))
-    judged = tested(blind, machine, ALPHA)
+    judged = look_for_changes(blind, machine, ALPHA)
     assert judged.tests == ()
     assert not judged.changed
     verdict = watch_verdict(judged, looked(1))

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 LEFT_OUT = re.compile(
-    r"seconds|time|\btook|folder|path|report|page|date|rate|python|numpy|version|files|out\b"
+    r"seconds|timings|time|\btook|folder|path|report|page|date|rate|python|numpy|version|files|out\b"
     r"|platform\.|opencv|scipy",
     re.IGNORECASE,
 )

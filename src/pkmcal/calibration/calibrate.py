@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.doubts import check_poses, richer_models, scale_doubt
@@ -21,13 +22,14 @@ from pkmcal.calibration.recognise import (
     platform_poses,
     read_photographs,
 )
-from pkmcal.calibration.turns import Progress, identify_poses, take_turns
+from pkmcal.calibration.turns import Progress, Turns, identify_poses, take_turns
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import Findings, explain, joined_by_boards, seen_legs
-from pkmcal.identify.verdict import judge
+from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
+from pkmcal.observe.legs import Photographs
 from pkmcal.outcome import Verdict
 from pkmcal.papers.conditions import conditions
 from pkmcal.papers.methods import Method as PaperMethod
@@ -92,20 +94,36 @@ def calibrate(
     # Matrices here are small: threads inside the linear algebra only wait for one another, and
     # beside our own threads they slow it twentyfold.
     with threadpool_limits(1, "blas"):
-        told = progress or (lambda _text, _share: None)
-        return _calibrate(session, method, seed, refine_camera, holdout, told)
+        clock = _Clock(progress)
+        session, cameras = _load(session, refine_camera, clock)
+        seen = _observe(session, seed, clock)
+        found = _identify(session, seen, cameras, method, seed, holdout, clock)
+        return _judge(session, seen, found, method, seed, clock)
 
 
-def _calibrate(
-    session: Session | Path | str,
-    method: Method,
-    seed: int,
-    refine_camera: bool,
-    holdout: int,
-    told: Progress,
-) -> Calibration:
-    """:func:`calibrate`, step by step."""
-    clock = _Clock()
+class _Seen(NamedTuple):
+    """A session's photographs, decoded, the boards in them, and all stations' poses (S, 4, 4)."""
+
+    photographs: list[Photographs]
+    boards: Boards
+    T_camera_base: Array
+
+
+class _Identified(NamedTuple):
+    """The last turn, the estimate by the method asked for, richer models that were tried, and what
+    was left out.
+    """
+
+    turns: Turns
+    estimate: Estimate
+    richer: tuple[RicherModel, ...]
+    out: LeftOut | None
+
+
+def _load(
+    session: Session | Path | str, refine_camera: bool, clock: _Clock
+) -> tuple[Session, CameraRefinement]:
+    """The session, whole and possible, and its cameras."""
     if not isinstance(session, Session):
         session = load_session(session)
     check_observable(session)
@@ -113,55 +131,80 @@ def _calibrate(
     platform_poses(session, most=not legs_stations(session))
     cameras = refinement_of(session, refine_camera)
     clock.lap("load")
-    told("Reading photographs", 0.0)
+    return session, cameras
+
+
+def _observe(session: Session, seed: int, clock: _Clock) -> _Seen:
+    """Where the stations stand, by what their photographs and tables show."""
+    clock.told("Reading photographs", 0.0)
     photographs = read_photographs(session)
     clock.lap("decode")
-    told("Recognising the machine", 0.2)
+    clock.told("Recognising the machine", 0.2)
     boards = boards_of(session, photographs)
     known = known_stations(session, boards)
     known = found_stations(session, photographs, np.random.default_rng(seed), boards, known)
     known = with_poses(session, boards, known)
     clock.lap("observe")
-    if photographs:
-        turns = take_turns(session, photographs, boards, known, cameras, told, clock.lap)
+    return _Seen(photographs, boards, known)
+
+
+def _identify(
+    session: Session,
+    seen: _Seen,
+    cameras: CameraRefinement,
+    method: Method,
+    seed: int,
+    holdout: int,
+    clock: _Clock,
+) -> _Identified:
+    """The machine, in turns with looks at the edges, and by the paper's method if asked for."""
+    if seen.photographs:
+        turns = take_turns(session, *seen, cameras, clock.told, clock.lap)
     else:
-        turns = identify_poses(session, boards, known, cameras, told)
+        turns = identify_poses(session, seen.boards, seen.T_camera_base, cameras, clock.told)
     clock.lap("identify")
     richer = richer_models(session, turns.measurements, turns.estimate)
     check_poses(session, turns.measurements, turns.estimate, richer)
-    whole = turns.measurements
-    out = chosen(session.machine, turns.estimate, holdout) if holdout else None
-    turns = set_aside(session.machine, turns, out) if out else turns
+    out = None
+    if holdout:
+        out = LeftOut(chosen(session.machine, turns.estimate, holdout), turns.measurements)
+        turns = set_aside(session.machine, turns, out.region)
     estimate = turns.estimate
     if method != "bundle":
-        told("Repeating the paper's method", 0.9)
+        clock.told("Repeating the paper's method", 0.9)
         estimate = by_paper(method, session.machine, turns.measurements, estimate, seed)
-    told("Judging", 0.95)
-    findings = _findings(turns.measurements, estimate)
-    unseen = len(out.rows) if out else 0
+    return _Identified(turns, estimate, richer, out)
+
+
+def _judge(
+    session: Session, seen: _Seen, found: _Identified, method: Method, seed: int, clock: _Clock
+) -> Calibration:
+    """What the data tell, what they leave open, and whether the result may be used."""
+    clock.told("Judging", 0.95)
+    findings = _findings(found.turns.measurements, found.estimate)
     verdict = judge(
-        turns.observation,
-        estimate,
+        found.turns.observation,
+        found.estimate,
         method,
         findings=findings,
-        richer=richer,
-        held_out=unseen,
-        doubts=scale_doubt(session, estimate),
+        richer=found.richer,
+        held_out=len(found.out.region.rows) if found.out else 0,
+        doubts=scale_doubt(session, found.estimate),
     )
     clock.lap("identify")
     return Calibration(
         session=session,
-        observation=turns.observation,
-        measurements=turns.measurements,
-        estimate=estimate,
+        observation=found.turns.observation,
+        measurements=found.turns.measurements,
+        estimate=found.estimate,
         verdict=verdict,
-        cameras=turns.cameras,
+        cameras=found.turns.cameras,
         method=method,
         seed=seed,
         timings=clock.laps,
-        boards=boards,
+        boards=seen.boards,
         findings=findings,
-        holdout=LeftOut(out, whole) if out else None,
+        holdout=found.out,
     )
 
 
@@ -181,9 +224,10 @@ def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
 
 
 class _Clock:
-    """Seconds by step; a step may be lapped several times."""
+    """Seconds by step, each of which may be lapped several times; told : what is being done."""
 
-    def __init__(self) -> None:
+    def __init__(self, progress: Progress | None) -> None:
+        self.told: Progress = progress or (lambda _text, _share: None)
         self.laps: dict[str, float] = {}
         self._last = time.perf_counter()
 

@@ -220,11 +220,10 @@ def _by_image(seen: SeenMachine, u: Array, readings: Array) -> Legs:
     by_pose[..., :3] = -skew(b - pivot[..., None, :])
     by_pose[..., 3:] = np.eye(3)
     by_reading = -dot(u, base.by_reading) - layout.rod_reads
-    pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
     return Legs(
         a, b, u, length, pivot, np.broadcast_to(base.by_reading, u.shape), by_pose,
         np.zeros((*b.shape, 0)), along(u, by_pose), np.zeros((*length.shape, 0)),
-        np.where(pick, by_reading[..., None], 0.0),
+        by_motors(layout, by_reading),
     )  # fmt: skip
 
 

@@ -202,8 +202,7 @@ def joint_rows(layout: LimbLayout, by_reading: Array, rows: Array) -> Array:
         driven = layout.driven_rows
         order = np.argsort(layout.row_motor[driven], kind="stable")
         return rows[..., driven[order]]
-    motors = layout.row_motor[:, None] == np.arange(layout.n_readings)
-    slope = by_reading[..., None] * motors
+    slope = by_reading[..., None] * layout.of_motor
     size = np.sqrt(np.sum(slope**2, axis=-2, keepdims=True))
     unit = slope / np.where(size > 0, size, 1.0)
     return (np.swapaxes(unit, -1, -2) @ rows[..., None])[..., 0]

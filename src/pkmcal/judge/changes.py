@@ -346,7 +346,7 @@ def made_tests(
     return tuple(map(test, causes)), tuple(cause and test(cause) for cause in zero), level
 
 
-def tested(found: Evidence, machine: Machine, alpha: float) -> ChangeTests:
+def look_for_changes(found: Evidence, machine: Machine, alpha: float) -> ChangeTests:
     """Every test on new data, and what explains a change.
 
     alpha : share of machines that did not change that may be flagged.

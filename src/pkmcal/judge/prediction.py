@@ -148,9 +148,8 @@ def _size(held: Held) -> Array:
     """Reading (K', m) that one standard deviation of its row is, m or rad, with its sign."""
     layout, c = held.problem.layout, held.problem.closure(held.state)
     by_reading = c.by_reading[0]
-    pick = layout.row_motor[:, None] == np.arange(layout.n_readings)
-    slope = np.sqrt(by_reading**2 @ pick)
-    sign = 1.0 if layout.shares_motors else np.sign(by_reading @ pick)
+    slope = np.sqrt(by_reading**2 @ layout.of_motor)
+    sign = 1.0 if layout.shares_motors else np.sign(by_reading @ layout.of_motor)
     return sign * np.hypot(PERFECT, SOFT * slope) / slope
 
 

@@ -22,7 +22,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import plain
 from pkmcal.identify.assembly import seen_configurations
 from pkmcal.judge.causes import magnified
-from pkmcal.judge.changes import ChangeTests, tested
+from pkmcal.judge.changes import ChangeTests, look_for_changes
 from pkmcal.judge.held import Held, Trust, evidence, hold
 from pkmcal.judge.new_data import known_rows, look, read
 from pkmcal.judge.words import LookedAt, watch_verdict
@@ -108,7 +108,7 @@ def watch(
         before = float(old.get("noise_scale", 1.0))
         trust = Trust.of(looked.estimate, before, float(old.get("pose_scale", 1.0)))
         held = _hold_new(saved, session, looked, trust, ~known)
-        judged = tested(evidence(held, saved.covariance), saved.machine, alpha)
+        judged = look_for_changes(evidence(held, saved.covariance), saved.machine, alpha)
         around = LookedAt(
             session.configurations,
             known,

@@ -66,8 +66,6 @@ from pkmcal.papers.leg_axes import (
 from pkmcal.papers.legs import DrawnLegs, base_gauge, legs_of, platform_gauge
 from pkmcal.papers.registration import Body, extent, fixes_pose, laid
 
-__all__ = ["Axes", "Form", "FourSteps", "centres_from_axes", "four_step", "solve"]
-
 Form = Literal["corrected", "printed"]
 VAGUE = 0.1
 """Standard deviation of a base centre, of the base's size, beyond which it does not count."""

@@ -188,8 +188,7 @@ class ImplicitProblem:
         rows = self._rows(state)
         by = rows.by_pose @ rows.seen.by_measured
         covariance = by @ noise @ transposed(by)
-        motors = self.layout.row_motor[:, None] == np.arange(self.layout.n_readings)
-        slope = (rows.scale * rows.closure.by_reading)[..., None] * motors
+        slope = (rows.scale * rows.closure.by_reading)[..., None] * self.layout.of_motor
         e = slope.shape[-2]
         covariance[..., :e, :e] += joint_noise**2 * (slope @ transposed(slope))
         covariance[..., :e, :e] += PERFECT**2 * np.eye(e) * rows.scale[..., None] ** 2

@@ -24,7 +24,8 @@ from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
-from pkmcal.papers.four_step import Axes, Form, FourSteps, centres_from_axes, solve
+from pkmcal.papers.four_step import Form, FourSteps, solve
+from pkmcal.papers.leg_axes import Axes, centres_from_axes
 from pkmcal.solver import RESTART_DAMPING
 from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, StudyResult
 from pkmcal.studies.estimates import Fitted, drawing, freedom, joint

@@ -72,11 +72,6 @@ class SimulatedRuns:
         """Configurations for the calibration."""
         return self.joints.shape[1] - self.control
 
-    def first(self, runs: int) -> SimulatedRuns:
-        """The first runs only."""
-        names = ("theta", "T_base_platform", "joints", "axis", "T_camera_board")
-        return replace(self, **{name: getattr(self, name)[:runs] for name in names})
-
 
 def spread_evenly(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Array:
     """Draws from a uniform distribution of zero mean and standard deviation sigma."""
