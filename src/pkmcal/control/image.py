@@ -107,7 +107,7 @@ def responses(points: EdgePoints) -> tuple[Array, Array, Array]:
     )
     tilt = 2 * run / np.maximum(run[..., -1:], 1e-300) - 1
     value = np.stack([np.ones(tilt.shape), tilt], axis=-1)
-    turned = np.swapaxes(rows, -1, -2)
+    turned = rows.mT
     normal = turned @ rows + 1e-300 * np.eye(2)
     gone = np.abs(np.linalg.det(normal)) < 1e-200  # no place of the edge has an image
     solved = np.linalg.solve(np.where(gone[..., None, None], np.eye(2), normal), turned @ value)

@@ -105,7 +105,7 @@ class ReadModel:
             first, second = (at[k] @ T for k, T in zip(loop.bodies, loop.frames, strict=True))
             out.append(first[..., :3, 3] - second[..., :3, 3])
             if loop.kind == "weld":
-                turn = first[..., :3, :3] @ second[..., :3, :3].swapaxes(-1, -2)
+                turn = first[..., :3, :3] @ second[..., :3, :3].mT
                 out.append(rotation_vector(turn))
         away = x - self.drawn
         for first, second, ratio in self.couplings:
@@ -129,7 +129,7 @@ class ReadModel:
         steps = SMALL * np.eye(x.shape[-1])[~held]
         for _ in range(STEPS):
             value = left(x)
-            by_freedom = (left(x[:, None] + steps) - value[:, None]).swapaxes(-1, -2) / SMALL
+            by_freedom = (left(x[:, None] + steps) - value[:, None]).mT / SMALL
             step = np.linalg.pinv(by_freedom, rcond=DEPENDENT) @ value[..., None]
             x = x.copy()
             x[:, ~held] -= step[..., 0]

@@ -115,7 +115,7 @@ def pose(rot: Array, t: Array) -> Array:
 
 def inverse(transform: Array) -> Array:
     """Inverse poses, (..., 4, 4) -> (..., 4, 4)."""
-    rot_t = np.swapaxes(transform[..., :3, :3], -1, -2)
+    rot_t = transform[..., :3, :3].mT
     return pose(rot_t, -(rot_t @ transform[..., :3, 3:])[..., 0])
 
 
@@ -133,7 +133,7 @@ def perturb(transform: Array, delta: Array) -> Array:
 
 def pose_difference(transform: Array, reference: Array) -> Array:
     """The six numbers with ``perturb(reference, delta) == transform``; (..., 6)."""
-    rot = transform[..., :3, :3] @ np.swapaxes(reference[..., :3, :3], -1, -2)
+    rot = transform[..., :3, :3] @ reference[..., :3, :3].mT
     return np.concatenate(
         [rotation_vector(rot), transform[..., :3, 3] - reference[..., :3, 3]], axis=-1
     )
@@ -160,7 +160,7 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
     mean_s = np.sum(w[..., None] * source, axis=-2)
     mean_t = np.sum(w[..., None] * target, axis=-2)
     ds, dt = source - mean_s[..., None, :], target - mean_t[..., None, :]
-    rot = nearest_rotation(np.swapaxes(dt, -1, -2) @ (w[..., None] * ds))
+    rot = nearest_rotation(dt.mT @ (w[..., None] * ds))
     return pose(rot, mean_t - (rot @ mean_s[..., None])[..., 0])
 
 

@@ -239,7 +239,7 @@ def _with_errors(
     basis = tangent_basis(normal, exact.rays[:, PLACES // 2])
     parts = np.stack([by_shift * noise.shift, by_tilt * noise.tilt], axis=-1)
     return replace(
-        edges, normal=normal, basis=basis, covariance=parts @ np.swapaxes(parts, -1, -2),
+        edges, normal=normal, basis=basis, covariance=parts @ parts.mT,
         shift=by_shift,
     )  # fmt: skip
 
