@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.geometry.rigid import inverse, nearest_rotation, pose
+from pkmcal.geometry.rigid import inverse, pose
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
@@ -61,7 +61,8 @@ def mean_pose(poses: Array) -> Array:
         return np.eye(4)
     weight, rot = np.ones(len(poses)), np.eye(3)
     for _ in range(TURNS):
-        rot = nearest_rotation(np.einsum("n,nij->ij", weight, poses[:, :3, :3]))
+        u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weight, poses[:, :3, :3]))
+        rot = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         apart = np.linalg.norm(poses[:, :3, :3] - rot, axis=(1, 2))
         weight = 1 / np.maximum(apart, ALIKE)
     return pose(rot, np.median(poses[:, :3, 3], axis=0))
