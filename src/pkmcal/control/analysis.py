@@ -126,7 +126,7 @@ def equilibria(seen: SeenMachine, law: str, goals: Array, starts: Array) -> Equi
     poses = _descended(seen, law, np.tile(starts, (g, 1, 1)), true_edges(seen, goal))
     task = _task(seen, law, poses, true_edges(seen, goal))
     size = np.sqrt(dot(task.error, task.error))
-    slope = (np.swapaxes(task.matrix, -1, -2) @ task.error[..., None])[..., 0]
+    slope = (task.matrix.mT @ task.error[..., None])[..., 0]
     largest = np.sqrt(np.sum(task.matrix**2, axis=(-1, -2)))
     off = platform_joints(machine, poses) - platform_joints(machine, goal)
     distance = np.sqrt(np.mean(dot(off, off), axis=-1))
@@ -199,7 +199,7 @@ class _Slope:
 
     def step(self, damping: Array, poses: Array) -> Array:
         """Damped steps (R, 6), the project's twist at the platform's origin; at most 0.1 m."""
-        turned = np.swapaxes(self.matrix, -1, -2)
+        turned = self.matrix.mT
         normal = turned @ self.matrix
         scale = np.trace(normal, axis1=-2, axis2=-1) / normal.shape[-1] + 1e-300
         normal = normal + (damping * scale)[:, None, None] * np.eye(normal.shape[-1])

@@ -162,7 +162,7 @@ def legs_from_image(
     near : (..., 4, 4) a pose to start forward kinematics from, where it is needed; the pose that
     the seen legs give, or home, unless given. The pivot is the middle of the platform's joints.
     """
-    rot_t = np.swapaxes(seen.T_camera_base[..., :3, :3], -1, -2)[..., None, :, :]
+    rot_t = seen.T_camera_base[..., :3, :3].mT[..., None, :, :]
     u = (rot_t @ u_camera[..., None])[..., 0]
     if seen.by_image_alone:
         return _by_image(seen, u, readings)

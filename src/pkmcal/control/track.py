@@ -122,7 +122,7 @@ def edge_misfits(
         [radii[j][k] for j, k in zip(edges.leg, edges.tube, strict=True)], dtype=float
     )
     at = edge_normal_jacobians(a[leg], b[leg], radius, edges.side)
-    to_tangent = np.swapaxes(edges.basis, -1, -2)
+    to_tangent = edges.basis.mT
     off = SHADING * edges.shift
     covariance = edges.covariance + off[:, :, None] * off[:, None, :]
     return EdgeMisfits(
@@ -150,7 +150,7 @@ def leg_lines(seen: SeenMachine, rows: EdgeMisfits) -> LegLines:
     across = tangent_basis(d / np.sqrt(dot(d, d))[:, None], rows.a)
     e = across[rows.leg]
     jac = np.concatenate([rows.by_a @ e, rows.by_b @ e], axis=-1)
-    to_right = np.swapaxes(jac, -1, -2) @ rows.information
+    to_right = jac.mT @ rows.information
     covariance = np.linalg.inv(np.tensordot(pick, to_right @ jac, 1) + np.eye(4) / ASIDE**2)
     right = pick @ (to_right @ rows.misfit[..., None])[..., 0]
     moved = (covariance @ right[..., None])[..., 0]
@@ -168,8 +168,8 @@ def leg_lines(seen: SeenMachine, rows: EdgeMisfits) -> LegLines:
     middle = (a + b)[:, None] / 2 + radius[..., None] * at.n
     basis = tangent_basis(at.n, middle / np.sqrt(dot(middle, middle))[..., None])
     by_move = np.concatenate([at.dn_da @ across[:, None], at.dn_db @ across[:, None]], axis=-1)
-    turn = (np.swapaxes(basis, -1, -2) @ by_move).reshape(-1, 4, 4)
-    joint = turn @ covariance @ np.swapaxes(turn, -1, -2)
+    turn = (basis.mT @ by_move).reshape(-1, 4, 4)
+    joint = turn @ covariance @ turn.mT
     lost = ~(both & agrees)[:, None, None]
     normal, joint = (np.where(lost, np.nan, v) for v in (at.n, joint))
     return LegLines(normal, np.where(lost[..., None], np.nan, basis), joint, agrees, both & agrees)
@@ -187,7 +187,7 @@ def weighted(law: str, task: Task, lines: LegLines, used: Booleans) -> tuple[Tas
         u, spread = _direction_spread(normal, basis, joint)
         tangent = tangent_basis(u, normal[:, 0])
         to_turn = _error_to_turn(tangent)
-        covariance = np.swapaxes(tangent, -1, -2) @ spread @ tangent
+        covariance = tangent.mT @ spread @ tangent
     else:
         to_turn = np.zeros((len(normal), 4, 6))
         to_turn[:, :2, :3], to_turn[:, 2:, 3:] = np.moveaxis(_error_to_turn(basis), 1, 0)
@@ -217,7 +217,7 @@ def _direction_spread(normal: Array, basis: Array, joint: Array) -> tuple[Array,
         [skew(normal[:, 1]) @ basis[:, 0], -skew(normal[:, 0]) @ basis[:, 1]], axis=-1
     )
     by_turn = (by_turn - u[:, :, None] * (u[:, None] @ by_turn)) / size
-    return u, by_turn @ joint @ np.swapaxes(by_turn, -1, -2)
+    return u, by_turn @ joint @ by_turn.mT
 
 
 def corrected_pose(
@@ -236,7 +236,7 @@ def corrected_pose(
     jac = rows.by_b[use] @ (rot @ c.ends.b_by_pose[leg]) @ motion
     square = dot(misfit, (information @ misfit[..., None])[..., 0])
     weight = 1 / (1 + square / (4 * max(float(np.median(square)), 2.0)))
-    to_right = np.swapaxes(jac, -1, -2) @ information * weight[:, None, None]
+    to_right = jac.mT @ information * weight[:, None, None]
     closing = c.by_pose @ motion / LAG
     normal = np.sum(to_right @ jac, axis=0) + closing.T @ closing
     right = np.sum(to_right @ misfit[..., None], axis=0)[:, 0] - closing.T @ c.value / LAG

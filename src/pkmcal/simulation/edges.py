@@ -199,7 +199,7 @@ def _with_errors(
     parts = np.stack([by_shift * noise.shift, by_tilt * noise.tilt], axis=-1)
     return replace(
         edges, normal=normal, basis=tangent_basis(normal, rays[:, PLACES // 2]),
-        covariance=parts @ np.swapaxes(parts, -1, -2), shift=by_shift,
+        covariance=parts @ parts.mT, shift=by_shift,
     )  # fmt: skip
 
 
@@ -216,7 +216,7 @@ def responses(by_turn: Array, pixels: Array) -> tuple[Array, Array]:
     tilt = 2 * run / np.maximum(run[..., -1:], 1e-300) - 1
     value = np.stack([np.ones(tilt.shape), tilt], axis=-1)
     rows = np.nan_to_num(by_turn)
-    turned = np.swapaxes(rows, -1, -2)
+    turned = rows.mT
     normal = turned @ rows + 1e-300 * np.eye(2)
     gone = np.abs(np.linalg.det(normal)) < 1e-200  # no place of the edge has an image
     solved = np.linalg.solve(np.where(gone[..., None, None], np.eye(2), normal), turned @ value)

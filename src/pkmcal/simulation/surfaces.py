@@ -36,14 +36,9 @@ class SmoothNoise:
 
     def at(self, u: Array, v: Array) -> Array:
         """Bilinear values (n,) at positions (n,) in cells."""
-        fu, fv = np.floor(u), np.floor(v)
-        i, j = fu.astype(np.int64) % NOISE_SIZE, fv.astype(np.int64) % NOISE_SIZE
-        i1, j1 = (i + 1) % NOISE_SIZE, (j + 1) % NOISE_SIZE
-        du, dv = u - fu, v - fv
-        t = self.table
-        top = t[i, j] * (1 - dv) + t[i, j1] * dv
-        bottom = t[i1, j] * (1 - dv) + t[i1, j1] * dv
-        return top * (1 - du) + bottom * du
+        from scipy.ndimage import map_coordinates
+
+        return map_coordinates(self.table, (u, v), output=float, order=1, mode="grid-wrap")
 
 
 class Pattern(ABC):
