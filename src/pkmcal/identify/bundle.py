@@ -247,7 +247,7 @@ def _estimate(
         configurations=assembled.seen,
         statistics=_statistics(result, assembled),
         gauge=gauge.name,
-        intrinsics_covariance=factor @ optics[:, 1:, 1:] @ np.swapaxes(factor, -1, -2),
+        intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
         mount_covariance=own_blocks(full, told.mounts, 6),

@@ -137,11 +137,11 @@ def mean_covariance(stated: Array, scatter: Array, count: Integers) -> Array:
     """
     root = np.linalg.cholesky(stated)
     back = np.linalg.inv(root)
-    share, axes = np.linalg.eigh(back @ scatter @ np.swapaxes(back, -1, -2))
+    share, axes = np.linalg.eigh(back @ scatter @ back.mT)
     share = np.maximum(share, 0.0)
     common = np.maximum(1.0 - share, np.minimum(share, 1.0))
     parts = root @ axes * np.sqrt(common + share / count[:, None])[:, None, :]
-    return parts @ np.swapaxes(parts, -1, -2)
+    return parts @ parts.mT
 
 
 def deviations(edges: EdgeSet, groups: Groups) -> Array:
@@ -295,7 +295,7 @@ def half_angles(edges: EdgeSet, legs: Cylinders) -> Array:
 def by_ends(edges: EdgeSet, basis: Array, legs: Cylinders) -> Array:
     """Turn of the edges, in tangent bases (N, 3, 2), by motions of a and b: (N, 2, 6), rad/m."""
     e = edge_normal_jacobians(legs.a, legs.b, legs.radius, edges.side)
-    return np.swapaxes(basis, 1, 2) @ np.concatenate([e.dn_da, e.dn_db], axis=-1)
+    return basis.mT @ np.concatenate([e.dn_da, e.dn_db], axis=-1)
 
 
 def by_camera(ends: Array, legs: Cylinders) -> Array:
@@ -334,11 +334,11 @@ def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> Fit:
     """
     white = (whiten @ turn[..., None])[..., 0]
     rows = whiten @ rows
-    normal = groups.total(np.swapaxes(rows, 1, 2) @ rows)
+    normal = groups.total(rows.mT @ rows)
     right = groups.total((white[:, None, :] @ rows)[:, 0])
     values, axes = np.linalg.eigh(normal)
     seen = values > _RANK * values[:, -1:]
-    along = (np.swapaxes(axes, 1, 2) @ right[..., None])[..., 0]
+    along = (axes.mT @ right[..., None])[..., 0]
     along = np.where(seen, along / np.where(seen, values, 1.0), 0.0)
     motion = (axes @ along[..., None])[..., 0]
     total = groups.total(dot(white, white))
