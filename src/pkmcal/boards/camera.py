@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     # self-import
     from pkmcal.boards.board import Board, Detection
 
-
 LEAST_VIEWS = 3
 GOOD_VIEWS = 6
 UNFIT = 3.0
@@ -48,6 +47,8 @@ FACING = 15.0
 """degrees; boards tilted by less all say the same about the focal length."""
 CELLS = (8, 6)
 COVERED = 0.5
+STRONG = 0.95
+"""Correlation from which two intrinsics are named as hardly told apart."""
 
 
 def check_enough(used: Sequence[Any], taken: int) -> None:
@@ -237,10 +238,6 @@ def _inseparable(c: CameraCalibration) -> list[str]:
         f"xi is hardly told apart from {others}, the correlation in brackets: use them together,"
         " never one of them with another calibration's rest."
     ]
-
-
-STRONG = 0.95
-"""Correlation from which two intrinsics are named as hardly told apart."""
 
 
 @dataclass(frozen=True)

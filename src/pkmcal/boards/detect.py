@@ -43,6 +43,7 @@ LEAST_MARKER = 10.0
 LEAST_MARKERS = 4
 NO_SIZE = 9999
 """Of a dictionary that is alone."""
+THREADS = 2
 
 
 def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board) -> None:
@@ -284,9 +285,6 @@ def _size_of(name: str) -> int:
     """Markers in a dictionary by its name, DICT_5X5_100; those without a number come last."""
     last = name.rpartition("_")[2]
     return int(last) if last.isdigit() else NO_SIZE
-
-
-THREADS = 2
 
 
 def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection, ...]:

@@ -30,6 +30,25 @@ BLURS = (0.25, 4.0)
 """px; outside, the window shows something other than a corner."""
 LEAST_SHARE = 0.6
 """Share of the window's variance that a corner explains; shadows and fingers leave less."""
+_MOST = np.array([1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3])
+"""Longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur."""
+REACH = 0.25
+"""Squares around a corner that its fit uses: longer edges say little more, and begin to bend."""
+BENT = 0.02
+"""px by which an edge may leave its tangent within the window before its bend is put in."""
+CLEAR = 0.9
+"""Share of the blank border between edge and marker that the window may fill."""
+LEAST_CORNERS = 6
+"""Corners below which a photograph says nothing: four fix a board's pose, two more test it."""
+WHOLE = 0.75
+"""Share of a chessboard's corners that must look like corners: what is found there is the whole
+board, or something else."""
+SMALL = 1000
+"""px; pictures wider than this are tried at half their size as well."""
+STRAIGHT_ENOUGH = 0.35
+"""Share of a square by which a corner may lie off the middle of its two neighbours' line."""
+Raw = tuple[Integers, Array]
+"""Corner ids (n,) and pixels (n, 2) as a detector gives them."""
 
 
 class Window(NamedTuple):
@@ -176,10 +195,6 @@ def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Ar
     return p, grey - value
 
 
-_MOST = np.array([1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3])
-"""Longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur."""
-
-
 def _levelled(grey: Array, weight: Array, shape: _Shape, p: Array) -> Array:
     """The start with level and amplitude fitted: these two are linear."""
     bare = p.copy()
@@ -248,26 +263,6 @@ def _judged(
     covariance = np.linalg.inv(normal) * noise[:, None, None]
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0) / 2)
     return Corners(start + np.where(good[:, None], p[:, :2], 0.0), good, sigma)
-
-
-REACH = 0.25
-"""Squares around a corner that its fit uses: longer edges say little more, and begin to bend."""
-BENT = 0.02
-"""px by which an edge may leave its tangent within the window before its bend is put in."""
-CLEAR = 0.9
-"""Share of the blank border between edge and marker that the window may fill."""
-LEAST_CORNERS = 6
-"""Corners below which a photograph says nothing: four fix a board's pose, two more test it."""
-WHOLE = 0.75
-"""Share of a chessboard's corners that must look like corners: what is found there is the whole
-board, or something else."""
-SMALL = 1000
-"""px; pictures wider than this are tried at half their size as well."""
-STRAIGHT_ENOUGH = 0.35
-"""Share of a square by which a corner may lie off the middle of its two neighbours' line."""
-
-Raw = tuple[Integers, Array]
-"""Corner ids (n,) and pixels (n, 2) as a detector gives them."""
 
 
 def detect_board(image: Integers, board: Board, name: str = "", quick: bool = False) -> Detection:

@@ -43,6 +43,20 @@ LEAST_CORNERS = 6
 TWO_TILTS = 25.0
 """Chi square by which a board must speak against its other tilt, which looks alike from afar."""
 UNSURE = "the board: too few corners agree on one pose, or its tilt is not sure"
+STILL = 0.2
+"""px, rms over the board, that two photographs may differ by beyond their noise. A camera on a
+tripod keeps a tenth; less than this hardly shows in the edges of legs, which are as uncertain."""
+SURE = 4.0
+"""Standard deviations of a photograph's own noise beyond that."""
+MOST_ODD = 1 / 3
+"""Share of the photographs that may disagree one by one; with more, the board was never still."""
+_EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
+    "station show the board in one place"  # fmt: skip
+MOST_COMMON = 0.99
+ODD = "the board lies {:.1f} standard deviations from where the repeats show it"
+FAR = 5.0
+"""Standard deviations (of six numbers: root mean square) of a repeat from the middle one beyond
+which it is not one of them."""
 
 
 @dataclass(frozen=True)
@@ -230,15 +244,6 @@ def _check_explained(seen: BoardViews) -> None:
     )
 
 
-STILL = 0.2
-"""px, rms over the board, that two photographs may differ by beyond their noise. A camera on a
-tripod keeps a tenth; less than this hardly shows in the edges of legs, which are as uncertain."""
-SURE = 4.0
-"""Standard deviations of a photograph's own noise beyond that."""
-MOST_ODD = 1 / 3
-"""Share of the photographs that may disagree one by one; with more, the board was never still."""
-
-
 @dataclass(frozen=True)
 class Standing:
     """Where a board stood, from the photographs that agree.
@@ -341,10 +346,6 @@ def _check_still(seen: BoardViews, there: Array, agreed: Booleans) -> None:
         )
 
 
-_EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
-    "station show the board in one place"  # fmt: skip
-
-
 def _moved(seen: BoardViews, there: Array, before: list[int], after: list[int]) -> InputError:
     """The error that names the photographs between which the board moved."""
     names, poses = seen.names, seen.poses.T_camera_board
@@ -403,13 +404,6 @@ def _wandering(seen: BoardViews, agreed: Booleans, T_camera_board: Array, noise:
     chi2 = np.einsum("fi,fij,fj->", off, np.linalg.inv(each), off)
     spread = chi2 / (6 * (count - 1))
     return max(spread - 1.0, 0.0) * each.mean(axis=0) / count
-
-
-MOST_COMMON = 0.99
-ODD = "the board lies {:.1f} standard deviations from where the repeats show it"
-FAR = 5.0
-"""Standard deviations (of six numbers: root mean square) of a repeat from the middle one beyond
-which it is not one of them."""
 
 
 class MeanPoses(NamedTuple):

@@ -30,6 +30,26 @@ XIS = (0.0, 0.5, 1.0, 1.5, 2.2)
 KEPT = 3
 """Best tries that are refined, over so many rounds of weights: it is a start only."""
 ROUNDS = 3
+FOLDS = 10
+"""Parts that the views are dealt into; each is predicted by a camera fitted to the others."""
+CHANCE = 1.5
+"""Disagreement of views (square) that chance alone explains, with ten views or so."""
+TERMS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "pinhole": (
+        (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
+    ),
+    "fisheye": ((), ("k1",), ("k1", "k2"), ("k1", "k2", "k3"), ("k1", "k2", "k3", "k4")),
+    "unified": ((), ("p1", "p2"), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2")),
+}  # fmt: skip
+"""Candidates, from few terms to many; the model with the fewest first among equals."""
+LEAST_GAIN = 0.01
+"""Share by which the error on left-out views must fall for a term to be worth having."""
+MOST_CORNERS = 1500
+"""Corners in all that the choice looks at; the final fit takes every one."""
+LEAST_OF_VIEW = 12
+"""Corners that every view keeps, where it has them."""
+HOPELESS = 5.0
+"""A model that fits so many times worse than another, with two radial terms, gets no more."""
 
 
 def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers:
@@ -86,12 +106,6 @@ def _score(camera: Camera, poses: Array, views: Views) -> float:
 def _median(fit: Fit) -> float:
     distance = np.linalg.norm(fit.residuals, axis=-1)
     return float(np.nanmedian(distance))
-
-
-FOLDS = 10
-"""Parts that the views are dealt into; each is predicted by a camera fitted to the others."""
-CHANCE = 1.5
-"""Disagreement of views (square) that chance alone explains, with ten views or so."""
 
 
 @dataclass(frozen=True)
@@ -174,24 +188,6 @@ def _without_each(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
     right = transposed(rows) @ linear.value[0][..., None]
     moved = np.stack([inverted(whole - part) for part in normals]) @ right
     return moved[..., 0], rows, whole
-
-
-TERMS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "pinhole": (
-        (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
-    ),
-    "fisheye": ((), ("k1",), ("k1", "k2"), ("k1", "k2", "k3"), ("k1", "k2", "k3", "k4")),
-    "unified": ((), ("p1", "p2"), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2")),
-}  # fmt: skip
-"""Candidates, from few terms to many; the model with the fewest first among equals."""
-LEAST_GAIN = 0.01
-"""Share by which the error on left-out views must fall for a term to be worth having."""
-MOST_CORNERS = 1500
-"""Corners in all that the choice looks at; the final fit takes every one."""
-LEAST_OF_VIEW = 12
-"""Corners that every view keeps, where it has them."""
-HOPELESS = 5.0
-"""A model that fits so many times worse than another, with two radial terms, gets no more."""
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,17 @@ FEWEST = 3
 """Poses on either side of a movement: fewer are outliers."""
 OTHER_SIZE = 2e-3
 """Relative difference of a board's size below which the print is as good as printers are."""
+SURE = 1.5
+"""Standard deviations that a mistake put right leaves, below which no other is tried."""
+BELIEVED = 0.85
+"""Share of the poses that a mistake put right has to explain."""
+CERTAIN = 12.0
+"""Standard deviations by which a board has to have moved, all six numbers together."""
+ENOUGH = 4.0
+"""Standard deviations that it may leave: a drawing's own errors are in them."""
+FEWEST_POSES = 4
+"""Whole poses of one station from which the platform's turning is tested."""
+KEPT = {"one axis": "turn about one axis", "none": "do not turn"}
 
 
 @dataclass(frozen=True)
@@ -64,16 +75,6 @@ def misfit(estimate: Estimate) -> float:
         return 0.0
     each = np.sort(np.mean(error**2, axis=1))
     return float(np.sqrt(np.mean(each[: max(int(np.ceil(BELIEVED * len(each))), 1)])))
-
-
-SURE = 1.5
-"""Standard deviations that a mistake put right leaves, below which no other is tried."""
-BELIEVED = 0.85
-"""Share of the poses that a mistake put right has to explain."""
-CERTAIN = 12.0
-"""Standard deviations by which a board has to have moved, all six numbers together."""
-ENOUGH = 4.0
-"""Standard deviations that it may leave: a drawing's own errors are in them."""
 
 
 def in_doubt(estimate: Estimate) -> bool:
@@ -389,11 +390,6 @@ def _error(session: Session, doubt: Doubt, scale: float) -> InputError:
         expected="a board screwed to the platform, and a camera that stands still",
         next_step=f"Calibrate with the configurations before {after}, or with those from it on",
     )
-
-
-FEWEST_POSES = 4
-"""Whole poses of one station from which the platform's turning is tested."""
-KEPT = {"one axis": "turn about one axis", "none": "do not turn"}
 
 
 def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tuple[bool, str]]:

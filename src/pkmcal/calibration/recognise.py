@@ -24,13 +24,11 @@ from pkmcal.wording import listed
 
 WORKERS = 2
 """Threads beside one another: decoding and array work release Python's lock."""
-
 NEARLY = 2.0
 """Tolerances of a centre by which legs may miss the platform at the drawing's nearest pose."""
 MOST = 0.5
 """Share of the configurations that the drawing has to reach for the rest to be believed."""
 ALMOST_ALL = 0.9
-
 NOWHERE = StationPose(np.eye(4), score=1.0, chance=1.0)
 """Of a station for whose search there was no start."""
 

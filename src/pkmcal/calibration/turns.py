@@ -39,9 +39,14 @@ the first look corrects a pixel, the second what shading leaves, and profiles re
 far."""
 FEWEST_EDGES = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
-
 Progress = Callable[[str, float], None]
 """Called with a sentence about the present step and the share that is done, 0 to 1."""
+_OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
+_OFF = (
+    "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
+    " machine, moved, or the readings are another configuration's"
+)
+_POINT_OFF = "the measurement lies {:.0f} standard deviations from where all others put it"
 
 
 class Turns(NamedTuple):
@@ -256,11 +261,3 @@ def _poses_given_up(
         )
         for k in lost
     )
-
-
-_OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
-_OFF = (
-    "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
-    " machine, moved, or the readings are another configuration's"
-)
-_POINT_OFF = "the measurement lies {:.0f} standard deviations from where all others put it"

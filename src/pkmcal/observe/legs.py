@@ -45,6 +45,19 @@ FEWEST_POINTS = 8
 """Edge points (of 12 an edge) without which a leg's place is not looked for."""
 SEARCH_SIGMA = 1.0
 """Standard deviation (px) given to edges found this way: one step of the search."""
+SEARCH_SAMPLES = 12
+SEGMENTS = 8
+"""Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
+PLACES = 5 * SEGMENTS
+"""Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
+BETWEEN = 5
+"""Profiles taken about each of these, so about one a pixel in all: faint edges need it."""
+FEWEST_SHARE = 1 / 3
+"""Share of a segment's samples that must be clear for its mean profile to count."""
+BLUR = 0.7
+"""Pixels of blur assumed where no profile is there to tell: lens 0.6, pixel 0.3."""
+CLEARANCE = 5.0
+"""Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
 
 
 @dataclass(frozen=True)
@@ -152,21 +165,6 @@ def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlace
     inside = np.abs(steps[step]) < REACH
     clear = (total >= FEWEST_POINTS) & (rival < RIVAL * best) & inside
     return LegPlaces(steps[step], TILTS[tilt], best, share, clear)
-
-
-SEARCH_SAMPLES = 12
-SEGMENTS = 8
-"""Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
-PLACES = 5 * SEGMENTS
-"""Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
-BETWEEN = 5
-"""Profiles taken about each of these, so about one a pixel in all: faint edges need it."""
-FEWEST_SHARE = 1 / 3
-"""Share of a segment's samples that must be clear for its mean profile to count."""
-BLUR = 0.7
-"""Pixels of blur assumed where no profile is there to tell: lens 0.6, pixel 0.3."""
-CLEARANCE = 5.0
-"""Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
 
 
 @dataclass(frozen=True)

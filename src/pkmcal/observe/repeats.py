@@ -28,14 +28,17 @@ FAR = 5.0
 """Standard deviations of a repeat from the others beyond which it is not one of them."""
 HARMLESS = 1.0
 """Stated standard deviations within which a repeat stays, however well the others agree."""
-
 MAJORITY = 0.5
 """Share of a configuration's repeats of which more must show an edge: those that show now and then
 are faint, and lie a pixel off as easily as not."""
-
 _RARE = "seen in only {} of {} repeats"
 _OUT = "a repeat lies {:.1f} standard deviations from the others, which are used without it"
 _DISPUTED = "its repeats lie up to {:.1f} standard deviations off, and no majority agrees"
+LEVEL = float(np.sin(np.deg2rad(10.0)))
+"""Part u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2) lies
+far away or nowhere (errata)."""
+_RANK = 1e-9
+"""Singular values below this part of the largest are those of motions that no edge shows."""
 
 
 @dataclass(frozen=True)
@@ -266,13 +269,6 @@ def _rejection(edges: EdgeSet, k: int, reason: str) -> Rejection:
         side=int(edges.side[k]),
         reason=reason,
     )
-
-
-LEVEL = float(np.sin(np.deg2rad(10.0)))
-"""Part u_y of an axis below which it is level in the image: its point with y = 0 ([A] 4.2) lies
-far away or nowhere (errata)."""
-_RANK = 1e-9
-"""Singular values below this part of the largest are those of motions that no edge shows."""
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,22 @@ STILL = 10.0
 """Grey levels from the station's median photograph within which a place counts as still."""
 ENOUGH_TO_COMPARE = 4
 """Photographs from which a median is a picture of the background."""
+SEARCH_ANGLE = np.radians(6.0)
+SEARCH_DISTANCE = 0.06
+"""Spread (per axis, rad and m) of the poses tried around the user's: its norm over three axes
+is 10 degrees and 10 cm."""
+TRIES = 800
+RETRIES = 400
+GOOD_SCORE = 0.34
+"""Mean truncated distance above which no leg was recognised. Photographs of the machine give 0.2;
+another configuration, station or order of legs 0.36 to 0.6."""
+BY_CHANCE = 0.5
+"""Share of the score by chance that recognised legs stay below. Photographs that are all texture
+score 0.3 anywhere; photographs of a machine score 0.2 where chance has 0.9."""
+FIRST_DAMPING = 1e-3
+"""Of a step, relative to the normal equations' diagonal."""
+LAST_REACH = 4.0
+"""Reduced pixels at which the final score cuts distances off."""
 
 
 @dataclass(frozen=True)
@@ -119,24 +135,6 @@ def _tables_of(image: Any, still: Array | None) -> Array:
         mask[y[near], x[near]] = 0
         tables[k] = cv2.distanceTransform(mask, cv2.DIST_L2, 3) if near.any() else 1e3
     return tables
-
-
-SEARCH_ANGLE = np.radians(6.0)
-SEARCH_DISTANCE = 0.06
-"""Spread (per axis, rad and m) of the poses tried around the user's: its norm over three axes
-is 10 degrees and 10 cm."""
-TRIES = 800
-RETRIES = 400
-GOOD_SCORE = 0.34
-"""Mean truncated distance above which no leg was recognised. Photographs of the machine give 0.2;
-another configuration, station or order of legs 0.36 to 0.6."""
-BY_CHANCE = 0.5
-"""Share of the score by chance that recognised legs stay below. Photographs that are all texture
-score 0.3 anywhere; photographs of a machine score 0.2 where chance has 0.9."""
-FIRST_DAMPING = 1e-3
-"""Of a step, relative to the normal equations' diagonal."""
-LAST_REACH = 4.0
-"""Reduced pixels at which the final score cuts distances off."""
 
 
 @dataclass(frozen=True)
