@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -64,22 +64,6 @@ class PoseSet:
         n = self.by_intrinsics.shape[-1]
         delta = (self.by_intrinsics @ change[self.station, :n, None])[..., 0]
         return replace(self, T_station_target=perturb(self.T_station_target, delta))
-
-
-def concatenate_poses(sets: Sequence[PoseSet]) -> PoseSet:
-    """All poses in one set; cameras with fewer parameters get zeros for the rest."""
-    parts = [PoseSet.empty(), *sets]
-    widest = max(s.by_intrinsics.shape[-1] for s in parts)
-    padded = [
-        np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
-        for s in parts
-    ]
-    joined = {
-        f.name: np.concatenate([getattr(s, f.name) for s in parts])
-        for f in fields(PoseSet)
-        if f.name != "by_intrinsics"
-    }
-    return PoseSet(**joined, by_intrinsics=np.concatenate(padded))
 
 
 @dataclass(frozen=True)
@@ -166,19 +150,23 @@ class Observation:
     poses: PoseSet = field(default_factory=PoseSet.empty)
 
 
-def concatenate(sets: list[EdgeSet]) -> EdgeSet:
-    """Several edge sets as one; cameras with fewer parameters get zeros for the rest."""
+Set = TypeVar("Set", PoseSet, EdgeSet)
+
+
+def concatenate(sets: Sequence[Set]) -> Set:
+    """One set or more as one; cameras with fewer parameters get zeros for the rest."""
     widest = max(s.by_intrinsics.shape[-1] for s in sets)
     padded = [
         np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
         for s in sets
     ]
     joined = {
-        f.name: np.concatenate([getattr(s, f.name) for s in sets])
-        for f in fields(EdgeSet)
-        if f.name != "by_intrinsics"
+        f.name: np.concatenate(
+            padded if f.name == "by_intrinsics" else [getattr(s, f.name) for s in sets]
+        )
+        for f in fields(sets[0])
     }
-    return EdgeSet(**joined, by_intrinsics=np.concatenate(padded))
+    return replace(sets[0], **joined)
 
 
 @dataclass(frozen=True)
