@@ -114,6 +114,11 @@ class EdgeSet:
         """The edges at a mask or at positions."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
+    def rejection(self, k: int, reason: str) -> Rejection:
+        """The edge at k, left out for a reason."""
+        place = (self.station, self.configuration, self.leg, self.tube, self.side)
+        return Rejection(*(int(index[k]) for index in place), reason)
+
 
 @dataclass(frozen=True)
 class Rejection:

@@ -214,11 +214,12 @@ def observation_of(
     edges = concatenate([look.edges for look in looks]) if looks else EdgeSet.empty()
     first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
     nowhere = [np.zeros((0, 2))], [np.zeros(0, dtype=int)]
+    given_up = np.flatnonzero(estimate.edge_weights < 0.5).tolist()
     return Observation(
         edges=edges,
         rejected=tuple(r for look in looks for r in look.rejected)
         + boards.rejected
-        + _edges_given_up(edges, estimate)
+        + tuple(edges.rejection(k, _OUTLIER) for k in given_up)
         + _poses_given_up(session, measurements, estimate),
         points=np.concatenate([look.points for look in looks] or nowhere[0]),
         point_edge=np.concatenate(
@@ -226,20 +227,6 @@ def observation_of(
         ),
         T_camera_base=estimate.state.T_camera_base,
         poses=measurements.poses,
-    )
-
-
-def _edges_given_up(edges: EdgeSet, estimate: Estimate) -> tuple[Rejection, ...]:
-    return tuple(
-        Rejection(
-            int(edges.station[k]),
-            int(edges.configuration[k]),
-            int(edges.leg[k]),
-            int(edges.tube[k]),
-            int(edges.side[k]),
-            _OUTLIER,
-        )
-        for k in np.flatnonzero(estimate.edge_weights < 0.5)
     )
 
 

@@ -240,7 +240,7 @@ def _typical_spread(turn: Array, groups: Groups) -> Array:
 
 def _rejections(edges: EdgeSet, odd: OddOnes) -> list[Rejection]:
     """What was left out and why: each repeat that is out, each other edge once."""
-    out = [_rejection(edges, k, _OUT.format(odd.off[k])) for k in np.flatnonzero(odd.out).tolist()]
+    out = [edges.rejection(k, _OUT.format(odd.off[k])) for k in np.flatnonzero(odd.out).tolist()]
     for kind in (odd.disputed, odd.rare):
         rows = np.flatnonzero(kind)
         groups = same_edges(edges.select(rows)) if rows.size else None
@@ -250,17 +250,5 @@ def _rejections(edges: EdgeSet, odd: OddOnes) -> list[Rejection]:
         np.maximum.at(apart, groups.member, odd.off[rows])
         for k, count, far in zip(rows[groups.first].tolist(), groups.count, apart, strict=True):
             said = _RARE.format(count, odd.most[k]) if kind is odd.rare else _DISPUTED.format(far)
-            out.append(_rejection(edges, k, said))
+            out.append(edges.rejection(k, said))
     return out
-
-
-def _rejection(edges: EdgeSet, k: int, reason: str) -> Rejection:
-    """The edge at k, left out for a reason."""
-    return Rejection(
-        station=int(edges.station[k]),
-        configuration=int(edges.configuration[k]),
-        leg=int(edges.leg[k]),
-        tube=int(edges.tube[k]),
-        side=int(edges.side[k]),
-        reason=reason,
-    )
