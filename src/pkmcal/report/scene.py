@@ -1,8 +1,6 @@
 """The geometry before and after, [B] Fig. 7: joint centres at home, errors drawn enlarged.
 
-Two plane views as SVG, and one in space as a Plotly figure: plain data, drawn by the page's
-script. Its colours are names of the page's CSS variables; the script puts in the values of the
-light or the dark theme. Lengths in it are millimetres.
+Two plane views as SVG, and one in space as a Plotly figure, whose lengths are millimetres.
 """
 
 from __future__ import annotations
@@ -19,6 +17,7 @@ from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
+from pkmcal.outcome import AXIS, LOOKS
 from pkmcal.report.charts import WIDTH
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
@@ -32,13 +31,6 @@ NEAR = 9.0
 """SVG units within which two labels are written as one."""
 RING = 25
 """Points of an ellipsoid's ring."""
-LOOKS = {
-    "paper_bgcolor": "--card",
-    "plot_bgcolor": "rgba(0,0,0,0)",
-    "font": {"color": "--ink", "family": "system-ui, sans-serif", "size": 12},
-    "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
-}
-AXIS = {"color": "--muted", "gridcolor": "--rule", "zerolinecolor": "--rule", "linecolor": "--rule"}
 
 
 @dataclass(frozen=True)

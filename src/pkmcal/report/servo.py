@@ -1,7 +1,4 @@
-"""What a study of servoing found, as an outcome, [B] Fig. 10: curves, an animation, the image.
-
-Plotly's colours are names of the page's CSS variables.
-"""
+"""What a study of servoing found, as an outcome, [B] Fig. 10: curves, an animation, the image."""
 
 from __future__ import annotations
 
@@ -17,8 +14,20 @@ from pkmcal.control.words import judgement, named
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Plot, Row, Table, Verdict
-from pkmcal.report.scene import AXIS, LOOKS, coordinates, line, markers, ring, space_layout
+from pkmcal.outcome import (
+    AXIS,
+    LOOKS,
+    Figure,
+    Finding,
+    Level,
+    Outcome,
+    Part,
+    Plot,
+    Row,
+    Table,
+    Verdict,
+)
+from pkmcal.report.scene import coordinates, line, markers, ring, space_layout
 from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2

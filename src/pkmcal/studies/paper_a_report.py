@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import Outcome, Part, Row, Table
+from pkmcal.outcome import AXIS, LOOKS, Outcome, Part, Row, Table
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.expected import Compared
@@ -39,7 +39,7 @@ from pkmcal.studies.paper_a_expected import (
     checks,
     figures_compared,
 )
-from pkmcal.studies.plots import AXIS, LOOKS, TICKS, bars, log_log, series
+from pkmcal.studies.plots import TICKS, bars, log_log, series
 from pkmcal.studies.reproduction import Column, Options, Shown, Words, accuracy_rows, deg, mm
 from pkmcal.studies.statistics import Summary, coverage, ratio
 from pkmcal.wording import joined, number

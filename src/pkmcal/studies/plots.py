@@ -1,17 +1,12 @@
-"""Plotly figures of studies; colours are names of the page's CSS variables."""
+"""Plotly figures of studies."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-LOOKS = {
-    "paper_bgcolor": "--card",
-    "plot_bgcolor": "rgba(0,0,0,0)",
-    "font": {"color": "--ink", "family": "system-ui, sans-serif", "size": 12},
-    "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
-}
-AXIS = {"color": "--muted", "gridcolor": "--rule", "zerolinecolor": "--rule", "linecolor": "--rule"}
+from pkmcal.outcome import AXIS, LOOKS
+
 TICKS = [0.01, 0.03, 0.1, 0.3, 1, 3]
 
 
