@@ -19,7 +19,6 @@ from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.outcome import Finding, Level, Outcome, Part, Plot, Verdict
 from pkmcal.report import (
-    charts,
     headline,
     identifiability,
     page,
@@ -44,12 +43,6 @@ MODEL_ERROR = Markup(
     " measurement and nothing of what the model leaves out: legs that bend, joints with play, a"
     " lens that its file does not describe. Photographs that the calibration has not seen are the"
     " test for those."
-)
-RESIDUALS = (
-    "Measured against predicted, in standard deviations. Bars hold the middle half of the values,"
-    " lines nine tenths; the grey band is where nine tenths belong if noise is all that is left."
-    " Longer lines mean that something other than the stated noise is at work; a box off zero,"
-    " that it always pulls the same way."
 )
 
 
@@ -109,7 +102,6 @@ def report_of(
     camera = residuals.camera_numbers(session)
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
-    measured = poses.section(session, observation, estimate)
     # boards and trackers alone have no edges to show; legs without any do have a question
     photographed = len(edges) > 0 or not len(observation.poses)
     parts = (
@@ -117,9 +109,11 @@ def report_of(
         _parameters(session, estimate),
         findings and _identifiability(findings, estimate),
         _photographs(session, edges, estimate, shifts, centres) if photographed else None,
-        measured and measured.part,
+        poses.section(session, observation, estimate),
         holdout and validation.held_out(holdout, session),
-        _residuals(session, edges, estimate, shifts, measured and measured.axes),
+        residuals.section(
+            session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
+        ),
         _left_out(session, observation, estimate, findings),
         _stations(session, estimate, camera),
         _how(session, estimate, timings or {}),
@@ -186,27 +180,6 @@ def _photographs(
         pictures=pictures.pictures(session, edges, estimate, shifts, centres),
     )
     return Part("photographs", "Photographs", html=html)
-
-
-def _residuals(
-    session: Session,
-    edges: EdgeSet,
-    estimate: Estimate,
-    shifts: Array,
-    axes: charts.RowChart | None,
-) -> Part:
-    found = residuals.residual_charts(session, edges, estimate, shifts)
-    shown = charts.panels(
-        found.by_leg,
-        found.by_station,
-        found.joints,
-        axes,
-        found.histogram,
-        found.by_configuration,
-        found.outward,
-        remarks=found.remarks,
-    )
-    return Part("residuals", "Residuals", (RESIDUALS,), html=shown)
 
 
 def _left_out(
