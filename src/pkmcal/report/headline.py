@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import ToolPoint
@@ -28,10 +28,26 @@ def cards(
     tool: ToolPoint,
 ) -> tuple[Figure, ...]:
     """The cards in their order; those that have nothing to tell are left out."""
+    sigma = np.concatenate([side.sigma for side in centres]) * 1e3
+    worst = int(np.argmax(sigma))
+    joints = Figure(
+        "How well are the joint centres known?",
+        ((brief(float(np.median(sigma))), "mm"),),
+        f"1σ of a coordinate, median of {len(sigma)} centres; the least certain, "
+        f"{_centre_name(centres, worst)}, {brief(float(sigma[worst]))} mm",
+    )
+    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres]) * 1e3
+    farthest = int(np.argmax(change))
+    moved = Figure(
+        "How far is the machine from its drawing?",
+        ((brief(float(change.mean())), "mm"),),
+        "mean distance of the joint centres, drawing and result laid over each other; largest "
+        f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
+    )
     found = (
-        _joint_sigma(centres) if len(observation.edges) else None,
+        joints if len(observation.edges) else None,
         _tool_sigma(session, tool),
-        _change(centres),
+        moved,
         _tool_change(session, tool),
         _data(session, observation, estimate),
         _fit(estimate),
@@ -68,18 +84,6 @@ def _mean(values: Array) -> float | None:
     return float(values.mean()) if values.size else None
 
 
-def _joint_sigma(centres: tuple[Centres, ...]) -> Figure:
-    """Standard deviation of a coordinate of a joint centre."""
-    sigma = np.concatenate([side.sigma for side in centres]) * 1e3
-    worst = int(np.argmax(sigma))
-    return Figure(
-        "How well are the joint centres known?",
-        ((brief(float(np.median(sigma))), "mm"),),
-        f"1σ of a coordinate, median of {len(sigma)} centres; the least certain, "
-        f"{_centre_name(centres, worst)}, {brief(float(sigma[worst]))} mm",
-    )
-
-
 def _tool_sigma(session: Session, tool: ToolPoint) -> Figure | None:
     """Uncertainty of the platform's pose from that of the geometry."""
     if not tool.configurations.size:
@@ -91,18 +95,6 @@ def _tool_sigma(session: Session, tool: ToolPoint) -> Figure | None:
         f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
         f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where})"
         f"{_turned(float(tool.orientation.max()))}",
-    )
-
-
-def _change(centres: tuple[Centres, ...]) -> Figure:
-    """How far the joint centres are from the drawing."""
-    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres]) * 1e3
-    worst = int(np.argmax(change))
-    return Figure(
-        "How far is the machine from its drawing?",
-        ((brief(float(change.mean())), "mm"),),
-        "mean distance of the joint centres, drawing and result laid over each other; largest "
-        f"{brief(float(change[worst]))} mm ({_centre_name(centres, worst)})",
     )
 
 
@@ -122,11 +114,21 @@ def _tool_change(session: Session, tool: ToolPoint) -> Figure | None:
 
 
 def _data(session: Session, observation: Observation, estimate: Estimate) -> Figure:
-    """Photographs and edges, used and not."""
+    """Photographs and edges, used and not; of a session without any, the trackers' poses."""
     taken = sum(len(station.photographs) for station in session.stations)
     if not taken:
-        return _tables(session, observation, estimate)
-    seen = set(zip(*(a.tolist() for a in _photograph_of(observation)), strict=True))
+        quiet, n = int(np.sum(estimate.pose_weights < KEPT)), len(observation.poses)
+        kinds = sorted({table.kind for table in session.trackers})
+        return Figure(
+            "What is it based on?",
+            ((f"{n - quiet} of {n}", " and ".join(kinds)),),
+            f"measured without a camera; {quiet} of them given less than half their weight",
+        )
+    seen = {
+        pair
+        for found in (observation.edges, observation.poses)
+        for pair in zip(found.station.tolist(), found.configuration.tolist(), strict=True)
+    }
     used = sum(
         (s, photo.configuration) in seen
         for s, station in enumerate(session.stations)
@@ -145,17 +147,6 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
     )
 
 
-def _tables(session: Session, observation: Observation, estimate: Estimate) -> Figure:
-    """The same of a session without photographs."""
-    quiet = int(np.sum(estimate.pose_weights < KEPT))
-    kinds = sorted({table.kind for table in session.trackers})
-    return Figure(
-        "What is it based on?",
-        ((f"{len(observation.poses) - quiet} of {len(observation.poses)}", " and ".join(kinds)),),
-        f"measured without a camera; {quiet} of them given less than half their weight",
-    )
-
-
 def _fit(estimate: Estimate) -> Figure:
     """Chi-square per degree of freedom."""
     s = estimate.statistics
@@ -171,15 +162,6 @@ def _fit(estimate: Estimate) -> Figure:
         f"1 is expected, over {count(s.dof, 'degree')} of freedom"
         + (f"; reached after {' and '.join(scaled)}" if scaled else ""),
     )
-
-
-def _photograph_of(observation: Observation) -> tuple[Integers, Integers]:
-    parts = observation.edges, observation.poses
-    station, configuration = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("station", "configuration")
-    )
-    return station, configuration
 
 
 def _pose_values(position: float, orientation: float) -> tuple[tuple[str, str], ...]:
