@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -90,7 +91,15 @@ def reproduce(options: Options) -> Outcome:
             (HexapodByAxes(drawing_error=NARROW), done + share),
         )
     )
-    by_poses = _by_poses(options, found, done + 2 * share) if options.long else {}
+    done += 2 * share
+    by_poses: dict[int, Found] = {}  # with other numbers of poses a station
+    for poses in PROTOTYPE_POSES if options.long else ():
+        upto = done + (1 - done) * poses / sum(PROTOTYPE_POSES)
+        told = options.within(done, upto)
+        same = poses == found.setting.poses
+        setting = replace(found.setting, poses=poses)
+        by_poses[poses] = found if same else run(setting, options.runs, options.seed, told)
+        done = upto
     figures = figures_compared(found)
     words = _words(found, narrow, figures, measured)
     return words.reproduction(
@@ -98,7 +107,14 @@ def reproduce(options: Options) -> Outcome:
             words.part("noise", table_1(measured), more=["measured"] if measured else []),
             _figure_part(words, found),
             words.part("effector", _effector_table(found), _readings_table(found, narrow)),
-            words.part("groups", _group_table(found)),
+            words.part(
+                "groups",
+                Table(
+                    "RMSE, mm",
+                    ("", *(QUANTITIES[g] for g in GROUPS)),
+                    tuple(_by_method(found, [Column(name, 3, 4) for name in GROUPS])),
+                ),
+            ),
             *([_poses_part(words, by_poses)] if by_poses else []),
             words.part("how"),
         ),
@@ -108,18 +124,13 @@ def reproduce(options: Options) -> Outcome:
     )
 
 
-def _by_poses(options: Options, found: Found, done: float) -> dict[int, Found]:
-    """Studies with other numbers of poses a station."""
-    total = sum(PROTOTYPE_POSES)
-    out: dict[int, Found] = {}
-    for poses in PROTOTYPE_POSES:
-        upto = done + (1 - done) * poses / total
-        told = options.within(done, upto)
-        same = poses == found.setting.poses
-        setting = replace(found.setting, poses=poses)
-        out[poses] = found if same else run(setting, options.runs, options.seed, told)
-        done = upto
-    return out
+def _by_method(s: Found, columns: Sequence[Column]) -> list[Row]:
+    """Every method's accuracy, beside the prototype's."""
+    return [
+        row
+        for m in METHODS
+        for row in accuracy_rows(s, (m,), _name(m), columns, PROTOTYPE.get((m,)))
+    ]
 
 
 def _name(method: str) -> str:
@@ -295,9 +306,8 @@ def _effector_table(s: Found) -> Table:
     rows = [
         Row("The paper, before", (mm(BEFORE[0], 2), deg(BEFORE[1], 3), ""), "paper"),
         Row("The paper, after", (mm(AFTER[0], 2), deg(AFTER[1], 3), ""), "paper"),
+        *_by_method(s, columns),
     ]
-    for m in METHODS:
-        rows += accuracy_rows(s, (m,), _name(m), columns, PROTOTYPE.get((m,)))
     note = "The paper's angles are printed in rad; degrees are meant, as in Table 1."
     heads = ("", "mm", "°", "mm, all joints")
     return Table("Errors of the end-effector", heads, tuple(rows), note)
@@ -321,15 +331,6 @@ def _readings_table(wide: Found, narrow: Found) -> Table:
         ),
         "End-effector, and mean |error| in z of the four steps as printed; mm.",
     )
-
-
-def _group_table(s: Found) -> Table:
-    """RMSE by kind of parameter, beside the prototype's."""
-    columns = [Column(name, 3, 4) for name in GROUPS]
-    rows: list[Row] = []
-    for m in METHODS:
-        rows += accuracy_rows(s, (m,), _name(m), columns, PROTOTYPE.get((m,)))
-    return Table("RMSE, mm", ("", *(QUANTITIES[g] for g in GROUPS)), tuple(rows))
 
 
 def _poses_part(words: Words, studies: dict[int, Found]) -> Part:
