@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from pkmcal.arrays import Array
 from pkmcal.calibration.results import REPORT, check_output, texts_of
 from pkmcal.files import write_folder
+from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import centres_and_tool
+from pkmcal.identify.tool import ToolPoint, centres_and_tool
 from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
-from pkmcal.outcome import Finding, Level, Outcome, Verdict
+from pkmcal.outcome import Figure, Finding, Level, Outcome, Verdict
 from pkmcal.report import (
-    headline,
     identifiability,
     page,
     parameters,
@@ -26,12 +29,17 @@ from pkmcal.report import (
     scene,
     validation,
 )
+from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session
+from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.unidentified import Findings
     from pkmcal.judge.holdouts import HoldOut
+
+NO_TURN = 1e-9
+"""rad; what rounding leaves."""
 
 
 def outcome_of(calibration: Calibration) -> Outcome:
@@ -48,16 +56,16 @@ def outcome_of(calibration: Calibration) -> Outcome:
     )
     groups = parameters.parameter_groups(c.session.machine, c.estimate)
     open_ = parameters.unidentified(groups, c.estimate, c.findings)
-    numbers = held_out and held_out.document(c.session.configurations)
+    predicted = held_out and held_out.document(c.session.configurations)
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, open_, numbers),
+        texts=texts_of(c, open_, predicted),
         summary={
             "verdict": asdict(c.verdict),
             **(told.summary or {}),
             "session_warnings": c.session.warnings,
-            "holdout": numbers,
+            "holdout": predicted,
             "timings": c.timings,
         },
     )
@@ -111,8 +119,171 @@ def report_of(
         title=f"Calibration of {session.machine.name}",
         verdict=verdict,
         kicker=f"session {session.folder.name}",
-        figures=headline.cards(session, observation, estimate, centres, tool),
+        figures=cards(session, observation, estimate, centres, tool),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
-        summary={"figures": headline.numbers(observation, estimate, centres, tool)},
+        summary={"figures": numbers(observation, estimate, centres, tool)},
     )
+
+
+# ------------------------------------------------------------------ the main numbers
+
+
+def cards(
+    session: Session,
+    observation: Observation,
+    estimate: Estimate,
+    centres: tuple[Centres, ...],
+    tool: ToolPoint,
+) -> tuple[Figure, ...]:
+    """The cards in their order; those that have nothing to tell are left out."""
+    sigma = np.concatenate([side.sigma for side in centres]) * 1e3
+    worst = int(np.argmax(sigma))
+    joints = Figure(
+        "How well are the joint centres known?",
+        ((brief(float(np.median(sigma))), "mm"),),
+        f"1σ of a coordinate, median of {len(sigma)} centres; the least certain, "
+        f"{_centre_name(centres, worst)}, {brief(float(sigma[worst]))} mm",
+    )
+    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres]) * 1e3
+    farthest = int(np.argmax(change))
+    moved = Figure(
+        "How far is the machine from its drawing?",
+        ((brief(float(change.mean())), "mm"),),
+        "mean distance of the joint centres, drawing and result laid over each other; largest "
+        f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
+    )
+    found = (
+        joints if len(observation.edges) else None,
+        _tool_sigma(session, tool),
+        moved,
+        _tool_change(session, tool),
+        _data(session, observation, estimate),
+        _fit(estimate),
+    )
+    return tuple(card for card in found if card)
+
+
+def numbers(
+    observation: Observation, estimate: Estimate, centres: tuple[Centres, ...], tool: ToolPoint
+) -> dict[str, Any]:
+    """In m and rad; means over joint centres and configurations, sigma of one coordinate."""
+    statistics, table = estimate.statistics, estimate.machine.parameters
+    offsets = np.sqrt(np.diag(estimate.covariance)[table.of_kind("offset")])
+    sigma = np.concatenate([side.sigma for side in centres])
+    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres])
+    return {
+        "joint_centre_sigma": float(np.median(sigma)),
+        "joint_offset_sigma": float(np.median(offsets)) if offsets.size else None,
+        "joint_centre_change": float(change.mean()),
+        "platform_position_sigma": _mean(tool.position),
+        "platform_orientation_sigma": _mean(tool.orientation),
+        "platform_position_change": _mean(tool.off_position),
+        "platform_orientation_change": _mean(tool.off_orientation),
+        "edges": len(observation.edges),
+        "rejected": len(observation.rejected),
+        "chi2_per_freedom": statistics.chi2 / statistics.dof if statistics.dof > 0 else None,
+        "edge_noise_scale": statistics.noise_scale,
+    }
+
+
+def _mean(values: Array) -> float | None:
+    """Of the finite ones."""
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if values.size else None
+
+
+def _tool_sigma(session: Session, tool: ToolPoint) -> Figure | None:
+    """Uncertainty of the platform's pose from that of the geometry."""
+    if not tool.configurations.size:
+        return None
+    where = session.configurations[tool.configurations[int(np.argmax(tool.position))]]
+    return Figure(
+        "How well is the platform's pose known?",
+        _pose_values(tool.position.mean(), tool.orientation.mean()),
+        f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
+        f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where})"
+        f"{_turned(float(tool.orientation.max()))}",
+    )
+
+
+def _tool_change(session: Session, tool: ToolPoint) -> Figure | None:
+    """What the drawing's errors did to the platform's pose."""
+    good = np.isfinite(tool.off_position)
+    if not good.any():
+        return None
+    off, turn = tool.off_position[good], tool.off_orientation[good]
+    where = session.configurations[tool.configurations[good][int(np.argmax(off))]]
+    return Figure(
+        "What did the drawing do to the platform's pose?",
+        _pose_values(off.mean(), turn.mean()),
+        "mean error of the drawing's pose at the same readings; worst "
+        f"{brief(off.max() * 1e3)} mm (configuration {where}){_turned(float(turn.max()))}",
+    )
+
+
+def _data(session: Session, observation: Observation, estimate: Estimate) -> Figure:
+    """Photographs and edges, used and not; of a session without any, the trackers' poses."""
+    taken = sum(len(station.photographs) for station in session.stations)
+    if not taken:
+        quiet, n = int(np.sum(estimate.pose_weights < KEPT)), len(observation.poses)
+        kinds = sorted({table.kind for table in session.trackers})
+        return Figure(
+            "What is it based on?",
+            ((f"{n - quiet} of {n}", " and ".join(kinds)),),
+            f"measured without a camera; {quiet} of them given less than half their weight",
+        )
+    seen = {
+        pair
+        for found in (observation.edges, observation.poses)
+        for pair in zip(found.station.tolist(), found.configuration.tolist(), strict=True)
+    }
+    used = sum(
+        (s, photo.configuration) in seen
+        for s, station in enumerate(session.stations)
+        for photo in station.photographs
+    )
+    parts = [
+        f"{count(len(weights), thing)} measured, {int(np.sum(weights < KEPT))} of them given less "
+        "than half their weight"
+        for thing, weights in (("edge", estimate.edge_weights), ("pose", estimate.pose_weights))
+        if len(weights)
+    ]
+    return Figure(
+        "What is it based on?",
+        ((f"{used} of {taken}", "photographs"),),
+        f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected",
+    )
+
+
+def _fit(estimate: Estimate) -> Figure:
+    """Chi-square per degree of freedom."""
+    s = estimate.statistics
+    value = s.chi2 / s.dof if s.dof > 0 else float("nan")
+    scaled = [
+        f"the {what}' stated noise was multiplied by {number(scale, 2)}"
+        for what, scale in (("edges", s.noise_scale), ("poses", s.pose_scale))
+        if np.isfinite(scale) and abs(scale - 1) > 0.005
+    ]
+    return Figure(
+        "Does the model explain the data?",
+        ((number(value, 2), "χ² per degree of freedom"),),
+        f"1 is expected, over {count(s.dof, 'degree')} of freedom"
+        + (f"; reached after {' and '.join(scaled)}" if scaled else ""),
+    )
+
+
+def _pose_values(position: float, orientation: float) -> tuple[tuple[str, str], ...]:
+    turn = ((brief(float(np.rad2deg(orientation))), "°"),) if orientation > NO_TURN else ()
+    return ((brief(position * 1e3), "mm"), *turn)
+
+
+def _turned(orientation: float) -> str:
+    """A turn (rad) as a further part; nothing of a platform that only shifts."""
+    return f", {brief(float(np.rad2deg(orientation)))}°" if orientation > NO_TURN else ""
+
+
+def _centre_name(centres: tuple[Centres, ...], position: int) -> str:
+    """``leg 3, platform`` of a position in the list of all base, then all platform centres."""
+    legs = len(centres[0].calibrated)
+    return f"leg {position % legs + 1}, {centres[position // legs].side}"
