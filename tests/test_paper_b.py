@@ -13,8 +13,9 @@ from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import edge_normals, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
 from pkmcal.papers import conics, linear
-from pkmcal.simulation import Settings, simulate_session
+from pkmcal.simulation import Settings
 from pkmcal.simulation.stations import StationPose
+from rendered import rendered
 
 RADIUS = 0.014
 CONFIGURATIONS, LEGS = 60, 6
@@ -96,7 +97,7 @@ def test_a_hexapod_seen_through_a_mirror(tmp_path):
     settings = Settings(
         stations=(station,), configurations=16, rough_position=0.02, rough_angle=0.05
     )
-    simulate_session(folder, pkmcal.load_mechanism("gough-stewart"), mirror(), settings, seed=3)
+    rendered(folder, pkmcal.load_mechanism("gough-stewart"), mirror(), settings, seed=3)
     found = pkmcal.calibrate(folder)
     result = compare(found, folder)
     assert result.calibrated.centre < result.drawing.centre / 5

@@ -31,6 +31,7 @@ from pkmcal.simulation.drives import drives_of, reaches, side_bars
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Cylinder
 from pkmcal.simulation.surfaces import SmoothNoise
+from rendered import rendered
 from test_catalogue import whitened
 
 NAMES = ("h4", "delta", "6-rus", "linear-delta", "hexaglide")
@@ -248,8 +249,7 @@ def photographed(folder, name, camera, configurations, board, seed):
         board_on="platform",
     )  # fmt: skip
     drawing = with_forearms(load_mechanism(name))
-    simulate_session(folder, drawing, camera, settings, seed=seed)
-    return folder
+    return rendered(folder, drawing, camera, settings, seed)
 
 
 def observing(folder, words):
