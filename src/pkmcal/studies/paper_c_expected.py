@@ -6,7 +6,6 @@ import numpy as np
 
 from pkmcal.outcome import Check
 from pkmcal.studies.engine import Key, StudyResult
-from pkmcal.studies.expected import Compared, at_most, compared, prototype_check
 from pkmcal.studies.paper_c import (
     AXIS,
     BOUND,
@@ -22,6 +21,7 @@ from pkmcal.studies.paper_c import (
 )
 from pkmcal.studies.paper_c_machine import Kind
 from pkmcal.studies.paper_c_validation import Before
+from pkmcal.studies.reproduction import Compared, at_most, compared, prototype_check
 from pkmcal.studies.statistics import ratio
 from pkmcal.wording import number
 
