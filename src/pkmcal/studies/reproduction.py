@@ -2,6 +2,7 @@
 
 A paper's words stand in ``paper_x.yaml``, with places for figures in braces, as ``str.format`` has
 them; its tables, checks and plots are code. Terminal, page and JSON show the same of them.
+Its figures are held against what the paper reports, or an independent prototype gave.
 """
 
 from __future__ import annotations
