@@ -15,8 +15,8 @@ from pkmcal.boards.views import Boards, StationBoard, find_boards
 from pkmcal.calibration.recognise import (
     boards_of,
     check_observable,
-    found_stations,
     read_photographs,
+    station_poses,
 )
 from pkmcal.check.check import Level, check_session
 from pkmcal.errors import InputError
@@ -147,7 +147,7 @@ def test_a_station_without_a_pose_is_found_through_the_board(rendered, folder):
     check_observable(session)
     photographs = read_photographs(session)
     boards = boards_of(session, photographs)
-    T = found_stations(session, photographs, np.random.default_rng(0), boards)
+    T = station_poses(session, photographs, boards, np.random.default_rng(0))
     truth = load_truth(rendered, session.machine)
     error = pose_difference(inverse(T), inverse(truth.T_camera_base))
     # as near as the search comes from a pose by hand; the estimate's start need not be nearer
@@ -187,10 +187,10 @@ def test_a_station_whose_pose_by_hand_is_wrong_is_found_all_the_same(folder):
     session = load_session(folder)
     photographs = read_photographs(session)
     boards = boards_of(session, photographs)
-    T = found_stations(session, photographs, np.random.default_rng(0), boards)
+    T = station_poses(session, photographs, boards, np.random.default_rng(0))
     assert np.linalg.norm(inverse(T[1])[:3, 3] - [0.9, 0.9, 1.1]) > 0.3
     with pytest.raises(InputError, match="not recognised in the photographs of station2"):
-        found_stations(session, photographs, np.random.default_rng(0), Boards())
+        station_poses(session, photographs, Boards(), np.random.default_rng(0))
 
 
 # the commands

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from pkmcal.boards.board import Detection, chessboard
-from pkmcal.boards.camera import calibrate_camera, calibrate_photographs, views_of
+from pkmcal.boards.camera import calibrate_camera, calibrate_photographs
 from pkmcal.boards.fit import (
     board_poses,
     covariance_of,
     fit_camera,
-    line_offsets,
     linear_poses,
     settled_poses,
+    views_of,
 )
-from pkmcal.boards.selection import positions
+from pkmcal.boards.selection import line_offsets, positions
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation

@@ -9,7 +9,13 @@ import pytest
 
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import perturb, pose, pose_difference, rotation
-from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate_poses
+from pkmcal.measurements import (
+    EdgeSet,
+    Measurements,
+    Mount,
+    PoseSet,
+    concatenate,
+)
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.papers.hand_eye import size_of, solve_pairs, start_from_poses
@@ -149,7 +155,7 @@ def test_several_stations_and_mounts_are_chained():
     cameras = [anywhere(rng, 1.0) for _ in range(3)]
     mounts = [anywhere(rng, 0.05), anywhere(rng, 0.3), anywhere(rng, 0.05)]
     still = np.broadcast_to(np.eye(4), body.shape)
-    poses = concatenate_poses(
+    poses = concatenate(
         [
             seen_from(cameras[0], body, mounts[0], rng),
             seen_from(cameras[0], still, mounts[1], rng, 0, 1),

@@ -9,7 +9,13 @@ from scipy.ndimage import gaussian_filter
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
 from pkmcal.observe.legs import REACH, photographs_of, search, search_legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
-from pkmcal.observe.stations import DIRECTIONS, View, direction_of, distance_tables, find_station
+from pkmcal.observe.stations import (
+    DIRECTIONS,
+    StationView,
+    direction_of,
+    distance_tables,
+    find_station,
+)
 from test_observe_drawing import (
     FRONT,
     camera_of,
@@ -123,7 +129,7 @@ def view_of(pictures, mechanism=None, seen=None):
     seen = poses()[: len(pictures)] if seen is None else seen
     readings = machine().inverse(seen)
     tables = distance_tables(pictures)
-    return View(mechanism, camera_of(), tubes_of(mechanism), readings, seen, tables)
+    return StationView(mechanism, camera_of(), tubes_of(mechanism), readings, seen, tables)
 
 
 def misplaced(T_camera_base):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.measurements import PoseSet, concatenate_poses
+from pkmcal.measurements import PoseSet, concatenate
 
 
 def some(n, station=0):
@@ -36,8 +36,8 @@ def test_select_by_mask_and_by_place():
 
 
 def test_concatenate_keeps_the_order():
-    joined = concatenate_poses([some(2, 5), PoseSet.empty(), some(1, 3)])
+    joined = concatenate([some(2, 5), PoseSet.empty(), some(1, 3)])
     assert joined.station.tolist() == [5, 5, 3]
     assert joined.configuration.tolist() == [0, 1, 0]
     assert joined.whiten.shape == (3, 6, 6)
-    assert len(concatenate_poses([])) == 0
+    assert len(concatenate([PoseSet.empty()])) == 0

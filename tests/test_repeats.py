@@ -11,7 +11,15 @@ import pytest
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
 from pkmcal.check.check import Level
-from pkmcal.check.repeats import _findings, _Look, _station_row
+from pkmcal.check.repeats import (
+    Cylinders,
+    _findings,
+    _Look,
+    _station_row,
+    axis_coordinates,
+    by_ends,
+    fit_motions,
+)
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
@@ -20,11 +28,7 @@ from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.legs import StationEdges
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.observe.repeats import (
-    Cylinders,
-    axis_coordinates,
-    by_ends,
     combined,
-    fit_motions,
     groups_of,
     mean_covariance,
     mean_edges,

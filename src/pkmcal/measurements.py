@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -66,22 +66,6 @@ class PoseSet:
         return replace(self, T_station_target=perturb(self.T_station_target, delta))
 
 
-def concatenate_poses(sets: Sequence[PoseSet]) -> PoseSet:
-    """All poses in one set; cameras with fewer parameters get zeros for the rest."""
-    parts = [PoseSet.empty(), *sets]
-    widest = max(s.by_intrinsics.shape[-1] for s in parts)
-    padded = [
-        np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
-        for s in parts
-    ]
-    joined = {
-        f.name: np.concatenate([getattr(s, f.name) for s in parts])
-        for f in fields(PoseSet)
-        if f.name != "by_intrinsics"
-    }
-    return PoseSet(**joined, by_intrinsics=np.concatenate(padded))
-
-
 @dataclass(frozen=True)
 class EdgeSet:
     """Silhouette edges of legs in photographs; N edges, flat arrays, all indices from 0.
@@ -130,6 +114,11 @@ class EdgeSet:
         """The edges at a mask or at positions."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
+    def rejection(self, k: int, reason: str) -> Rejection:
+        """The edge at k, left out for a reason."""
+        place = (self.station, self.configuration, self.leg, self.tube, self.side)
+        return Rejection(*(int(index[k]) for index in place), reason)
+
 
 @dataclass(frozen=True)
 class Rejection:
@@ -166,19 +155,23 @@ class Observation:
     poses: PoseSet = field(default_factory=PoseSet.empty)
 
 
-def concatenate(sets: list[EdgeSet]) -> EdgeSet:
-    """Several edge sets as one; cameras with fewer parameters get zeros for the rest."""
+Set = TypeVar("Set", PoseSet, EdgeSet)
+
+
+def concatenate(sets: Sequence[Set]) -> Set:
+    """One set or more as one; cameras with fewer parameters get zeros for the rest."""
     widest = max(s.by_intrinsics.shape[-1] for s in sets)
     padded = [
         np.pad(s.by_intrinsics, ((0, 0), (0, 0), (0, widest - s.by_intrinsics.shape[-1])))
         for s in sets
     ]
     joined = {
-        f.name: np.concatenate([getattr(s, f.name) for s in sets])
-        for f in fields(EdgeSet)
-        if f.name != "by_intrinsics"
+        f.name: np.concatenate(
+            padded if f.name == "by_intrinsics" else [getattr(s, f.name) for s in sets]
+        )
+        for f in fields(sets[0])
     }
-    return EdgeSet(**joined, by_intrinsics=np.concatenate(padded))
+    return replace(sets[0], **joined)
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.boards.fit import Fit, Views, covariance_of
+from pkmcal.boards.board import Board, Detection
+from pkmcal.boards.detect import detect_boards
+from pkmcal.boards.fit import CameraFit, Views, covariance_of, views_of
 from pkmcal.boards.selection import (
     TERMS,
     Candidate,
@@ -29,11 +31,6 @@ from pkmcal.files import closest
 from pkmcal.geometry.rigid import dot
 from pkmcal.wording import listed
 
-if TYPE_CHECKING:
-    # self-import
-    from pkmcal.boards.board import Board, Detection
-
-
 LEAST_VIEWS = 3
 GOOD_VIEWS = 6
 UNFIT = 3.0
@@ -48,197 +45,6 @@ FACING = 15.0
 """degrees; boards tilted by less all say the same about the focal length."""
 CELLS = (8, 6)
 COVERED = 0.5
-
-
-def check_enough(used: Sequence[Any], taken: int) -> None:
-    """Raise `InputError` where fewer than three photographs show the board."""
-    if len(used) < LEAST_VIEWS:
-        raise InputError(
-            "too few photographs show the board",
-            found=f"{len(used)} of {taken}",
-            expected=f"{LEAST_VIEWS} at least, better ten, with the board tilted differently",
-        )
-
-
-def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
-    """The chosen model cannot even be begun."""
-    other = min(pool, key=lambda c: c.left_out) if pool else None
-    return InputError(
-        f"the model {model} does not fit the photographs",
-        expected=f"{other.model}, which predicts views left out to {other.left_out:.2g} px"
-        if other
-        else "photographs of one flat board by one camera",
-    )
-
-
-def check_model(model: str, chosen: Candidate, best: Candidate) -> list[str]:
-    """Sentences of doubt about a model named by the user; `InputError` where it does not fit."""
-    if model == "auto" or best.model == chosen.model or not is_worse(chosen, best):
-        return []
-    ratio = chosen.left_out / best.left_out
-    if ratio > UNFIT:
-        raise InputError(
-            f"the model {model} does not fit the photographs",
-            found=f"an error of {chosen.left_out:.2g} px on views left out",
-            expected=f"{best.model}, with {best.left_out:.2g} px",
-        )
-    return [
-        f"The model {best.model} predicts views left out better than {model}:"
-        f" {best.left_out:.3g} px against {chosen.left_out:.3g} px."
-    ]
-
-
-def check_determined(fit: Fit, covariance: Array, views: Views) -> None:
-    """Raise `ResultError` where the views do not tell the focal length."""
-    names = fit.camera.parameter_names
-    mine = [names.index("focal.x"), names.index("focal.y")]
-    if "xi" in names:
-        # Pixels a radian in the picture's middle, f / (1 + xi): f and xi alone are never sure.
-        xi = names.index("xi")
-        by = np.zeros((2, len(names)))
-        by[[0, 1], mine] = 1.0
-        by[:, xi] = -fit.camera.parameters[mine] / (1 + fit.camera.parameters[xi])
-        sigma = np.sqrt(np.diag(by @ covariance @ by.T))
-    else:
-        sigma = np.sqrt(np.diag(covariance))[mine]
-    share = float(np.max(sigma / fit.camera.parameters[mine]))
-    if share <= LEAST_SURE and np.isfinite(share):
-        return
-    tilt = tilts(fit.T_camera_board, views.points)
-    raise ResultError(
-        "the photographs do not tell the focal length, because the board looks much the same in"
-        " all of them",
-        found=f"a standard deviation of {100 * min(share, 9.99):.0f} % of it, with the board"
-        f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
-        next_step="Take photographs with the board tilted by 20 to 45 degrees, each to another"
-        " side, and near the picture's corners",
-    )
-
-
-def check_explained(rms: float, camera: Camera) -> None:
-    """Raise `ResultError` where not even the best model explains the photographs."""
-    limit = EXPLAINED * camera.image_size[0]
-    if rms <= limit:
-        return
-    raise ResultError(
-        "no camera model explains these photographs",
-        found=f"an error of {rms:.2g} px on views left out ({camera.model} fits best)",
-        expected=f"{limit:.2g} px at most, usually a tenth of that",
-        next_step="Look for a bent board, a wrong board file, a zoom or focus that moved, or"
-        " photographs of two cameras",
-    )
-
-
-def tilts(T_camera_board: Array, points: Array) -> Array:
-    """Angle (V,) in degrees between the board's normal and the line of sight to its middle."""
-    middle = T_camera_board[:, :3, :3] @ points.mean(axis=0) + T_camera_board[:, :3, 3]
-    normal = T_camera_board[:, :3, 2]
-    across = np.linalg.norm(np.cross(normal, middle), axis=-1)
-    return np.rad2deg(np.arctan2(across, np.abs(dot(normal, middle))))
-
-
-def coverage(pixels: Array, image_size: tuple[int, int]) -> Array:
-    """Corners in each cell of the picture, CELLS columns and rows, (rows, columns)."""
-    flat = pixels[np.isfinite(pixels).all(axis=-1)]
-    edges = [
-        np.linspace(-0.5, size - 0.5, n + 1) for size, n in zip(image_size, CELLS, strict=True)
-    ]
-    return np.histogram2d(flat[:, 1], flat[:, 0], bins=(edges[1], edges[0]))[0]
-
-
-def warnings_of(calibration: CameraCalibration) -> list[str]:
-    """Sentences about what is not wrong but should be known."""
-    c = calibration
-    found = [_missed(c), _few(c), _mirrored(c), _spread(c), _facing(c), _uncovered(c), _aside(c)]
-    found += _outstanding(c) + _inseparable(c)
-    return [text for text in found if text]
-
-
-def _missed(c: CameraCalibration) -> str:
-    missed = [d for d in c.detections if not d.found]
-    if not missed:
-        return ""
-    return (
-        f"{len(missed)} of {len(c.detections)} photographs are not used:"
-        f" {listed([f'{d.name} ({d.reason})' for d in missed])}."
-    )
-
-
-def _few(c: CameraCalibration) -> str:
-    if len(c.views) >= GOOD_VIEWS:
-        return ""
-    return f"Only {len(c.views)} photographs: how far they agree says little; ten are better."
-
-
-def _mirrored(c: CameraCalibration) -> str:
-    mirrored = [d.name for d in c.detections if d.mirrored]
-    if not mirrored:
-        return ""
-    return (
-        f"{len(mirrored)} photographs are mirror images, such as {mirrored[0]}: flip all of this"
-        " camera's photographs, for the calibration and for the machine, or the machine's model"
-        " comes out as its mirror image."
-    )
-
-
-def _spread(c: CameraCalibration) -> str:
-    if c.spread <= 1:
-        return ""
-    return (
-        f"The views disagree by {c.spread:.1f} times what the corners' noise explains (a board"
-        " that is not flat, or a lens that the model does not describe wholly); the standard"
-        " deviations contain it."
-    )
-
-
-def _facing(c: CameraCalibration) -> str:
-    most = tilts(c.T_camera_board, c.board.points).max()
-    if most >= FACING:
-        return ""
-    return (
-        f"The board is tilted by {most:.0f} degrees at most; tilts of 20 to 45 degrees tell the"
-        " focal length better."
-    )
-
-
-def _uncovered(c: CameraCalibration) -> str:
-    share = float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
-    if share >= COVERED:
-        return ""
-    return f"Corners cover {100 * share:.0f} % of the picture; outside, the camera is extrapolated."
-
-
-def _aside(c: CameraCalibration) -> str:
-    seen = np.isfinite(c.residuals).all(axis=-1)
-    aside = int((seen & ~c.kept).sum())
-    if not aside:
-        return ""
-    return f"{aside} of {int(seen.sum())} corners lie too far off and have lost their weight."
-
-
-def _outstanding(c: CameraCalibration) -> list[str]:
-    middle = float(np.median(c.held_out.by_view))
-    return [
-        f"The residuals of {name} are {rms / middle:.1f} times those of the middle photograph."
-        for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True)
-        if rms > STANDS_OUT * middle
-    ]
-
-
-def _inseparable(c: CameraCalibration) -> list[str]:
-    """Xi with f, and the like: known together, not alone."""
-    if c.camera.model != "unified":
-        return []
-    pairs = [p for p in c.correlations if "xi" in p[:2]]
-    if not pairs:
-        return []
-    others = listed([f"{a if b == 'xi' else b} ({rho:+.3f})" for a, b, rho in pairs])
-    return [
-        f"xi is hardly told apart from {others}, the correlation in brackets: use them together,"
-        " never one of them with another calibration's rest."
-    ]
-
-
 STRONG = 0.95
 """Correlation from which two intrinsics are named as hardly told apart."""
 
@@ -343,9 +149,7 @@ def calibrate_photographs(
     paths: Sequence[Path | str], board: Board, model: str = "auto"
 ) -> CameraCalibration:
     """Find the board in photographs of one size and calibrate the camera that took them."""
-    from pkmcal.boards.detect import detect_boards
-
-    _check_model(model)
+    _check_known(model)
     return calibrate_camera(detect_boards(paths, board), board, model)
 
 
@@ -357,7 +161,7 @@ def calibrate_camera(
     Raises `InputError` where the views are too few or `model` does not fit, and `ResultError`
     where the views do not determine the camera.
     """
-    _check_model(model)
+    _check_known(model)
     used = [detection for detection in detections if detection.found]
     check_enough(used, len(detections))
     image_size = used[0].image_size
@@ -366,32 +170,9 @@ def calibrate_camera(
     mine = tuple(c for c in pool if model in ("auto", c.model))
     if not mine:
         raise no_fit(model, pool)
-    chosen, best = best_of(mine), best_of(pool)
-    doubt = check_model(model, chosen, best)
+    chosen = best_of(mine)
+    doubt = check_model(model, chosen, best_of(pool))
     fit = fitted_to_all(chosen, views)
-    return _calibration(fit, chosen, pool, views, board, tuple(detections), doubt)
-
-
-def views_of(detections: Sequence[Detection], board: Board) -> Views:
-    """Detections as arrays."""
-    shape = len(detections), len(board.points)
-    pixels, sigma = np.full((*shape, 2), np.nan), np.zeros(shape)
-    for v, detection in enumerate(detections):
-        pixels[v, detection.ids] = detection.pixels
-        sigma[v, detection.ids] = detection.sigma
-    return Views(board.points, pixels, sigma)
-
-
-def _calibration(
-    fit: Fit,
-    chosen: Candidate,
-    pool: tuple[Candidate, ...],
-    views: Views,
-    board: Board,
-    detections: tuple[Detection, ...],
-    doubt: list[str],
-) -> CameraCalibration:
-    names = tuple(d.name for d in detections if d.found)
     by_noise, poses_by_noise, _ = covariance_of(fit, views)
     spread = spread_of_views(fit, views)
     covariance = by_noise * spread**2
@@ -405,7 +186,7 @@ def _calibration(
         terms=chosen.terms,
         covariance=covariance,
         spread=spread,
-        views=names,
+        views=tuple(detection.name for detection in used),
         T_camera_board=fit.T_camera_board,
         pose_covariance=poses_by_noise * spread**2,
         pixels=views.pixels,
@@ -416,13 +197,13 @@ def _calibration(
         held_out=tested,
         compared=pool,
         board=board,
-        detections=detections,
+        detections=tuple(detections),
         warnings=(),
     )
     return replace(calibration, warnings=(*doubt, *warnings_of(calibration)))
 
 
-def _check_model(model: str) -> None:
+def _check_known(model: str) -> None:
     known = ("auto", *TERMS)
     if model not in known:
         raise InputError(
@@ -430,3 +211,161 @@ def _check_model(model: str) -> None:
             found=model,
             expected=closest(model, known) or listed(known),
         )
+
+
+def check_enough(used: Sequence[Any], taken: int) -> None:
+    """Raise `InputError` where fewer than three photographs show the board."""
+    if len(used) < LEAST_VIEWS:
+        raise InputError(
+            "too few photographs show the board",
+            found=f"{len(used)} of {taken}",
+            expected=f"{LEAST_VIEWS} at least, better ten, with the board tilted differently",
+        )
+
+
+def no_fit(model: str, pool: tuple[Candidate, ...]) -> InputError:
+    """The chosen model cannot even be begun."""
+    other = min(pool, key=lambda c: c.left_out) if pool else None
+    return InputError(
+        f"the model {model} does not fit the photographs",
+        expected=f"{other.model}, which predicts views left out to {other.left_out:.2g} px"
+        if other
+        else "photographs of one flat board by one camera",
+    )
+
+
+def check_model(model: str, chosen: Candidate, best: Candidate) -> list[str]:
+    """Sentences of doubt about a model named by the user; `InputError` where it does not fit."""
+    if model == "auto" or best.model == chosen.model or not is_worse(chosen, best):
+        return []
+    ratio = chosen.left_out / best.left_out
+    if ratio > UNFIT:
+        raise InputError(
+            f"the model {model} does not fit the photographs",
+            found=f"an error of {chosen.left_out:.2g} px on views left out",
+            expected=f"{best.model}, with {best.left_out:.2g} px",
+        )
+    return [
+        f"The model {best.model} predicts views left out better than {model}:"
+        f" {best.left_out:.3g} px against {chosen.left_out:.3g} px."
+    ]
+
+
+def check_determined(fit: CameraFit, covariance: Array, views: Views) -> None:
+    """Raise `ResultError` where the views do not tell the focal length."""
+    names = fit.camera.parameter_names
+    mine = [names.index("focal.x"), names.index("focal.y")]
+    if "xi" in names:
+        # Pixels a radian in the picture's middle, f / (1 + xi): f and xi alone are never sure.
+        xi = names.index("xi")
+        by = np.zeros((2, len(names)))
+        by[[0, 1], mine] = 1.0
+        by[:, xi] = -fit.camera.parameters[mine] / (1 + fit.camera.parameters[xi])
+        sigma = np.sqrt(np.diag(by @ covariance @ by.T))
+    else:
+        sigma = np.sqrt(np.diag(covariance))[mine]
+    share = float(np.max(sigma / fit.camera.parameters[mine]))
+    if share <= LEAST_SURE and np.isfinite(share):
+        return
+    tilt = tilts(fit.T_camera_board, views.points)
+    raise ResultError(
+        "the photographs do not tell the focal length, because the board looks much the same in"
+        " all of them",
+        found=f"a standard deviation of {100 * min(share, 9.99):.0f} % of it, with the board"
+        f" tilted by {tilt.min():.0f} to {tilt.max():.0f} degrees",
+        next_step="Take photographs with the board tilted by 20 to 45 degrees, each to another"
+        " side, and near the picture's corners",
+    )
+
+
+def check_explained(rms: float, camera: Camera) -> None:
+    """Raise `ResultError` where not even the best model explains the photographs."""
+    limit = EXPLAINED * camera.image_size[0]
+    if rms <= limit:
+        return
+    raise ResultError(
+        "no camera model explains these photographs",
+        found=f"an error of {rms:.2g} px on views left out ({camera.model} fits best)",
+        expected=f"{limit:.2g} px at most, usually a tenth of that",
+        next_step="Look for a bent board, a wrong board file, a zoom or focus that moved, or"
+        " photographs of two cameras",
+    )
+
+
+def tilts(T_camera_board: Array, points: Array) -> Array:
+    """Angle (V,) in degrees between the board's normal and the line of sight to its middle."""
+    middle = T_camera_board[:, :3, :3] @ points.mean(axis=0) + T_camera_board[:, :3, 3]
+    normal = T_camera_board[:, :3, 2]
+    across = np.linalg.norm(np.cross(normal, middle), axis=-1)
+    return np.rad2deg(np.arctan2(across, np.abs(dot(normal, middle))))
+
+
+def coverage(pixels: Array, image_size: tuple[int, int]) -> Array:
+    """Corners in each cell of the picture, CELLS columns and rows, (rows, columns)."""
+    flat = pixels[np.isfinite(pixels).all(axis=-1)]
+    edges = [
+        np.linspace(-0.5, size - 0.5, n + 1) for size, n in zip(image_size, CELLS, strict=True)
+    ]
+    return np.histogram2d(flat[:, 1], flat[:, 0], bins=(edges[1], edges[0]))[0]
+
+
+def warnings_of(calibration: CameraCalibration) -> list[str]:
+    """Sentences about what is not wrong but should be known."""
+    c = calibration
+    found: list[str] = []
+    missed = [f"{d.name} ({d.reason})" for d in c.detections if not d.found]
+    if missed:
+        found.append(
+            f"{len(missed)} of {len(c.detections)} photographs are not used: {listed(missed)}."
+        )
+    if len(c.views) < GOOD_VIEWS:
+        found.append(
+            f"Only {len(c.views)} photographs: how far they agree says little; ten are better."
+        )
+    mirrored = [d.name for d in c.detections if d.mirrored]
+    if mirrored:
+        found.append(
+            f"{len(mirrored)} photographs are mirror images, such as {mirrored[0]}: flip all of"
+            " this camera's photographs, for the calibration and for the machine, or the machine's"
+            " model comes out as its mirror image."
+        )
+    if c.spread > 1:
+        found.append(
+            f"The views disagree by {c.spread:.1f} times what the corners' noise explains (a board"
+            " that is not flat, or a lens that the model does not describe wholly); the standard"
+            " deviations contain it."
+        )
+    most = tilts(c.T_camera_board, c.board.points).max()
+    if most < FACING:
+        found.append(
+            f"The board is tilted by {most:.0f} degrees at most; tilts of 20 to 45 degrees tell the"
+            " focal length better."
+        )
+    covered = float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
+    if covered < COVERED:
+        found.append(
+            f"Corners cover {100 * covered:.0f} % of the picture; outside, the camera is"
+            " extrapolated."
+        )
+    seen = np.isfinite(c.residuals).all(axis=-1)
+    aside = int((seen & ~c.kept).sum())
+    if aside:
+        found.append(
+            f"{aside} of {int(seen.sum())} corners lie too far off and have lost their weight."
+        )
+    middle = float(np.median(c.held_out.by_view))
+    found += [
+        f"The residuals of {name} are {rms / middle:.1f} times those of the middle photograph."
+        for name, rms in zip(c.views, c.held_out.by_view.tolist(), strict=True)
+        if rms > STANDS_OUT * middle
+    ]
+    # xi with f, and the like: known together, not alone
+    others = [
+        f"{a if b == 'xi' else b} ({rho:+.3f})" for a, b, rho in c.correlations if "xi" in (a, b)
+    ]
+    if c.camera.model == "unified" and others:
+        found.append(
+            f"xi is hardly told apart from {listed(others)}, the correlation in brackets: use them"
+            " together, never one of them with another calibration's rest."
+        )
+    return found

@@ -43,249 +43,6 @@ LEAST_MARKER = 10.0
 LEAST_MARKERS = 4
 NO_SIZE = 9999
 """Of a dictionary that is alone."""
-
-
-def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board) -> None:
-    """Raise `InputError` where some or all photographs show another board than `board`."""
-    missed = [f for f, d in zip(files, found, strict=True) if not d.found]
-    seen = [(f, d) for f, d in zip(files, found, strict=True) if d.found]
-    shown = [path for path, _ in seen]
-    size = found[0].image_size
-    other: str | None = None
-    for path, detection in seen[:LOOKED_AT]:
-        # One photograph alone may show something beside the board that looks like more of it.
-        image = decode(path, size, path.name)
-        other = _larger(image, board)
-        if other is None:
-            _check_marker(image, board, detection, path)
-            break
-    if other is not None:
-        raise _another(shown[0], other, board)
-    for path in missed[:LOOKED_AT]:
-        other = other_board(decode(path, size, path.name), board, part=not shown)
-        if other is not None and not shown:
-            raise _another(path, other, board)
-        if other is not None:
-            raise InputError(
-                "photographs of two boards are mixed",
-                where=path.name,
-                found=other,
-                expected=f"{board.described}, as in {listed([f.name for f in shown], 3)}",
-                next_step="Calibrate with the photographs of one board",
-            )
-
-
-def _check_marker(image: Integers, board: Board, detection: Detection, path: Path) -> None:
-    """Raise `InputError` where a ChArUco board's markers have another size than described.
-
-    Corners stay right to 0.02 px with any size, yet those of squares that seem to be full of
-    marker, or empty, come out up to six times as uncertain as they are.
-    """
-    share = marker_share(image, board, detection) if board.type == "charuco" else None
-    if share is None:
-        return
-    square, marker = board.document["square"], board.document["marker"]
-    if abs(share * square / marker - 1) <= OTHER_MARKER:
-        return
-    raise InputError(
-        "the board's markers have another size than its file says",
-        where=path.name,
-        found=f"markers {share:.2f} of a square wide",
-        expected=f"{marker / square:.2f}, by marker: {marker:g} and square: {square:g}",
-        next_step="Measure a marker and a square with a ruler, the marker with its black border",
-    )
-
-
-def marker_share(image: Integers, board: Board, detection: Detection) -> float | None:
-    """Width of a ChArUco board's markers in squares, by the corners found; None for too few."""
-    import cv2
-
-    ids, corners = detect_markers(image, board.document["dictionary"])
-    wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
-    large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER
-    corners, wide = corners[large], wide[large]
-    if len(corners) < LEAST_MARKERS:
-        return None
-    places = board.points[detection.ids, :2] / board.document["square"]
-    plane: Any = cv2.findHomography(detection.pixels, places, cv2.RANSAC, 0.05)[0]
-    if plane is None:
-        return None
-    there = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), plane).reshape(-1, 4, 2)
-    shares = np.linalg.norm(np.diff(there, axis=1), axis=-1)
-    # the detector's corners lie on the outermost dark pixels' centres
-    return float(np.median(shares * (wide + 1) / wide))
-
-
-def check_any(found: Sequence[Detection], board: Board) -> None:
-    """Raise `InputError` where no photograph shows the board."""
-    if not any(detection.found for detection in found):
-        raise InputError(
-            "the board is in none of the photographs",
-            where=listed([detection.name for detection in found], 3),
-            found=found[0].reason,
-            expected=board.described,
-            next_step="Check the board file, the light and the focus; a chessboard's white border"
-            " must be seen as well",
-        )
-
-
-def _another(path: Path, other: str, board: Board) -> InputError:
-    return InputError(
-        "the photographs show another board than the one described",
-        where=path.name,
-        found=other,
-        expected=f"{board.described}, as the board file says",
-        next_step="Write what the board has into the board file",
-    )
-
-
-def other_board(image: Integers, board: Board, part: bool) -> str | None:
-    """The board that a photograph shows in place of `board`, in words; None for none.
-
-    part : whether a part of a described chessboard is another one, or badly seen.
-    """
-    if board.type == "chessboard":
-        # Markers first: they are looked for once, chessboards for every count.
-        return _other_markers(image, "") or _other_chessboard(image, board.counts, part)
-    name = board.document["dictionary"]
-    if board.type == "charuco":
-        best = _other_charuco(image, board)
-        if best:
-            return best
-    return _other_markers(image, name) or _other_chessboard(image, (0, 0), part=True)
-
-
-def _larger(image: Integers, board: Board) -> str | None:
-    """More of the board than described, in a photograph in which the described one was found."""
-    if board.type == "chessboard":
-        columns, rows = board.counts
-        for counts in ((columns + 1, rows), (columns, rows + 1), (columns + 1, rows + 1)):
-            if _all_corners(image, counts):
-                return _chess(counts)
-        return None
-    ids, _ = detect_markers(image, board.document["dictionary"])
-    if board.type == "aruco_grid":
-        ids = ids - board.document.get("first_id", 0)
-        count = board.counts[0] * board.counts[1]
-    else:
-        squares = board.document["squares"]
-        count = squares[0] * squares[1] // 2
-    beyond = ids[(ids < 0) | (ids >= count)]
-    if len(beyond) < 2:
-        return None
-    if board.type == "charuco":
-        return _other_charuco(image, board)
-    return f"markers {listed([str(i) for i in sorted(beyond.tolist())], 4)} beyond its {count}"
-
-
-def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> str | None:
-    """The counts near the described ones that fit; with (0, 0), of the usual ones."""
-    if counts == (0, 0):
-        candidates = [(9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (6, 5), (11, 8), (10, 7), (6, 4)]
-    else:
-        span = range(-NEIGHBOURS, NEIGHBOURS + 1)
-        candidates = [(counts[0] + a, counts[1] + b) for a, b in product(span, span)]
-    image = _reduced(image)
-    # The largest first: a smaller grid is found inside a larger one.
-    for candidate in sorted(candidates, key=lambda c: -c[0] * c[1]):
-        if min(candidate) < 3 or candidate in (counts, counts[::-1]):
-            continue
-        if not part and all(n <= m for n, m in zip(sorted(candidate), sorted(counts), strict=True)):
-            continue
-        if _all_corners(image, candidate):
-            return _chess(candidate)
-    return None
-
-
-def _reduced(image: Integers) -> Integers:
-    """The photograph, not wider than WIDEST."""
-    import cv2
-
-    scale = WIDEST / image.shape[1]
-    if scale >= 1:
-        return image
-    small: Any = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return small
-
-
-def _all_corners(image: Integers, counts: tuple[int, int]) -> bool:
-    """True where a chessboard of these counts is there, every corner of it looking like one."""
-    if find_chessboard(image, counts, quick=True) is None:
-        return False
-    return len(detect_board(image, chessboard(counts, 1.0), "").ids) == counts[0] * counts[1]
-
-
-def _chess(counts: tuple[int, int]) -> str:
-    return "a chessboard of {}x{} inner corners".format(*counts)
-
-
-def _other_charuco(image: Integers, board: Board) -> str | None:
-    """The counts of squares, or the older pattern, with which most corners are found."""
-    ids, corners = detect_markers(image, board.document["dictionary"])
-    if len(ids) < 2:
-        return None
-    most = int(ids.max()) + 1
-    # A board has at least as many markers as its highest says, and seldom twice as many.
-    layouts: list[dict[str, Any]] = [
-        {**board.document, "squares": [columns, rows], "legacy": legacy}
-        for columns, rows in product(range(3, MOST_SQUARES), repeat=2)
-        if most <= (columns * rows) // 2 <= 2 * most + 4
-        for legacy in [False, True][: 2 - rows % 2]
-    ]
-    scored = [(_found(image, data, ids, corners), data) for data in layouts]
-    mine = _found(image, board.document, ids, corners)
-    scored = [item for item in scored if item[0][0] >= max(LEAST_CORNERS, mine[0] + 1)]
-    if not scored:
-        return None
-    data = max(scored, key=lambda item: item[0])[1]
-    if (
-        len(detect_board(image, board_from_document(Document(Path(), "", data, {})), "").ids)
-        <= mine[0]
-    ):
-        return None
-    changed = bool(data["legacy"]) != bool(board.document.get("legacy", False))
-    pattern = f" with legacy: {str(data['legacy']).lower()}" if changed else ""
-    return "a ChArUco board of {}x{} squares".format(*data["squares"]) + pattern
-
-
-def _found(
-    image: Integers, data: dict[str, Any], ids: Integers, corners: Array
-) -> tuple[int, float]:
-    """Corners of a ChArUco board between given markers, and their share of the board's."""
-    marker_corners = [corner[None].astype(np.float32) for corner in corners]
-    marker_ids = ids.astype(np.int32)[:, None]
-    detector: Any = charuco_detector(data)
-    found: Any = detector.detectBoard(image, None, None, marker_corners, marker_ids)[1]
-    count = 0 if found is None else len(found)
-    columns, rows = data["squares"]
-    return count, count / ((columns - 1) * (rows - 1))
-
-
-def _other_markers(image: Integers, mine: str) -> str | None:
-    """The dictionary whose markers the photograph shows; the smallest that has them all."""
-    # DICT_4X4_50 is the first 50 markers of DICT_4X4_1000: one search finds either's.
-    wanted = [n for n in dictionaries() if _size_of(n) in (FAMILY, NO_SIZE) or n == mine]
-    # some names differ by a capital only
-    names = list({name.lower(): name for name in wanted}.values())
-    ids = {name: detect_markers(image, name)[0] for name in names}
-    best = max(names, key=lambda name: len(ids[name]))
-    count = len(ids[best])
-    if count < 4 or (mine in ids and len(ids[mine]) > 0.7 * count):
-        return None
-    if _size_of(best) == NO_SIZE:
-        return f"{count} markers of {best}"
-    family = best.rpartition("_")[0]
-    sizes = [_size_of(n) for n in dictionaries() if n.rpartition("_")[0] == family]
-    size = min(size for size in sizes if size > np.quantile(ids[best], 0.9))
-    return f"{count} markers of {family}_{size}"
-
-
-def _size_of(name: str) -> int:
-    """Markers in a dictionary by its name, DICT_5X5_100; those without a number come last."""
-    last = name.rpartition("_")[2]
-    return int(last) if last.isdigit() else NO_SIZE
-
-
 THREADS = 2
 
 
@@ -335,3 +92,232 @@ def _common_size(files: Sequence[Path]) -> tuple[int, int]:
         if turned
         else "Calibrate each resolution on its own, from unscaled, uncropped photographs",
     )
+
+
+def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board) -> None:
+    """Raise `InputError` where some or all photographs show another board than `board`."""
+    missed = [f for f, d in zip(files, found, strict=True) if not d.found]
+    seen = [(f, d) for f, d in zip(files, found, strict=True) if d.found]
+    shown = [path for path, _ in seen]
+    size = found[0].image_size
+    other: str | None = None
+    for path, detection in seen[:LOOKED_AT]:
+        # One photograph alone may show something beside the board that looks like more of it.
+        image = decode(path, size, path.name)
+        other = _larger(image, board)
+        if other is None:
+            _check_marker(image, board, detection, path)
+            break
+    if other is not None:
+        raise _another(shown[0], other, board)
+    for path in missed[:LOOKED_AT]:
+        other = other_board(decode(path, size, path.name), board, part=not shown)
+        if other is not None and not shown:
+            raise _another(path, other, board)
+        if other is not None:
+            raise InputError(
+                "photographs of two boards are mixed",
+                where=path.name,
+                found=other,
+                expected=f"{board.described}, as in {listed([f.name for f in shown], 3)}",
+                next_step="Calibrate with the photographs of one board",
+            )
+
+
+def check_any(found: Sequence[Detection], board: Board) -> None:
+    """Raise `InputError` where no photograph shows the board."""
+    if not any(detection.found for detection in found):
+        raise InputError(
+            "the board is in none of the photographs",
+            where=listed([detection.name for detection in found], 3),
+            found=found[0].reason,
+            expected=board.described,
+            next_step="Check the board file, the light and the focus; a chessboard's white border"
+            " must be seen as well",
+        )
+
+
+def _another(path: Path, other: str, board: Board) -> InputError:
+    return InputError(
+        "the photographs show another board than the one described",
+        where=path.name,
+        found=other,
+        expected=f"{board.described}, as the board file says",
+        next_step="Write what the board has into the board file",
+    )
+
+
+def _check_marker(image: Integers, board: Board, detection: Detection, path: Path) -> None:
+    """Raise `InputError` where a ChArUco board's markers have another size than described.
+
+    Corners stay right to 0.02 px with any size, yet those of squares that seem to be full of
+    marker, or empty, come out up to six times as uncertain as they are.
+    """
+    share = marker_share(image, board, detection) if board.type == "charuco" else None
+    if share is None:
+        return
+    square, marker = board.document["square"], board.document["marker"]
+    if abs(share * square / marker - 1) <= OTHER_MARKER:
+        return
+    raise InputError(
+        "the board's markers have another size than its file says",
+        where=path.name,
+        found=f"markers {share:.2f} of a square wide",
+        expected=f"{marker / square:.2f}, by marker: {marker:g} and square: {square:g}",
+        next_step="Measure a marker and a square with a ruler, the marker with its black border",
+    )
+
+
+def marker_share(image: Integers, board: Board, detection: Detection) -> float | None:
+    """Width of a ChArUco board's markers in squares, by the corners found; None for too few."""
+    import cv2
+
+    ids, corners = detect_markers(image, board.document["dictionary"])
+    wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
+    large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER
+    corners, wide = corners[large], wide[large]
+    if len(corners) < LEAST_MARKERS:
+        return None
+    places = board.points[detection.ids, :2] / board.document["square"]
+    plane: Any = cv2.findHomography(detection.pixels, places, cv2.RANSAC, 0.05)[0]
+    if plane is None:
+        return None
+    there = cv2.perspectiveTransform(corners.reshape(-1, 1, 2), plane).reshape(-1, 4, 2)
+    shares = np.linalg.norm(np.diff(there, axis=1), axis=-1)
+    # the detector's corners lie on the outermost dark pixels' centres
+    return float(np.median(shares * (wide + 1) / wide))
+
+
+def other_board(image: Integers, board: Board, part: bool) -> str | None:
+    """The board that a photograph shows in place of `board`, in words; None for none.
+
+    part : whether a part of a described chessboard is another one, or badly seen.
+    """
+    if board.type == "chessboard":
+        # Markers first: they are looked for once, chessboards for every count.
+        return _other_markers(image, "") or _other_chessboard(image, board.counts, part)
+    name = board.document["dictionary"]
+    if board.type == "charuco":
+        best = _other_charuco(image, board)
+        if best:
+            return best
+    return _other_markers(image, name) or _other_chessboard(image, (0, 0), part=True)
+
+
+def _larger(image: Integers, board: Board) -> str | None:
+    """More of the board than described, in a photograph in which the described one was found."""
+    if board.type == "chessboard":
+        columns, rows = board.counts
+        for counts in ((columns + 1, rows), (columns, rows + 1), (columns + 1, rows + 1)):
+            if _all_corners(image, counts):
+                return chessboard(counts, 1.0).described
+        return None
+    ids, _ = detect_markers(image, board.document["dictionary"])
+    if board.type == "aruco_grid":
+        ids = ids - board.document.get("first_id", 0)
+        count = board.counts[0] * board.counts[1]
+    else:
+        squares = board.document["squares"]
+        count = squares[0] * squares[1] // 2
+    beyond = ids[(ids < 0) | (ids >= count)]
+    if len(beyond) < 2:
+        return None
+    if board.type == "charuco":
+        return _other_charuco(image, board)
+    return f"markers {listed([str(i) for i in sorted(beyond.tolist())], 4)} beyond its {count}"
+
+
+def _other_chessboard(image: Integers, counts: tuple[int, int], part: bool) -> str | None:
+    """The counts near the described ones that fit; with (0, 0), of the usual ones."""
+    import cv2
+
+    if counts == (0, 0):
+        candidates = [(9, 6), (8, 6), (7, 6), (7, 5), (8, 5), (6, 5), (11, 8), (10, 7), (6, 4)]
+    else:
+        span = range(-NEIGHBOURS, NEIGHBOURS + 1)
+        candidates = [(counts[0] + a, counts[1] + b) for a, b in product(span, span)]
+    scale = WIDEST / image.shape[1]
+    if scale < 1:
+        small: Any = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        image = small
+    # The largest first: a smaller grid is found inside a larger one.
+    for candidate in sorted(candidates, key=lambda c: -c[0] * c[1]):
+        if min(candidate) < 3 or candidate in (counts, counts[::-1]):
+            continue
+        if not part and all(n <= m for n, m in zip(sorted(candidate), sorted(counts), strict=True)):
+            continue
+        if _all_corners(image, candidate):
+            return chessboard(candidate, 1.0).described
+    return None
+
+
+def _all_corners(image: Integers, counts: tuple[int, int]) -> bool:
+    """True where a chessboard of these counts is there, every corner of it looking like one."""
+    if find_chessboard(image, counts, quick=True) is None:
+        return False
+    return len(detect_board(image, chessboard(counts, 1.0)).ids) == counts[0] * counts[1]
+
+
+def _other_charuco(image: Integers, board: Board) -> str | None:
+    """The counts of squares, or the older pattern, with which most corners are found."""
+    ids, corners = detect_markers(image, board.document["dictionary"])
+    if len(ids) < 2:
+        return None
+    most = int(ids.max()) + 1
+    # A board has at least as many markers as its highest says, and seldom twice as many.
+    layouts: list[dict[str, Any]] = [
+        {**board.document, "squares": [columns, rows], "legacy": legacy}
+        for columns, rows in product(range(3, MOST_SQUARES), repeat=2)
+        if most <= (columns * rows) // 2 <= 2 * most + 4
+        for legacy in [False, True][: 2 - rows % 2]
+    ]
+    scored = [(_found(image, data, ids, corners), data) for data in layouts]
+    mine = _found(image, board.document, ids, corners)
+    scored = [item for item in scored if item[0][0] >= max(LEAST_CORNERS, mine[0] + 1)]
+    if not scored:
+        return None
+    data = max(scored, key=lambda item: item[0])[1]
+    other = board_from_document(Document(Path(), "", data, {}))
+    if len(detect_board(image, other).ids) <= mine[0]:
+        return None
+    changed = bool(data["legacy"]) != bool(board.document.get("legacy", False))
+    pattern = f" with legacy: {str(data['legacy']).lower()}" if changed else ""
+    return other.described + pattern
+
+
+def _found(
+    image: Integers, data: dict[str, Any], ids: Integers, corners: Array
+) -> tuple[int, float]:
+    """Corners of a ChArUco board between given markers, and their share of the board's."""
+    marker_corners = [corner[None].astype(np.float32) for corner in corners]
+    marker_ids = ids.astype(np.int32)[:, None]
+    detector: Any = charuco_detector(data)
+    found: Any = detector.detectBoard(image, None, None, marker_corners, marker_ids)[1]
+    count = 0 if found is None else len(found)
+    columns, rows = data["squares"]
+    return count, count / ((columns - 1) * (rows - 1))
+
+
+def _other_markers(image: Integers, mine: str) -> str | None:
+    """The dictionary whose markers the photograph shows; the smallest that has them all."""
+    # DICT_4X4_50 is the first 50 markers of DICT_4X4_1000: one search finds either's.
+    wanted = [n for n in dictionaries() if _size_of(n) in (FAMILY, NO_SIZE) or n == mine]
+    # some names differ by a capital only
+    names = list({name.lower(): name for name in wanted}.values())
+    ids = {name: detect_markers(image, name)[0] for name in names}
+    best = max(names, key=lambda name: len(ids[name]))
+    count = len(ids[best])
+    if count < 4 or (mine in ids and len(ids[mine]) > 0.7 * count):
+        return None
+    if _size_of(best) == NO_SIZE:
+        return f"{count} markers of {best}"
+    family = best.rpartition("_")[0]
+    sizes = [_size_of(n) for n in dictionaries() if n.rpartition("_")[0] == family]
+    size = min(size for size in sizes if size > np.quantile(ids[best], 0.9))
+    return f"{count} markers of {family}_{size}"
+
+
+def _size_of(name: str) -> int:
+    """Markers in a dictionary by its name, DICT_5X5_100; those without a number come last."""
+    last = name.rpartition("_")[2]
+    return int(last) if last.isdigit() else NO_SIZE

@@ -1,4 +1,7 @@
-"""Board corners to sub-pixel: a model of the corner fitted to the grey levels around it.
+"""A board's corners in one photograph: found by OpenCV's detectors, then fitted to sub-pixel.
+
+A detector says which corners there are and where they lie to a pixel; of boards with markers also
+whether the picture is a mirror image. Each corner is then fitted to the grey levels around it.
 
 Around a corner two edges cross. With e1 and e2 the signed distances of a pixel from them and s
 the blur, the picture of a chessboard's corner is ``c + a g(e1 / s) g(e2 / s)`` with
@@ -30,226 +33,8 @@ BLURS = (0.25, 4.0)
 """px; outside, the window shows something other than a corner."""
 LEAST_SHARE = 0.6
 """Share of the window's variance that a corner explains; shadows and fingers leave less."""
-
-
-class Window(NamedTuple):
-    """Which pixels around a corner count, in squares of the board from the corner.
-
-    reach : as far along the edges. margin : as far across them (a ChArUco board's markers begin
-    behind it); reach again where nothing is printed inside the squares.
-    saddle : two dark squares meet at the corner, not one.
-    """
-
-    reach: float
-    margin: float
-    saddle: bool
-
-
-class Corners(NamedTuple):
-    """Fitted corners: places (n, 2) px, where the fit holds (n,), sigma (n,) px a coordinate."""
-
-    pixels: Array
-    good: Booleans
-    sigma: Array
-
-
-def refine(
-    image: Integers, start: Array, axes: Array, window: Window, bends: Array | None = None
-) -> Corners:
-    """Fit corners near `start`.
-
-    image : (height, width) grey levels. start : (n, 2) px.
-    axes : (n, 2, 2) px; axes[:, k] is the picture of one square along the board's axis k; of a
-        marker's corner, of its side, away from the corner.
-    bends : (n, 2, 2) px; second differences of the picture along the same axes, by which a lens
-        or mirror bends the edges; none for straight ones.
-    """
-    if len(start) == 0:
-        return Corners(start, np.zeros(0, dtype=bool), np.zeros(0))
-    scale = np.sqrt(np.abs(np.linalg.det(axes)))
-    widened = np.maximum(1.0, LEAST_RADIUS / np.maximum(window.reach * scale, 1e-6))
-    offsets, grey, inside = _pixels(image, start, axes, window.reach * widened)
-    weight = _weights(offsets, axes, window, widened) * inside
-    offsets, grey, weight = _packed(offsets, grey, weight)
-    first = _first(grey, weight, axes, window.saddle)
-    shape = _Shape(offsets, _curvature(first, axes, bends), window.saddle)
-    p, residual = _fit(grey, weight, shape, first)
-    return _judged(start, p, residual, grey, weight, scale, shape)
-
-
-def _pixels(
-    image: Integers, start: Array, axes: Array, reach: Array
-) -> tuple[Array, Array, Booleans]:
-    """Pixels around every corner: offsets from it (n, m, 2), grey (n, m), inside the picture."""
-    longest = float(np.max(reach * np.abs(axes).sum(axis=1).max(axis=-1), initial=0.0))
-    radius = int(np.clip(np.ceil(longest), 3, MOST_RADIUS))
-    dy, dx = np.mgrid[-radius : radius + 1, -radius : radius + 1]
-    base = np.rint(start).astype(int)
-    x, y = base[:, :1] + dx.ravel(), base[:, 1:] + dy.ravel()
-    height, width = image.shape
-    inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
-    offsets = np.stack([x - start[:, :1], y - start[:, 1:]], axis=-1)
-    return offsets, grey, inside
-
-
-def _weights(offsets: Array, axes: Array, window: Window, widened: Array) -> Array:
-    """1 for pixels of the window, falling to 0 over the last fifth of its reach; (n, m)."""
-    board = np.abs(np.linalg.solve(axes.mT, offsets.mT))
-    along, across = board.max(axis=1), board.min(axis=1)
-    reach, margin = window.reach * widened[:, None], window.margin * widened[:, None]
-    taper = np.clip((reach - along) / (0.2 * reach), 0, 1)
-    return taper * (across < margin) * (np.abs(offsets).max(axis=-1) <= MOST_RADIUS)
-
-
-def _packed(offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
-    """Only the pixels that count, each corner's to the left, as wide as the largest window."""
-    most = max(int(np.count_nonzero(weight, axis=1).max()), 1)
-    order = np.argsort(weight == 0, axis=1, kind="stable")[:, :most]
-    rows = np.arange(len(order))[:, None]
-    return offsets[rows, order], grey[rows, order], weight[rows, order]
-
-
-def _first(grey: Array, weight: Array, axes: Array, saddle: bool) -> Array:
-    """Start of the fit: x, y, two directions, log blur, level, amplitude; (n, 7).
-
-    Of a marker's corner both edges are directed so that the marker is on their positive side.
-    """
-    angle = np.arctan2(axes[..., 1], axes[..., 0])
-    if not saddle:
-        inward = np.sum(_normals(angle) * axes[:, ::-1], axis=-1)
-        angle = angle + np.where(inward < 0, np.pi, 0.0)
-    total = np.maximum(weight.sum(axis=1), 1e-9)
-    mean = np.sum(weight * grey, axis=1) / total
-    spread = np.sqrt(np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total)
-    zero = np.zeros(len(grey))
-    return np.stack([zero, zero, angle[:, 0], angle[:, 1], zero, mean, spread], axis=-1)
-
-
-def _normals(angle: Array) -> Array:
-    """Positive sides (..., 2) of edges with these directions."""
-    return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
-
-
-class _Shape(NamedTuple):
-    """What a corner's picture is made of: pixels' offsets (n, m, 2), curvatures (n, 2) 1/px of its
-    two edges towards their positive sides, and whether two dark squares meet.
-    """
-
-    offsets: Array
-    curvature: Array
-    saddle: bool
-
-
-def _curvature(first: Array, axes: Array, bends: Array | None) -> Array:
-    """Curvatures of the edges, (n, 2): the part of the second difference across the edge."""
-    if bends is None:
-        return np.zeros((len(first), 2))
-    across = np.sum(_normals(first[:, 2:4]) * bends, axis=-1)
-    return across / np.maximum(np.sum(axes**2, axis=-1), 1e-9)
-
-
-def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Array]:
-    """Weighted Levenberg-Marquardt of all corners at once; parameters (n, 7), residuals (n, m)."""
-    p = _levelled(grey, weight, shape, p)
-    value, by = _model(p, shape)
-    cost = np.sum(weight * (grey - value) ** 2, axis=1)
-    damping = np.full(len(p), 1e-3)
-    for _ in range(STEPS):
-        weighted = by * weight[..., None]
-        normal = by.mT @ weighted
-        right = (weighted.mT @ (grey - value)[..., None])[..., 0]
-        diagonal = np.einsum("nii->ni", normal)
-        normal = normal + (damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
-        step = np.clip(np.linalg.solve(normal, right[..., None])[..., 0], -_MOST, _MOST)
-        trial = p + step
-        trial_value, trial_by = _model(trial, shape)
-        trial_cost = np.sum(weight * (grey - trial_value) ** 2, axis=1)
-        better = trial_cost < cost
-        p = np.where(better[:, None], trial, p)
-        value = np.where(better[:, None], trial_value, value)
-        by = np.where(better[:, None, None], trial_by, by)
-        cost = np.where(better, trial_cost, cost)
-        damping = np.where(better, damping * 0.1, damping * 10)
-        if np.abs(step[:, :2]).max() < SETTLED:
-            break
-    return p, grey - value
-
-
-_MOST = np.array([1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3])
+LONGEST_STEP = np.array([1.0, 1.0, 0.3, 0.3, 0.5, 1e3, 1e3])
 """Longest step of each unknown: a pixel, a sixth of a right angle, half a natural unit of blur."""
-
-
-def _levelled(grey: Array, weight: Array, shape: _Shape, p: Array) -> Array:
-    """The start with level and amplitude fitted: these two are linear."""
-    bare = p.copy()
-    bare[:, 5], bare[:, 6] = 0.0, 1.0
-    form = _model(bare, shape)[0]
-    total = np.maximum(weight.sum(axis=1), 1e-9)
-    mean = np.sum(weight * form, axis=1) / total
-    off = form - mean[:, None]
-    variance = np.maximum(np.sum(weight * off * off, axis=1), 1e-9)
-    bare[:, 6] = np.sum(weight * off * grey, axis=1) / variance
-    bare[:, 5] = np.sum(weight * grey, axis=1) / total - bare[:, 6] * mean
-    return bare
-
-
-def _model(p: Array, shape: _Shape) -> tuple[Array, Array]:
-    """Grey levels (n, m) and their derivatives by the seven unknowns (n, m, 7)."""
-    from scipy.special import erf
-
-    d = shape.offsets - p[:, None, :2]
-    blur = np.exp(p[:, 4])[:, None]
-    half = 1.0 if shape.saddle else 0.5
-    forms: list[Array] = []
-    chains: list[Array] = []
-    for k in (0, 1):
-        cos, sin = np.cos(p[:, 2 + k])[:, None], np.sin(p[:, 2 + k])[:, None]
-        bend = shape.curvature[:, k, None]
-        along, across = d[..., 0] * cos + d[..., 1] * sin, d[..., 1] * cos - d[..., 0] * sin
-        z = (across - 0.5 * bend * along**2) / blur
-        forms.append(half * erf(z / np.sqrt(2)) + (1 - half))
-        slope = half * np.sqrt(2 / np.pi) * np.exp(-0.5 * z * z) / blur
-        by_angle = -along - bend * along * across
-        parts = (sin + bend * along * cos, bend * along * sin - cos, by_angle, -z * blur)
-        chains.append(slope[..., None] * np.stack(np.broadcast_arrays(*parts), axis=-1))
-    level, amplitude = p[:, 5:6], p[:, 6:7]
-    by = np.empty((*d.shape[:-1], 7))
-    first = (amplitude * forms[1])[..., None] * chains[0]
-    second = (amplitude * forms[0])[..., None] * chains[1]
-    by[..., :2] = first[..., :2] + second[..., :2]
-    by[..., 2], by[..., 3] = first[..., 2], second[..., 2]
-    by[..., 4] = first[..., 3] + second[..., 3]
-    by[..., 5], by[..., 6] = 1.0, forms[0] * forms[1]
-    return level + amplitude * by[..., 6], by
-
-
-def _judged(
-    start: Array, p: Array, residual: Array, grey: Array, weight: Array, scale: Array, shape: _Shape
-) -> Corners:
-    """Where the fit is a corner, and how sure its place is by what it leaves unexplained."""
-    total = np.maximum(weight.sum(axis=1), 1e-9)
-    mean = np.sum(weight * grey, axis=1) / total
-    variance = np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total
-    left = np.sum(weight * residual**2, axis=1) / total
-    blur, moved = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
-    good = (
-        (left < (1 - LEAST_SHARE) * variance)
-        & (blur > BLURS[0] / 2)
-        & (blur < np.maximum(BLURS[1], 0.2 * scale))
-        & (moved < np.maximum(1.5, FARTHEST * scale))
-        & (weight.sum(axis=1) > 12)
-        & np.isfinite(p).all(axis=1)
-    )
-    by = _model(p, shape)[1]
-    normal = by.mT @ (by * weight[..., None]) + 1e-9 * np.eye(7)
-    # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.
-    noise = np.maximum(left, 1 / 12)
-    covariance = np.linalg.inv(normal) * noise[:, None, None]
-    sigma = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0) / 2)
-    return Corners(start + np.where(good[:, None], p[:, :2], 0.0), good, sigma)
-
-
 REACH = 0.25
 """Squares around a corner that its fit uses: longer edges say little more, and begin to bend."""
 BENT = 0.02
@@ -265,7 +50,6 @@ SMALL = 1000
 """px; pictures wider than this are tried at half their size as well."""
 STRAIGHT_ENOUGH = 0.35
 """Share of a square by which a corner may lie off the middle of its two neighbours' line."""
-
 Raw = tuple[Integers, Array]
 """Corner ids (n,) and pixels (n, 2) as a detector gives them."""
 
@@ -295,93 +79,6 @@ def detect_board(image: Integers, board: Board, name: str = "", quick: bool = Fa
     )
 
 
-def _fitted(image: Integers, board: Board, raw: Raw) -> Corners:
-    """The corners' fits; a grid of markers may have plain corners or touching dark squares."""
-    ids, pixels = raw
-    data = board.document
-    if board.type == "aruco_grid":
-        module = 1 / (marker_bits(data["dictionary"]) + 2)
-        reach = min(REACH, 0.8 * data["gap"] / data["marker"])
-        axes = _marker_axes(ids, pixels)
-        plain = refine(image, pixels, axes, Window(reach, CLEAR * module, False))
-        touching = refine(image, pixels, axes, Window(reach, CLEAR * module, True))
-        # Both may be found: on a marker's inner pattern too. The right ones are the surer ones.
-        right = plain.good.sum() > touching.good.sum() or (
-            np.median(plain.sigma) <= np.median(touching.sigma)
-        )
-        return plain if right else touching
-    margin = REACH
-    if board.type == "charuco":
-        margin = min(REACH, CLEAR * 0.5 * (1 - data["marker"] / data["square"]))
-    window = Window(REACH, margin, True)
-    fitted = refine(image, pixels, _axes(board, ids, pixels)[0], window)
-    # How lines bend is told by the fitted corners; the detector's are too rough for it.
-    sides, bends = _axes(board, ids, fitted.pixels)
-    if np.abs(bends).max() * REACH**2 / 2 < BENT:
-        return fitted
-    return refine(image, fitted.pixels, sides, window, bends)
-
-
-def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
-    """Pictures of the square's two sides at every corner, (n, 2, 2) px, [:, k] along axis k; and
-    second differences along them, (n, 2, 2) px.
-
-    From the neighbours found; where a corner has none along an axis, from the mean of the rest.
-    """
-    columns, rows = board.counts
-    grid = np.full((rows * columns, 2), np.nan)
-    grid[ids] = pixels
-    grid = grid.reshape(rows, columns, 2)
-    sides = np.empty((len(ids), 2, 2))
-    bends = np.zeros((len(ids), 2, 2))
-    for k, axis in enumerate((1, 0)):
-        step = np.diff(grid, axis=axis)
-        mean = np.nanmean(step.reshape(-1, 2), axis=0) if np.isfinite(step).any() else np.nan
-        side = _beside(step, axis).reshape(-1, 2)[ids]
-        sides[:, k] = np.where(np.isfinite(side), side, mean)
-        # At the board's border the bend of the nearest corner inside serves as well.
-        second = _nearest(_padded(np.diff(step, axis=axis), axis, 1, 1), axis)
-        bends[:, k] = np.nan_to_num(second.reshape(-1, 2)[ids])
-    # A single row of corners has no second side: take it square.
-    for k in (0, 1):
-        bare = ~np.isfinite(sides[:, k]).all(axis=1)
-        sides[bare, k] = (1 - 2 * k) * sides[bare, 1 - k][:, ::-1] * [1, -1]
-    return sides, bends
-
-
-def _padded(values: Array, axis: int, before: int, after: int) -> Array:
-    """With NaN before and after along an axis."""
-    pad = [(0, 0)] * values.ndim
-    pad[axis] = (before, after)
-    return np.pad(values, pad, constant_values=np.nan)
-
-
-def _beside(step: Array, axis: int) -> Array:
-    """Mean of the steps to both sides, or the one that there is."""
-    both = np.stack([_padded(step, axis, 1, 0), _padded(step, axis, 0, 1)])
-    known = np.isfinite(both)
-    total = np.where(known, both, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return np.where(known.any(axis=0), total, np.nan)
-
-
-def _nearest(values: Array, axis: int) -> Array:
-    """NaN replaced by the mean of the two neighbours' values, or the one that there is."""
-    around = [np.roll(values, shift, axis) for shift in (1, -1)]
-    known = np.isfinite(np.stack(around))
-    total = np.where(known, np.stack(around), 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    return np.where(np.isfinite(values), values, total)
-
-
-def _marker_axes(ids: Integers, pixels: Array) -> Array:
-    """As :func:`_axes`, with a marker's sides, away from the corner; ids come in fours."""
-    corner = pixels.reshape(-1, 4, 2)
-    top, right = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 1]
-    bottom, left = corner[:, 2] - corner[:, 3], corner[:, 3] - corner[:, 0]
-    x = np.stack([top, -top, -bottom, bottom], axis=1)
-    y = np.stack([left, right, -right, -left], axis=1)
-    return np.stack([x, y], axis=2).reshape(len(ids), 2, 2)
-
-
 def _on_a_line(xy: Array) -> bool:
     spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
     return bool(spread[1] < 1e-6 * spread[0])
@@ -403,6 +100,17 @@ def _charuco(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     return best, False, why if markers else "none of the board's markers is recognised"
 
 
+def charuco_detector(data: dict[str, Any]) -> Any:
+    """OpenCV's detector of a ChArUco board's fields."""
+    import cv2
+
+    board = cv2.aruco.CharucoBoard(
+        tuple(data["squares"]), data["square"], data["marker"], dictionary(data["dictionary"])
+    )
+    board.setLegacyPattern(bool(data.get("legacy", False)))
+    return cv2.aruco.CharucoDetector(board)
+
+
 def _raw(corners: Any, ids: Any, width: int, mirrored: bool) -> Raw:
     """OpenCV's corners and ids, whose shapes differ between versions."""
     if _length(ids) == 0:
@@ -416,17 +124,6 @@ def _raw(corners: Any, ids: Any, width: int, mirrored: bool) -> Raw:
 def _length(found: Any) -> int:
     """Entries of what OpenCV found; None where it found nothing."""
     return 0 if found is None else len(found)
-
-
-def charuco_detector(data: dict[str, Any]) -> Any:
-    """OpenCV's detector of a ChArUco board's fields."""
-    import cv2
-
-    board = cv2.aruco.CharucoBoard(
-        tuple(data["squares"]), data["square"], data["marker"], dictionary(data["dictionary"])
-    )
-    board.setLegacyPattern(bool(data.get("legacy", False)))
-    return cv2.aruco.CharucoDetector(board)
 
 
 def dictionary(name: str) -> Any:
@@ -562,3 +259,306 @@ def _first_square_light(image: Integers, grid: Array) -> bool:
     # inner square (0, 0) has the colour of the first outer one, a diagonal step away
     same = (row + column) % 2 == 0
     return bool(grey[same].mean() > grey[~same].mean())
+
+
+def _fitted(image: Integers, board: Board, raw: Raw) -> Corners:
+    """The corners' fits; a grid of markers may have plain corners or touching dark squares."""
+    ids, pixels = raw
+    data = board.document
+    if board.type == "aruco_grid":
+        module = 1 / (marker_bits(data["dictionary"]) + 2)
+        reach = min(REACH, 0.8 * data["gap"] / data["marker"])
+        axes = _marker_axes(ids, pixels)
+        plain = refine(image, pixels, axes, Window(reach, CLEAR * module, False))
+        touching = refine(image, pixels, axes, Window(reach, CLEAR * module, True))
+        # Both may be found: on a marker's inner pattern too. The right ones are the surer ones.
+        right = plain.good.sum() > touching.good.sum() or (
+            np.median(plain.sigma) <= np.median(touching.sigma)
+        )
+        return plain if right else touching
+    margin = REACH
+    if board.type == "charuco":
+        margin = min(REACH, CLEAR * 0.5 * (1 - data["marker"] / data["square"]))
+    window = Window(REACH, margin, True)
+    fitted = refine(image, pixels, _axes(board, ids, pixels)[0], window)
+    # How lines bend is told by the fitted corners; the detector's are too rough for it.
+    sides, bends = _axes(board, ids, fitted.pixels)
+    if np.abs(bends).max() * REACH**2 / 2 < BENT:
+        return fitted
+    return refine(image, fitted.pixels, sides, window, bends)
+
+
+def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
+    """Pictures of the square's two sides at every corner, (n, 2, 2) px, [:, k] along axis k; and
+    second differences along them, (n, 2, 2) px.
+
+    From the neighbours found; where a corner has none along an axis, from the mean of the rest.
+    """
+    columns, rows = board.counts
+    grid = np.full((rows * columns, 2), np.nan)
+    grid[ids] = pixels
+    grid = grid.reshape(rows, columns, 2)
+    sides = np.empty((len(ids), 2, 2))
+    bends = np.zeros((len(ids), 2, 2))
+    for k, axis in enumerate((1, 0)):
+        step = np.diff(grid, axis=axis)
+        mean = np.nanmean(step.reshape(-1, 2), axis=0) if np.isfinite(step).any() else np.nan
+        side = _beside(step, axis).reshape(-1, 2)[ids]
+        sides[:, k] = np.where(np.isfinite(side), side, mean)
+        # At the board's border the bend of the nearest corner inside serves as well.
+        second = _nearest(_padded(np.diff(step, axis=axis), axis, 1, 1), axis)
+        bends[:, k] = np.nan_to_num(second.reshape(-1, 2)[ids])
+    # A single row of corners has no second side: take it square.
+    for k in (0, 1):
+        bare = ~np.isfinite(sides[:, k]).all(axis=1)
+        sides[bare, k] = (1 - 2 * k) * sides[bare, 1 - k][:, ::-1] * [1, -1]
+    return sides, bends
+
+
+def _padded(values: Array, axis: int, before: int, after: int) -> Array:
+    """With NaN before and after along an axis."""
+    pad = [(0, 0)] * values.ndim
+    pad[axis] = (before, after)
+    return np.pad(values, pad, constant_values=np.nan)
+
+
+def _beside(step: Array, axis: int) -> Array:
+    """Mean of the steps to both sides, or the one that there is."""
+    both = np.stack([_padded(step, axis, 1, 0), _padded(step, axis, 0, 1)])
+    known = np.isfinite(both)
+    total = np.where(known, both, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(known.any(axis=0), total, np.nan)
+
+
+def _nearest(values: Array, axis: int) -> Array:
+    """NaN replaced by the mean of the two neighbours' values, or the one that there is."""
+    around = [np.roll(values, shift, axis) for shift in (1, -1)]
+    known = np.isfinite(np.stack(around))
+    total = np.where(known, np.stack(around), 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    return np.where(np.isfinite(values), values, total)
+
+
+def _marker_axes(ids: Integers, pixels: Array) -> Array:
+    """As :func:`_axes`, with a marker's sides, away from the corner; ids come in fours."""
+    corner = pixels.reshape(-1, 4, 2)
+    top, right = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 1]
+    bottom, left = corner[:, 2] - corner[:, 3], corner[:, 3] - corner[:, 0]
+    x = np.stack([top, -top, -bottom, bottom], axis=1)
+    y = np.stack([left, right, -right, -left], axis=1)
+    return np.stack([x, y], axis=2).reshape(len(ids), 2, 2)
+
+
+class Window(NamedTuple):
+    """Which pixels around a corner count, in squares of the board from the corner.
+
+    reach : as far along the edges. margin : as far across them (a ChArUco board's markers begin
+    behind it); reach again where nothing is printed inside the squares.
+    saddle : two dark squares meet at the corner, not one.
+    """
+
+    reach: float
+    margin: float
+    saddle: bool
+
+
+class Corners(NamedTuple):
+    """Fitted corners: places (n, 2) px, where the fit holds (n,), sigma (n,) px a coordinate."""
+
+    pixels: Array
+    good: Booleans
+    sigma: Array
+
+
+def refine(
+    image: Integers, start: Array, axes: Array, window: Window, bends: Array | None = None
+) -> Corners:
+    """Fit corners near `start`.
+
+    image : (height, width) grey levels. start : (n, 2) px.
+    axes : (n, 2, 2) px; axes[:, k] is the picture of one square along the board's axis k; of a
+        marker's corner, of its side, away from the corner.
+    bends : (n, 2, 2) px; second differences of the picture along the same axes, by which a lens
+        or mirror bends the edges; none for straight ones.
+    """
+    if len(start) == 0:
+        return Corners(start, np.zeros(0, dtype=bool), np.zeros(0))
+    scale = np.sqrt(np.abs(np.linalg.det(axes)))
+    widened = np.maximum(1.0, LEAST_RADIUS / np.maximum(window.reach * scale, 1e-6))
+    offsets, grey, inside = _pixels(image, start, axes, window.reach * widened)
+    weight = _weights(offsets, axes, window, widened) * inside
+    offsets, grey, weight = _packed(offsets, grey, weight)
+    first = _first(grey, weight, axes, window.saddle)
+    shape = _Shape(offsets, _curvature(first, axes, bends), window.saddle)
+    p, residual = _fit(grey, weight, shape, first)
+    return _judged(start, p, residual, grey, weight, scale, shape)
+
+
+def _pixels(
+    image: Integers, start: Array, axes: Array, reach: Array
+) -> tuple[Array, Array, Booleans]:
+    """Pixels around every corner: offsets from it (n, m, 2), grey (n, m), inside the picture."""
+    longest = float(np.max(reach * np.abs(axes).sum(axis=1).max(axis=-1), initial=0.0))
+    radius = int(np.clip(np.ceil(longest), 3, MOST_RADIUS))
+    dy, dx = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    base = np.rint(start).astype(int)
+    x, y = base[:, :1] + dx.ravel(), base[:, 1:] + dy.ravel()
+    height, width = image.shape
+    inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
+    offsets = np.stack([x - start[:, :1], y - start[:, 1:]], axis=-1)
+    return offsets, grey, inside
+
+
+def _weights(offsets: Array, axes: Array, window: Window, widened: Array) -> Array:
+    """1 for pixels of the window, falling to 0 over the last fifth of its reach; (n, m)."""
+    board = np.abs(np.linalg.solve(axes.mT, offsets.mT))
+    along, across = board.max(axis=1), board.min(axis=1)
+    reach, margin = window.reach * widened[:, None], window.margin * widened[:, None]
+    taper = np.clip((reach - along) / (0.2 * reach), 0, 1)
+    return taper * (across < margin) * (np.abs(offsets).max(axis=-1) <= MOST_RADIUS)
+
+
+def _packed(offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Only the pixels that count, each corner's to the left, as wide as the largest window."""
+    most = max(int(np.count_nonzero(weight, axis=1).max()), 1)
+    order = np.argsort(weight == 0, axis=1, kind="stable")[:, :most]
+    rows = np.arange(len(order))[:, None]
+    return offsets[rows, order], grey[rows, order], weight[rows, order]
+
+
+def _first(grey: Array, weight: Array, axes: Array, saddle: bool) -> Array:
+    """Start of the fit: x, y, two directions, log blur, level, amplitude; (n, 7).
+
+    Of a marker's corner both edges are directed so that the marker is on their positive side.
+    """
+    angle = np.arctan2(axes[..., 1], axes[..., 0])
+    if not saddle:
+        inward = np.sum(_normals(angle) * axes[:, ::-1], axis=-1)
+        angle = angle + np.where(inward < 0, np.pi, 0.0)
+    total = np.maximum(weight.sum(axis=1), 1e-9)
+    mean = np.sum(weight * grey, axis=1) / total
+    spread = np.sqrt(np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total)
+    zero = np.zeros(len(grey))
+    return np.stack([zero, zero, angle[:, 0], angle[:, 1], zero, mean, spread], axis=-1)
+
+
+def _normals(angle: Array) -> Array:
+    """Positive sides (..., 2) of edges with these directions."""
+    return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+
+
+class _Shape(NamedTuple):
+    """What a corner's picture is made of: pixels' offsets (n, m, 2), curvatures (n, 2) 1/px of its
+    two edges towards their positive sides, and whether two dark squares meet.
+    """
+
+    offsets: Array
+    curvature: Array
+    saddle: bool
+
+
+def _curvature(first: Array, axes: Array, bends: Array | None) -> Array:
+    """Curvatures of the edges, (n, 2): the part of the second difference across the edge."""
+    if bends is None:
+        return np.zeros((len(first), 2))
+    across = np.sum(_normals(first[:, 2:4]) * bends, axis=-1)
+    return across / np.maximum(np.sum(axes**2, axis=-1), 1e-9)
+
+
+def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Array]:
+    """Weighted Levenberg-Marquardt of all corners at once; parameters (n, 7), residuals (n, m)."""
+    p = _levelled(grey, weight, shape, p)
+    value, by = _model(p, shape)
+    cost = np.sum(weight * (grey - value) ** 2, axis=1)
+    damping = np.full(len(p), 1e-3)
+    for _ in range(STEPS):
+        weighted = by * weight[..., None]
+        normal = by.mT @ weighted
+        right = (weighted.mT @ (grey - value)[..., None])[..., 0]
+        diagonal = np.einsum("nii->ni", normal)
+        normal = normal + (damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
+        step = np.clip(
+            np.linalg.solve(normal, right[..., None])[..., 0], -LONGEST_STEP, LONGEST_STEP
+        )
+        trial = p + step
+        trial_value, trial_by = _model(trial, shape)
+        trial_cost = np.sum(weight * (grey - trial_value) ** 2, axis=1)
+        better = trial_cost < cost
+        p = np.where(better[:, None], trial, p)
+        value = np.where(better[:, None], trial_value, value)
+        by = np.where(better[:, None, None], trial_by, by)
+        cost = np.where(better, trial_cost, cost)
+        damping = np.where(better, damping * 0.1, damping * 10)
+        if np.abs(step[:, :2]).max() < SETTLED:
+            break
+    return p, grey - value
+
+
+def _levelled(grey: Array, weight: Array, shape: _Shape, p: Array) -> Array:
+    """The start with level and amplitude fitted: these two are linear."""
+    bare = p.copy()
+    bare[:, 5], bare[:, 6] = 0.0, 1.0
+    form = _model(bare, shape)[0]
+    total = np.maximum(weight.sum(axis=1), 1e-9)
+    mean = np.sum(weight * form, axis=1) / total
+    off = form - mean[:, None]
+    variance = np.maximum(np.sum(weight * off * off, axis=1), 1e-9)
+    bare[:, 6] = np.sum(weight * off * grey, axis=1) / variance
+    bare[:, 5] = np.sum(weight * grey, axis=1) / total - bare[:, 6] * mean
+    return bare
+
+
+def _model(p: Array, shape: _Shape) -> tuple[Array, Array]:
+    """Grey levels (n, m) and their derivatives by the seven unknowns (n, m, 7)."""
+    from scipy.special import erf
+
+    d = shape.offsets - p[:, None, :2]
+    blur = np.exp(p[:, 4])[:, None]
+    half = 1.0 if shape.saddle else 0.5
+    forms: list[Array] = []
+    chains: list[Array] = []
+    for k in (0, 1):
+        cos, sin = np.cos(p[:, 2 + k])[:, None], np.sin(p[:, 2 + k])[:, None]
+        bend = shape.curvature[:, k, None]
+        along, across = d[..., 0] * cos + d[..., 1] * sin, d[..., 1] * cos - d[..., 0] * sin
+        z = (across - 0.5 * bend * along**2) / blur
+        forms.append(half * erf(z / np.sqrt(2)) + (1 - half))
+        slope = half * np.sqrt(2 / np.pi) * np.exp(-0.5 * z * z) / blur
+        by_angle = -along - bend * along * across
+        parts = (sin + bend * along * cos, bend * along * sin - cos, by_angle, -z * blur)
+        chains.append(slope[..., None] * np.stack(np.broadcast_arrays(*parts), axis=-1))
+    level, amplitude = p[:, 5:6], p[:, 6:7]
+    by = np.empty((*d.shape[:-1], 7))
+    first = (amplitude * forms[1])[..., None] * chains[0]
+    second = (amplitude * forms[0])[..., None] * chains[1]
+    by[..., :2] = first[..., :2] + second[..., :2]
+    by[..., 2], by[..., 3] = first[..., 2], second[..., 2]
+    by[..., 4] = first[..., 3] + second[..., 3]
+    by[..., 5], by[..., 6] = 1.0, forms[0] * forms[1]
+    return level + amplitude * by[..., 6], by
+
+
+def _judged(
+    start: Array, p: Array, residual: Array, grey: Array, weight: Array, scale: Array, shape: _Shape
+) -> Corners:
+    """Where the fit is a corner, and how sure its place is by what it leaves unexplained."""
+    total = np.maximum(weight.sum(axis=1), 1e-9)
+    mean = np.sum(weight * grey, axis=1) / total
+    variance = np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total
+    left = np.sum(weight * residual**2, axis=1) / total
+    blur, moved = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
+    good = (
+        (left < (1 - LEAST_SHARE) * variance)
+        & (blur > BLURS[0] / 2)
+        & (blur < np.maximum(BLURS[1], 0.2 * scale))
+        & (moved < np.maximum(1.5, FARTHEST * scale))
+        & (weight.sum(axis=1) > 12)
+        & np.isfinite(p).all(axis=1)
+    )
+    by = _model(p, shape)[1]
+    normal = by.mT @ (by * weight[..., None]) + 1e-9 * np.eye(7)
+    # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.
+    noise = np.maximum(left, 1 / 12)
+    covariance = np.linalg.inv(normal) * noise[:, None, None]
+    sigma = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0) / 2)
+    return Corners(start + np.where(good[:, None], p[:, :2], 0.0), good, sigma)

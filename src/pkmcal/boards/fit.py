@@ -1,9 +1,12 @@
-"""Maximum-likelihood fit of a camera and of the board's poses to the corners seen.
+"""A camera, and the board's poses, by maximum likelihood from the corners seen in views.
 
 Unknowns: the free intrinsics, and six numbers a view (left perturbation of ``T_camera_board``).
 A corner's residual is divided by sqrt(sigma^2 + tau^2): sigma is what its own fit in the picture
 says, tau what the model leaves out, estimated so that chi square is what it should be. Corners
 far off lose their weight. The poses are eliminated view by view (:mod:`pkmcal.solver`).
+
+With a known camera the poses alone are fitted in the same way (:func:`board_poses`); they start
+from a linear solution, and the better of a board's two tilts is kept.
 """
 
 from __future__ import annotations
@@ -15,10 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.boards.board import Board, Detection
 from pkmcal.cameras.contract import Camera
-from pkmcal.geometry.rigid import apply, dot, perturb, pose, rotation, skew
+from pkmcal.geometry.rigid import apply, perturb, pose, rotation, skew
 from pkmcal.solver import (
     Linear,
+    Stop,
     Values,
     eliminate,
     final_weights,
@@ -59,7 +64,17 @@ class Views(NamedTuple):
         return Views(self.points, self.pixels[views], self.sigma[views])
 
 
-class State(NamedTuple):
+def views_of(detections: Sequence[Detection], board: Board) -> Views:
+    """Detections as arrays."""
+    shape = len(detections), len(board.points)
+    pixels, sigma = np.full((*shape, 2), np.nan), np.zeros(shape)
+    for v, detection in enumerate(detections):
+        pixels[v, detection.ids] = detection.pixels
+        sigma[v, detection.ids] = detection.sigma
+    return Views(board.points, pixels, sigma)
+
+
+class CameraState(NamedTuple):
     """Free intrinsics (B, k), of one run where there are any, and poses ``T_camera_board``
     (B, K, 4, 4).
     """
@@ -69,7 +84,7 @@ class State(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Problem:
+class CameraProblem:
     """Corners as the solver wants them: B runs of K views with one camera.
 
     camera : model and image size; its parameters where not free.
@@ -83,7 +98,7 @@ class Problem:
     pixels: Array
     scale: Array
 
-    def residuals(self, state: State) -> Values:
+    def residuals(self, state: CameraState) -> Values:
         """Whitened residuals, NaN where the camera does not see a corner that was seen."""
         camera = with_free(self.camera, self.free, state)
         there = apply(state.T_camera_board[..., None, :, :], self.points)
@@ -91,7 +106,7 @@ class Problem:
         off = np.where(self.scale[..., None] > 0, off, 0.0)
         return Values(off.reshape(*off.shape[:2], -1), np.zeros((len(off), 0)))
 
-    def linearize(self, state: State) -> Linear:
+    def linearize(self, state: CameraState) -> Linear:
         """Whitened residuals and their exact derivatives."""
         camera = with_free(self.camera, self.free, state)
         rotated = apply(state.T_camera_board[..., None, :, :], self.points)
@@ -121,7 +136,7 @@ class Problem:
             np.zeros((0, shared.shape[-1])),
         )
 
-    def moved(self, state: State, shared: Array, own: Array) -> State:
+    def moved(self, state: CameraState, shared: Array, own: Array) -> CameraState:
         """The state after a step; xi stays at 0 or above."""
         intrinsics = state.intrinsics
         if len(self.free):
@@ -129,14 +144,14 @@ class Problem:
             if "xi" in self.camera.parameter_names:
                 xi = self.free == self.camera.parameter_names.index("xi")
                 intrinsics[:, xi] = np.maximum(intrinsics[:, xi], 0.0)
-        return State(intrinsics, perturb(state.T_camera_board, own))
+        return CameraState(intrinsics, perturb(state.T_camera_board, own))
 
-    def select(self, runs: Integers) -> Problem:
+    def select(self, runs: Integers) -> CameraProblem:
         """The problem of some runs."""
         return replace(self, pixels=self.pixels[runs], scale=self.scale[runs])
 
 
-def with_free(camera: Camera, free: Integers, state: State) -> Camera:
+def with_free(camera: Camera, free: Integers, state: CameraState) -> Camera:
     """The camera with its free intrinsics as the state has them."""
     if not len(free):
         return camera
@@ -146,7 +161,7 @@ def with_free(camera: Camera, free: Integers, state: State) -> Camera:
 
 
 @dataclass(frozen=True)
-class Fit:
+class CameraFit:
     """A camera fitted to views.
 
     free : positions of the estimated intrinsics. T_camera_board : (V, 4, 4).
@@ -162,48 +177,49 @@ class Fit:
     tau: float
     converged: bool
 
-    def problem(self, views: Views) -> Problem:
+    def problem(self, views: Views) -> CameraProblem:
         """The whitened problem at the fit's weights, as one run."""
         return _problem(self.camera, self.free, views, self.weight, self.tau)
 
     @property
-    def state(self) -> State:
+    def state(self) -> CameraState:
         """The fit as the solver's state."""
-        return State(self.camera.parameters[None, self.free], self.T_camera_board[None])
+        return CameraState(self.camera.parameters[None, self.free], self.T_camera_board[None])
 
 
 def fit_camera(
     camera: Camera, free: Integers, views: Views, T_camera_board: Array, rounds: int = ROUNDS
-) -> Fit:
+) -> CameraFit:
     """Fit intrinsics and poses from a start; weights and noise alternate with the search."""
     seen = views.seen
     weight = seen.astype(float)
-    state = State(camera.parameters[None, free], T_camera_board[None])
+    state = CameraState(camera.parameters[None, free], T_camera_board[None])
     tau, cut, converged, off = 1.0, 4.0, True, views.pixels
     for _ in range(rounds):
         problem = _problem(camera, free, views, weight, tau)
         found = minimise(problem, state, max_steps=STEPS)
-        state, converged = found.state, "converged" in found.stop[0].value
+        state, converged = found.state, found.stop[0] is Stop.CONVERGED
         off = _off(with_free(camera, free, state), state, views)
         dof = max(2 * weight.sum() - 6 * len(seen) - len(free), 1.0)
         new_tau = noise_beyond(off, views.sigma, weight, dof)
         robust = _robust_scale(off, views.sigma, seen)
-        new_weight = _weights(off, views.sigma, robust * cut, seen)
+        distance = np.sum(np.nan_to_num(off) ** 2, axis=-1) / (views.sigma**2 + (robust * cut) ** 2)
+        new_weight = np.where(seen, final_weights(np.sqrt(distance)), 0.0)
         change = np.abs(new_weight - weight).max(initial=0.0)
         done = cut == 1.0 and change < SETTLED and abs(new_tau - tau) <= SETTLED * max(tau, new_tau)
         weight, tau, cut = new_weight, new_tau, max(cut / 2, 1.0)
         if done:
             break
-    return Fit(
+    return CameraFit(
         with_free(camera, free, state), free, state.T_camera_board[0], off, weight, tau, converged
     )
 
 
-def refit(fit: Fit, views: Views, kept: Integers) -> Fit:
+def refit(fit: CameraFit, views: Views, kept: Integers) -> CameraFit:
     """The camera from some of the views, from the fit to all, with its weights and noise."""
     part = views.take(kept)
     problem = _problem(fit.camera, fit.free, part, fit.weight[kept], fit.tau)
-    state = State(fit.camera.parameters[None, fit.free], fit.T_camera_board[kept][None])
+    state = CameraState(fit.camera.parameters[None, fit.free], fit.T_camera_board[kept][None])
     found = minimise(problem, state, max_steps=15)
     camera = with_free(fit.camera, fit.free, found.state)
     off = _off(camera, found.state, part)
@@ -217,16 +233,16 @@ def fit_poses(
     camera: Camera, views: Views, T_camera_board: Array, scale: Array
 ) -> tuple[Array, Array]:
     """Poses (V, 4, 4) alone, each view on its own, and their costs (V,). scale : (V, N)."""
-    problem = Problem(
+    problem = CameraProblem(
         camera, np.zeros(0, dtype=int), views.points, views.pixels[:, None], scale[:, None]
     )
     found = minimise(
-        problem, State(np.zeros((len(scale), 0)), T_camera_board[:, None]), max_steps=STEPS
+        problem, CameraState(np.zeros((len(scale), 0)), T_camera_board[:, None]), max_steps=STEPS
     )
     return found.state.T_camera_board[:, 0], found.cost
 
 
-def covariance_of(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
+def covariance_of(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     """Covariances at a fit: intrinsics (n, n), zero where not free; poses (V, 6, 6); and the
     poses' derivative by the intrinsics (V, 6, n).
     """
@@ -234,7 +250,8 @@ def covariance_of(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
     n = len(fit.camera.parameters)
     whole = np.zeros((n, n))
     if len(fit.free):
-        part = inverted(reduced_normals(linear).sum(axis=0))
+        rows = eliminate(linear, np.zeros(1)).rows[0]
+        part = inverted((rows.mT @ rows).sum(axis=0))
         whole[np.ix_(fit.free, fit.free)] = part
     q, r = own_factors(linear.by_own, np.zeros(1))
     rows = linear.by_own.shape[-2]
@@ -244,12 +261,6 @@ def covariance_of(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
         by[..., fit.free] = -inner @ (q[0, :, :rows].mT @ linear.by_shared[0])
     poses = inner @ inner.mT + by @ whole @ by.mT
     return whole, poses, by
-
-
-def reduced_normals(linear: Linear) -> Array:
-    """Each view's share of the intrinsics' normal matrix, poses eliminated, (V, k, k)."""
-    rows = eliminate(linear, np.zeros(1)).rows[0]
-    return rows.mT @ rows
 
 
 def inverted(normal: Array) -> Array:
@@ -274,12 +285,14 @@ def noise_beyond(off: Array, sigma: Array, weight: Array, dof: float) -> float:
     return float(high)
 
 
-def _problem(camera: Camera, free: Integers, views: Views, weight: Array, tau: float) -> Problem:
+def _problem(
+    camera: Camera, free: Integers, views: Views, weight: Array, tau: float
+) -> CameraProblem:
     scale = np.where(views.seen, np.sqrt(weight / (views.sigma**2 + tau**2)), 0.0)
-    return Problem(camera, free, views.points, views.pixels[None], scale[None])
+    return CameraProblem(camera, free, views.points, views.pixels[None], scale[None])
 
 
-def _off(camera: Camera, state: State, views: Views) -> Array:
+def _off(camera: Camera, state: CameraState, views: Views) -> Array:
     """Predicted minus seen, (V, N, 2) px; far away where the camera cannot see the corner."""
     off = camera.project(apply(state.T_camera_board[0][:, None], views.points)) - views.pixels
     lost = views.seen[..., None] & ~np.isfinite(off)
@@ -292,12 +305,6 @@ def _robust_scale(off: Array, sigma: Array, seen: Booleans) -> float:
     """
     middle = float(np.median(np.sum(off[seen] ** 2, axis=-1))) / (2 * np.log(2))
     return float(np.sqrt(max(middle - float(np.median(sigma[seen] ** 2)), LEAST_NOISE**2)))
-
-
-def _weights(off: Array, sigma: Array, tau: float, seen: Booleans) -> Array:
-    """Weights (V, N) of corners that are off by so many px; 0 where not seen."""
-    distance = np.sqrt(np.sum(np.nan_to_num(off) ** 2, axis=-1) / (sigma**2 + tau**2))
-    return np.where(seen, final_weights(distance), 0.0)
 
 
 class BoardPoses(NamedTuple):
@@ -319,10 +326,14 @@ class BoardPoses(NamedTuple):
 
 def board_poses(camera: Camera, views: Views) -> BoardPoses:
     """The board's pose in every view, by maximum likelihood with a known camera."""
+    n = len(camera.parameters)
+    if not len(views.pixels):
+        none = np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros((0, 6, n))
+        return BoardPoses(*none, views.pixels, views.sigma, 0.0)
     start = settled_poses(camera, views)
     fit = fit_camera(camera, np.zeros(0, dtype=int), views, start)
     # The derivative by all intrinsics, though none of them is estimated here.
-    as_if_free = replace(fit, free=np.arange(len(camera.parameters)))
+    as_if_free = replace(fit, free=np.arange(n))
     return BoardPoses(
         fit.T_camera_board,
         covariance_of(fit, views)[1],
@@ -375,39 +386,12 @@ def linear_poses(rays: Array, points: Array) -> Array:
     m0 = m0 - m1 * middle[0] - m2 * middle[1]
     size = np.sqrt(np.linalg.norm(m1, axis=-1) * np.linalg.norm(m2, axis=-1))
     size = np.maximum(size, 1e-300)[..., None]
-    ahead = np.einsum("...ni,...ni->...", s, _planar(m1, m2, m0, points))
+    x, y = points[:, :1], points[:, 1:2]
+    there = m1[..., None, :] * x + m2[..., None, :] * y + m0[..., None, :]
+    ahead = np.einsum("...ni,...ni->...", s, there)
     size = size * np.where(ahead < 0, -1.0, 1.0)[..., None]
     m1, m2, t = m1 / size, m2 / size, m0 / size
     u, _, vt = np.linalg.svd(np.stack([m1, m2], axis=-1), full_matrices=False)
     r12 = u @ vt
     rot = np.concatenate([r12, np.cross(r12[..., 0], r12[..., 1])[..., None]], axis=-1)
     return pose(rot, t)
-
-
-def _planar(m1: Array, m2: Array, m0: Array, points: Array) -> Array:
-    x, y = points[:, :1], points[:, 1:2]
-    return m1[..., None, :] * x + m2[..., None, :] * y + m0[..., None, :]
-
-
-def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ...]) -> Array:
-    """Distances (n,) px of corners from the great circle through their line's rays.
-
-    pixels : (N, 2) of one view, NaN where not seen. lines : ids of corners on a straight line.
-    A line's plane is fitted to its rays, weighted so that pixels count, not angles.
-    """
-    rays = camera.ray(pixels)
-    by_pixel = camera.ray_jacobians(pixels)[0]
-    good = np.asarray(np.isfinite(rays).all(axis=-1))
-    out: list[Array] = []
-    for line in lines:
-        ids = np.array(line)[good[list(line)]]
-        if len(ids) < 3:
-            continue
-        s, turn = rays[ids], by_pixel[ids]
-        weight, normal = np.ones(len(ids)), np.zeros(3)
-        for _ in range(3):
-            normal = np.linalg.eigh((s * weight[:, None]).T @ s)[1][:, 0]
-            slope = np.linalg.norm(np.einsum("nik,i->nk", turn, normal), axis=-1)
-            weight = 1 / np.maximum(slope, 1e-12) ** 2
-        out.append(dot(s, normal) * np.sqrt(weight))
-    return np.concatenate(out) if out else np.zeros(0)

@@ -4,7 +4,8 @@ Every photograph that shows the board gives a pose by maximum likelihood from al
 their noise; corners far off lose their weight, and a board that is partly hidden counts by what
 is seen of it. A board on the platform is somewhere else in every photograph, and each photograph
 (each repeat too) is one measurement. A board on the base is always in the same place: its
-photographs are one measurement, by the means of their corners (:mod:`pkmcal.boards.poses`).
+photographs are one measurement, by the means of their corners (:func:`standing`). Repeats of a
+configuration become one measurement each (:func:`one_a_configuration`).
 
 A pose's uncertainty here is that of its corners: their noise in the picture, and what camera
 model and board leave unexplained. What the camera's calibration may be wrong by is not in it.
@@ -27,12 +28,19 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.board import Board, Detection
 from pkmcal.boards.detect import THREADS
 from pkmcal.boards.find import detect_board
-from pkmcal.boards.fit import BoardPoses, Views, board_poses, fit_poses, tilted_back
+from pkmcal.boards.fit import (
+    BoardPoses,
+    Views,
+    board_poses,
+    fit_poses,
+    tilted_back,
+    views_of,
+)
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
 from pkmcal.measurements import PoseSet, Rejection
-from pkmcal.observe.repeats import Groups, groups_of
+from pkmcal.observe.repeats import groups_of
 from pkmcal.wording import listed
 
 UNEXPLAINED = 0.004
@@ -43,6 +51,20 @@ LEAST_CORNERS = 6
 TWO_TILTS = 25.0
 """Chi square by which a board must speak against its other tilt, which looks alike from afar."""
 UNSURE = "the board: too few corners agree on one pose, or its tilt is not sure"
+STILL = 0.2
+"""px, rms over the board, that two photographs may differ by beyond their noise. A camera on a
+tripod keeps a tenth; less than this hardly shows in the edges of legs, which are as uncertain."""
+SURE = 4.0
+"""Standard deviations of a photograph's own noise beyond that."""
+MOST_ODD = 1 / 3
+"""Share of the photographs that may disagree one by one; with more, the board was never still."""
+_EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
+    "station show the board in one place"  # fmt: skip
+MOST_COMMON = 0.99
+ODD = "the board lies {:.1f} standard deviations from where the repeats show it"
+FAR = 5.0
+"""Standard deviations (of six numbers: root mean square) of a repeat from the middle one beyond
+which it is not one of them."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +151,8 @@ def board_views(
     """
     _check_sides(board, detections)
     shown = np.flatnonzero([detection.found for detection in detections])
-    views = _views(board, [detection for detection in detections if detection.found])
-    poses = board_poses(camera, views) if len(shown) else _no_poses(camera, views)
+    views = views_of([detection for detection in detections if detection.found], board)
+    poses = board_poses(camera, views)
     squares = poses.weight * np.nan_to_num(np.sum(poses.residuals**2, axis=-1))
     used = poses.weight.sum(axis=1)
     rms = np.sqrt(squares.sum(axis=1) / (2 * np.maximum(used, 1e-9)))
@@ -166,21 +188,6 @@ def pose_set(
         T_station_target=T_camera_board,
         whiten=np.linalg.inv(np.linalg.cholesky(covariance)),
     )
-
-
-def _views(board: Board, detections: Sequence[Detection]) -> Views:
-    """Corners as the fit wants them, NaN where not seen."""
-    shape = (len(detections), len(board.points))
-    pixels, sigma = np.full((*shape, 2), np.nan), np.zeros(shape)
-    for k, detection in enumerate(detections):
-        pixels[k, detection.ids], sigma[k, detection.ids] = detection.pixels, detection.sigma
-    return Views(board.points, pixels, sigma)
-
-
-def _no_poses(camera: Camera, views: Views) -> BoardPoses:
-    n = len(camera.parameters)
-    none = np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros((0, 6, n))
-    return BoardPoses(*none, views.pixels, views.sigma, 0.0)
 
 
 def _one_tilt(camera: Camera, views: Views, poses: BoardPoses) -> Booleans:
@@ -228,15 +235,6 @@ def _check_explained(seen: BoardViews) -> None:
         expected=f"{limit:.2g} px at most, usually a hundredth of that",
         next_step="Look for a wrong board file, a bent board, or another camera's file",
     )
-
-
-STILL = 0.2
-"""px, rms over the board, that two photographs may differ by beyond their noise. A camera on a
-tripod keeps a tenth; less than this hardly shows in the edges of legs, which are as uncertain."""
-SURE = 4.0
-"""Standard deviations of a photograph's own noise beyond that."""
-MOST_ODD = 1 / 3
-"""Share of the photographs that may disagree one by one; with more, the board was never still."""
 
 
 @dataclass(frozen=True)
@@ -335,14 +333,10 @@ def _check_still(seen: BoardViews, there: Array, agreed: Booleans) -> None:
     if odd > MOST_ODD * len(used) and odd > 1:
         raise InputError(
             "the board, or the camera, did not stand still",
-            where=_folder(seen),
+            where=seen.names[0].rpartition("/")[0] or seen.names[0],
             found=f"{odd} of {len(used)} photographs show it in other places than the rest",
             expected=_EXPECTED,
         )
-
-
-_EXPECTED = "a board fixed to the base, and a camera that stands still: all photographs of a " \
-    "station show the board in one place"  # fmt: skip
 
 
 def _moved(seen: BoardViews, there: Array, before: list[int], after: list[int]) -> InputError:
@@ -361,10 +355,6 @@ def _moved(seen: BoardViews, there: Array, before: list[int], after: list[int]) 
         next_step=f"Make the photographs from {names[after[0]]} on a station of their own, if only"
         " the camera was moved; take them again, if the board was",
     )
-
-
-def _folder(seen: BoardViews) -> str:
-    return seen.names[0].rpartition("/")[0] or seen.names[0]
 
 
 def _mean_pose(seen: BoardViews, agreed: Booleans) -> tuple[Array, Array, float]:
@@ -405,13 +395,6 @@ def _wandering(seen: BoardViews, agreed: Booleans, T_camera_board: Array, noise:
     return max(spread - 1.0, 0.0) * each.mean(axis=0) / count
 
 
-MOST_COMMON = 0.99
-ODD = "the board lies {:.1f} standard deviations from where the repeats show it"
-FAR = 5.0
-"""Standard deviations (of six numbers: root mean square) of a repeat from the middle one beyond
-which it is not one of them."""
-
-
 class MeanPoses(NamedTuple):
     """One pose a configuration, (G,); which repeats took part (N,), and how far each lies off (N,),
     in standard deviations.
@@ -434,7 +417,9 @@ def mean_poses(configuration: Integers, T: Array, covariance: Array, common: flo
     delta = pose_difference(T, T[groups.first[groups.member]])
     off = _deviation(delta - groups.median(delta)[groups.member], covariance)
     # Of two that differ nobody knows which is wrong, so both stay and their scatter tells.
-    used = (off < FAR * max(1.0, _usual(off, groups))) | (groups.count[groups.member] < 3)
+    several = groups.count[groups.member] > 2
+    usual = float(np.median(off[several])) if several.any() else 1.0
+    used = (off < FAR * max(1.0, usual)) | ~several
     kept = groups_of(configuration[used])
     delta, covariance_used = delta[used], covariance[used]
     mean, stated = kept.mean(delta), kept.mean(covariance_used)
@@ -455,12 +440,6 @@ def _deviation(delta: Array, covariance: Array) -> Array:
     """Root mean square (N,) of six numbers (N, 6) in standard deviations."""
     white = np.linalg.solve(np.linalg.cholesky(covariance), delta[..., None])[..., 0]
     return np.sqrt(np.mean(white**2, axis=-1))
-
-
-def _usual(off: Array, groups: Groups) -> float:
-    """The middle distance of repeats from their median, where there are several."""
-    several = groups.count[groups.member] > 2
-    return float(np.median(off[several])) if several.any() else 1.0
 
 
 def one_a_configuration(seen: BoardViews, mount: int) -> tuple[PoseSet, tuple[Rejection, ...]]:

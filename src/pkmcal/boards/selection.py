@@ -1,4 +1,9 @@
-"""Which camera model: first fits, errors on photographs left out, and the choice among models."""
+"""Which camera model: first fits, errors on photographs left out, and the choice among models.
+
+Of each model a few focal lengths are tried without distortion, and the best goes on with more and
+more terms. Candidates are judged by what they predict of views left out of their fit: to first
+order while choosing, by refitting for the one that is chosen.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +14,17 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.fit import (
-    Fit,
+    CameraFit,
     Views,
     fit_camera,
     fit_poses,
     inverted,
-    line_offsets,
     linear_poses,
     refit,
     settled_poses,
 )
 from pkmcal.cameras.contract import Camera, camera_models
-from pkmcal.geometry.rigid import apply
+from pkmcal.geometry.rigid import apply, dot
 from pkmcal.solver import eliminate
 
 FOCALS = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
@@ -30,6 +34,26 @@ XIS = (0.0, 0.5, 1.0, 1.5, 2.2)
 KEPT = 3
 """Best tries that are refined, over so many rounds of weights: it is a start only."""
 ROUNDS = 3
+FOLDS = 10
+"""Parts that the views are dealt into; each is predicted by a camera fitted to the others."""
+CHANCE = 1.5
+"""Disagreement of views (square) that chance alone explains, with ten views or so."""
+TERMS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "pinhole": (
+        (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
+    ),
+    "fisheye": ((), ("k1",), ("k1", "k2"), ("k1", "k2", "k3"), ("k1", "k2", "k3", "k4")),
+    "unified": ((), ("p1", "p2"), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2")),
+}  # fmt: skip
+"""Candidates, from few terms to many; the model with the fewest first among equals."""
+LEAST_GAIN = 0.01
+"""Share by which the error on left-out views must fall for a term to be worth having."""
+MOST_CORNERS = 1500
+"""Corners in all that the choice looks at; the final fit takes every one."""
+LEAST_OF_VIEW = 12
+"""Corners that every view keeps, where it has them."""
+HOPELESS = 5.0
+"""A model that fits so many times worse than another, with two radial terms, gets no more."""
 
 
 def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers:
@@ -39,25 +63,28 @@ def positions(camera: Camera | type[Camera], terms: tuple[str, ...]) -> Integers
     return np.array([k for k, name in enumerate(names) if name in base or name in terms])
 
 
-def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> Fit | None:
+def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFit | None:
     """The best fit without distortion, None where no try gives finite pixels."""
     scored: list[tuple[float, Camera, Array]] = []
     for camera in _tries(model, image_size):
         poses = linear_poses(camera.ray(views.pixels), views.points)
-        score = _score(camera, poses, views)
+        off = camera.project(apply(poses[:, None], views.points)) - views.pixels
+        distance = np.linalg.norm(off, axis=-1)[views.seen]
+        # Lost corners count as far.
+        score = float(np.median(np.where(np.isfinite(distance), distance, np.inf)))
         if np.isfinite(score):
             scored.append((score, camera, poses))
     scored.sort(key=lambda item: item[0])
-    best: Fit | None = None
+    best: CameraFit | None = None
     for _, camera, poses in scored[:KEPT]:
         settled = settled_poses(camera, views, poses)
         fit = fit_camera(camera, positions(camera, ()), views, settled, ROUNDS)
-        if best is None or _median(fit) < _median(best):
+        if best is None or _level(fit) < _level(best):
             best = fit
     return best
 
 
-def extended(fit: Fit, views: Views, terms: tuple[str, ...]) -> Fit:
+def extended(fit: CameraFit, views: Views, terms: tuple[str, ...]) -> CameraFit:
     """The fit continued with more free terms."""
     return fit_camera(fit.camera, positions(fit.camera, terms), views, fit.T_camera_board)
 
@@ -76,24 +103,6 @@ def _tries(model: str, image_size: tuple[int, int]) -> Iterator[Camera]:
             yield kind(image_size, np.array([values[name] for name in names]))
 
 
-def _score(camera: Camera, poses: Array, views: Views) -> float:
-    """Median distance, px, of predicted corners from seen ones; lost corners count as far."""
-    off = camera.project(apply(poses[:, None], views.points)) - views.pixels
-    distance = np.linalg.norm(off, axis=-1)[views.seen]
-    return float(np.median(np.where(np.isfinite(distance), distance, np.inf)))
-
-
-def _median(fit: Fit) -> float:
-    distance = np.linalg.norm(fit.residuals, axis=-1)
-    return float(np.nanmedian(distance))
-
-
-FOLDS = 10
-"""Parts that the views are dealt into; each is predicted by a camera fitted to the others."""
-CHANCE = 1.5
-"""Disagreement of views (square) that chance alone explains, with ten views or so."""
-
-
 @dataclass(frozen=True)
 class HeldOut:
     """Errors on held-out views.
@@ -110,7 +119,7 @@ class HeldOut:
     straightness: float
 
 
-def held_out(fit: Fit, views: Views, lines: tuple[tuple[int, ...], ...]) -> HeldOut:
+def held_out(fit: CameraFit, views: Views, lines: tuple[tuple[int, ...], ...]) -> HeldOut:
     """Refit without each part of the views, and predict that part."""
     count = len(fit.T_camera_board)
     kept = (fit.weight >= 0.5) & views.seen
@@ -138,7 +147,31 @@ def held_out(fit: Fit, views: Views, lines: tuple[tuple[int, ...], ...]) -> Held
     )
 
 
-def left_out_residuals(fit: Fit, views: Views) -> Array:
+def line_offsets(camera: Camera, pixels: Array, lines: tuple[tuple[int, ...], ...]) -> Array:
+    """Distances (n,) px of corners from the great circle through their line's rays.
+
+    pixels : (N, 2) of one view, NaN where not seen. lines : ids of corners on a straight line.
+    A line's plane is fitted to its rays, weighted so that pixels count, not angles.
+    """
+    rays = camera.ray(pixels)
+    by_pixel = camera.ray_jacobians(pixels)[0]
+    good = np.asarray(np.isfinite(rays).all(axis=-1))
+    out: list[Array] = []
+    for line in lines:
+        ids = np.array(line)[good[list(line)]]
+        if len(ids) < 3:
+            continue
+        s, turn = rays[ids], by_pixel[ids]
+        weight, normal = np.ones(len(ids)), np.zeros(3)
+        for _ in range(3):
+            normal = np.linalg.eigh((s * weight[:, None]).T @ s)[1][:, 0]
+            slope = np.linalg.norm(np.einsum("nik,i->nk", turn, normal), axis=-1)
+            weight = 1 / np.maximum(slope, 1e-12) ** 2
+        out.append(dot(s, normal) * np.sqrt(weight))
+    return np.concatenate(out) if out else np.zeros(0)
+
+
+def left_out_residuals(fit: CameraFit, views: Views) -> Array:
     """Residuals (V, N, 2) px of each view under the camera of the others, to first order."""
     moved, rows, _ = _without_each(fit, views)
     change = (rows @ moved[..., None])[..., 0].reshape(*views.seen.shape, 2)
@@ -146,7 +179,7 @@ def left_out_residuals(fit: Fit, views: Views) -> Array:
     return fit.residuals + np.where(scale > 0, change / np.where(scale > 0, scale, 1.0), 0.0)
 
 
-def spread_of_views(fit: Fit, views: Views) -> float:
+def spread_of_views(fit: CameraFit, views: Views) -> float:
     """Factor by which the intrinsics scatter over the views more than the corners' noise says.
 
     The jackknife over views, whose covariance is (V - 1) / V of the sum of squares of what each
@@ -160,7 +193,7 @@ def spread_of_views(fit: Fit, views: Views) -> float:
     return float(np.sqrt(ratio)) if ratio > CHANCE else 1.0
 
 
-def _without_each(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
+def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     """How leaving out each view moves the free intrinsics (V, k), to first order; the rows with
     poses eliminated (V, r, k); the normal matrix of all (k, k).
 
@@ -174,24 +207,6 @@ def _without_each(fit: Fit, views: Views) -> tuple[Array, Array, Array]:
     right = rows.mT @ linear.value[0][..., None]
     moved = np.stack([inverted(whole - part) for part in normals]) @ right
     return moved[..., 0], rows, whole
-
-
-TERMS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "pinhole": (
-        (), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2"), ("k1", "k2", "p1", "p2", "k3"),
-    ),
-    "fisheye": ((), ("k1",), ("k1", "k2"), ("k1", "k2", "k3"), ("k1", "k2", "k3", "k4")),
-    "unified": ((), ("p1", "p2"), ("k1",), ("k1", "k2"), ("k1", "k2", "p1", "p2")),
-}  # fmt: skip
-"""Candidates, from few terms to many; the model with the fewest first among equals."""
-LEAST_GAIN = 0.01
-"""Share by which the error on left-out views must fall for a term to be worth having."""
-MOST_CORNERS = 1500
-"""Corners in all that the choice looks at; the final fit takes every one."""
-LEAST_OF_VIEW = 12
-"""Corners that every view keeps, where it has them."""
-HOPELESS = 5.0
-"""A model that fits so many times worse than another, with two radial terms, gets no more."""
 
 
 @dataclass(frozen=True)
@@ -208,14 +223,14 @@ class Candidate:
     rms: float
     left_out: float
     by_view: Array
-    fit: Fit
+    fit: CameraFit
 
 
 def candidates(
     views: Views, image_size: tuple[int, int], models: tuple[str, ...]
 ) -> tuple[Candidate, ...]:
     """Every model with each of its sets of terms, fitted; models without a start are missing."""
-    fits: list[tuple[str, tuple[str, ...], Fit]] = []
+    fits: list[tuple[str, tuple[str, ...], CameraFit]] = []
     # The unified camera fits almost anything: it tells which of the others are hopeless.
     for model in sorted(models, key=list(TERMS).index, reverse=True):
         start = first_fit(model, views, image_size)
@@ -230,7 +245,8 @@ def candidates(
             start = fit if "k1" in terms else start
     if not fits:
         return ()
-    judged = _judged_corners([fit for _, _, fit in fits], views)
+    # Judged by the corners in use by the one that fits best.
+    judged = (min((fit for _, _, fit in fits), key=_level).weight > 0.5) & views.seen
     pool = [_candidate(model, terms, fit, views, judged) for model, terms, fit in fits]
     return tuple(sorted(pool, key=lambda c: list(TERMS).index(c.model)))
 
@@ -252,7 +268,7 @@ def is_worse(candidate: Candidate, best: Candidate) -> bool:
     return bool(gain.mean() > error)
 
 
-def fitted_to_all(chosen: Candidate, views: Views) -> Fit:
+def fitted_to_all(chosen: Candidate, views: Views) -> CameraFit:
     """A candidate's fit continued with every corner."""
     fit = chosen.fit
     return fit_camera(fit.camera, fit.free, views, fit.T_camera_board)
@@ -272,18 +288,13 @@ def thinned(views: Views) -> Views:
     return Views(views.points[used], views.pixels[:, used], views.sigma[:, used])
 
 
-def _judged_corners(fits: list[Fit], views: Views) -> Booleans:
-    """Corners by which all candidates are judged: those in use by the one that fits best."""
-    return (min(fits, key=_level).weight > 0.5) & views.seen
-
-
-def _level(fit: Fit) -> float:
+def _level(fit: CameraFit) -> float:
     """Median length of a residual, px."""
     return float(np.nanmedian(np.linalg.norm(fit.residuals, axis=-1)))
 
 
 def _candidate(
-    model: str, terms: tuple[str, ...], fit: Fit, views: Views, judged: Booleans
+    model: str, terms: tuple[str, ...], fit: CameraFit, views: Views, judged: Booleans
 ) -> Candidate:
     def squares(off: Array) -> Array:
         return np.where(judged, np.sum(np.nan_to_num(off) ** 2, axis=-1), 0.0)

@@ -22,7 +22,7 @@ from pkmcal.boards.poses import (
 )
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse
-from pkmcal.measurements import PoseSet, Rejection, concatenate_poses
+from pkmcal.measurements import PoseSet, Rejection, concatenate
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import label_of
 from pkmcal.session.schema import Body
@@ -70,7 +70,9 @@ class Boards:
     @property
     def poses(self) -> PoseSet:
         """All measurements."""
-        return concatenate_poses([station.poses for station in self.stations.values()])
+        return concatenate(
+            [PoseSet.empty(), *(station.poses for station in self.stations.values())]
+        )
 
     @property
     def rejected(self) -> tuple[Rejection, ...]:
@@ -134,7 +136,14 @@ def station_board(
     most = len(images) if moves else ENOUGH if nowhere else 0
     detections = detect_again(images, board, detections, most)
     if not any(detection.found for detection in detections):
-        raise _nowhere(session, board, number, detections)
+        raise InputError(
+            f"the board is in none of the photographs of station {station.name}",
+            where=detections[0].name,
+            found=detections[0].reason,
+            expected=f"{board.described}, sharp, and not hidden by the machine",
+            next_step="Check the board file, the light and the focus, or write observe: legs for"
+            " this station",
+        )
     rows = np.array([photo.configuration for photo in station.photographs])
     seen = board_views(number, station.camera, rows, board, detections)
     stood = None if moves else standing(seen)
@@ -161,18 +170,3 @@ def _check_another(
         check_boards(paths, [detections[k] for k in few], board)
     except InputError as error:
         raise error.located(f"session.yaml, stations.{station.name}") from None
-
-
-def _nowhere(
-    session: Session, board: Board, number: int, detections: Sequence[Detection]
-) -> InputError:
-    """The error about a board that none of a station's photographs shows."""
-    station = session.stations[number]
-    return InputError(
-        f"the board is in none of the photographs of station {station.name}",
-        where=detections[0].name,
-        found=detections[0].reason,
-        expected=f"{board.described}, sharp, and not hidden by the machine",
-        next_step="Check the board file, the light and the focus, or write observe: legs for this"
-        " station",
-    )

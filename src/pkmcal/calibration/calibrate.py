@@ -13,14 +13,14 @@ from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.doubts import check_poses, richer_models, scale_doubt
-from pkmcal.calibration.gather import CameraRefinement, known_stations, refinement_of, with_poses
+from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.recognise import (
     boards_of,
     check_observable,
-    found_stations,
     legs_stations,
     platform_poses,
     read_photographs,
+    station_poses,
 )
 from pkmcal.calibration.turns import Progress, Turns, identify_poses, take_turns
 from pkmcal.identify.bundle import what_data_tell
@@ -141,9 +141,7 @@ def _observe(session: Session, seed: int, clock: _Clock) -> _Seen:
     clock.lap("decode")
     clock.told("Recognising the machine", 0.2)
     boards = boards_of(session, photographs)
-    known = known_stations(session, boards)
-    known = found_stations(session, photographs, np.random.default_rng(seed), boards, known)
-    known = with_poses(session, boards, known)
+    known = station_poses(session, photographs, boards, np.random.default_rng(seed))
     clock.lap("observe")
     return _Seen(photographs, boards, known)
 

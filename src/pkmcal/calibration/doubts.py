@@ -1,4 +1,11 @@
-"""Mistakes in a session that its measured poses betray, as errors that name file and place."""
+"""Mistakes in a session that its measured poses betray, as errors that name file and place.
+
+Where poses disagree with the machine, each of the usual mistakes is put right in turn, and the
+estimate made again: a motor's readings with the wrong sign, two motors exchanged, a board of
+another size, a board or a camera that moved. The one that leaves least is named, if it leaves
+little. Besides: richer models of the mechanism, a common factor on all lengths, and whether the
+platform turns as the mechanism file says.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +26,7 @@ from pkmcal.identify.verdict import POOR, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.hand_eye import start_from_poses
-from pkmcal.papers.rotation_axis import RotationAxis, rotation_axis
+from pkmcal.papers.rotation_axis import rotation_axis
 from pkmcal.session.load import Session
 
 BAD = 2.0
@@ -32,6 +39,17 @@ FEWEST = 3
 """Poses on either side of a movement: fewer are outliers."""
 OTHER_SIZE = 2e-3
 """Relative difference of a board's size below which the print is as good as printers are."""
+SURE = 1.5
+"""Standard deviations that a mistake put right leaves, below which no other is tried."""
+BELIEVED = 0.85
+"""Share of the poses that a mistake put right has to explain."""
+CERTAIN = 12.0
+"""Standard deviations by which a board has to have moved, all six numbers together."""
+ENOUGH = 4.0
+"""Standard deviations that it may leave: a drawing's own errors are in them."""
+FEWEST_POSES = 4
+"""Whole poses of one station from which the platform's turning is tested."""
+KEPT = {"one axis": "turn about one axis", "none": "do not turn"}
 
 
 @dataclass(frozen=True)
@@ -64,16 +82,6 @@ def misfit(estimate: Estimate) -> float:
         return 0.0
     each = np.sort(np.mean(error**2, axis=1))
     return float(np.sqrt(np.mean(each[: max(int(np.ceil(BELIEVED * len(each))), 1)])))
-
-
-SURE = 1.5
-"""Standard deviations that a mistake put right leaves, below which no other is tried."""
-BELIEVED = 0.85
-"""Share of the poses that a mistake put right has to explain."""
-CERTAIN = 12.0
-"""Standard deviations by which a board has to have moved, all six numbers together."""
-ENOUGH = 4.0
-"""Standard deviations that it may leave: a drawing's own errors are in them."""
 
 
 def in_doubt(estimate: Estimate) -> bool:
@@ -391,11 +399,6 @@ def _error(session: Session, doubt: Doubt, scale: float) -> InputError:
     )
 
 
-FEWEST_POSES = 4
-"""Whole poses of one station from which the platform's turning is tested."""
-KEPT = {"one axis": "turn about one axis", "none": "do not turn"}
-
-
 def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tuple[bool, str]]:
     """Whether the platform turns as the mechanism file says, by every station that saw it whole: in
     doubt or not, and the words. on_platform : (M,) of the mounts.
@@ -409,20 +412,17 @@ def turning(session: Session, poses: PoseSet, on_platform: Booleans) -> list[tup
         part = poses.select(whole & (poses.station == s))
         if len(part) >= FEWEST_POSES:
             found = rotation_axis(part, motion)
-            doubt = _doubt(found)
-            said = found.sentence if doubt or found.tenable else _nearly(found)
+            # Noise that is stated a little too small is no reason to doubt a mechanism.
+            doubt = not found.tenable and found.chi2 > POOR**2 * found.dof
+            said = found.sentence
+            if not (doubt or found.tenable):
+                off, noise = (
+                    np.rad2deg(np.sqrt(np.mean(tilt**2)))
+                    for tilt in (found.tilt, found.expected_tilt)
+                )
+                said = (
+                    f"The boards {KEPT[found.hypothesis]} but for {off:.3f}°, where their stated"
+                    f" noise alone gives {noise:.3f}°."
+                )
             out.append((doubt, f"{session.station_names[s]}: {said}"))
     return out
-
-
-def _doubt(found: RotationAxis) -> bool:
-    """Noise that is stated a little too small is no reason to doubt a mechanism."""
-    return not found.tenable and found.chi2 > POOR**2 * found.dof
-
-
-def _nearly(found: RotationAxis) -> str:
-    off, noise = (np.rad2deg(np.sqrt(np.mean(x**2))) for x in (found.tilt, found.expected_tilt))
-    return (
-        f"The boards {KEPT[found.hypothesis]} but for {off:.3f}°, where their stated noise alone"
-        f" gives {noise:.3f}°."
-    )

@@ -1,4 +1,8 @@
-"""What a session's photographs and tables measured, put together; cameras refined with it."""
+"""What a session's photographs and tables measured, put together; cameras refined with it.
+
+A camera's intrinsics, where they are refined, are those of its calibration plus F u: F F^T is the
+calibration's covariance, and the u are unknowns of the estimate with unit variance.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +13,10 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.cameras import Camera
-from pkmcal.errors import GeometryError, InputError, ResultError
+from pkmcal.errors import InputError
 from pkmcal.identify.estimate import Estimate
-from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate_poses
-from pkmcal.papers.hand_eye import start_from_poses
+from pkmcal.measurements import EdgeSet, Measurements, Mount, concatenate
 from pkmcal.session.load import Session
-from pkmcal.session.poses import check_lengths
 
 
 @dataclass(frozen=True)
@@ -77,13 +79,13 @@ def refinement_of(session: Session, refine: bool) -> CameraRefinement:
             where="session.yaml, stations",
             next_step="Leave --refine-camera out",
         )
-    roots = [_root(file, camera) for file, camera in cameras.items()]
+    roots = [covariance_root(file, camera) for file, camera in cameras.items()]
     n, r = (max(root.shape[k] for root in roots) for k in (0, 1))
     factor = np.stack([np.pad(f, ((0, n - len(f)), (0, r - f.shape[1]))) for f in roots])
     return CameraRefinement(files, calibrated, factor, np.zeros((len(files), r)))
 
 
-def _root(file: str, camera: Camera) -> Array:
+def covariance_root(file: str, camera: Camera) -> Array:
     """F (n, r) of a camera; what its calibration held fixed has no variance and no column."""
     if camera.covariance is None:
         raise InputError(
@@ -110,15 +112,23 @@ def measurements_of(
     numbers = {name: k for k, name in enumerate(dict.fromkeys(files))}
     # A tracker has no camera; the first one's number moves nothing of what it measured.
     number = [numbers[name] for name in files] + [0] * len(session.trackers)
-    mounts, poses = _poses(session, boards, cameras)
+    # What targets are fixed to: the board, then each tracker's own.
+    mounts = [Mount("board", boards.body)] if boards.stations else []
+    poses = boards.poses
+    if cameras is not None and cameras.active:
+        poses = poses.moved(np.stack([cameras.change(s.camera_file) for s in session.stations]))
+    sets = [poses]
+    for k, table in enumerate(session.trackers, start=len(session.stations)):
+        sets.append(table.poses(k, len(mounts)))
+        mounts.append(Mount(table.name, "platform"))
     measurements = Measurements(
         edges=EdgeSet.empty() if edges is None else edges,
         joints=session.joints,
         joint_noise=session.joint_noise,
         n_stations=len(number),
         camera_of_station=np.array(number, dtype=int),
-        poses=poses,
-        mounts=mounts,
+        poses=concatenate(sets),
+        mounts=tuple(mounts),
     )
     if cameras is None or not cameras.files:
         return measurements
@@ -128,60 +138,3 @@ def measurements_of(
         intrinsics_at=cameras.at,
         shaded=len(measurements.edges) > 0,
     )
-
-
-def _poses(
-    session: Session, boards: Boards, cameras: CameraRefinement | None
-) -> tuple[tuple[Mount, ...], PoseSet]:
-    """All measured poses, and what their targets are fixed to: the board, each tracker's own."""
-    mounts = [Mount("board", boards.body)] if boards.stations else []
-    poses = boards.poses
-    if cameras is not None and cameras.active:
-        poses = poses.moved(np.stack([cameras.change(s.camera_file) for s in session.stations]))
-    sets = [poses]
-    for number, table in enumerate(session.trackers, start=len(session.stations)):
-        sets.append(table.poses(number, len(mounts)))
-        mounts.append(Mount(table.name, "platform"))
-    return tuple(mounts), concatenate_poses(sets)
-
-
-def known_stations(session: Session, boards: Boards) -> Array:
-    """T_camera_base (S, 4, 4) of all stations before any leg is looked for: as the session says, or
-    by what a board on the platform tells; NaN where neither does.
-    """
-    given = [station.T_camera_base for station in session.stations]
-    given = boards.joined(given) + _tracker_starts(session)
-    known = np.stack([np.full((4, 4), np.nan) if T is None else T for T in given])
-    first = known[: len(session.stations)]
-    if boards.body == "base" or not boards.stations or np.isfinite(first).all():
-        return known
-    return with_poses(session, boards, known)
-
-
-def with_poses(session: Session, boards: Boards, known: Array) -> Array:
-    """Stations (S, 4, 4) with those that are not known (NaN) by what measured poses tell.
-
-    Raises `InputError`, or `ResultError`, where they tell too little.
-    """
-    if np.isfinite(known).all():
-        return known
-    measurements = measurements_of(session, boards)
-    try:
-        return start_from_poses(session.machine, measurements, known).T_camera_base
-    except (InputError, ResultError) as error:
-        lost = session.station_names[int(np.flatnonzero(np.isnan(known[:, 0, 0]))[0])]
-        raise error.located(f"session.yaml, stations.{lost}") from None
-
-
-def _tracker_starts(session: Session) -> list[Array | None]:
-    """First poses of trackers whose points or heights do not tell their turn."""
-    if not session.trackers:
-        return []
-    try:
-        found = session.machine.forward_result(session.joints)
-    except GeometryError:
-        return [None] * len(session.trackers)
-    poses = np.where(found.converged[:, None, None], found.T_base_platform, np.nan)
-    for table in session.trackers:
-        check_lengths(table, poses)
-    return [table.start(poses) for table in session.trackers]

@@ -12,26 +12,27 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.views import Boards, find_boards
-from pkmcal.errors import GeometryError, InputError
+from pkmcal.calibration.gather import measurements_of
+from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import unrecognised
 from pkmcal.observe.images import decode, decode_all
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import StationPose, View, find_station
+from pkmcal.observe.stations import FoundStation, StationView, find_station
+from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import label_of
+from pkmcal.session.poses import check_lengths
 from pkmcal.wording import listed
 
 WORKERS = 2
 """Threads beside one another: decoding and array work release Python's lock."""
-
 NEARLY = 2.0
 """Tolerances of a centre by which legs may miss the platform at the drawing's nearest pose."""
 MOST = 0.5
 """Share of the configurations that the drawing has to reach for the rest to be believed."""
 ALMOST_ALL = 0.9
-
-NOWHERE = StationPose(np.eye(4), score=1.0, chance=1.0)
+NOWHERE = FoundStation(np.eye(4), score=1.0, chance=1.0)
 """Of a station for whose search there was no start."""
 
 
@@ -171,9 +172,9 @@ class Recognition:
     rough : the poses it began from, by hand, or through the board from a station that was found.
     """
 
-    views: tuple[View, ...]
+    views: tuple[StationView, ...]
     rough: tuple[Array, ...]
-    found: tuple[StationPose, ...]
+    found: tuple[FoundStation, ...]
 
     @property
     def complete(self) -> bool:
@@ -198,7 +199,7 @@ def recognise(
     boards = boards or Boards()
     machine, tubes = session.machine, tubes_of(session.machine)
     views = tuple(
-        View(machine, p.camera, tubes, p.joints, poses[p.configuration], p.tables)
+        StationView(machine, p.camera, tubes, p.joints, poses[p.configuration], p.tables)
         for p in photographs
     )
     at = [p.station for p in photographs]
@@ -224,26 +225,25 @@ def recognise(
     return Recognition(
         views,
         tuple(np.eye(4) if T is None else T for T in rough),
-        tuple(_better(first, second) for first, second in zip(found, again, strict=True)),
+        tuple(
+            min((end for end in ends if end), key=lambda pose: pose.score, default=NOWHERE)
+            for ends in zip(found, again, strict=True)
+        ),
     )
 
 
 def _searched(
-    views: tuple[View, ...], starts: list[Array | None], rngs: list[np.random.Generator]
-) -> list[StationPose | None]:
+    views: tuple[StationView, ...], starts: list[Array | None], rngs: list[np.random.Generator]
+) -> list[FoundStation | None]:
     """The search from each start that there is."""
 
-    def search(view: View, start: Array | None, rng: np.random.Generator) -> StationPose | None:
+    def search(
+        view: StationView, start: Array | None, rng: np.random.Generator
+    ) -> FoundStation | None:
         return None if start is None else find_station(view, start, rng)
 
     with ThreadPoolExecutor(WORKERS) as pool:
         return list(pool.map(search, views, starts, rngs))
-
-
-def _better(first: StationPose | None, second: StationPose | None) -> StationPose:
-    """The end of two searches, or of the one that there was."""
-    ends = [pose for pose in (first, second) if pose is not None]
-    return min(ends, key=lambda pose: pose.score, default=NOWHERE)
 
 
 def why_unrecognised(
@@ -264,27 +264,67 @@ def why_unrecognised(
     )
 
 
-def found_stations(
+def station_poses(
     session: Session,
     photographs: list[legs.Photographs],
+    boards: Boards,
     rng: np.random.Generator,
-    boards: Boards | None = None,
-    starts: Array | None = None,
 ) -> Array:
-    """Poses T_camera_base (S, 4, 4) of the stations that observe legs, or the reason why one is not
-    recognised; of the rest as ``starts`` has them, NaN where it has none.
+    """Poses T_camera_base (S, 4, 4) of all stations, each by the first that tells it: what is known
+    before any leg is looked for, the search for the legs, and what measured poses tell.
+
+    Raises `InputError`, or `ResultError`, where nothing tells one of them.
     """
-    if starts is None:
-        starts = np.full((len(session.station_names), 4, 4), np.nan)
-    if not photographs:
-        return starts
-    rngs = rng.spawn(len(photographs) + 1)
-    found = recognise(session, photographs, platform_poses(session), rngs[1:], boards, starts)
-    if not found.complete:
-        raise why_unrecognised(session, photographs, found, rngs[0])
-    out = starts.copy()
-    out[[p.station for p in photographs]] = [pose.T_camera_base for pose in found.found]
-    return out
+    known = known_stations(session, boards)
+    if photographs:
+        rngs = rng.spawn(len(photographs) + 1)
+        found = recognise(session, photographs, platform_poses(session), rngs[1:], boards, known)
+        if not found.complete:
+            raise why_unrecognised(session, photographs, found, rngs[0])
+        known[[p.station for p in photographs]] = [pose.T_camera_base for pose in found.found]
+    return _by_poses(session, boards, known)
+
+
+def known_stations(session: Session, boards: Boards) -> Array:
+    """T_camera_base (S, 4, 4) of all stations before any leg is looked for: as the session says, or
+    by what a board on the platform tells; NaN where neither does.
+    """
+    given = [station.T_camera_base for station in session.stations]
+    given = boards.joined(given) + _tracker_starts(session)
+    known = np.stack([np.full((4, 4), np.nan) if T is None else T for T in given])
+    first = known[: len(session.stations)]
+    if boards.body == "base" or not boards.stations or np.isfinite(first).all():
+        return known
+    return _by_poses(session, boards, known)
+
+
+def _by_poses(session: Session, boards: Boards, known: Array) -> Array:
+    """Stations (S, 4, 4) with those that are not known (NaN) by what measured poses tell.
+
+    Raises `InputError`, or `ResultError`, where they tell too little.
+    """
+    if np.isfinite(known).all():
+        return known
+    measurements = measurements_of(session, boards)
+    try:
+        return start_from_poses(session.machine, measurements, known).T_camera_base
+    except (InputError, ResultError) as error:
+        lost = session.station_names[int(np.flatnonzero(np.isnan(known[:, 0, 0]))[0])]
+        raise error.located(f"session.yaml, stations.{lost}") from None
+
+
+def _tracker_starts(session: Session) -> list[Array | None]:
+    """First poses of trackers whose points or heights do not tell their turn."""
+    if not session.trackers:
+        return []
+    try:
+        found = session.machine.forward_result(session.joints)
+    except GeometryError:
+        return [None] * len(session.trackers)
+    poses = np.where(found.converged[:, None, None], found.T_base_platform, np.nan)
+    for table in session.trackers:
+        check_lengths(table, poses)
+    return [table.start(poses) for table in session.trackers]
 
 
 def boards_of(session: Session, photographs: list[legs.Photographs]) -> Boards:

@@ -39,9 +39,14 @@ the first look corrects a pixel, the second what shading leaves, and profiles re
 far."""
 FEWEST_EDGES = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
-
 Progress = Callable[[str, float], None]
 """Called with a sentence about the present step and the share that is done, 0 to 1."""
+_OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
+_OFF = (
+    "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
+    " machine, moved, or the readings are another configuration's"
+)
+_POINT_OFF = "the measurement lies {:.0f} standard deviations from where all others put it"
 
 
 class Turns(NamedTuple):
@@ -209,11 +214,12 @@ def observation_of(
     edges = concatenate([look.edges for look in looks]) if looks else EdgeSet.empty()
     first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
     nowhere = [np.zeros((0, 2))], [np.zeros(0, dtype=int)]
+    given_up = np.flatnonzero(estimate.edge_weights < 0.5).tolist()
     return Observation(
         edges=edges,
         rejected=tuple(r for look in looks for r in look.rejected)
         + boards.rejected
-        + _edges_given_up(edges, estimate)
+        + tuple(edges.rejection(k, _OUTLIER) for k in given_up)
         + _poses_given_up(session, measurements, estimate),
         points=np.concatenate([look.points for look in looks] or nowhere[0]),
         point_edge=np.concatenate(
@@ -221,20 +227,6 @@ def observation_of(
         ),
         T_camera_base=estimate.state.T_camera_base,
         poses=measurements.poses,
-    )
-
-
-def _edges_given_up(edges: EdgeSet, estimate: Estimate) -> tuple[Rejection, ...]:
-    return tuple(
-        Rejection(
-            int(edges.station[k]),
-            int(edges.configuration[k]),
-            int(edges.leg[k]),
-            int(edges.tube[k]),
-            int(edges.side[k]),
-            _OUTLIER,
-        )
-        for k in np.flatnonzero(estimate.edge_weights < 0.5)
     )
 
 
@@ -256,11 +248,3 @@ def _poses_given_up(
         )
         for k in lost
     )
-
-
-_OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
-_OFF = (
-    "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
-    " machine, moved, or the readings are another configuration's"
-)
-_POINT_OFF = "the measurement lies {:.0f} standard deviations from where all others put it"

@@ -21,14 +21,16 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards, StationBoard, board_of, station_board
 from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.doubts import check_poses, richer_models, turning
-from pkmcal.calibration.gather import known_stations, measurements_of, refinement_of, with_poses
+from pkmcal.calibration.gather import measurements_of, refinement_of
 from pkmcal.calibration.recognise import (
     Recognition,
     board_images,
     check_observable,
+    known_stations,
     legs_stations,
     platform_poses,
     recognise,
+    station_poses,
     why_unrecognised,
 )
 from pkmcal.calibration.turns import identify_poses
@@ -546,7 +548,7 @@ def pose_findings(session: Session, boards: Boards) -> list[Finding]:
 
 def _fit(session: Session, boards: Boards) -> list[Finding]:
     """Whether the mechanism, its parameters adjusted, explains the poses."""
-    known = with_poses(session, boards, known_stations(session, boards))
+    known = station_poses(session, [], boards, np.random.default_rng(0))
     cameras = refinement_of(session, refine=False)
     turns = identify_poses(session, boards, known, cameras, lambda _text, _share: None)
     richer = richer_models(session, turns.measurements, turns.estimate)

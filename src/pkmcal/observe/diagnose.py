@@ -9,7 +9,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.observe.stations import GOOD_SCORE, StationPose, View, find_station
+from pkmcal.observe.stations import GOOD_SCORE, FoundStation, StationView, find_station
 from pkmcal.wording import listed
 
 CLEARLY_BETTER = 0.75
@@ -20,9 +20,9 @@ WELL = 0.26
 
 def unrecognised(
     names: list[str],
-    views: list[View],
+    views: list[StationView],
     rough: list[Array],
-    found: list[StationPose],
+    found: list[FoundStation],
     all_joints: Array,
     configurations: list[Integers],
     rng: np.random.Generator,
@@ -58,7 +58,7 @@ def unrecognised(
 
 def _swapped_stations(
     names: list[str],
-    views: list[View],
+    views: list[StationView],
     rough: list[Array],
     bad: list[int],
     rng: np.random.Generator,
@@ -78,7 +78,7 @@ def _swapped_stations(
 
 
 def _mixed_columns(
-    view: View, rough: Array, found: StationPose, joints: Array, rng: np.random.Generator
+    view: StationView, rough: Array, found: FoundStation, joints: Array, rng: np.random.Generator
 ) -> InputError | None:
     """Readings whose columns stand in another order: turned round, or two of them swapped.
 
@@ -120,6 +120,6 @@ def _exchanged(count: int, a: int, b: int) -> Integers:
     return order
 
 
-def _with_joints(view: View, joints: Array) -> View:
+def _with_joints(view: StationView, joints: Array) -> StationView:
     poses = view.machine.forward_result(joints).T_base_platform
     return replace(view, joints=joints, poses=poses)

@@ -1,9 +1,12 @@
-"""Each leg found in each photograph: its sideways shift and tilt from where it was predicted.
+"""Each leg found in each photograph, then its edges to sub-pixel: what one look at a station gives.
 
 The drawing's errors leave predictions a few pixels off, more than the distance to highlights,
-shadows and neighbours. But all edges of one leg, two to a tube, move together: so the leg is
-shifted and tilted as a whole until the grey-level gradients under all its edges are strongest.
-A highlight imitates one edge; four at the right distances it does not.
+shadows and neighbours. But all edges of one leg, two to a tube, move together: so
+:func:`search` shifts and tilts the leg as a whole until the grey-level gradients under all its
+edges are strongest. A highlight imitates one edge; four at the right distances it does not.
+
+Where the prediction is good to a pixel, :func:`measure` fits every edge by itself, to the profiles
+across it (:mod:`pkmcal.observe.profiles`).
 """
 
 from __future__ import annotations
@@ -45,6 +48,22 @@ FEWEST_POINTS = 8
 """Edge points (of 12 an edge) without which a leg's place is not looked for."""
 SEARCH_SIGMA = 1.0
 """Standard deviation (px) given to edges found this way: one step of the search."""
+SEARCH_SAMPLES = 12
+SEGMENTS = 8
+"""Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
+PLACES = 5 * SEGMENTS
+"""Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
+BETWEEN = 5
+"""Profiles taken about each of these, so about one a pixel in all: faint edges need it."""
+FEWEST_SHARE = 1 / 3
+"""Share of a segment's samples that must be clear for its mean profile to count."""
+BLUR = 0.7
+"""Pixels of blur assumed where no profile is there to tell: lens 0.6, pixel 0.3."""
+CLEARANCE = 5.0
+"""Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
+
+_HIDDEN = "hidden behind another leg or outside the photograph"
+_NO_PLACE = "not found: no place, or two places, where all its edges fit"
 
 
 @dataclass(frozen=True)
@@ -154,21 +173,6 @@ def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlace
     return LegPlaces(steps[step], TILTS[tilt], best, share, clear)
 
 
-SEARCH_SAMPLES = 12
-SEGMENTS = 8
-"""Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
-PLACES = 5 * SEGMENTS
-"""Points along an edge that are predicted in full: an odd count a segment, so one is its middle."""
-BETWEEN = 5
-"""Profiles taken about each of these, so about one a pixel in all: faint edges need it."""
-FEWEST_SHARE = 1 / 3
-"""Share of a segment's samples that must be clear for its mean profile to count."""
-BLUR = 0.7
-"""Pixels of blur assumed where no profile is there to tell: lens 0.6, pixel 0.3."""
-CLEARANCE = 5.0
-"""Pixels kept free of other legs' outlines: a profile's outer reach and the search about it."""
-
-
 @dataclass(frozen=True)
 class Photographs:
     """One station's decoded photographs.
@@ -229,17 +233,11 @@ def search(
     rejected = [
         Rejection(photographs.station, int(photographs.configuration[k]), int(leg), -1, -1, why)
         for k, leg in zip(*np.nonzero(~places.clear), strict=True)
-        for why in [_search_reason(float(places.share[k, leg]))]
+        for why in [_HIDDEN if places.share[k, leg] < 0.1 else _NO_PLACE]
         if leg in tubes.leg
     ]
     nowhere = np.zeros((0, 2)), np.zeros(0, dtype=int)
     return StationEdges(edges, tuple(rejected), *nowhere, float("nan"), REACH)
-
-
-def _search_reason(share: float) -> str:
-    if share < 0.1:
-        return "hidden behind another leg or outside the photograph"
-    return "not found: no place, or two places, where all its edges fit"
 
 
 def measure(
@@ -250,14 +248,16 @@ def measure(
     blur: float | None = None,
     refine_camera: bool = False,
 ) -> StationEdges:
-    """Every edge to sub-pixel, by the shading-aware model of :mod:`profiles`.
+    """Every edge to sub-pixel, by the shading-aware model of :mod:`pkmcal.observe.profiles`.
 
     blur : px, from an earlier look; estimated from these profiles when absent. refine_camera :
     also how the edges depend on the camera's parameters.
     """
     tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, PLACES, CLEARANCE)
     grey = sample(photographs.images, _profile_pixels(photographs.camera, points))
-    places = _at_samples(points, np.arange(SEGMENTS) * 5 + 2)
+    middles = np.arange(SEGMENTS) * 5 + 2  # of the segments, among the points
+    per_point = (f.name for f in fields(points) if f.name != "normal")
+    places = replace(points, **{name: getattr(points, name)[:, :, middles] for name in per_point})
     half_width = places.gain * machine.values[tubes.radius][:, None]
     full, across = _segment_profiles(grey, np.repeat(clear, BETWEEN, axis=-1), half_width)
     if blur is None:
@@ -325,14 +325,6 @@ def _segment_profiles(
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
 
 
-def _at_samples(points: EdgePoints, samples: Integers) -> EdgePoints:
-    """The same edges at some of their samples only."""
-    per_sample = {
-        f.name: getattr(points, f.name)[:, :, samples] for f in fields(points) if f.name != "normal"
-    }
-    return replace(points, **per_sample)
-
-
 def _rejections(
     photographs: Photographs,
     tubes: TubeList,
@@ -345,7 +337,7 @@ def _rejections(
     out: list[Rejection] = []
     for k, e in zip(*np.nonzero(~fits.good), strict=True):
         if visible[k, e] == 0:
-            why = "hidden behind another leg or outside the photograph"
+            why = _HIDDEN
         elif seen[k, e] < 3:
             why = "too little of it is seen as a clear edge"
         else:

@@ -60,6 +60,14 @@ MOST_CUT = -0.25
 """Place (px) beyond which a profile must be free of saturation: its edge itself."""
 FAINT = 0.25
 """Standard deviation (px) of a position above which a profile shows no edge."""
+FLOOR = 0.02
+"""Pixels below which no position is believed, however crisp the profile."""
+HALVES = 2.0
+"""Independent measurements that an edge counts as, whatever its length. Shading and paint move
+all positions along an edge together, so they do not average out: an edge is one line measured
+once at each of two halves, not three hundred points."""
+FEWEST = 3
+"""Places along an edge without which its tilt is a guess."""
 
 
 @dataclass(frozen=True)
@@ -207,16 +215,6 @@ def estimate_blur(profiles: Profiles) -> float:
     left, here, right = total[k - 1 : k + 2]
     bend = max(left - 2 * here + right, 1e-12)
     return float(BLURS[k] + (BLURS[1] - BLURS[0]) * np.clip((left - right) / (2 * bend), -1, 1))
-
-
-FLOOR = 0.02
-"""Pixels below which no position is believed, however crisp the profile."""
-HALVES = 2.0
-"""Independent measurements that an edge counts as, whatever its length. Shading and paint move
-all positions along an edge together, so they do not average out: an edge is one line measured
-once at each of two halves, not three hundred points."""
-FEWEST = 3
-"""Places along an edge without which its tilt is a guess."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,13 @@
-"""Distance to the nearest picture edge of a given direction: what the coarse search looks at.
+"""Where a station's camera stands: a coarse search for the machine in its photographs.
 
 Photographs are reduced, picture edges found, and for each of a few directions the distance to
 the nearest edge of about that direction is tabulated. A predicted silhouette then scores by the
 distances under its points, smooth enough to be descended from a hundred pixels away. Where a
 station took several photographs, edges that never move are left out: the floor and the wall do
 not say where the machine is.
+
+About the rough pose many are tried at random, on a few photographs; the best descend by damped
+steps on the distances, on more and more photographs, with distances cut off ever nearer.
 """
 
 from __future__ import annotations
@@ -35,6 +38,22 @@ STILL = 10.0
 """Grey levels from the station's median photograph within which a place counts as still."""
 ENOUGH_TO_COMPARE = 4
 """Photographs from which a median is a picture of the background."""
+SEARCH_ANGLE = np.radians(6.0)
+SEARCH_DISTANCE = 0.06
+"""Spread (per axis, rad and m) of the poses tried around the user's: its norm over three axes
+is 10 degrees and 10 cm."""
+TRIES = 800
+RETRIES = 400
+GOOD_SCORE = 0.34
+"""Mean truncated distance above which no leg was recognised. Photographs of the machine give 0.2;
+another configuration, station or order of legs 0.36 to 0.6."""
+BY_CHANCE = 0.5
+"""Share of the score by chance that recognised legs stay below. Photographs that are all texture
+score 0.3 anywhere; photographs of a machine score 0.2 where chance has 0.9."""
+FIRST_DAMPING = 1e-3
+"""Of a step, relative to the normal equations' diagonal."""
+LAST_REACH = 4.0
+"""Reduced pixels at which the final score cuts distances off."""
 
 
 @dataclass(frozen=True)
@@ -121,26 +140,8 @@ def _tables_of(image: Any, still: Array | None) -> Array:
     return tables
 
 
-SEARCH_ANGLE = np.radians(6.0)
-SEARCH_DISTANCE = 0.06
-"""Spread (per axis, rad and m) of the poses tried around the user's: its norm over three axes
-is 10 degrees and 10 cm."""
-TRIES = 800
-RETRIES = 400
-GOOD_SCORE = 0.34
-"""Mean truncated distance above which no leg was recognised. Photographs of the machine give 0.2;
-another configuration, station or order of legs 0.36 to 0.6."""
-BY_CHANCE = 0.5
-"""Share of the score by chance that recognised legs stay below. Photographs that are all texture
-score 0.3 anywhere; photographs of a machine score 0.2 where chance has 0.9."""
-FIRST_DAMPING = 1e-3
-"""Of a step, relative to the normal equations' diagonal."""
-LAST_REACH = 4.0
-"""Reduced pixels at which the final score cuts distances off."""
-
-
 @dataclass(frozen=True)
-class View:
+class StationView:
     """What the search looks at: one station's photographs and what should be in them.
 
     joints : (K, m) and poses : T_base_platform (K, 4, 4) of its photographs.
@@ -160,7 +161,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class StationPose:
+class FoundStation:
     """A found pose T_camera_base (4, 4) and its score: 0 perfect, 1 nothing fits.
 
     chance : the score of legs laid anywhere, low where the photographs are full of edges.
@@ -176,7 +177,7 @@ class StationPose:
         return self.score < min(GOOD_SCORE, BY_CHANCE * self.chance)
 
 
-def find_station(view: View, T_camera_base: Array, rng: np.random.Generator) -> StationPose:
+def find_station(view: StationView, T_camera_base: Array, rng: np.random.Generator) -> FoundStation:
     """Refine a rough pose; every photograph of the station takes part."""
     candidates = _random_search(view, T_camera_base, rng)
     few, more, every = view.few(4), view.few(8), view.few(len(view.joints))
@@ -187,10 +188,10 @@ def find_station(view: View, T_camera_base: Array, rng: np.random.Generator) -> 
     candidates = _descend(view, candidates, every, 8, (3, 2, 2, 1.5, 1.5))
     chance = np.minimum(view.tables.tables, LAST_REACH).mean() / LAST_REACH
     last = score(view, candidates, every, reach=LAST_REACH)
-    return StationPose(candidates[0], float(last[0]), float(chance))
+    return FoundStation(candidates[0], float(last[0]), float(chance))
 
 
-def _random_search(view: View, T_camera_base: Array, rng: np.random.Generator) -> Array:
+def _random_search(view: StationView, T_camera_base: Array, rng: np.random.Generator) -> Array:
     """Candidates (16, 4, 4): a wide random draw, then a narrower one around its best."""
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3)
     T_base_camera = inverse(T_camera_base)
@@ -208,13 +209,15 @@ def _random_search(view: View, T_camera_base: Array, rng: np.random.Generator) -
     return moved(steps[order])
 
 
-def _best(view: View, candidates: Array, photographs: Integers, reach: float, keep: int) -> Array:
+def _best(
+    view: StationView, candidates: Array, photographs: Integers, reach: float, keep: int
+) -> Array:
     order = np.argsort(score(view, candidates, photographs, reach))
     return candidates[order[:keep]]
 
 
 def score(
-    view: View, T_camera_base: Array, photographs: Integers, reach: float, samples: int = 5
+    view: StationView, T_camera_base: Array, photographs: Integers, reach: float, samples: int = 5
 ) -> Array:
     """Mean distance from predicted edges to picture edges, cut off at ``reach``: (H,), 0 to 1.
 
@@ -274,7 +277,11 @@ class _Look(NamedTuple):
 
 
 def _descend(
-    view: View, candidates: Array, photographs: Integers, samples: int, reaches: tuple[float, ...]
+    view: StationView,
+    candidates: Array,
+    photographs: Integers,
+    samples: int,
+    reaches: tuple[float, ...],
 ) -> Array:
     """Levenberg-Marquardt on the distances, candidates (H, 4, 4) side by side, a step a reach.
 
@@ -292,7 +299,7 @@ def _descend(
     return candidates
 
 
-def _look(view: View, candidates: Array, photographs: Integers, samples: int) -> _Look:
+def _look(view: StationView, candidates: Array, photographs: Integers, samples: int) -> _Look:
     """Distances under the edges predicted from poses (H, 4, 4)."""
     number = np.arange(len(view.joints))[photographs][:, None, None]
     legs = legs_in_camera(
