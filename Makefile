@@ -21,8 +21,7 @@ test: $(VENV)/.test-tools
 	@./.ci/chromium $(VENV)/.chromium-tried
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/pyright
-	$(BIN)/pytest -n 2
+	./.ci/checks $(BIN)
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis

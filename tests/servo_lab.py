@@ -8,9 +8,8 @@ from pkmcal.cameras import Camera, camera_models
 from pkmcal.geometry.rigid import apply, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.simulation.casting import Part
 from pkmcal.simulation.demo import camera_of_size
-from pkmcal.simulation.render import Sensor, View, photograph, render
+from pkmcal.simulation.render import PixelRays, ScenePart, Sensor, photograph, render
 from pkmcal.simulation.scene import Finish, Room, discs_of, machine_parts
 from pkmcal.simulation.shapes import Wall
 from pkmcal.simulation.surfaces import Clouds, Lamp, Lighting, Material, SmoothNoise
@@ -35,10 +34,10 @@ class Lab:
         floor = Wall(self.discs.base - 0.6 * UP, UP)
         place = np.array([0.8, -1.0, 2.5])
         self.room = Room(
-            (Part(floor, Material(0.2, Clouds(noise, 0.05, 0.3)), False),),
+            (ScenePart(floor, Material(0.2, Clouds(noise, 0.05, 0.3)), False),),
             Lighting((Lamp(place, 0.1, 1.6, 2.5, shadows=False),), sky=0.5, ground=0.35),
         )
-        self.view = View.of(camera)
+        self.view = PixelRays.of(camera)
 
     def photograph(self, T_base_platform, readings):
         parts = machine_parts(self.machine, self.discs, self.finish, T_base_platform, readings)

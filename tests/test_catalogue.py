@@ -39,7 +39,7 @@ from pkmcal.simulation import (
     simulate_session,
     true_machine,
 )
-from pkmcal.simulation.configurations import draw_configurations
+from pkmcal.simulation.placement import draw_configurations
 
 NAMES = sorted(n for n in catalogue() if any(r.size for r in load_mechanism(n).radii()))
 """Machines whose legs a camera can see; cranks and sliders are in test_h4 and test_delta."""

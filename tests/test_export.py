@@ -15,7 +15,7 @@ from pkmcal.cameras.files import read_camera
 from pkmcal.cameras.unified import Unified
 from pkmcal.errors import InputError, ResultError
 from pkmcal.export import ros
-from pkmcal.export.contract import Difference, export, exporters, quaternion
+from pkmcal.export.contract import Difference, export, exporters
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import apply, pose, rotation
 from pkmcal.mechanisms import catalogue, load_mechanism
@@ -287,12 +287,6 @@ def test_ros_gets_cameras_and_where_they_stand(tmp_path):
     path = tmp_path / "camera.yaml"
     path.write_text(made.files["camera_info_front.yaml"])
     np.testing.assert_array_equal(read_camera(path).parameters, CAMERA.parameters)
-
-
-def test_a_quaternion_of_half_a_turn():
-    for axis in np.eye(3):
-        rot = 2 * np.outer(axis, axis) - np.eye(3)
-        np.testing.assert_allclose(np.abs(quaternion(rot)), [*axis, 0.0], atol=1e-15)
 
 
 def test_a_tampered_transform_is_found(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
 
 from pkmcal.errors import GeometryError
 from pkmcal.geometry import cylinders, rigid
@@ -33,6 +34,26 @@ def test_rotation_vector_round_trip(omega):
     np.testing.assert_allclose(rigid.rotation(back), rot, atol=1e-12)
     if angle < np.pi - 1e-3:
         np.testing.assert_allclose(back, omega, atol=1e-9)
+
+
+def test_quaternions():
+    rng = np.random.default_rng(0)
+    turns = rigid.rotation(rng.normal(size=(50, 3)) * 2)
+    found = rigid.quaternion(turns)
+    assert np.all(found[:, 0] >= 0)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-15)
+    np.testing.assert_allclose(rigid.from_quaternion(found), turns, atol=1e-12)
+    np.testing.assert_allclose(rigid.from_quaternion(-3 * found), turns, atol=1e-12)
+    np.testing.assert_allclose(rigid.quaternion(np.eye(3)), [1, 0, 0, 0])
+    by_scipy = Rotation.from_matrix(turns).as_quat()[:, [3, 0, 1, 2]]
+    by_scipy *= np.sign(by_scipy[:, :1])
+    np.testing.assert_allclose(found, by_scipy, atol=1e-14)
+
+
+def test_a_quaternion_of_half_a_turn():
+    for axis in np.eye(3):
+        rot = 2 * np.outer(axis, axis) - np.eye(3)
+        np.testing.assert_allclose(np.abs(rigid.quaternion(rot)), [0.0, *axis], atol=1e-15)
 
 
 @pytest.mark.parametrize("angle", [1e-3, 1e-4 * 1.001, 1e-4 * 0.999, 1e-6, 1e-12, 0.0])

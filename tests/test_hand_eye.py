@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from pkmcal.errors import InputError, ResultError
-from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation
+from pkmcal.geometry.rigid import perturb, pose, pose_difference, rotation
 from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.kinematics import on_manifold
-from pkmcal.papers.hand_eye import matrix, quaternion, size_of, solve_pairs, start_from_poses
+from pkmcal.papers.hand_eye import size_of, solve_pairs, start_from_poses
 
 NOISE = np.repeat([np.radians(0.03), 2e-4], 3)
 BOARD = (Mount("board", "platform"),)
@@ -198,12 +198,3 @@ def test_runs_are_solved_together():
         alone = solve_pairs(body[k : k + 1], seen[k : k + 1], 0.4)
         np.testing.assert_allclose(together.T_camera_base[k], alone.T_camera_base[0], atol=1e-6)
     assert np.abs(pose_difference(together.T_camera_base, cameras)).max() < 2e-3
-
-
-def test_quaternions():
-    rng = np.random.default_rng(0)
-    turns = rotation(rng.normal(size=(50, 3)) * 2)
-    np.testing.assert_allclose(matrix(quaternion(turns)), turns, atol=1e-12)
-    np.testing.assert_allclose(matrix(-3 * quaternion(turns)), turns, atol=1e-12)
-    np.testing.assert_allclose(quaternion(np.eye(3)), [1, 0, 0, 0])
-    assert inverse(pose(turns, np.zeros(3))).shape == (50, 4, 4)

@@ -25,7 +25,7 @@ from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.papers.four_step import four_step
 from pkmcal.simulation import EdgeNoise, Settings, simulate_edges, true_machine
-from pkmcal.simulation.stations import default_stations
+from pkmcal.simulation.placement import default_stations
 from test_joint_machines import JOINT_NOISE, Session, camera
 
 LARGEST = 1.9

@@ -13,8 +13,9 @@ from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import edge_normals, line_through, tangent_basis
 from pkmcal.geometry.rigid import apply, look_at, perturb
 from pkmcal.papers import conics, linear
-from pkmcal.simulation import Settings, simulate_session
-from pkmcal.simulation.stations import StationPose
+from pkmcal.simulation import Settings
+from pkmcal.simulation.placement import StationPlace
+from rendered import rendered
 
 RADIUS = 0.014
 CONFIGURATIONS, LEGS = 60, 6
@@ -92,11 +93,11 @@ def test_plain_and_m_regressions_collapse(method):
 def test_a_hexapod_seen_through_a_mirror(tmp_path):
     """Rendered photographs from between the legs, one place, to two tenths of a millimetre."""
     folder = Path(tmp_path) / "session"
-    station = StationPose((0.01, -0.02, 0.07), (0.01, -0.02, 0.4), (0.0, -1.0, 0.0))
+    station = StationPlace((0.01, -0.02, 0.07), (0.01, -0.02, 0.4), (0.0, -1.0, 0.0))
     settings = Settings(
         stations=(station,), configurations=16, rough_position=0.02, rough_angle=0.05
     )
-    simulate_session(folder, pkmcal.load_mechanism("gough-stewart"), mirror(), settings, seed=3)
+    rendered(folder, pkmcal.load_mechanism("gough-stewart"), mirror(), settings, seed=3)
     found = pkmcal.calibrate(folder)
     result = compare(found, folder)
     assert result.calibrated.centre < result.drawing.centre / 5

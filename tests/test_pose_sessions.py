@@ -23,7 +23,7 @@ from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session
-from pkmcal.simulation.configurations import draw_configurations
+from pkmcal.simulation.placement import draw_configurations
 from pkmcal.simulation.truth import true_machine
 
 T_TRACKER_BASE = pose(rotation(np.array([0.4, -0.2, 2.0])), np.array([1.5, 0.3, -0.4]))

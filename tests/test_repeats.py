@@ -38,9 +38,10 @@ from pkmcal.observe.repeats import (
 )
 from pkmcal.papers.axis_measurements import to_coordinates
 from pkmcal.session.load import load_session
-from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges, simulate_session
-from pkmcal.simulation.configurations import draw_configurations
+from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges
 from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.placement import draw_configurations
+from rendered import rendered
 
 CAMERA = camera_of_size((640, 480))
 STATION = look_at(np.array([0.1, -0.9, 0.25]), np.array([0.0, 0.0, 0.2]), np.array([0, 0, 1.0]))
@@ -142,7 +143,7 @@ def test_the_scatter_is_measured_by_leg(machine, poses):
     assert np.sqrt(np.mean(found[(leg != 2)] ** 2)) == pytest.approx(0.05, rel=0.06)
 
 
-@pytest.mark.parametrize("count", [1, 3, 10])
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.slow), 10])
 @pytest.mark.parametrize(("share", "inside"), [(0.1, True), (0.4, True), (3.0, False)])
 def test_errors_agree_with_their_deviations_for_any_number_of_repeats(
     machine, poses, count, share, inside
@@ -345,8 +346,7 @@ def test_repeats_without_an_edge_in_common_are_no_accuracy():
 def simulated(folder, repeats, shake=(0.0, 0.0), stations=2):
     settings = Settings(stations=stations, configurations=4, repeats=repeats, shake=shake)
     drawing = load_mechanism("gough-stewart")
-    simulate_session(folder, drawing, camera_of_size((480, 360)), settings, seed=5)
-    return folder
+    return rendered(folder, drawing, camera_of_size((480, 360)), settings, seed=5)
 
 
 @pytest.fixture(scope="module")

@@ -8,33 +8,32 @@ import numpy as np
 import pytest
 
 from pkmcal.cameras import camera_models
-from pkmcal.control.analysis import equilibria, matrix_at, of_legs, subsets, visibility
-from pkmcal.control.image import Eye, responses
+from pkmcal.control.analysis import equilibria, matrix_at, subsets, visibility
+from pkmcal.control.image import Eye, edge_responses
 from pkmcal.control.laws import limited, task_of
 from pkmcal.control.seen import legs_at, seen_machine, true_edges
 from pkmcal.control.simulation import (
     End,
-    Loop,
-    assembly_sign,
+    LoopSettings,
+    aspect_at,
     loop_factor,
     one_image,
     outside,
     platform_joints,
     simulate,
 )
-from pkmcal.control.study import Plan, Scene, Uncertainty, check_loop, check_pose, estimates, study
+from pkmcal.control.study import Plan, Plant, Uncertainty, check_loop, check_pose, estimates, study
 from pkmcal.control.words import judgement
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, perturb
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
-from pkmcal.simulation.configurations import draw_configurations
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
-from pkmcal.simulation.stations import default_stations
+from pkmcal.simulation.placement import default_stations, draw_configurations
 
 QUIET = EdgeNoise(0.0, 0.0)
-CLEAN = Loop(noise=QUIET, joint_noise=0.0, rate=10.0, delay=0, duration=8.0)
+CLEAN = LoopSettings(noise=QUIET, joint_noise=0.0, rate=10.0, delay=0, duration=8.0)
 
 
 def mirror():
@@ -84,7 +83,7 @@ def test_noise_is_that_of_simulated_edges(camera):
         eye.true.machine, T[None], camera, poses, EdgeNoise(0.1, 0.1), np.random.default_rng(0)
     )
     points = eye.points(poses, joints, 24)
-    by_shift, by_tilt, _ = responses(points)
+    by_shift, by_tilt, _ = edge_responses(points)
     parts = 0.1 * np.stack([by_shift, by_tilt], axis=-1)
     own = np.linalg.det(parts @ np.swapaxes(parts, -1, -2))[0]
     checked = 0
@@ -187,7 +186,9 @@ def test_limits_keep_the_direction():
 def test_predicted_stillness_is_what_the_loop_does(eye, delay):
     goals = np.repeat(ways_of(eye, 1)[1], 32, axis=0)
     noise = EdgeNoise(0.05, 0.05)
-    loop = Loop(noise=noise, joint_noise=0.0, rate=10.0, gain=2.0, delay=delay, duration=25.0)
+    loop = LoopSettings(
+        noise=noise, joint_noise=0.0, rate=10.0, gain=2.0, delay=delay, duration=25.0
+    )
     runs = simulate(eye, eye.true, goals, goals, loop, np.random.default_rng(0))
     measured = np.sqrt(np.mean(runs.way[:, 30:] ** 2))
     joints = eye.true.machine.inverse(goals)
@@ -215,9 +216,9 @@ def test_edges_hold_steadier_than_directions(eye):
 
 
 def test_unstable_loops_are_refused():
-    check_loop(Loop(gain=5.0, rate=25.0, delay=3))
+    check_loop(LoopSettings(gain=5.0, rate=25.0, delay=3))
     with pytest.raises(InputError, match=r"unstable.*less than 11\.1/s"):
-        check_loop(Loop(gain=12.0, rate=25.0, delay=3))
+        check_loop(LoopSettings(gain=12.0, rate=25.0, delay=3))
 
 
 # ------------------------------------------------------------------ runs that fail
@@ -262,7 +263,7 @@ def test_coming_to_a_singular_pose():
     weak = machine.forward_result(machine.inverse(turned), turned).singularity
     first = int(np.argmax(weak < NEAR_SINGULAR / 2))
     goal = turned[first : first + 1]
-    assert assembly_sign(machine, goal) == assembly_sign(machine, start)
+    assert aspect_at(machine, goal) == aspect_at(machine, start)
     runs = simulate(eye, eye.true, start, goal, CLEAN, np.random.default_rng(0))
     assert runs.end == (End.SINGULAR,)
     assert runs.last[0] > 3
@@ -275,9 +276,7 @@ def test_wrong_assembly_as_start():
     goal = turned_home(machine, 0.0)
     readings = machine.inverse(goal)[0]
     modes = machine.assembly_modes(readings, np.random.default_rng(0))
-    start = next(
-        m for m in modes if assembly_sign(machine, m[None]) != assembly_sign(machine, goal)
-    )
+    start = next(m for m in modes if aspect_at(machine, m[None]) != aspect_at(machine, goal))
     runs = simulate(eye, eye.true, start[None], goal, CLEAN, np.random.default_rng(0))
     assert runs.end == (End.WRONG_ASSEMBLY,)
     assert runs.last[0] == 0
@@ -302,9 +301,9 @@ def test_losing_a_leg(eye):
 
 
 def test_noise_that_keeps_the_goal_away(eye):
-    eye = Eye.of(of_legs(eye.true, [0, 2, 4]), eye.camera)
+    eye = Eye.of(eye.true.only(np.array([0, 2, 4])), eye.camera)
     starts, goals = ways_of(eye, 6)
-    loop = Loop(law="directions", rate=10.0, duration=6.0, noise=EdgeNoise(0.3, 0.3))
+    loop = LoopSettings(law="directions", rate=10.0, duration=6.0, noise=EdgeNoise(0.3, 0.3))
     runs = simulate(eye, eye.true, starts, goals, loop, np.random.default_rng(0))
     assert not runs.reached.any()
 
@@ -350,7 +349,7 @@ def test_three_legs_leave_other_poses(eye):
     """Legs 1, 2 and 3: poses in the workspace with the same directions, to the last digit."""
     poses = draw_configurations(eye.true.machine, 60, 0.2, np.random.default_rng(8))[0]
     goals, starts = poses[:4], poses[4:40]
-    three = of_legs(eye.true, [0, 1, 2])
+    three = eye.true.only(np.array([0, 1, 2]))
     found = equilibria(three, "directions", goals, starts)
     assert found.alike > 0.05
     assert found.looks_alike.any()
@@ -367,7 +366,7 @@ def test_three_legs_leave_other_poses(eye):
 def test_an_equilibrium_is_one(eye):
     """N^T e vanishes where the search says that the control rests."""
     poses = draw_configurations(eye.true.machine, 60, 0.2, np.random.default_rng(8))[0]
-    three = of_legs(eye.true, [0, 1, 2])
+    three = eye.true.only(np.array([0, 1, 2]))
     found = equilibria(three, "directions", poses[:3], poses[3:40])
     for pose, goal in zip(found.T_base_platform, found.goal, strict=True):
         wanted = true_edges(three, poses[goal][None])
@@ -407,11 +406,11 @@ def test_estimates_have_the_errors_asked_for(eye):
     np.testing.assert_allclose(np.arccos(cosine), 0.1, atol=1e-6)
 
 
-def scene_of(eye: Eye, legs=None) -> Scene:
+def scene_of(eye: Eye, legs=None) -> Plant:
     n = len(eye.true.theta)
     unsure = Uncertainty(1e-9 * np.eye(n), np.full(3, 3e-4), np.full(3, 2e-4))
     machine = eye.true.machine
-    return Scene(machine, machine.values, unsure, eye.camera, eye.true.T_camera_base, legs)
+    return Plant(machine, machine.values, unsure, eye.camera, eye.true.T_camera_base, legs)
 
 
 SHORT = replace(CLEAN, rate=4.0, duration=8.0)

@@ -26,10 +26,9 @@ from pkmcal.simulation import (
     simulate_session,
     true_machine,
 )
-from pkmcal.simulation.casting import Part, Scene
-from pkmcal.simulation.configurations import draw_configurations, usable
 from pkmcal.simulation.demo import MECHANISM, SETTINGS, demo_camera
-from pkmcal.simulation.render import View, photograph, render
+from pkmcal.simulation.placement import draw_configurations, usable
+from pkmcal.simulation.render import PixelRays, Scene, ScenePart, photograph, render
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
 from pkmcal.simulation.surfaces import Lamp, Lighting, Material, SmoothNoise
@@ -56,11 +55,11 @@ def machine():
 
 @pytest.fixture(scope="module")
 def view():
-    return View.of(CAMERA)
+    return PixelRays.of(CAMERA)
 
 
 def glowing(shape, level=1.0):
-    return Part(shape, Material(0.0, emission=level))
+    return ScenePart(shape, Material(0.0, emission=level))
 
 
 def between(a, b, radius):
@@ -155,8 +154,8 @@ def test_every_shape_is_entered_on_its_surface_facing_the_ray():
 def test_shadows_fall_behind_what_stands_in_the_light(view):
     lamp = Lamp(np.array([0.6, -0.3, 1.2]), 0.03, 1.0, 1.4, shadows=True)
     lighting = Lighting((lamp,), 0.1, 0.1)
-    floor = Part(Wall(np.array([0, 0, -0.15]), Z), Material(0.6))
-    ball = Part(Ball(np.zeros(3), 0.08), Material(0.6))
+    floor = ScenePart(Wall(np.array([0, 0, -0.15]), Z), Material(0.6))
+    ball = ScenePart(Ball(np.zeros(3), 0.08), Material(0.6))
     behind = -lamp.place * 0.15 / lamp.place[2]  # on the floor, in line with lamp and ball
     x, y = np.rint(CAMERA.project(apply(FRONT, behind))).astype(int)
     alone, shaded = (picture(parts, view, lighting) for parts in ([floor], [floor, ball]))
@@ -174,8 +173,8 @@ def test_turned_steel_shows_a_narrow_line_along_the_rod(view):
     noise = SmoothNoise.from_rng(np.random.default_rng(0))
     lighting = Lighting((lamp,), 0.1, 0.1)
     steel = replace(Finish.from_noise(noise).steel, pattern=None, mirror=0.0)
-    bright = picture([Part(rod, steel)], view, lighting)
-    dull = picture([Part(rod, replace(steel, gloss=0.0))], view, lighting)
+    bright = picture([ScenePart(rod, steel)], view, lighting)
+    dull = picture([ScenePart(rod, replace(steel, gloss=0.0))], view, lighting)
     line = (bright - dull)[150:330]
     peak = line.max(axis=1)
     assert peak.min() > 0.15

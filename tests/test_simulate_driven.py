@@ -25,12 +25,13 @@ from pkmcal.simulation import (
     with_forearms,
 )
 from pkmcal.simulation.board import board_from_fields
-from pkmcal.simulation.configurations import FARTHEST_TURN, unfolded
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.drives import drives_of, reaches, side_bars
+from pkmcal.simulation.placement import FARTHEST_TURN, unfolded
 from pkmcal.simulation.scene import Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Cylinder
 from pkmcal.simulation.surfaces import SmoothNoise
+from rendered import rendered
 from test_catalogue import whitened
 
 NAMES = ("h4", "delta", "6-rus", "linear-delta", "hexaglide")
@@ -248,8 +249,7 @@ def photographed(folder, name, camera, configurations, board, seed):
         board_on="platform",
     )  # fmt: skip
     drawing = with_forearms(load_mechanism(name))
-    simulate_session(folder, drawing, camera, settings, seed=seed)
-    return folder
+    return rendered(folder, drawing, camera, settings, seed)
 
 
 def observing(folder, words):

@@ -12,7 +12,7 @@ from pkmcal.control.seen import legs_at, seen_machine, true_edges
 from pkmcal.control.track import (
     Sight,
     corrected_pose,
-    edge_rows,
+    edge_misfits,
     leg_lines,
     start_state,
     track,
@@ -180,7 +180,7 @@ NEAR_READINGS = MACHINE.inverse(NEAR[None])[0]
 
 
 def test_lines_of_exact_edges_are_exact_to_second_order():
-    rows = edge_rows(SEEN, NEAR_READINGS, NEAR, edges_of(AT, READINGS, sigma=1e-7), 0.0)
+    rows = edge_misfits(SEEN, NEAR_READINGS, NEAR, edges_of(AT, READINGS, sigma=1e-7), 0.0)
     rows = replace(rows, information=np.tile(np.eye(2) / 1e-14, (len(rows.leg), 1, 1)))
     lines = leg_lines(SEEN, rows)
     assert lines.found.all()
@@ -191,7 +191,7 @@ def test_lines_scatter_as_their_covariance_says():
     rng = np.random.default_rng(0)
     truth, whitened = true_edges(SEEN, AT), []
     for _ in range(60):
-        rows = edge_rows(SEEN, READINGS, AT, edges_of(AT, READINGS, rng), 0.0)
+        rows = edge_misfits(SEEN, READINGS, AT, edges_of(AT, READINGS, rng), 0.0)
         rows = replace(rows, information=np.linalg.inv(edges_of(AT, READINGS).covariance))
         lines = leg_lines(SEEN, rows)
         turn = np.swapaxes(lines.basis, -1, -2) @ truth[..., None]
@@ -204,7 +204,7 @@ def test_an_edge_of_something_else_costs_the_leg_and_not_the_truth():
     edges = edges_of(AT, READINGS)
     turn = np.zeros((len(edges), 2))
     turn[0, 0] = 3 * PIXEL  # leg 1, one of its four edges
-    rows = edge_rows(SEEN, READINGS, AT, turned(edges, turn), 0.0)
+    rows = edge_misfits(SEEN, READINGS, AT, turned(edges, turn), 0.0)
     lines = leg_lines(SEEN, rows)
     assert not lines.agrees[0]
     assert lines.found.tolist() == [False, True, True, True, True, True]
@@ -213,22 +213,22 @@ def test_an_edge_of_something_else_costs_the_leg_and_not_the_truth():
 
 def test_one_side_alone_is_no_leg():
     edges = edges_of(AT, READINGS)
-    rows = edge_rows(SEEN, READINGS, AT, edges.select((edges.leg != 2) | (edges.side == 0)), 0.0)
+    rows = edge_misfits(SEEN, READINGS, AT, edges.select((edges.leg != 2) | (edges.side == 0)), 0.0)
     assert leg_lines(SEEN, rows).found.tolist() == [True, True, False, True, True, True]
 
 
 def test_only_the_legs_that_count_are_answered():
     seen = seen_machine(MACHINE, BESIDE, np.array([4, 1]))
-    lines = leg_lines(seen, edge_rows(seen, READINGS, AT, edges_of(AT, READINGS), 0.0))
+    lines = leg_lines(seen, edge_misfits(seen, READINGS, AT, edges_of(AT, READINGS), 0.0))
     np.testing.assert_allclose(lines.normal, true_edges(SEEN, AT)[[4, 1]], atol=1e-6)
 
 
 def test_the_constant_shift_of_a_camera_is_taken_off():
     edges = edges_of(AT, READINGS)
     outward = turned(edges, 0.3 * edges.shift)
-    rows = edge_rows(SEEN, READINGS, AT, outward, 0.3)
+    rows = edge_misfits(SEEN, READINGS, AT, outward, 0.3)
     np.testing.assert_allclose(leg_lines(SEEN, rows).normal, true_edges(SEEN, AT), atol=1e-6)
-    raw = leg_lines(SEEN, edge_rows(SEEN, READINGS, AT, outward, 0.0))
+    raw = leg_lines(SEEN, edge_misfits(SEEN, READINGS, AT, outward, 0.0))
     assert np.abs(raw.normal - true_edges(SEEN, AT)).max() > 1e-4
 
 
@@ -242,14 +242,14 @@ def test_the_pose_of_exact_edges_is_found_with_and_without_one_bad_leg():
             edges = turned(edges, turn)
         T = NEAR
         for _ in range(4):
-            T = corrected_pose(SEEN, T, edge_rows(SEEN, READINGS, T, edges, 0.0), every)
+            T = corrected_pose(SEEN, T, edge_misfits(SEEN, READINGS, T, edges, 0.0), every)
         # a leg of six that is 3 px aside would carry the pose along by ten times as much
         limit = 3e-3 if bad else 1e-6
         assert np.abs(pose_difference(T, AT)).max() < limit
 
 
 def test_a_pose_without_edges_stays():
-    rows = edge_rows(SEEN, READINGS, AT, edges_of(AT, READINGS), 0.0)
+    rows = edge_misfits(SEEN, READINGS, AT, edges_of(AT, READINGS), 0.0)
     assert corrected_pose(SEEN, AT, rows, np.zeros(6, dtype=bool)) is AT
 
 
@@ -258,7 +258,7 @@ def test_weights_make_errors_white(law):
     """Errors of measured edges, drawn with their covariance, come out of one size in all rows."""
     rng = np.random.default_rng(3)
     goal, legs, every = true_edges(SEEN, AT), legs_at(SEEN, AT), np.ones(6, dtype=bool)
-    lines = leg_lines(SEEN, edge_rows(SEEN, READINGS, AT, edges_of(AT, READINGS), 0.0))
+    lines = leg_lines(SEEN, edge_misfits(SEEN, READINGS, AT, edges_of(AT, READINGS), 0.0))
     factor = 1e-2 * np.linalg.cholesky(lines.joint)  # small, so that all is linear
     rows = []
     for _ in range(400):

@@ -29,12 +29,13 @@ from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth
+from rendered import rendered
 
 
 def photographed(folder, drawing, machine, camera, seed, **settings):
     """New photographs of a machine, beside its drawing: truth reaches nothing."""
     wanted = {"stations": 1, "configurations": 4, "tolerance": 0.0, **settings}
-    simulate_session(folder, machine, camera, Settings(**wanted), seed=seed)
+    rendered(folder, machine, camera, Settings(**wanted), seed)
     (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
     (folder / "truth.json").unlink()
     return folder

@@ -177,11 +177,6 @@ class Solution:
     stop: tuple[Stop, ...]
 
 
-def transposed(m: Array) -> Array:
-    """The matrices' transposes."""
-    return np.swapaxes(m, -1, -2)
-
-
 def own_factors(by_own: Array, damping: Array) -> tuple[Array, Array]:
     """QR factors of the own Jacobian with Marquardt damping (B,), zero for none.
 
@@ -199,14 +194,14 @@ def eliminate(linear: Linear, damping: Array) -> Reduced:
     n_rows = linear.by_own.shape[-2]
     q, r = own_factors(linear.by_own, damping)
     top, bottom = q[..., :n_rows, :], q[..., n_rows:, :]
-    along = transposed(top) @ linear.by_shared
+    along = top.mT @ linear.by_shared
     rows = linear.by_shared - top @ along
     if np.any(damping > 0):
         rows = np.concatenate([rows, -bottom @ along], axis=-2)
     value = linear.value[..., None]
     # the damping's rows carry no residual of their own, only -bottom top^T value
-    left = value - top @ (transposed(top) @ value)
-    gradient = (transposed(linear.by_shared) @ left)[..., 0].sum(axis=1)
+    left = value - top @ (top.mT @ value)
+    gradient = (linear.by_shared.mT @ left)[..., 0].sum(axis=1)
     gradient = gradient + linear.shared_value @ linear.shared_by
     return Reduced(rows, left[..., 0], top, r, gradient)
 
@@ -225,7 +220,7 @@ def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
 def reduced_normal(linear: Linear, reduced: Reduced) -> Array:
     """Normal matrix of the shared unknowns, (B, na, na)."""
     rows = reduced.rows.reshape(reduced.rows.shape[0], -1, reduced.rows.shape[-1])
-    return transposed(rows) @ rows + linear.shared_by.T @ linear.shared_by
+    return rows.mT @ rows + linear.shared_by.T @ linear.shared_by
 
 
 def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
@@ -236,7 +231,7 @@ def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
     ridge = np.maximum(damping, 1e-15)[:, None, None] * np.eye(scale.shape[1])
     shared = -np.linalg.solve(scaled + ridge, (reduced.gradient / scale)[..., None])[..., 0] / scale
     fitted = linear.value + (linear.by_shared @ shared[:, None, :, None])[..., 0]
-    right = (transposed(reduced.q) @ fitted[..., None])[..., 0]
+    right = (reduced.q.mT @ fitted[..., None])[..., 0]
     own = -np.linalg.solve(reduced.r, right[..., None])[..., 0]
     return shared, own
 
@@ -378,7 +373,7 @@ def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:
     s, vt, scale = directions(rows)
     limit = least * s[..., :1]
     inverse = 1 / np.maximum(s, limit) if loose else _of_known(s, limit)
-    return np.swapaxes(vt, -1, -2) * inverse[..., None, :] / scale[..., None]
+    return vt.mT * inverse[..., None, :] / scale[..., None]
 
 
 def normal_root(normal: Array, least: float, *, loose: bool) -> Array:

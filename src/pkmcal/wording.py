@@ -62,8 +62,8 @@ def split_name(name: str) -> tuple[int | None, str]:
     return (int(match[1]), match[2]) if match else (None, name)
 
 
-def legs_named(numbers: Iterable[int], all_legs: int) -> str:
-    """``all legs``, ``leg 3``, ``legs 1, 2 and 5``."""
+def legs_named(numbers: Iterable[int], all_legs: int = 0) -> str:
+    """``all legs`` where their number is given, ``leg 3``, ``legs 1, 2 and 5``; from 1."""
     found = sorted(set(numbers))
     if len(found) == all_legs and all_legs > 1:
         return "all legs"

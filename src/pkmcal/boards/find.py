@@ -411,7 +411,7 @@ def _pixels(
 
 def _weights(offsets: Array, axes: Array, window: Window, widened: Array) -> Array:
     """1 for pixels of the window, falling to 0 over the last fifth of its reach; (n, m)."""
-    board = np.abs(np.linalg.solve(np.swapaxes(axes, -1, -2), np.swapaxes(offsets, -1, -2)))
+    board = np.abs(np.linalg.solve(axes.mT, offsets.mT))
     along, across = board.max(axis=1), board.min(axis=1)
     reach, margin = window.reach * widened[:, None], window.margin * widened[:, None]
     taper = np.clip((reach - along) / (0.2 * reach), 0, 1)
@@ -473,8 +473,8 @@ def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Ar
     damping = np.full(len(p), 1e-3)
     for _ in range(STEPS):
         weighted = by * weight[..., None]
-        normal = np.swapaxes(by, 1, 2) @ weighted
-        right = (np.swapaxes(weighted, 1, 2) @ (grey - value)[..., None])[..., 0]
+        normal = by.mT @ weighted
+        right = (weighted.mT @ (grey - value)[..., None])[..., 0]
         diagonal = np.einsum("nii->ni", normal)
         normal = normal + (damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
         step = np.clip(
@@ -556,7 +556,7 @@ def _judged(
         & np.isfinite(p).all(axis=1)
     )
     by = _model(p, shape)[1]
-    normal = np.swapaxes(by, 1, 2) @ (by * weight[..., None]) + 1e-9 * np.eye(7)
+    normal = by.mT @ (by * weight[..., None]) + 1e-9 * np.eye(7)
     # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.
     noise = np.maximum(left, 1 / 12)
     covariance = np.linalg.inv(normal) * noise[:, None, None]

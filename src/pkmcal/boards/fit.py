@@ -30,7 +30,6 @@ from pkmcal.solver import (
     minimise,
     normal_root,
     own_factors,
-    transposed,
 )
 
 LEAST_KNOWN = 1e-14
@@ -252,22 +251,22 @@ def covariance_of(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     whole = np.zeros((n, n))
     if len(fit.free):
         rows = eliminate(linear, np.zeros(1)).rows[0]
-        part = inverted((transposed(rows) @ rows).sum(axis=0))
+        part = inverted((rows.mT @ rows).sum(axis=0))
         whole[np.ix_(fit.free, fit.free)] = part
     q, r = own_factors(linear.by_own, np.zeros(1))
     rows = linear.by_own.shape[-2]
     inner = np.linalg.inv(r[0] + 1e-150 * np.eye(6))
     by = np.zeros((len(fit.T_camera_board), 6, n))
     if len(fit.free):
-        by[..., fit.free] = -inner @ (transposed(q[0, :, :rows]) @ linear.by_shared[0])
-    poses = inner @ transposed(inner) + by @ whole @ transposed(by)
+        by[..., fit.free] = -inner @ (q[0, :, :rows].mT @ linear.by_shared[0])
+    poses = inner @ inner.mT + by @ whole @ by.mT
     return whole, poses, by
 
 
 def inverted(normal: Array) -> Array:
     """Inverse of a normal matrix; what is not determined becomes very uncertain, not an error."""
     half = normal_root(normal, LEAST_KNOWN, loose=True)
-    return half @ transposed(half)
+    return half @ half.mT
 
 
 def noise_beyond(off: Array, sigma: Array, weight: Array, dof: float) -> float:

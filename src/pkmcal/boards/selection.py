@@ -25,7 +25,7 @@ from pkmcal.boards.fit import (
 )
 from pkmcal.cameras.contract import Camera, camera_models
 from pkmcal.geometry.rigid import apply, dot
-from pkmcal.solver import eliminate, transposed
+from pkmcal.solver import eliminate
 
 FOCALS = {"pinhole": (0.3, 6.0), "fisheye": (0.12, 2.0), "unified": (0.12, 2.0)}
 """Range of pixels a radian in the picture's middle, as a share of its width."""
@@ -202,9 +202,9 @@ def _without_each(fit: CameraFit, views: Views) -> tuple[Array, Array, Array]:
     """
     linear = fit.problem(views).linearize(fit.state)
     rows = eliminate(linear, np.zeros(1)).rows[0]
-    normals = transposed(rows) @ rows
+    normals = rows.mT @ rows
     whole = normals.sum(axis=0)
-    right = transposed(rows) @ linear.value[0][..., None]
+    right = rows.mT @ linear.value[0][..., None]
     moved = np.stack([inverted(whole - part) for part in normals]) @ right
     return moved[..., 0], rows, whole
 

@@ -10,14 +10,13 @@ import platform
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from importlib import metadata
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from pkmcal import __version__
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import (
@@ -119,7 +118,7 @@ def calibrated_mechanism_text(calibration: Calibration) -> str:
     verdict = calibration.verdict
     name = calibration.session.folder.resolve().name
     lines = [
-        f"Calibrated by pkmcal {__version__} from the session {name}"
+        f"Calibrated by pkmcal {version('pkmcal')} from the session {name}"
         f" (method {calibration.method}, seed {calibration.seed}).",
         verdict.headline if verdict.usable else "NOT TO BE USED: " + " ".join(verdict.reasons),
         f"Frames: {calibration.estimate.gauge}. Lengths in metres.",
@@ -172,11 +171,11 @@ def document_of(
 
 def versions() -> dict[str, str]:
     """Versions of pkmcal, Python and the packages that numbers depend on."""
-    found = {"pkmcal": __version__, "python": platform.python_version()}
+    found = {"pkmcal": version("pkmcal"), "python": platform.python_version()}
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
+            found[name] = version(name)
+        except PackageNotFoundError:
             continue
     return found
 

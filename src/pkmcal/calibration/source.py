@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
-from pkmcal import __version__
 from pkmcal.arrays import Array
 from pkmcal.calibration.results import EVERYTHING, MECHANISM, SavedCalibration, load
 from pkmcal.cameras.contract import Camera
@@ -56,7 +56,8 @@ class Source:
         """Lines for the top of every file: what this is, of what, and in which conventions."""
         state = "" if self.usable else "REFUSED, NOT TO BE USED: "
         lines = (
-            f"Machine {self.machine.name}, exported by pkmcal {__version__} from {self.origin}.",
+            f"Machine {self.machine.name}, exported by pkmcal {version('pkmcal')}"
+            f" from {self.origin}.",
             state + " ".join((self.headline, *self.reasons)),
             f"Frames: {self.frames}.",
             *conventions,

@@ -358,7 +358,7 @@ def half_angles(edges: EdgeSet, legs: Cylinders) -> Array:
 def by_ends(edges: EdgeSet, basis: Array, legs: Cylinders) -> Array:
     """Turn of the edges, in tangent bases (N, 3, 2), by motions of a and b: (N, 2, 6), rad/m."""
     e = edge_normal_jacobians(legs.a, legs.b, legs.radius, edges.side)
-    return np.swapaxes(basis, 1, 2) @ np.concatenate([e.dn_da, e.dn_db], axis=-1)
+    return basis.mT @ np.concatenate([e.dn_da, e.dn_db], axis=-1)
 
 
 def by_camera(ends: Array, legs: Cylinders) -> Array:
@@ -397,11 +397,11 @@ def fit_motions(turn: Array, rows: Array, whiten: Array, groups: Groups) -> Moti
     """
     white = (whiten @ turn[..., None])[..., 0]
     rows = whiten @ rows
-    normal = groups.total(np.swapaxes(rows, 1, 2) @ rows)
+    normal = groups.total(rows.mT @ rows)
     right = groups.total((white[:, None, :] @ rows)[:, 0])
     values, axes = np.linalg.eigh(normal)
     seen = values > _RANK * values[:, -1:]
-    along = (np.swapaxes(axes, 1, 2) @ right[..., None])[..., 0]
+    along = (axes.mT @ right[..., None])[..., 0]
     along = np.where(seen, along / np.where(seen, values, 1.0), 0.0)
     motion = (axes @ along[..., None])[..., 0]
     total = groups.total(dot(white, white))

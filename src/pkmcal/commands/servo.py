@@ -124,7 +124,7 @@ def _plan(
     import numpy as np
 
     from pkmcal.control.laws import law_named
-    from pkmcal.control.simulation import Loop
+    from pkmcal.control.simulation import LoopSettings
     from pkmcal.control.source import pose_of
     from pkmcal.control.study import Plan
     from pkmcal.simulation.edges import EdgeNoise
@@ -134,7 +134,7 @@ def _plan(
     _positive("--rate", rate, 10000)
     _positive("--speed", 1.0 if speed is None else speed, 1e6)
     _positive("--duration", 1.0 if duration is None else duration, 3600)
-    loop = Loop(
+    loop = LoopSettings(
         law=law,
         gain=gain,
         rate=rate,

@@ -8,8 +8,7 @@ poses of a platform of six freedoms, as three points seen by a camera do.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -17,9 +16,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.control.laws import Task, task_of
 from pkmcal.control.seen import SeenMachine, legs_at, moved_to, true_edges
-from pkmcal.control.simulation import assembly_sign, outside, platform_joints
+from pkmcal.control.simulation import aspect_at, outside, platform_joints
 from pkmcal.geometry.rigid import dot, perturb
-from pkmcal.mechanisms.kinematics import inverse_result, on_manifold
+from pkmcal.mechanisms.kinematics import on_manifold
 
 BLIND = 1e-6
 """Visibility below which a motion is not seen at all: rounding leaves 1e-9."""
@@ -85,16 +84,13 @@ def subsets(matrix: Array, legs: Integers) -> tuple[Subset, ...]:
     """
     found: list[Subset] = []
     for size in range(1, len(legs) + 1):
-        several = [_subset(matrix, legs, rows) for rows in combinations(range(len(legs)), size)]
+        several: list[Subset] = []
+        for rows in combinations(range(len(legs)), size):
+            values = visibility(matrix[:, list(rows)])
+            numbers = tuple(int(legs[row]) for row in rows)
+            several.append(Subset(numbers, float(values.min()), float(np.median(values))))
         found += sorted(several, key=lambda subset: -subset.worst)
     return tuple(found)
-
-
-def _subset(matrix: Array, legs: Integers, rows: Iterable[int]) -> Subset:
-    chosen = list(rows)
-    values = visibility(matrix[:, chosen])
-    numbers = tuple(int(legs[row]) for row in chosen)
-    return Subset(numbers, float(values.min()), float(np.median(values)))
 
 
 @dataclass(frozen=True)
@@ -130,37 +126,30 @@ def equilibria(seen: SeenMachine, law: str, goals: Array, starts: Array) -> Equi
     poses = _descended(seen, law, np.tile(starts, (g, 1, 1)), true_edges(seen, goal))
     task = _task(seen, law, poses, true_edges(seen, goal))
     size = np.sqrt(dot(task.error, task.error))
-    slope = (np.swapaxes(task.matrix, -1, -2) @ task.error[..., None])[..., 0]
+    slope = (task.matrix.mT @ task.error[..., None])[..., 0]
     largest = np.sqrt(np.sum(task.matrix**2, axis=(-1, -2)))
     off = platform_joints(machine, poses) - platform_joints(machine, goal)
     distance = np.sqrt(np.mean(dot(off, off), axis=-1))
-    readings, wanted = (_readings(seen, p) for p in (poses, goal))
+    readings, wanted = machine.inverse(poses), machine.inverse(goal)
     inside = ~outside(machine, readings)
-    inside &= assembly_sign(machine, poses) * assembly_sign(machine, goal) >= 0
+    inside &= aspect_at(machine, poses) * aspect_at(machine, goal) >= 0
     looks = size < ALIKE
     flat = np.sqrt(dot(slope, slope)) < FLAT * largest * np.maximum(size, ALIKE)
     at_goal = looks & (distance < APART)
     other = inside & ~at_goal & (looks | flat)
-    kept = _distinct(platform_joints(machine, poses), other, _of(g, s))
+    goal_of = np.repeat(np.arange(g), s)
+    kept = _distinct(platform_joints(machine, poses), other, goal_of)
     return Equilibria(
         reached=float(at_goal.mean()),
         alike=float((other & looks).mean()),
         cancelled=float((other & ~looks).mean()),
         out=float((~inside & ~at_goal).mean()),
         T_base_platform=poses[kept],
-        goal=_of(g, s)[kept],
+        goal=goal_of[kept],
         looks_alike=looks[kept],
         distance=distance[kept],
         readings=np.abs(readings - wanted).max(axis=-1)[kept],
     )
-
-
-def _of(goals: int, starts: int) -> Integers:
-    return np.repeat(np.arange(goals), starts)
-
-
-def _readings(seen: SeenMachine, poses: Array) -> Array:
-    return inverse_result(seen.machine.layout, seen.theta, poses)[0]
 
 
 def _descended(seen: SeenMachine, law: str, poses: Array, goal: Array) -> Array:
@@ -210,7 +199,7 @@ class _Slope:
 
     def step(self, damping: Array, poses: Array) -> Array:
         """Damped steps (R, 6), the project's twist at the platform's origin; at most 0.1 m."""
-        turned = np.swapaxes(self.matrix, -1, -2)
+        turned = self.matrix.mT
         normal = turned @ self.matrix
         scale = np.trace(normal, axis1=-2, axis2=-1) / normal.shape[-1] + 1e-300
         normal = normal + (damping * scale)[:, None, None] * np.eye(normal.shape[-1])
@@ -231,10 +220,3 @@ def _distinct(joints: Array, which: Booleans, goal_of: Integers) -> Integers:
         if not same or np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=-1)).min() > APART:
             kept.append(int(row))
     return np.array(kept, dtype=int)
-
-
-def of_legs(seen: SeenMachine, legs: Iterable[int]) -> SeenMachine:
-    """The same with fewer seen legs, numbers from 0."""
-    wanted = list(legs)
-    rows = [int(np.flatnonzero(seen.legs == j)[0]) for j in wanted]
-    return replace(seen, legs=np.array(wanted), radius=seen.radius[rows])

@@ -1,4 +1,4 @@
-"""What one step of control tells: velocities, how far it is, and why it stopped."""
+"""What one step of control tells, in numbers and sentences, and the goal that it goes to."""
 
 from __future__ import annotations
 
@@ -22,6 +22,11 @@ from pkmcal.geometry.cylinders import line_through
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
+from pkmcal.mechanisms.velocities import sign_of
+from pkmcal.wording import legs_named
+
+UNIT = 1e-6
+"""By how much a normal's length may differ from 1: six digits written to a file."""
 
 
 class Status(Enum):
@@ -70,17 +75,9 @@ class Step:
     normals: Array
 
 
-def leg_list(numbers: list[int]) -> str:
-    """Legs counted from 1, for sentences: "legs 1, 2 and 5"."""
-    names = [str(j + 1) for j in numbers]
-    if len(names) < 2:
-        return f"leg {''.join(names)}"
-    return f"legs {', '.join(names[:-1])} and {names[-1]}"
-
-
 def motor_name(machine: Machine, column: int) -> str:
     """A reading by the leg, or legs, that it drives."""
-    return leg_list(np.flatnonzero(machine.layout.actuated == column).tolist())
+    return legs_named(np.flatnonzero(machine.layout.actuated == column) + 1)
 
 
 def missing_clauses(
@@ -91,9 +88,9 @@ def missing_clauses(
     for k in np.flatnonzero(~used):
         left_out = np.isnan(goal[k]).any()
         why = "left out by the goal" if left_out else f"not seen ({reasons[k]})"
-        missing.setdefault(why, []).append(int(legs[k]))
+        missing.setdefault(why, []).append(int(legs[k]) + 1)
     return [
-        f"{leg_list(group)} {'are' if len(group) > 1 else 'is'} {why}"
+        f"{legs_named(group)} {'are' if len(group) > 1 else 'is'} {why}"
         for why, group in missing.items()
     ]
 
@@ -129,10 +126,6 @@ def leaving(
         high = (after > ranges[:, 1]) & (velocities > 0)
         outside = (readings < ranges[:, 0]) | (readings > ranges[:, 1])
     return low | high, outside
-
-
-UNIT = 1e-6
-"""By how much a normal's length may differ from 1: six digits written to a file."""
 
 
 @dataclass(frozen=True)
@@ -200,10 +193,9 @@ def aspect_of(machine: Machine, legs: Legs) -> float:
     It changes only where the platform can move with all motors locked, so between poses of two
     signs lies a singular one. 0 where axes or hinges make the rows more than the freedoms.
     """
-    rows = legs.rows @ machine.layout.motion
-    if machine.layout.n_internal or rows.shape[-2] != rows.shape[-1]:
+    if machine.layout.n_internal:
         return 0.0
-    return float(np.sign(np.linalg.det(rows)))
+    return float(sign_of(legs.rows @ machine.layout.motion))
 
 
 def check_sides(seen: SeenMachine, normals: Array, T_base_platform: Array) -> None:

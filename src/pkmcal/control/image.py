@@ -24,7 +24,7 @@ from pkmcal.observe.predict import (
     tubes_of,
     unobstructed,
 )
-from pkmcal.simulation.edges import EdgeNoise
+from pkmcal.simulation.edges import EdgeNoise, disturbed, responses
 
 PLACES = 5
 """Places along an edge; more change its noise by less than a tenth."""
@@ -53,11 +53,7 @@ class Eye:
             for side in (0, 1)
         ]
         picked = np.array(rows)
-        tubes = TubeList(
-            every.leg[picked], every.tube[picked], every.side[picked],
-            every.start[picked], every.stop[picked], every.radius[picked],
-        )  # fmt: skip
-        return cls(true, camera, tubes)
+        return cls(true, camera, TubeList(*(column[picked] for column in vars(every).values())))
 
     def points(self, poses: Array, readings: Array, places: int = PLACES) -> EdgePoints:
         """Places (R, E, n) along the edges at poses (R, 4, 4) and readings (R, m)."""
@@ -87,28 +83,14 @@ class Eye:
         shape = (*points.normal.shape[:-2], -1, 2, 3)
         if not (noise.shift or noise.tilt or noise.outward):
             return points.normal.reshape(shape)
-        by_shift, by_tilt, basis = responses(points)
-        error = rng.standard_normal((*by_shift.shape[:-1], 2)) * (noise.shift, noise.tilt)
-        turn = by_shift * (error[..., :1] + noise.outward) + by_tilt * error[..., 1:]
-        normal = points.normal + (basis @ turn[..., None])[..., 0]
-        return (normal / np.sqrt(dot(normal, normal))[..., None]).reshape(shape)
+        by_shift, by_tilt, basis = edge_responses(points)
+        return disturbed(points.normal, basis, by_shift, by_tilt, noise, rng).reshape(shape)
 
 
-def responses(points: EdgePoints) -> tuple[Array, Array, Array]:
-    """Turns (R, E, 2) of the normals when an edge moves outward by one pixel everywhere, and when
-    its far end moves out and its near end in; and the bases (R, E, 3, 2) that they are told in.
+def edge_responses(points: EdgePoints) -> tuple[Array, Array, Array]:
+    """Turns (R, E, 2) of the normals by a pixel's shift and by a pixel's tilt, see
+    :func:`pkmcal.simulation.edges.responses`; and the bases (R, E, 3, 2) that they are told in.
     """
     middle = points.point[..., points.point.shape[-2] // 2, :]
     basis = tangent_basis(points.normal, middle / np.sqrt(dot(middle, middle))[..., None])
-    rows = np.nan_to_num(points.by_normal() @ basis)
-    step = np.diff(np.nan_to_num(points.pixel), axis=-2)
-    run = np.concatenate(
-        [np.zeros((*step.shape[:-2], 1)), np.cumsum(np.sqrt(dot(step, step)), axis=-1)], axis=-1
-    )
-    tilt = 2 * run / np.maximum(run[..., -1:], 1e-300) - 1
-    value = np.stack([np.ones(tilt.shape), tilt], axis=-1)
-    turned = np.swapaxes(rows, -1, -2)
-    normal = turned @ rows + 1e-300 * np.eye(2)
-    gone = np.abs(np.linalg.det(normal)) < 1e-200  # no place of the edge has an image
-    solved = np.linalg.solve(np.where(gone[..., None, None], np.eye(2), normal), turned @ value)
-    return solved[..., 0], solved[..., 1], basis
+    return *responses(points.by_normal() @ basis, points.pixel), basis

@@ -81,11 +81,11 @@ def _free(seen: SeenMachine, legs: Legs, driving: Array, scale: Array) -> Array:
     if bound > 0:
         if layout.shares_motors or layout.n_internal:
             blind = np.linalg.qr(driving, mode="complete")[0][..., driving.shape[-1] :]
-            rows = np.swapaxes(blind, -1, -2) @ legs.rows
+            rows = blind.mT @ legs.rows
         else:
             rows = legs.rows[..., np.flatnonzero(layout.row_motor < 0), :]
         held = (rows * units[..., None, :]) @ layout.motion
-        v = np.swapaxes(np.linalg.svd(np.nan_to_num(held))[2], -1, -2)
+        v = np.linalg.svd(np.nan_to_num(held))[2].mT
         motion = layout.motion @ v[..., bound:]
     return units[..., :, None] * motion
 
@@ -172,7 +172,7 @@ class Law(ABC):
 
 
 @final
-class Directions(Law):
+class DirectionLaw(Law):
     """[B] 8-9: e = u x u*, N = -[u*]x L."""
 
     name: ClassVar = "directions"
@@ -192,7 +192,7 @@ class Directions(Law):
 
 
 @final
-class Edges(Law):
+class EdgeLaw(Law):
     """Errata: e = n x n*, N = -[n*]x J L."""
 
     name: ClassVar = "edges"
@@ -209,7 +209,7 @@ class Edges(Law):
         return -skew(goal) @ edge_interaction(seen, legs, normals, rate)
 
 
-LAWS: dict[str, type[Law]] = {law.name: law for law in (Edges, Directions)}
+LAWS: dict[str, type[Law]] = {law.name: law for law in (EdgeLaw, DirectionLaw)}
 """By name; edges first, which hold the platform an order of magnitude steadier."""
 
 
@@ -281,11 +281,11 @@ def solution(task: Task) -> Array:
     known = known & np.isfinite(task.error).all(axis=-1)
     matrix = np.where(known[..., None, None], task.matrix, 0.0)
     error = np.where(known[..., None], task.error, 0.0)
-    turned = np.swapaxes(matrix, -1, -2)
+    turned = matrix.mT
     values, vectors = np.linalg.eigh(turned @ matrix)
     seen = values > BLIND**2 * values[..., -1:]
     weights = np.where(seen & (values > 0), 1 / np.where(seen & (values > 0), values, 1.0), 0.0)
-    wanted = np.swapaxes(vectors, -1, -2) @ (turned @ error[..., None])
+    wanted = vectors.mT @ (turned @ error[..., None])
     step = (vectors @ (weights[..., None] * wanted))[..., 0]
     return np.where(known[..., None], step, np.nan)
 

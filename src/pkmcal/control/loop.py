@@ -1,10 +1,10 @@
-"""What a loop needs of a calibration on disk."""
+"""Visual servoing of a calibrated machine: from a photograph and its readings to velocities."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from pkmcal.control.goal import (
     checked_normals,
     goal_of,
     leaving,
-    leg_list,
     missing_clauses,
     motor_name,
     range_sentence,
@@ -44,69 +43,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import dot, inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
-
-if TYPE_CHECKING:
-    from pkmcal.calibration.source import Source
-
-
-@dataclass(frozen=True)
-class CalibratedStation:
-    """A machine and one camera before it. T_camera_base : (4, 4). edge_shift : px outward."""
-
-    machine: Machine
-    camera: Camera
-    T_camera_base: Array
-    edge_shift: float
-
-
-def calibrated_station(
-    folder: Path | str, station: str, session: Path | None = None
-) -> CalibratedStation:
-    """One station of a calibration's folder.
-
-    session : where the cameras' files are, if not above or beside the folder.
-    Raises InputError where there is no such station or no camera file, ResultError for a
-    calibration that was refused.
-    """
-    from pkmcal.calibration.results import load
-    from pkmcal.calibration.source import load_source
-
-    saved = load(folder)
-    if not saved.verdict.usable:
-        raise ResultError(
-            what="the calibration was refused: " + " ".join(saved.verdict.reasons),
-            where=str(folder),
-            next_step="control needs a machine that is known; calibrate again",
-        )
-    source = load_source(folder, session)
-    _check_station(folder, station, source)
-    files = {s.name: s.camera for s in saved.stations}
-    shifts = {c["file"]: float(c["edge_shift"]) for c in saved.document["cameras"]}
-    return CalibratedStation(
-        machine=source.machine,
-        camera=source.cameras[station],
-        T_camera_base=inverse(source.T_base_camera[station]),
-        edge_shift=shifts.get(files[station], 0.0),
-    )
-
-
-def _check_station(folder: Path | str, station: str, source: Source) -> None:
-    if station not in source.T_base_camera:
-        raise InputError(
-            what="the calibration has no such station",
-            where=str(folder),
-            found=station,
-            expected=" or ".join(source.T_base_camera),
-        )
-    if station not in source.cameras:
-        raise InputError(
-            what="the station's camera file was not found",
-            where=str(folder),
-            found=station,
-            expected="the session above or beside the calibration, with its cameras",
-            next_step="give the session's folder as session",
-        )
-
+from pkmcal.wording import legs_named
 
 __all__ = ["GoalPhotograph", "Status", "Step", "VisualServo"]
 
@@ -124,8 +61,6 @@ UNSEEN = 0.05
 ELSEWHERE = 0.02
 """Root mean square angle (rad) that is no noise: where readings are to stay and the edges are this
 far from the goal, the law has come to rest in another place."""
-
-
 NOT_FOUND = (
     "likely causes: another assembly than the start's, readings of another photograph, a camera"
     " that was moved, too little light"
@@ -205,11 +140,37 @@ class VisualServo:
         the class. Raises InputError where the calibration has no such station, and ResultError
         for a calibration that was refused.
         """
-        # self-import
+        from pkmcal.calibration.results import load
+        from pkmcal.calibration.source import load_source
 
-        at = calibrated_station(folder, station, session)
-        options.setdefault("edge_shift", at.edge_shift)
-        return cls(at.machine, at.camera, at.T_camera_base, goal, **options)
+        saved = load(folder)
+        if not saved.verdict.usable:
+            raise ResultError(
+                what="the calibration was refused: " + " ".join(saved.verdict.reasons),
+                where=str(folder),
+                next_step="control needs a machine that is known; calibrate again",
+            )
+        source = load_source(folder, session)
+        if station not in source.T_base_camera:
+            raise InputError(
+                what="the calibration has no such station",
+                where=str(folder),
+                found=station,
+                expected=" or ".join(source.T_base_camera),
+            )
+        if station not in source.cameras:
+            raise InputError(
+                what="the station's camera file was not found",
+                where=str(folder),
+                found=station,
+                expected="the session above or beside the calibration, with its cameras",
+                next_step="give the session's folder as session",
+            )
+        file = next(s.camera for s in saved.stations if s.name == station)
+        shifts = {c["file"]: float(c["edge_shift"]) for c in saved.document["cameras"]}
+        options.setdefault("edge_shift", shifts.get(file, 0.0))
+        T_camera_base = inverse(source.T_base_camera[station])
+        return cls(source.machine, source.cameras[station], T_camera_base, goal, **options)
 
     def reset(self, start: Array | None = None) -> None:
         """Forget all samples; the next one is a first one near ``start`` (4, 4), or home."""
@@ -242,8 +203,8 @@ class VisualServo:
         if not at.closed:
             return self._stopped(sample, Status.UNREACHABLE, "")
         if not self._started and 2 * at.found.sum() < len(at.found):
-            legs = self.seen.legs[at.found].tolist()
-            found = f"only {leg_list(legs)} found" if legs else "no leg was found"
+            legs = (self.seen.legs[at.found] + 1).tolist()
+            found = f"only {legs_named(legs)} found" if legs else "no leg was found"
             return self._stopped(sample, Status.NOT_FOUND, f"{found}; {NOT_FOUND}")
         return self._step(sample)
 
@@ -266,7 +227,7 @@ class VisualServo:
         self._pose = pose
         cosine = dot(sample.normals[used], self.goal.normals[used])
         if np.min(cosine) < 0:
-            far = leg_list(seen.legs[np.min(cosine, axis=1) < 0].tolist())
+            far = legs_named(seen.legs[np.min(cosine, axis=1) < 0] + 1)
             why = f"{far} would turn by more than 90 degrees in the image; go there in parts"
             return self._stopped(sample, Status.TOO_FAR, why)
         u = directions_of(sample.normals[used])
@@ -304,7 +265,12 @@ class VisualServo:
         converged = still and (error < ELSEWHERE or typical < SIGMAS)
         warnings = self._warnings(sample, used, slowed, outside)
         if still and not converged:
-            warnings = (*warnings, _elsewhere(error))
+            elsewhere = (
+                f"the machine comes to rest with its legs {np.rad2deg(error):.2g} degrees from the"
+                " goal's: another equilibrium of the law, or a goal of another machine or camera"
+                " place"
+            )
+            warnings = (*warnings, elsewhere)
         if vague > VAGUE * self.tolerance:
             warnings = (*warnings, vague_sentence(self.machine, sigma))
         status = Status.CONVERGED if converged else Status.RUNNING
@@ -352,9 +318,7 @@ class VisualServo:
         """The seen machine with some of its legs only; made once for each choice."""
         key = used.tobytes()
         if key not in self._parts:
-            seen = self.seen
-            legs, radius = seen.legs[used], seen.radius[used]
-            self._parts[key] = replace(seen, legs=legs, radius=radius)
+            self._parts[key] = self.seen.only(used)
         return self._parts[key]
 
     def _stopped(self, sample: _Sample, status: Status, why: str) -> Step:
@@ -377,7 +341,7 @@ class VisualServo:
         lost = "; ".join(self._lost(sample, used))
         if not used.any():
             return lost
-        left = f"{leg_list(self.seen.legs[used].tolist())} alone cannot show every motion"
+        left = f"{legs_named(self.seen.legs[used] + 1)} alone cannot show every motion"
         return f"{left}; {lost}" if lost else left
 
     def _lost(self, sample: _Sample, used: Booleans) -> list[str]:
@@ -418,13 +382,6 @@ def _spread(task: Task) -> Array:
     """Standard deviations (m,) of the readings' way to the goal, for rows with that of 1."""
     factor = task.readings @ np.linalg.inv(task.matrix.T @ task.matrix)
     return np.sqrt(np.sum(factor * task.readings, axis=1))
-
-
-def _elsewhere(error: float) -> str:
-    return (
-        f"the machine comes to rest with its legs {np.rad2deg(error):.2g} degrees from the goal's:"
-        " another equilibrium of the law, or a goal of another machine or camera place"
-    )
 
 
 def _check_positive(name: str, value: float) -> None:

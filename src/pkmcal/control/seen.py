@@ -18,9 +18,9 @@ from functools import cached_property
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
-from pkmcal.geometry.cylinders import SIDE_SIGNS, line_through
+from pkmcal.geometry.cylinders import SIDE_SIGNS, edge_normal, line_through
 from pkmcal.geometry.rigid import apply, cross, dot, inverse, register, skew
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import (
@@ -48,6 +48,10 @@ class SeenMachine:
     T_camera_base: Array
     legs: Integers
     radius: Array
+
+    def only(self, which: Integers | Booleans) -> SeenMachine:
+        """The same with some of the seen legs, by their places (s,) or a mask of them."""
+        return replace(self, legs=self.legs[which], radius=self.radius[which])
 
     @property
     def theta(self) -> Array:
@@ -158,7 +162,7 @@ def legs_from_image(
     near : (..., 4, 4) a pose to start forward kinematics from, where it is needed; the pose that
     the seen legs give, or home, unless given. The pivot is the middle of the platform's joints.
     """
-    rot_t = np.swapaxes(seen.T_camera_base[..., :3, :3], -1, -2)[..., None, :, :]
+    rot_t = seen.T_camera_base[..., :3, :3].mT[..., None, :, :]
     u = (rot_t @ u_camera[..., None])[..., 0]
     if seen.by_image_alone:
         return _by_image(seen, u, readings)
@@ -228,39 +232,32 @@ def _by_image(seen: SeenMachine, u: Array, readings: Array) -> Legs:
 
 
 def _of_closure(seen: SeenMachine, c: Closure, u: Array, pivot: Array) -> Legs:
-    """The limbs of a closed machine, with the directions (..., L, 3) given."""
+    """The limbs of a closed machine, with the directions (..., L, 3) given: the lengths' rows are
+    by these, and the axes' rows stay.
+    """
     layout, ends = seen.machine.layout, c.ends
+    rows, hinges, by_reading = c.by_pose, c.by_internal, c.by_reading
     if u is not c.u:
-        c = _with_directions(seen, c, u)
-    shape = u.shape[:-1]
+        rows, hinges, by_reading = (np.array(x) for x in (rows, hinges, by_reading))
+        keep, n = layout.closing, int(layout.closing.sum())
+        own = u[..., keep, :]
+        rows[..., :n, :] = along(own, ends.b_by_pose[..., keep, :, :])
+        hinges[..., :n, :] = along(own, ends.b_by_internal[..., keep, :, :])
+        moved = dot(own, np.broadcast_to(ends.a_by_reading, u.shape)[..., keep, :])
+        by_reading[..., :n] = -moved - layout.rod_reads[keep]
     return Legs(
         a=np.broadcast_to(ends.a, u.shape),
         b=np.broadcast_to(ends.b, u.shape),
         u=u,
-        length=np.broadcast_to(c.distance, shape),
+        length=np.broadcast_to(c.distance, u.shape[:-1]),
         pivot=pivot,
         a_by_reading=np.broadcast_to(ends.a_by_reading, u.shape),
         b_by_pose=np.broadcast_to(ends.b_by_pose, (*u.shape, 6)),
         b_by_internal=np.broadcast_to(ends.b_by_internal, (*u.shape, layout.n_internal)),
-        rows=c.by_pose,
-        hinges=c.by_internal,
-        drives=by_motors(layout, c.by_reading),
+        rows=rows,
+        hinges=hinges,
+        drives=by_motors(layout, by_reading),
     )
-
-
-def _with_directions(seen: SeenMachine, c: Closure, u: Array) -> Closure:
-    """The rows of the lengths by measured directions; the axes' rows stay."""
-    layout, ends = seen.machine.layout, c.ends
-    keep, n = layout.closing, int(layout.closing.sum())
-    own = u[..., keep, :]
-    by_pose, by_internal, by_reading = (
-        np.array(x) for x in (c.by_pose, c.by_internal, c.by_reading)
-    )
-    by_pose[..., :n, :] = along(own, ends.b_by_pose[..., keep, :, :])
-    by_internal[..., :n, :] = along(own, ends.b_by_internal[..., keep, :, :])
-    moved = dot(own, np.broadcast_to(ends.a_by_reading, u.shape)[..., keep, :])
-    by_reading[..., :n] = -moved - layout.rod_reads[keep]
-    return replace(c, by_pose=by_pose, by_internal=by_internal, by_reading=by_reading)
 
 
 def true_edges(seen: SeenMachine, T_base_platform: Array, readings: Array | None = None) -> Array:
@@ -271,12 +268,7 @@ def true_edges(seen: SeenMachine, T_base_platform: Array, readings: Array | None
     """
     a, b = seen_ends(seen, T_base_platform, readings)
     u, m = line_through(a, b)
-    distance = np.sqrt(dot(m, m))
-    with np.errstate(invalid="ignore"):
-        sin = np.where(distance > seen.radius, seen.radius / distance, np.nan)[..., None, None]
-    m_unit = (m / distance[..., None])[..., None, :]
-    across = cross(u[..., None, :], m_unit)
-    return SIDE_SIGNS[:, None] * np.sqrt(1 - sin**2) * m_unit - sin * across
+    return edge_normal(u[..., None, :], m[..., None, :], seen.radius[:, None], SIDE_SIGNS)
 
 
 def seen_ends(
@@ -296,18 +288,3 @@ def directions_of(normals: Array) -> Array:
     """Directions u (..., s, 3) of legs from their edges (..., s, 2, 3); errata, [B] eq. 11."""
     u = cross(normals[..., 1, :], normals[..., 0, :])
     return u / np.sqrt(dot(u, u))[..., None]
-
-
-__all__ = [
-    "Legs",
-    "SeenMachine",
-    "directions_of",
-    "legs_at",
-    "legs_from_image",
-    "moved_to",
-    "seen_ends",
-    "seen_machine",
-    "true_edges",
-    "twist_change",
-    "visible_tubes",
-]

@@ -1,4 +1,8 @@
-"""How a servoing run can end, and what the user is told."""
+"""Simulated control: many runs at once, how each can end, and what noise leaves at the goal.
+
+The true machine stands before the true camera, :class:`pkmcal.control.image.Eye`; the controller
+believes its own geometry, and its readings and edges come late and with noise.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,29 @@ from pkmcal.control.laws import Where, joint_velocities, law_named, limited, sol
 from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import closure, limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, forward, inverse_result
+from pkmcal.mechanisms.velocities import assembly_sign
 from pkmcal.simulation.edges import EdgeNoise
+
+DRAWS = 24
+"""Images of each goal; the standard deviation over all goals is then good to a few percent."""
+SETTLED = 0.02
+"""Part of the way at which a platform counts as arrived, as control engineers have it."""
+LEAST_WAY = 5e-4
+"""m, of the platform's joints, within which a goal is reached however short the way was."""
+LAST = 0.1
+"""Part of a run, at its end, whose mean decides where it ended."""
+NOISY = 3.0
+"""Standard deviations of the noise at the goal within which a platform is there."""
+STILL = 0.1
+"""Part of the way beyond which a platform that trembles is not at its goal."""
+AT_REST = 0.02
+"""Part of the rate that the error would ask for, below which a run stands still."""
+AT_STOP = 1e-9
+"""m or rad by which a reading may be beyond its range: rounding."""
+SILENT = EdgeNoise(shift=0.0, tilt=0.0)
+"""A camera without errors."""
 
 
 class End(Enum):
@@ -96,8 +120,7 @@ class End(Enum):
         return f"{what} {self.help[0].upper()}{self.help[1:]}." if self.help else what
 
 
-DRAWS = 24
-"""Images of each goal; the standard deviation over all goals is then good to a few percent."""
+ENDS = tuple(End)
 
 
 @dataclass(frozen=True)
@@ -164,26 +187,8 @@ def one_image(
     return Stillness(*np.sqrt(squares / draws))
 
 
-SETTLED = 0.02
-"""Part of the way at which a platform counts as arrived, as control engineers have it."""
-LEAST_WAY = 5e-4
-"""m, of the platform's joints, within which a goal is reached however short the way was."""
-LAST = 0.1
-"""Part of a run, at its end, whose mean decides where it ended."""
-NOISY = 3.0
-"""Standard deviations of the noise at the goal within which a platform is there."""
-STILL = 0.1
-"""Part of the way beyond which a platform that trembles is not at its goal."""
-AT_REST = 0.02
-"""Part of the rate that the error would ask for, below which a run stands still."""
-AT_STOP = 1e-9
-"""m or rad by which a reading may be beyond its range: rounding."""
-SILENT = EdgeNoise(shift=0.0, tilt=0.0)
-"""A camera without errors."""
-
-
 @dataclass(frozen=True)
-class Loop:
+class LoopSettings:
     """A controller's settings.
 
     gain : 1/s. rate : samples a second. delay : samples from the exposure to the drives' answer.
@@ -238,7 +243,7 @@ def simulate(
     believed: SeenMachine,
     starts: Array,
     goals: Array,
-    loop: Loop,
+    loop: LoopSettings,
     rng: np.random.Generator,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Runs:
@@ -247,7 +252,7 @@ def simulate(
     believed : its values (R, P) or (P,), its camera's place (R, 4, 4) or (4, 4). The wanted edges
     are the true ones at the goal, taught there without noise.
     """
-    kind, goal_readings = law_named(loop.law), _readings(eye.true.machine, goals)
+    kind, goal_readings = law_named(loop.law), eye.true.machine.inverse(goals)
     wanted = eye.normals(eye.points(goals, np.nan_to_num(goal_readings)), SILENT, rng)
     now = _begin(eye, starts, goals)
     record = _Record.empty(eye.true.machine, starts, goals, now.readings.shape[-1], loop.samples)
@@ -256,7 +261,7 @@ def simulate(
     for k in range(loop.samples):
         points = eye.points(now.poses, now.readings)
         record.take(k, now, kind.error(points.normal.reshape(wanted.shape), wanted))
-        now = _stopped(now, ~_all(eye.in_view(points)), End.LOST_LEG, k)
+        now = _stopped(now, ~np.all(eye.in_view(points), axis=-1), End.LOST_LEG, k)
         noise = loop.joint_noise * rng.standard_normal(now.readings.shape)
         queue.append((eye.normals(points, loop.noise, rng), now.readings + noise))
         if len(queue) > loop.delay and now.active.any():
@@ -273,7 +278,7 @@ def simulate(
 
 @dataclass(frozen=True)
 class _Now:
-    """All runs at one sample. sign : (R,) of the start's assembly. end : (R,) place in ``_ENDS``,
+    """All runs at one sample. sign : (R,) of the start's assembly. end : (R,) place in ``ENDS``,
     -1 for none yet. last : (R,) sample at which it came.
     """
 
@@ -289,20 +294,16 @@ class _Now:
         return self.end < 0
 
 
-def _readings(machine: Machine, poses: Array) -> Array:
-    return inverse_result(machine.layout, machine.values, poses)[0]
-
-
 def _begin(eye: Eye, starts: Array, goals: Array) -> _Now:
     """All runs at their start; those that cannot begin are ended."""
     machine = eye.true.machine
-    readings, wanted = _readings(machine, starts), _readings(machine, goals)
+    readings, wanted = machine.inverse(starts), machine.inverse(goals)
     n = len(starts)
-    sign = assembly_sign(machine, starts)
+    sign = aspect_at(machine, starts)
     now = _Now(starts, np.nan_to_num(readings), sign, np.full(n, -1), np.zeros(n, dtype=int))
     out = outside(machine, readings) | outside(machine, wanted)
     now = _stopped(now, out, End.LEFT_WORKSPACE, 0)
-    return _stopped(now, sign * assembly_sign(machine, goals) < 0, End.WRONG_ASSEMBLY, 0)
+    return _stopped(now, sign * aspect_at(machine, goals) < 0, End.WRONG_ASSEMBLY, 0)
 
 
 def _stopped(now: _Now, which: Booleans, end: End, sample: int) -> _Now:
@@ -310,7 +311,7 @@ def _stopped(now: _Now, which: Booleans, end: End, sample: int) -> _Now:
     which = which & now.active
     return replace(
         now,
-        end=np.where(which, _ENDS.index(end), now.end),
+        end=np.where(which, ENDS.index(end), now.end),
         last=np.where(which, sample, now.last),
     )
 
@@ -318,13 +319,13 @@ def _stopped(now: _Now, which: Booleans, end: End, sample: int) -> _Now:
 def _moved(machine: Machine, now: _Now, step: Array, sample: int) -> _Now:
     """Drives go by steps (R, m), and the platforms follow."""
     step = np.where(now.active[:, None], step, 0.0)
-    now = _stopped(now, ~_all(np.isfinite(step)), End.LOST_LEG, sample)
+    now = _stopped(now, ~np.all(np.isfinite(step), axis=-1), End.LOST_LEG, sample)
     wanted = now.readings + np.nan_to_num(step)
     now = _stopped(now, outside(machine, wanted), End.LEFT_WORKSPACE, sample)
     wanted = np.where(now.active[:, None], wanted, now.readings)
     found = forward(machine.layout, machine.values, wanted, now.poses)
     poses, closed = found.T_base_platform, found.converged
-    turned = assembly_sign(machine, poses) * now.sign < 0
+    turned = aspect_at(machine, poses) * now.sign < 0
     now = _stopped(
         now, closed & (turned | (found.singularity < NEAR_SINGULAR)), End.SINGULAR, sample
     )
@@ -336,10 +337,6 @@ def _moved(machine: Machine, now: _Now, step: Array, sample: int) -> _Now:
     )
 
 
-def _all(flags: Booleans) -> Booleans:
-    return np.asarray(flags.all(axis=-1))
-
-
 def outside(machine: Machine, readings: Array) -> Booleans:
     """(R,) True where a reading (R, m) is beyond its range, or a limb cannot reach."""
     low, high = machine.joint_ranges.T
@@ -348,16 +345,14 @@ def outside(machine: Machine, readings: Array) -> Booleans:
     return (beyond | ~np.isfinite(readings)).any(axis=-1)
 
 
-def assembly_sign(machine: Machine, poses: Array) -> Array:
-    """Sign (R,) of the closure's determinant at poses (R, 4, 4): it changes where a way from one
-    assembly to another crosses a singular pose. 0 where rows and freedoms differ in number.
+def aspect_at(machine: Machine, poses: Array) -> Array:
+    """Sign (R,) of the assembly at poses (R, 4, 4): it changes where a way from one assembly to
+    another crosses a singular pose. 0 where rows and freedoms differ in number, and where a limb
+    cannot reach.
     """
     layout, theta = machine.layout, machine.values
     readings, internal = inverse_result(layout, theta, poses)
-    by_own = layout.by_own(closure(layout, theta, np.nan_to_num(readings), poses, internal))
-    if by_own.shape[-1] != by_own.shape[-2]:
-        return np.zeros(len(poses))
-    return np.sign(np.linalg.det(np.nan_to_num(by_own)))
+    return assembly_sign(layout, theta, readings, poses, internal)
 
 
 def platform_joints(machine: Machine, poses: Array) -> Array:
@@ -403,11 +398,11 @@ class _Record:
         self.past[:, sample] = -ahead / np.where(whole > 0, whole, np.inf)
         self.poses[:, sample], self.readings[:, sample] = now.poses, now.readings
 
-    def runs(self, now: _Now, goals: Array, loop: Loop, floor: Array) -> Runs:
+    def runs(self, now: _Now, goals: Array, loop: LoopSettings, floor: Array) -> Runs:
         """What the runs were, with their ends judged."""
         last = np.where(now.active, loop.samples - 1, now.last)
         judged = _judged(self.error, self.way, loop, floor)
-        ends = [_ENDS[e] if e >= 0 else end for e, end in zip(now.end, judged, strict=True)]
+        ends = [ENDS[e] if e >= 0 else end for e, end in zip(now.end, judged, strict=True)]
         time = np.arange(loop.samples) / loop.rate
         return Runs(
             time, self.error, self.way, self.past, self.poses, self.readings, tuple(ends), last,
@@ -415,14 +410,16 @@ class _Record:
         )  # fmt: skip
 
 
-def _floor(eye: Eye, goals: Array, readings: Array, loop: Loop, rng: np.random.Generator) -> Array:
+def _floor(
+    eye: Eye, goals: Array, readings: Array, loop: LoopSettings, rng: np.random.Generator
+) -> Array:
     """Distance (R,) m of the platform's joints from the goal that the noise alone explains."""
     still = one_image(eye, eye.true, loop.law, goals, readings, loop.noise, rng, draws=8)
     part = loop_factor(loop.gain / loop.rate, loop.delay)
     return np.nan_to_num(NOISY * still.joints * (part if np.isfinite(part) else 0.0))
 
 
-def _judged(error: Array, way: Array, loop: Loop, floor: Array) -> list[End]:
+def _judged(error: Array, way: Array, loop: LoopSettings, floor: Array) -> list[End]:
     """Where runs (R, K) that used all their time ended, by the means over their last part.
 
     floor : (R,) m, what noise alone explains.
@@ -448,6 +445,3 @@ def _end(arrived: bool, shaken: bool, alike: bool, rest: bool, worse: bool) -> E
     if rest:
         return End.STUCK
     return End.DIVERGED if worse else End.SLOW
-
-
-_ENDS = tuple(End)

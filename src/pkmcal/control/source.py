@@ -12,12 +12,11 @@ from pkmcal.calibration.results import SavedCalibration, SavedStation, load
 from pkmcal.calibration.source import Source, load_source
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.control.seen import seen_machine
-from pkmcal.control.study import Scene, Uncertainty
+from pkmcal.control.study import Plant, Uncertainty
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
-from pkmcal.mechanisms import Machine
 from pkmcal.simulation.demo import demo_camera
-from pkmcal.simulation.stations import default_stations
+from pkmcal.simulation.placement import default_stations
 from pkmcal.simulation.truth import stream, true_machine
 
 CALIBRATED = 1 / 30
@@ -35,7 +34,7 @@ class Controlled:
     name : of the machine. origin : a sentence. station : the camera's, None for a drawing.
     """
 
-    scene: Scene
+    scene: Plant
     name: str
     origin: str
     station: str | None = None
@@ -82,7 +81,7 @@ def _of_calibration(
     """
     place = _station(saved, source, station, eye)
     eye = source.cameras[place.name] if eye is None else eye
-    scene = Scene(
+    scene = Plant(
         machine=saved.machine,
         drawing=saved.drawing,
         uncertainty=Uncertainty(saved.covariance, place.sigma_rotation, place.sigma_translation),
@@ -130,11 +129,15 @@ def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed:
     seen_machine(machine, np.eye(4), None if legs is None else np.array(legs))  # before any place
     rng = np.random.default_rng(stream(seed, "stations"))
     place = default_stations(machine, (eye,), rng)[0]
+    table = machine.parameters
+    free = table.free_matrix() * (CALIBRATED * table.tolerances_free())
     truth = true_machine(machine, 1.0, np.random.default_rng(stream(seed, "machine")))
-    scene = Scene(
+    scene = Plant(
         machine=truth,
         drawing=np.array(machine.values),
-        uncertainty=_expected(machine),
+        uncertainty=Uncertainty(
+            free @ free.T, np.full(3, CAMERA_ROTATION), np.full(3, CAMERA_POSITION)
+        ),
         camera=eye,
         T_camera_base=place.T_camera_base(),
         legs=legs,
@@ -146,12 +149,6 @@ def _of_drawing(source: Source, eye: Camera, legs: tuple[int, ...] | None, seed:
         f" {1e3 * CAMERA_POSITION:g} mm and {np.rad2deg(CAMERA_ROTATION):g}° of the camera's place."
     )
     return Controlled(scene, machine.name, origin)
-
-
-def _expected(machine: Machine) -> Uncertainty:
-    table = machine.parameters
-    free = table.free_matrix() * (CALIBRATED * table.tolerances_free())
-    return Uncertainty(free @ free.T, np.full(3, CAMERA_ROTATION), np.full(3, CAMERA_POSITION))
 
 
 def pose_of(text: str, where: str) -> Array:

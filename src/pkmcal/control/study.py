@@ -1,7 +1,9 @@
-"""What a controller may believe of a machine's geometry, [B] Fig. 10, for many runs at once.
+"""How well a machine is controlled with what may be believed of its geometry, [B] Fig. 10.
 
-E1: the drawing, laid on the identified base centres ([B] eq. 15). E2: the identified geometry. E3:
-the drawing, with the camera's place measured by hand. Beside them the truth.
+Every belief is tried in many runs of the simulated loop at once, and the legs' choice and other
+equilibria are looked at beside them. The beliefs: E1, the drawing, laid on the identified base
+centres ([B] eq. 15). E2, the identified geometry. E3, the drawing, with the camera's place measured
+by hand. Beside them the truth.
 """
 
 from __future__ import annotations
@@ -12,15 +14,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
-from pkmcal.control.analysis import Equilibria, Subset, equilibria, matrix_at, of_legs, subsets
+from pkmcal.control.analysis import Equilibria, Subset, equilibria, matrix_at, subsets
 from pkmcal.control.image import Eye
 from pkmcal.control.seen import SeenMachine, seen_machine
 from pkmcal.control.simulation import (
     SETTLED,
     End,
-    Loop,
+    LoopSettings,
     Runs,
     Stillness,
     loop_factor,
@@ -32,11 +34,22 @@ from pkmcal.geometry.rigid import apply, inverse, perturb, pose, register, rotat
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.simulation.configurations import draw_configurations
+from pkmcal.simulation.placement import draw_configurations
 
 HAND_POSITION = 0.03
 HAND_ROTATION = float(np.deg2rad(3))
 """m and rad by which a camera's place is wrong that was measured by ruler and eye."""
+INSIDE = 0.15
+"""Part of a reading's range at both ends in which no way begins or ends: a platform that is led
+by its image does not go straight in its readings."""
+WORKSPACE = 60
+"""Poses of the workspace at which visibility is judged."""
+CLOSED = 1e-6
+"""m; a pose told with six decimals leaves so much."""
+MOST_LEGS = 8
+"""Legs of which all choices are compared."""
+GOALS, STARTS = 5, 40
+"""Goals for which other equilibria are sought, and starts of the search for each."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +66,7 @@ class Uncertainty:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Belief:
     """One estimate of the geometry. seen : values (R, P) and camera's places (R, 4, 4)."""
 
     name: str
@@ -69,7 +82,7 @@ def estimates(
     rng: np.random.Generator,
     hand_position: float = HAND_POSITION,
     hand_rotation: float = HAND_ROTATION,
-) -> tuple[Estimate, ...]:
+) -> tuple[Belief, ...]:
     """The truth, the identified geometry, the drawing fitted to it, and the drawing by hand.
 
     true : the machine that is controlled. drawing : (P,) values. Every run has its own error of
@@ -77,26 +90,19 @@ def estimates(
     random directions.
     """
     identified = _identified(true, uncertainty, runs, rng)
+    T_camera_base = np.broadcast_to(true.T_camera_base, (runs, 4, 4))
+    values = np.broadcast_to(true.theta, (runs, true.theta.shape[-1]))
+    repeated = replace(true, machine=true.machine.with_values(values), T_camera_base=T_camera_base)
     drawn = true.machine.with_values(drawing)
     fitted = _fitted(drawn, identified)
-    exact = _fitted(drawn, replace(true, T_camera_base=_many(true.T_camera_base, runs)))
+    exact = _fitted(drawn, replace(true, T_camera_base=T_camera_base))
     by_hand = _moved_by_hand(exact, hand_position, hand_rotation, rng)
     return (
-        Estimate("true", "True geometry", _repeated(true, runs)),
-        Estimate("identified", "Identified", identified),
-        Estimate("cad", "Drawing, fitted", fitted),
-        Estimate("hand", "By hand", by_hand),
+        Belief("true", "True geometry", repeated),
+        Belief("identified", "Identified", identified),
+        Belief("cad", "Drawing, fitted", fitted),
+        Belief("hand", "By hand", by_hand),
     )
-
-
-def _many(T: Array, runs: int) -> Array:
-    return np.broadcast_to(T, (runs, 4, 4))
-
-
-def _repeated(true: SeenMachine, runs: int) -> SeenMachine:
-    values = np.broadcast_to(true.theta, (runs, true.theta.shape[-1]))
-    machine = true.machine.with_values(values)
-    return replace(true, machine=machine, T_camera_base=_many(true.T_camera_base, runs))
 
 
 def _identified(
@@ -126,27 +132,11 @@ def _moved_by_hand(
     seen: SeenMachine, position: float, turn: float, rng: np.random.Generator
 ) -> SeenMachine:
     """The camera's places off by the sizes, m and rad, in random directions."""
-    way, axis = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in _normal(seen, rng))
+    drawn = rng.standard_normal((2, *seen.T_camera_base.shape[:-2], 3))
+    way, axis = drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
     T = inverse(seen.T_camera_base)
     moved = pose(rotation(turn * axis) @ T[..., :3, :3], T[..., :3, 3] + position * way)
     return replace(seen, T_camera_base=inverse(moved))
-
-
-def _normal(seen: SeenMachine, rng: np.random.Generator) -> Array:
-    return rng.standard_normal((2, *seen.T_camera_base.shape[:-2], 3))
-
-
-INSIDE = 0.15
-"""Part of a reading's range at both ends in which no way begins or ends: a platform that is led
-by its image does not go straight in its readings."""
-WORKSPACE = 60
-"""Poses of the workspace at which visibility is judged."""
-CLOSED = 1e-6
-"""m; a pose told with six decimals leaves so much."""
-MOST_LEGS = 8
-"""Legs of which all choices are compared."""
-GOALS, STARTS = 5, 40
-"""Goals for which other equilibria are sought, and starts of the search for each."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +147,7 @@ class Plan:
     by hand is off. start, goal : (4, 4) of every run; drawn unless given.
     """
 
-    loop: Loop = field(default_factory=Loop)
+    loop: LoopSettings = field(default_factory=LoopSettings)
     runs: int = 60
     seed: int = 0
     hand_position: float = HAND_POSITION
@@ -167,7 +157,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Plant:
     """What is controlled. drawing : (P,) values. uncertainty : of its calibration. legs : numbers
     from 0 of those seen, all with tubes unless given.
     """
@@ -194,7 +184,7 @@ class Trials:
     s after which the platform is within SETTLED of its way, NaN where it never is.
     """
 
-    estimate: Estimate
+    estimate: Belief
     runs: Runs
     overshoot: Array
     rise: Array
@@ -219,7 +209,7 @@ class Study:
     with tubes.
     """
 
-    scene: Scene
+    scene: Plant
     plan: Plan
     eye: Eye
     outcomes: tuple[Trials, ...]
@@ -241,7 +231,7 @@ class Study:
 
 
 def study(
-    scene: Scene, plan: Plan, progress: Callable[[str, float], None] = lambda _text, _share: None
+    scene: Plant, plan: Plan, progress: Callable[[str, float], None] = lambda _text, _share: None
 ) -> Study:
     """Simulate the loop with every estimate, and analyse what the legs show.
 
@@ -267,22 +257,27 @@ def study(
         runs = simulate(eye, belief.seen, starts, goals, plan.loop, rng, told)
         outcomes.append(outcome(belief, runs))
     progress("Looking for other equilibria", 0.87)
-    rng = np.random.default_rng(seeds[4])
-    image = _still(eye, plan, goals, rng)
+    ends, joints = np.concatenate([starts, goals]), np.nan_to_num(scene.machine.inverse(goals))
+    rng, loop = np.random.default_rng(seeds[4]), plan.loop
+    image = one_image(eye, eye.true, loop.law, goals, joints, loop.noise, rng)
+    # of all legs with tubes; of those seen where there are too many to choose from
+    seen = seen_machine(scene.machine, scene.T_camera_base)
+    if len(seen.legs) > MOST_LEGS and scene.legs is not None:
+        seen = scene.seen()
     return Study(
         scene=scene,
         plan=plan,
         eye=eye,
         outcomes=tuple(outcomes),
         image=image,
-        held=image.held(plan.loop.gain / plan.loop.rate, plan.loop.delay),
-        hidden=_hidden(eye, np.concatenate([starts, goals])),
-        choices=_choices(scene, plan, workspace),
-        equilibria=equilibria(eye.true, plan.loop.law, goals[:GOALS], workspace[:STARTS]),
+        held=image.held(loop.gain / loop.rate, loop.delay),
+        hidden=eye.hidden(ends, np.nan_to_num(scene.machine.inverse(ends))).mean(axis=0),
+        choices=subsets(matrix_at(seen, loop.law, workspace), seen.legs),
+        equilibria=equilibria(eye.true, loop.law, goals[:GOALS], workspace[:STARTS]),
     )
 
 
-def check_loop(loop: Loop) -> None:
+def check_loop(loop: LoopSettings) -> None:
     """Raise InputError where the loop is unstable even with perfect knowledge."""
     if np.isfinite(loop_factor(loop.gain / loop.rate, loop.delay)):
         return
@@ -299,7 +294,7 @@ def check_loop(loop: Loop) -> None:
     )
 
 
-def outcome(estimate: Estimate, runs: Runs) -> Trials:
+def outcome(estimate: Belief, runs: Runs) -> Trials:
     """The figures of an estimate's runs."""
     last = np.arange(len(runs.time)) <= runs.last[:, None]
     past = np.where(last, runs.past, 0.0)
@@ -382,7 +377,8 @@ def _drawn(eye: Eye, count: int, rng: np.random.Generator) -> Array:
         with np.errstate(invalid="ignore"):
             edge = INSIDE * (high - low)
             out = (joints < low + edge) | (joints > high - edge)
-        good = ~np.asarray(out.any(axis=-1)) & _in_view(eye, poses, joints)
+        in_view = eye.in_view(eye.points(poses, joints)).all(axis=-1)
+        good = ~np.asarray(out.any(axis=-1)) & np.asarray(in_view)
         found.append(poses[good])
         tried += len(poses)
     out = np.concatenate(found)[:count]
@@ -394,29 +390,3 @@ def _drawn(eye: Eye, count: int, rng: np.random.Generator) -> Array:
             next_step="Use a wider lens, another place for the camera, or fewer --legs",
         )
     return out
-
-
-def _in_view(eye: Eye, poses: Array, joints: Array) -> Booleans:
-    return np.asarray(eye.in_view(eye.points(poses, joints)).all(axis=-1))
-
-
-def _readings(eye: Eye, poses: Array) -> Array:
-    return np.nan_to_num(eye.true.machine.inverse(poses))
-
-
-def _still(eye: Eye, plan: Plan, goals: Array, rng: np.random.Generator) -> Stillness:
-    joints = _readings(eye, goals)
-    return one_image(eye, eye.true, plan.loop.law, goals, joints, plan.loop.noise, rng)
-
-
-def _hidden(eye: Eye, poses: Array) -> Array:
-    """Part (s,) of the poses at which each seen leg stands behind another one."""
-    return eye.hidden(poses, _readings(eye, poses)).mean(axis=0)
-
-
-def _choices(scene: Scene, plan: Plan, workspace: Array) -> tuple[Subset, ...]:
-    """Of all legs with tubes; of those seen where there are too many to choose from."""
-    seen = seen_machine(scene.machine, scene.T_camera_base)
-    if len(seen.legs) > MOST_LEGS and scene.legs is not None:
-        seen = of_legs(seen, scene.legs)
-    return subsets(matrix_at(seen, plan.loop.law, workspace), seen.legs)

@@ -1,4 +1,9 @@
-"""Why the machine is not seen where its readings put it: asked once, while it stands still."""
+"""Tracking of the legs from photograph to photograph: edges, lines with covariances, the pose.
+
+A photograph is looked at about the pose that the readings give. Its edges become the legs' lines,
+which the law needs, and correct the pose for the next look. Where the machine is not seen where
+its readings put it, other assemblies are asked: once, while it stands still.
+"""
 
 from __future__ import annotations
 
@@ -23,49 +28,6 @@ FITS = float(np.deg2rad(5.0))
 """Angle between a leg as seen and as predicted, median over the legs, up to which it is the
 assembly that was expected: a camera placed by hand is right to a few degrees, other assemblies
 lie tens of degrees away."""
-
-
-def misfit(seen: SeenMachine, normals: Array, T_base_platform: Array, readings: Array) -> float:
-    """Median angle (rad) between the legs as seen, (s, 2, 3), and at a pose (4, 4)."""
-    a, b = seen_ends(seen, T_base_platform, readings)
-    known = np.isfinite(normals).all(axis=(-1, -2))
-    cosine = dot(directions_of(normals[known]), line_through(a[known], b[known])[0])
-    return float(np.median(np.arccos(np.clip(cosine, -1, 1))))
-
-
-def nearest_assembly(
-    seen: SeenMachine, normals: Array, readings: Array
-) -> tuple[Array, float] | None:
-    """Of all assemblies at the readings the one that the legs (s, 2, 3) show best, and its misfit;
-    None where there is none. A search: takes a fraction of a second.
-    """
-    modes = seen.machine.assembly_modes(readings, np.random.default_rng(0))
-    if not len(modes):
-        return None
-    angles = [misfit(seen, normals, T, readings) for T in modes]
-    best = int(np.argmin(angles))
-    return modes[best], angles[best]
-
-
-def assembly_sentence(seen: SeenMachine, normals: Array, expected: Array, readings: Array) -> str:
-    """What the legs show instead of the expected pose (4, 4)."""
-    off = np.rad2deg(misfit(seen, normals, expected, readings))
-    text = f"the legs point {off:.0f} degrees away from where the start and the readings put them"
-    found = nearest_assembly(seen, normals, readings)
-    if found is None or found[1] > FITS:
-        return (
-            f"{text}, and no other assembly fits them: check the readings' order and units,"
-            " and the camera's place"
-        )
-    x, y, z = found[0][:3, 3]
-    turn = np.rad2deg(np.linalg.norm(pose_difference(found[0], expected)[:3]))
-    return (
-        f"{text}; they show the assembly with the platform at ({x:.3f}, {y:.3f}, {z:.3f}) m,"
-        f" turned by {turn:.0f} degrees against it: give that pose as start, or bring the machine"
-        " back to the other assembly"
-    )
-
-
 SHADING = 0.1
 """Pixels by which a whole edge may lie off, whatever its own sigma: shading that the edge model
 leaves out (docs/observation.md measures 0.14 and 0.22 px a place)."""
@@ -78,6 +40,12 @@ tell some motions of the platform a hundred times worse than others, and there r
 AGREE = 16.0
 """Mean squared misfit, in variances, beyond which a leg's edges are not one leg's."""
 SIDES = np.array([0, 1])
+HIDDEN = "hidden behind another leg or outside the photograph"
+FAR = 0.7
+"""Median distance (px) of edges from their prediction from which none is believed: of legs that
+turned away more than that, the ends that still lie within reach pass for whole edges."""
+SEARCH_ROUNDS = 3
+"""Gauss-Newton steps of the pose after a search: ten pixels are far enough to bend the way."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +80,7 @@ class LegLines:
 
 
 @dataclass(frozen=True)
-class EdgeRows:
+class EdgeMisfits:
     """Edges of one photograph against the pose where they were looked for; M edges of s seen legs.
 
     leg : (M,) place of the edge's leg among the seen ones. misfit : (M, 2) turn from the predicted
@@ -136,9 +104,9 @@ class EdgeRows:
         return (self.leg == np.arange(count)[:, None]).astype(float)
 
 
-def edge_rows(
+def edge_misfits(
     seen: SeenMachine, readings: Array, T_base_platform: Array, edges: EdgeSet, edge_shift: float
-) -> EdgeRows:
+) -> EdgeMisfits:
     """Edges of the seen legs against the machine at a pose (4, 4) and its readings (m,).
 
     edge_shift : px by which the camera shows all edges outward.
@@ -149,11 +117,15 @@ def edge_rows(
     own = edges.leg[:, None] == seen.legs
     edges = edges.select(own.any(axis=1))
     leg = own[own.any(axis=1)].argmax(axis=1)
-    at = edge_normal_jacobians(a[leg], b[leg], _radii(seen, edges.leg, edges.tube), edges.side)
-    to_tangent = np.swapaxes(edges.basis, -1, -2)
+    radii = machine.radii()
+    radius = np.array(
+        [radii[j][k] for j, k in zip(edges.leg, edges.tube, strict=True)], dtype=float
+    )
+    at = edge_normal_jacobians(a[leg], b[leg], radius, edges.side)
+    to_tangent = edges.basis.mT
     off = SHADING * edges.shift
     covariance = edges.covariance + off[:, :, None] * off[:, None, :]
-    return EdgeRows(
+    return EdgeMisfits(
         leg=leg,
         misfit=-(to_tangent @ at.n[..., None])[..., 0] - edge_shift * edges.shift,
         by_a=to_tangent @ at.dn_da,
@@ -166,13 +138,7 @@ def edge_rows(
     )
 
 
-def _radii(seen: SeenMachine, leg: Integers, tube: Integers) -> Array:
-    """Radii (M,) of tubes, m."""
-    radii = seen.machine.radii()
-    return np.array([radii[j][t] for j, t in zip(leg, tube, strict=True)], dtype=float)
-
-
-def leg_lines(seen: SeenMachine, rows: EdgeRows) -> LegLines:
+def leg_lines(seen: SeenMachine, rows: EdgeMisfits) -> LegLines:
     """Lines of the seen legs from their edges.
 
     A leg's line has four freedoms, its two ends across the leg; every edge tells two, whatever its
@@ -184,7 +150,7 @@ def leg_lines(seen: SeenMachine, rows: EdgeRows) -> LegLines:
     across = tangent_basis(d / np.sqrt(dot(d, d))[:, None], rows.a)
     e = across[rows.leg]
     jac = np.concatenate([rows.by_a @ e, rows.by_b @ e], axis=-1)
-    to_right = np.swapaxes(jac, -1, -2) @ rows.information
+    to_right = jac.mT @ rows.information
     covariance = np.linalg.inv(np.tensordot(pick, to_right @ jac, 1) + np.eye(4) / ASIDE**2)
     right = pick @ (to_right @ rows.misfit[..., None])[..., 0]
     moved = (covariance @ right[..., None])[..., 0]
@@ -196,24 +162,17 @@ def leg_lines(seen: SeenMachine, rows: EdgeRows) -> LegLines:
         p + (across @ m[..., None])[..., 0]
         for p, m in ((rows.a, moved[:, :2]), (rows.b, moved[:, 2:]))
     )
-    return _answered(seen, a, b, across, covariance, agrees, both & agrees)
-
-
-def _answered(
-    seen: SeenMachine, a: Array, b: Array, across: Array, covariance: Array,
-    agrees: Booleans, found: Booleans,
-) -> LegLines:  # fmt: skip
-    """Lines (L, 3) through a and b as edges of the controller's radius."""
+    # and as the edges that a cylinder of the controller's radius would show
     radius = seen.radius[:, None]
     at = edge_normal_jacobians(a[:, None], b[:, None], radius, SIDES)
     middle = (a + b)[:, None] / 2 + radius[..., None] * at.n
     basis = tangent_basis(at.n, middle / np.sqrt(dot(middle, middle))[..., None])
     by_move = np.concatenate([at.dn_da @ across[:, None], at.dn_db @ across[:, None]], axis=-1)
-    turn = (np.swapaxes(basis, -1, -2) @ by_move).reshape(-1, 4, 4)
-    joint = turn @ covariance @ np.swapaxes(turn, -1, -2)
-    lost = ~found[:, None, None]
+    turn = (basis.mT @ by_move).reshape(-1, 4, 4)
+    joint = turn @ covariance @ turn.mT
+    lost = ~(both & agrees)[:, None, None]
     normal, joint = (np.where(lost, np.nan, v) for v in (at.n, joint))
-    return LegLines(normal, np.where(lost[..., None], np.nan, basis), joint, agrees, found)
+    return LegLines(normal, np.where(lost[..., None], np.nan, basis), joint, agrees, both & agrees)
 
 
 def weighted(law: str, task: Task, lines: LegLines, used: Booleans) -> tuple[Task, float]:
@@ -228,7 +187,7 @@ def weighted(law: str, task: Task, lines: LegLines, used: Booleans) -> tuple[Tas
         u, spread = _direction_spread(normal, basis, joint)
         tangent = tangent_basis(u, normal[:, 0])
         to_turn = _error_to_turn(tangent)
-        covariance = np.swapaxes(tangent, -1, -2) @ spread @ tangent
+        covariance = tangent.mT @ spread @ tangent
     else:
         to_turn = np.zeros((len(normal), 4, 6))
         to_turn[:, :2, :3], to_turn[:, 2:, 3:] = np.moveaxis(_error_to_turn(basis), 1, 0)
@@ -258,11 +217,11 @@ def _direction_spread(normal: Array, basis: Array, joint: Array) -> tuple[Array,
         [skew(normal[:, 1]) @ basis[:, 0], -skew(normal[:, 0]) @ basis[:, 1]], axis=-1
     )
     by_turn = (by_turn - u[:, :, None] * (u[:, None] @ by_turn)) / size
-    return u, by_turn @ joint @ np.swapaxes(by_turn, -1, -2)
+    return u, by_turn @ joint @ by_turn.mT
 
 
 def corrected_pose(
-    seen: SeenMachine, T_base_platform: Array, rows: EdgeRows, found: Booleans
+    seen: SeenMachine, T_base_platform: Array, rows: EdgeMisfits, found: Booleans
 ) -> Array:
     """The pose (4, 4) moved so that the edges of the legs found (s,) fit best: one Gauss-Newton
     step, in the directions in which the platform moves.
@@ -277,19 +236,11 @@ def corrected_pose(
     jac = rows.by_b[use] @ (rot @ c.ends.b_by_pose[leg]) @ motion
     square = dot(misfit, (information @ misfit[..., None])[..., 0])
     weight = 1 / (1 + square / (4 * max(float(np.median(square)), 2.0)))
-    to_right = np.swapaxes(jac, -1, -2) @ information * weight[:, None, None]
+    to_right = jac.mT @ information * weight[:, None, None]
     closing = c.by_pose @ motion / LAG
     normal = np.sum(to_right @ jac, axis=0) + closing.T @ closing
     right = np.sum(to_right @ misfit[..., None], axis=0)[:, 0] - closing.T @ c.value / LAG
     return perturb(T_base_platform, motion @ np.linalg.solve(normal, right))
-
-
-HIDDEN = "hidden behind another leg or outside the photograph"
-FAR = 0.7
-"""Median distance (px) of edges from their prediction from which none is believed: of legs that
-turned away more than that, the ends that still lie within reach pass for whole edges."""
-SEARCH_ROUNDS = 3
-"""Gauss-Newton steps of the pose after a search: ten pixels are far enough to bend the way."""
 
 
 @dataclass(frozen=True)
@@ -363,42 +314,41 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
     image that is not this camera's.
     """
     check_image(image, sight.camera)
-    forward = sight.seen.machine.forward_result(readings, state.T_base_platform)
+    seen = sight.seen
+    forward = seen.machine.forward_result(readings, state.T_base_platform)
     if not bool(forward.converged):
-        return _lost(sight, state, "the readings cannot be the machine's")
-    closed, first = forward.T_base_platform, np.isnan(state.blur)
-    photograph = _photograph(sight.camera, image, readings)
+        lines = LegLines.nothing(len(seen.legs))
+        reasons = ("the readings cannot be the machine's",) * len(seen.legs)
+        lost = replace(state, found=lines.found)
+        return TrackedLegs(lines, lines.found, reasons, state.T_base_platform, False, 0.0, lost)
+    closed, first, blur = forward.T_base_platform, np.isnan(state.blur), state.blur
+    no_tables = DistanceTables(np.zeros((1, 1, 1, 1)), 1.0)
+    station = np.zeros(1, dtype=int)
+    photograph = Photographs(0, sight.camera, station, readings[None], [image], no_tables)
     predicted = perturb(closed, state.correction)
     searched = not first and _poor(state.found) and not state.searched
     if searched:
         predicted = _searched(sight, photograph, predicted)
-    at = _look(sight, photograph, predicted, state.blur)
+    at = _look(sight, photograph, predicted, blur)
     if first:
-        again = _look(sight, photograph, _searched(sight, photograph, predicted), state.blur)
+        again = _look(sight, photograph, _searched(sight, photograph, predicted), blur)
         searched = again.evidence > at.evidence
         at = again if searched else at
-    return _tracked(sight, state, closed, at, searched)
-
-
-def _poor(found: Booleans) -> bool:
-    """Fewer than half of the legs: the prediction is at fault and not what hides them."""
-    return 2 * int(found.sum()) < len(found)
-
-
-def _tracked(
-    sight: Sight, state: TrackState, closed: Array, at: _Look, searched: bool
-) -> TrackedLegs:
-    """The answer of a look about the pose that the readings give, (4, 4)."""
-    found, blur = at.lines.found, state.blur
-    if found.any() and np.isnan(blur):
+    found = at.lines.found
+    if found.any() and first:
         blur = at.look.blur
         warm_up(blur)
-    T = closed if _poor(found) else corrected_pose(sight.seen, at.predicted, at.rows, found)
+    T = closed if _poor(found) else corrected_pose(seen, at.predicted, at.rows, found)
     correction = pose_difference(T, closed)
     beside = np.abs(at.rows.closure.by_pose @ correction)
     next_state = TrackState(closed, correction, found, blur, searched)
     reasons = _reasons(sight, at)
     return TrackedLegs(at.lines, found, reasons, T, True, float(beside.max()), next_state)
+
+
+def _poor(found: Booleans) -> bool:
+    """Fewer than half of the legs: the prediction is at fault and not what hides them."""
+    return 2 * int(found.sum()) < len(found)
 
 
 @dataclass(frozen=True)
@@ -409,7 +359,7 @@ class _Look:
 
     predicted: Array
     look: StationEdges
-    rows: EdgeRows
+    rows: EdgeMisfits
     lines: LegLines
     far: bool
 
@@ -423,7 +373,7 @@ def _look(sight: Sight, photograph: Photographs, predicted: Array, blur: float) 
     seen = sight.seen
     known = None if np.isnan(blur) else blur
     look = measure(photograph, seen.machine, seen.T_camera_base, predicted[None], known)
-    rows = edge_rows(seen, photograph.joints[0], predicted, look.edges, sight.edge_shift)
+    rows = edge_misfits(seen, photograph.joints[0], predicted, look.edges, sight.edge_shift)
     far = look.moved > FAR
     lines = LegLines.nothing(len(seen.legs)) if far else leg_lines(seen, rows)
     return _Look(predicted, look, rows, lines, far)
@@ -435,7 +385,7 @@ def _searched(sight: Sight, photograph: Photographs, predicted: Array) -> Array:
     look = search(photograph, seen.machine, seen.T_camera_base, predicted[None])
     every = np.ones(len(seen.legs), dtype=bool)
     for _ in range(SEARCH_ROUNDS):
-        rows = edge_rows(seen, readings, predicted, look.edges, sight.edge_shift)
+        rows = edge_misfits(seen, readings, predicted, look.edges, sight.edge_shift)
         predicted = corrected_pose(seen, predicted, rows, every)
     return predicted
 
@@ -450,20 +400,6 @@ def _reasons(sight: Sight, at: _Look) -> tuple[str, ...]:
         why = (shown or mine or ["only one of its sides is seen"])[0]
         out.append("" if found else why if agrees else "its edges do not belong to one leg")
     return tuple(out)
-
-
-def _photograph(camera: Camera, image: Integers, readings: Array) -> Photographs:
-    no_tables = DistanceTables(np.zeros((1, 1, 1, 1)), 1.0)
-    return Photographs(0, camera, np.zeros(1, dtype=int), readings[None], [image], no_tables)
-
-
-def _lost(sight: Sight, state: TrackState, reason: str) -> TrackedLegs:
-    count = len(sight.seen.legs)
-    none = np.zeros(count, dtype=bool)
-    lines = LegLines.nothing(count)
-    state = replace(state, found=none)
-    reasons = (reason,) * count
-    return TrackedLegs(lines, none, reasons, state.T_base_platform, False, 0.0, state)
 
 
 def check_image(image: Integers, camera: Camera) -> None:
@@ -483,3 +419,44 @@ def check_image(image: Integers, camera: Camera) -> None:
             expected=f"{camera.image_size[0]}x{camera.image_size[1]}, as the camera file says",
             next_step="set the camera to that size; scaled photographs do not fit its calibration",
         )
+
+
+def misfit(seen: SeenMachine, normals: Array, T_base_platform: Array, readings: Array) -> float:
+    """Median angle (rad) between the legs as seen, (s, 2, 3), and at a pose (4, 4)."""
+    a, b = seen_ends(seen, T_base_platform, readings)
+    known = np.isfinite(normals).all(axis=(-1, -2))
+    cosine = dot(directions_of(normals[known]), line_through(a[known], b[known])[0])
+    return float(np.median(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def nearest_assembly(
+    seen: SeenMachine, normals: Array, readings: Array
+) -> tuple[Array, float] | None:
+    """Of all assemblies at the readings the one that the legs (s, 2, 3) show best, and its misfit;
+    None where there is none. A search: takes a fraction of a second.
+    """
+    modes = seen.machine.assembly_modes(readings, np.random.default_rng(0))
+    if not len(modes):
+        return None
+    angles = [misfit(seen, normals, T, readings) for T in modes]
+    best = int(np.argmin(angles))
+    return modes[best], angles[best]
+
+
+def assembly_sentence(seen: SeenMachine, normals: Array, expected: Array, readings: Array) -> str:
+    """What the legs show instead of the expected pose (4, 4)."""
+    off = np.rad2deg(misfit(seen, normals, expected, readings))
+    text = f"the legs point {off:.0f} degrees away from where the start and the readings put them"
+    found = nearest_assembly(seen, normals, readings)
+    if found is None or found[1] > FITS:
+        return (
+            f"{text}, and no other assembly fits them: check the readings' order and units,"
+            " and the camera's place"
+        )
+    x, y, z = found[0][:3, 3]
+    turn = np.rad2deg(np.linalg.norm(pose_difference(found[0], expected)[:3]))
+    return (
+        f"{text}; they show the assembly with the platform at ({x:.3f}, {y:.3f}, {z:.3f}) m,"
+        f" turned by {turn:.0f} degrees against it: give that pose as start, or bring the machine"
+        " back to the other assembly"
+    )

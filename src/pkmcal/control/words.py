@@ -31,17 +31,16 @@ def judgement(found: Study) -> Verdict:
         f" {len(good.runs.end)} runs with the identified geometry."
     )
     if not usable:
-        headline = f"Control by the {law} of {legs} should not be used: " + _why(found, good)
+        why = (
+            "these legs do not show every motion of the platform."
+            if own.blind
+            else f"{good.reached} of {len(good.runs.end)} runs reach the goal."
+        )
+        headline = f"Control by the {law} of {legs} should not be used: {why}"
     warnings = (*_fading(found), *_others(found), *_hidden(found), *_by_hand(found), *_noise(found))
     if usable:
         return Verdict(usable, headline, (), (*reasons, *warnings), _advice(found))
     return Verdict(usable, headline, reasons, warnings, _advice(found))
-
-
-def _why(found: Study, good: Trials) -> str:
-    if found.own.blind:
-        return "these legs do not show every motion of the platform."
-    return f"{good.reached} of {len(good.runs.end)} runs reach the goal."
 
 
 def named(choice: Subset, found: Study) -> str:

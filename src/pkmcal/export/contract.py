@@ -19,7 +19,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pkmcal.arrays import Array
 from pkmcal.calibration.source import Source
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import check_own_folder, closest, write_folder
@@ -153,23 +152,3 @@ def largest(values: Any, expected: Any = 0.0) -> float:
     """The largest absolute difference of two arrays, or sets of numbers; 0 for none."""
     off = np.asarray(values, dtype=float) - np.asarray(expected, dtype=float)
     return float(np.abs(off).max(initial=0.0))
-
-
-def quaternion(rot: Array) -> Array:
-    """Unit quaternion (4,) x y z w of a rotation matrix (3, 3), w not negative."""
-    from scipy.spatial.transform import Rotation
-
-    q = Rotation.from_matrix(rot).as_quat()
-    return q if q[3] >= 0 else -q
-
-
-def rotation_of(q: Array) -> Array:
-    """The rotation matrix (3, 3) of a quaternion (4,) x y z w of any length but zero."""
-    x, y, z, w = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -17,9 +17,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.calibration.source import Source
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.export.contract import quaternion
 from pkmcal.export.limbs import FIXED, SLIDE, TELESCOPE, TURN, Limbs, limbs_of
-from pkmcal.geometry.rigid import cross, dot, inverse, rotation, rotation_vector
+from pkmcal.geometry.rigid import cross, dot, inverse, quaternion, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import platform_carriers
 from pkmcal.mechanisms.closure import limb_ends
@@ -579,7 +578,7 @@ def _body(
 def _turned(node: Element, rot: Array) -> None:
     """The body's orientation in its parent, where it is not the parent's own."""
     if np.abs(rot - np.eye(3)).max() > 1e-15:  # rounding is no turn
-        node.set("quat", numbers(np.roll(quaternion(rot), 1)))
+        node.set("quat", numbers(quaternion(rot)))
 
 
 def _joint(parent: Element, name: str, kind: str, axis: Array, ref: float = 0.0) -> Element:

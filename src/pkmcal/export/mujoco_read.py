@@ -15,9 +15,9 @@ from xml.etree.ElementTree import Element, fromstring
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.export.contract import rotation_of
 from pkmcal.geometry.rigid import (
     apply,
+    from_quaternion,
     inverse,
     perturb,
     pose,
@@ -105,7 +105,7 @@ class ReadModel:
             first, second = (at[k] @ T for k, T in zip(loop.bodies, loop.frames, strict=True))
             out.append(first[..., :3, 3] - second[..., :3, 3])
             if loop.kind == "weld":
-                turn = first[..., :3, :3] @ second[..., :3, :3].swapaxes(-1, -2)
+                turn = first[..., :3, :3] @ second[..., :3, :3].mT
                 out.append(rotation_vector(turn))
         away = x - self.drawn
         for first, second, ratio in self.couplings:
@@ -129,7 +129,7 @@ class ReadModel:
         steps = SMALL * np.eye(x.shape[-1])[~held]
         for _ in range(STEPS):
             value = left(x)
-            by_freedom = (left(x[:, None] + steps) - value[:, None]).swapaxes(-1, -2) / SMALL
+            by_freedom = (left(x[:, None] + steps) - value[:, None]).mT / SMALL
             step = np.linalg.pinv(by_freedom, rcond=DEPENDENT) @ value[..., None]
             x = x.copy()
             x[:, ~held] -= step[..., 0]
@@ -199,7 +199,8 @@ def _collect(
                 ref = float(j.get("ref", "0"))
                 joints.append(ReadJoint(j.attrib["name"], kind, axis, dofs, ref))
                 dofs += 6 if kind == "free" else 1
-        place = _pose(_vector(child, "pos", "0 0 0"), _vector(child, "quat", "1 0 0 0"))
+        turn = from_quaternion(_vector(child, "quat", "1 0 0 0"))
+        place = pose(turn, _vector(child, "pos", "0 0 0"))
         bodies.append(ReadBody(child.attrib["name"], number, place, tuple(joints)))
         dofs = _collect(child, me, bodies, dofs, sites, radii)
     return dofs
@@ -225,7 +226,7 @@ def _of_qpos(bodies: Sequence[ReadBody], drawn: Array, qpos: Array) -> Array:
     for body in bodies:
         for j in body.joints:
             if j.kind == "free":
-                here = _pose(qpos[at : at + 3], qpos[at + 3 : at + 7])
+                here = pose(from_quaternion(qpos[at + 3 : at + 7]), qpos[at : at + 3])
                 x[j.dof : j.dof + 6] = pose_difference(here, body.T_parent_body)
                 at += 7
             else:
@@ -250,11 +251,6 @@ def _placed(bodies: Sequence[ReadBody], x: Array) -> list[Array]:
             here = here @ (pose(rotation(way), ZERO) if turns else pose(np.eye(3), way))
         at.append(here)
     return at
-
-
-def _pose(place: Array, quat: Array) -> Array:
-    """A pose (4, 4) by a place (3,) and MuJoCo's quaternion (4,), scalar first."""
-    return pose(rotation_of(np.roll(quat, -1)), place)
 
 
 def _vector(node: Element, key: str, default: str = "") -> Array:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import version
 from typing import Any, ClassVar, final
 
 import yaml
 
-from pkmcal import __version__
 from pkmcal.calibration.source import Source
 from pkmcal.export.contract import Difference, Exporter, commented, largest
 from pkmcal.files import json_text
@@ -58,7 +58,7 @@ class MachineJson(Exporter):
         values = table.unit_axes(machine.values)
         document = {
             "pkmcal_machine": FORMAT,
-            "pkmcal": __version__,
+            "pkmcal": version("pkmcal"),
             "about": source.header(),
             "conventions": CONVENTIONS,
             "name": machine.name,

@@ -19,7 +19,8 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.source import Source
 from pkmcal.cameras.files import read_camera, write_camera
 from pkmcal.errors import InputError
-from pkmcal.export.contract import Difference, Exporter, commented, exact, quaternion, rotation_of
+from pkmcal.export.contract import Difference, Exporter, commented, exact
+from pkmcal.geometry.rigid import from_quaternion, pose, quaternion
 from pkmcal.outcome import Finding, Level
 from pkmcal.wording import listed
 
@@ -111,9 +112,9 @@ def _launch(source: Source) -> str:
         shift = " ".join(
             f"--{axis} {exact(v)}" for axis, v in zip("xyz", transform[:3, 3].tolist(), strict=True)
         )
+        turned = np.roll(quaternion(transform[:3, :3]), -1)
         turn = " ".join(
-            f"--q{axis} {exact(v)}"
-            for axis, v in zip("xyzw", quaternion(transform[:3, :3]).tolist(), strict=True)
+            f"--q{axis} {exact(v)}" for axis, v in zip("xyzw", turned.tolist(), strict=True)
         )
         frame = f"--frame-id {BASE} --child-frame-id {names[station]}_optical_frame"
         nodes.append(
@@ -158,9 +159,7 @@ def transforms(text: str) -> dict[str, Array]:
     for entry in yaml.safe_load(text)["launch"]:
         words = entry["node"]["args"].split()
         given = dict(zip(words[::2], words[1::2], strict=True))
-        matrix = np.eye(4)
-        q = np.array([float(given[f"--q{axis}"]) for axis in "xyzw"])
-        matrix[:3, :3] = rotation_of(q)
-        matrix[:3, 3] = [float(given[f"--{axis}"]) for axis in "xyz"]
-        out[given["--child-frame-id"].removesuffix("_optical_frame")] = matrix
+        rot = from_quaternion(np.array([float(given[f"--q{axis}"]) for axis in "wxyz"]))
+        place = np.array([float(given[f"--{axis}"]) for axis in "xyz"])
+        out[given["--child-frame-id"].removesuffix("_optical_frame")] = pose(rot, place)
     return out

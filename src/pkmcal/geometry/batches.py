@@ -121,7 +121,7 @@ def damped_step(jac: Array, value: Array, damping: Array) -> Array:
     """
     if is_batch_last(jac):
         return _eliminated(jac, value, damping)
-    transposed = jac.swapaxes(-1, -2)
+    transposed = jac.mT
     normal = transposed @ jac
     d = jac.shape[-1]
     diagonal = normal.reshape(*normal.shape[:-2], d * d)[..., :: d + 1]

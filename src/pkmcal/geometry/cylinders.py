@@ -44,6 +44,20 @@ def leg_is_seen(a: Array, b: Array, radius: Array) -> Booleans:
     return dot(m, m) > (1.02 * np.asarray(radius)) ** 2
 
 
+def edge_normal(u: Array, m: Array, radius: Array, sign: Array) -> Array:
+    """Tangent planes of cylinders through the camera's centre, n = s cos m - sin u x m, [B] eq. 3.
+
+    u, m : (..., 3) the axes' Pluecker coordinates, camera frame, as of :func:`line_through`.
+    radius : (...,) m. sign : (...,) of SIDE_SIGNS.
+    Returns unit n (..., 3), NaN where the centre of projection lies inside the cylinder.
+    """
+    distance = np.sqrt(dot(m, m))
+    with np.errstate(invalid="ignore"):
+        sin = np.where(distance > np.abs(radius), radius / distance, np.nan)[..., None]
+    m_unit = m / distance[..., None]
+    return sign[..., None] * np.sqrt(1 - sin**2) * m_unit - sin * cross(u, m_unit)
+
+
 def edge_normals(a_camera: Array, u_camera: Array, radius: Array) -> Array:
     """Tangent planes of a cylinder through the camera's centre, [B] eq. 3.
 
@@ -61,11 +75,7 @@ def edge_normals(a_camera: Array, u_camera: Array, radius: Array) -> Array:
             expected="more than the leg's radius",
             next_step="check the station's pose and the drawing of the legs",
         )
-    sin = (radius / distance)[..., None]
-    cos = np.sqrt(1 - sin**2)
-    m_unit = m / distance[..., None]
-    a_perp = cross(u_camera, m_unit)
-    return np.stack([cos * m_unit - sin * a_perp, -cos * m_unit - sin * a_perp], axis=-2)
+    return np.stack([edge_normal(u_camera, m, radius, sign) for sign in SIDE_SIGNS], axis=-2)
 
 
 def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Integers) -> EdgeNormals:
@@ -80,11 +90,7 @@ def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Integers) -> 
     values are NaN: the caller leaves such edges out with :func:`leg_is_seen`.
     """
     u, m = line_through(a, b)
-    distance = np.sqrt(dot(m, m))
-    sin = np.where(distance > np.abs(radius), radius / distance, np.nan)[..., None]
-    m_unit = m / distance[..., None]
-    sign = SIDE_SIGNS[side][..., None]
-    n = sign * np.sqrt(1 - sin**2) * m_unit - sin * cross(u, m_unit)
+    n = edge_normal(u, m, radius, SIDE_SIGNS[side])
     # columns of the inverse of the matrix with rows a, b, n
     det = dot(cross(a, b), n)[..., None]
     col_a, col_b = cross(b, n) / det, cross(n, a) / det

@@ -59,6 +59,14 @@ def rotation(omega: Array) -> Array:
     return np.eye(3) + sinc * k + cosc * (k @ k)
 
 
+def axial(matrix: Array) -> Array:
+    """The vector (..., 3) of M - M^T (..., 3, 3); of a rotation, twice its axis times the sine."""
+    out = np.empty(matrix.shape[:-1])
+    for k, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
+        out[..., k] = matrix[..., i, j] - matrix[..., j, i]
+    return out
+
+
 def rotation_vector(rot: Array) -> Array:
     """Rotation vectors (rad, norm at most pi) of rotation matrices, (..., 3, 3) -> (..., 3).
 
@@ -67,9 +75,7 @@ def rotation_vector(rot: Array) -> Array:
     turn, near which it is SciPy's.
     """
     rot = np.asarray(rot, dtype=float)
-    v = np.empty(rot.shape[:-1])
-    for k, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
-        v[..., k] = rot[..., i, j] - rot[..., j, i]
+    v = axial(rot)
     sine, cosine = np.sqrt(dot(v, v)), np.trace(rot, axis1=-2, axis2=-1) - 1  # twice each
     small = sine < 1e-7
     out = np.where(small, 0.5, np.arctan2(sine, cosine) / np.where(small, 1.0, sine))[..., None] * v
@@ -79,6 +85,24 @@ def rotation_vector(rot: Array) -> Array:
 
         out[half] = Rotation.from_matrix(rot[half]).as_rotvec()
     return out
+
+
+def quaternion(rot: Array) -> Array:
+    """Unit quaternions (..., 4), scalar first, of rotations (..., 3, 3); the scalar is not
+    negative.
+    """
+    omega = rotation_vector(rot)
+    angle = np.sqrt(dot(omega, omega))[..., None]
+    axis = omega / np.where(angle > 0, angle, 1.0)
+    return np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], axis=-1)
+
+
+def from_quaternion(q: Array) -> Array:
+    """Rotations (..., 3, 3) of quaternions (..., 4), scalar first, of any length but zero."""
+    q = q / np.sqrt(dot(q, q))[..., None]
+    w, v = q[..., :1, None], q[..., 1:]
+    k = skew(v)
+    return np.eye(3) + 2 * (w * k + k @ k)
 
 
 def pose(rot: Array, t: Array) -> Array:
@@ -91,7 +115,7 @@ def pose(rot: Array, t: Array) -> Array:
 
 def inverse(transform: Array) -> Array:
     """Inverse poses, (..., 4, 4) -> (..., 4, 4)."""
-    rot_t = np.swapaxes(transform[..., :3, :3], -1, -2)
+    rot_t = transform[..., :3, :3].mT
     return pose(rot_t, -(rot_t @ transform[..., :3, 3:])[..., 0])
 
 
@@ -109,7 +133,7 @@ def perturb(transform: Array, delta: Array) -> Array:
 
 def pose_difference(transform: Array, reference: Array) -> Array:
     """The six numbers with ``perturb(reference, delta) == transform``; (..., 6)."""
-    rot = transform[..., :3, :3] @ np.swapaxes(reference[..., :3, :3], -1, -2)
+    rot = transform[..., :3, :3] @ reference[..., :3, :3].mT
     return np.concatenate(
         [rotation_vector(rot), transform[..., :3, 3] - reference[..., :3, 3]], axis=-1
     )
@@ -136,7 +160,7 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
     mean_s = np.sum(w[..., None] * source, axis=-2)
     mean_t = np.sum(w[..., None] * target, axis=-2)
     ds, dt = source - mean_s[..., None, :], target - mean_t[..., None, :]
-    rot = nearest_rotation(np.swapaxes(dt, -1, -2) @ (w[..., None] * ds))
+    rot = nearest_rotation(dt.mT @ (w[..., None] * ds))
     return pose(rot, mean_t - (rot @ mean_s[..., None])[..., 0])
 
 

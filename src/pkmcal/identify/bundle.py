@@ -258,7 +258,7 @@ def _estimate(
         configurations=assembled.seen,
         statistics=_statistics(result, assembled),
         gauge=gauge.name,
-        intrinsics_covariance=factor @ optics[:, 1:, 1:] @ np.swapaxes(factor, -1, -2),
+        intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=assembled.poses.taken(poses),
         pose_weights=assembled.poses.taken(result.pose_weight[0]),
         mount_covariance=own_blocks(full, told.mounts, 6),

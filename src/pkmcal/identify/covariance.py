@@ -39,7 +39,6 @@ from pkmcal.solver import (
     normal_root,
     reduced_normal,
     stacked,
-    transposed,
 )
 
 NULL = 1e-12
@@ -70,7 +69,7 @@ def information(problem: Problem, state: BatchState) -> Information:
     linear = problem.linearize(state)
     reduced = eliminate(linear, np.zeros(len(state.z)))
     half = inverse_root(stacked(linear, reduced)[0], NULL, loose=True)
-    return Information(linear, reduced, half @ transposed(half))
+    return Information(linear, reduced, half @ half.mT)
 
 
 def reduced_rows(

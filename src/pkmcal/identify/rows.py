@@ -145,7 +145,7 @@ class EdgeRows:
 
     def _whitened(self, vectors: Array) -> Array:
         """basis^T v, whitened and weighted: (B, K, G, g, 3, n) -> (B, K, G, 2g, n)."""
-        flat = np.swapaxes(self.data.basis, -1, -2) @ vectors
+        flat = self.data.basis.mT @ vectors
         flat = flat.reshape(*flat.shape[:3], 2 * flat.shape[3], flat.shape[-1])
         return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ flat)
 
@@ -205,7 +205,7 @@ def joint_rows(layout: LimbLayout, by_reading: Array, rows: Array) -> Array:
     slope = by_reading[..., None] * layout.of_motor
     size = np.sqrt(np.sum(slope**2, axis=-2, keepdims=True))
     unit = slope / np.where(size > 0, size, 1.0)
-    return (np.swapaxes(unit, -1, -2) @ rows[..., None])[..., 0]
+    return (unit.mT @ rows[..., None])[..., 0]
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,6 @@ from pkmcal.solver import (
     eliminate,
     inverse_root,
     stacked,
-    transposed,
 )
 
 SOFT = 0.01
@@ -105,15 +104,15 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     n, m, n_rows = picks.shape
 
     along = picks @ own
-    along = along @ transposed(along)
+    along = along @ along.mT
     beside = picks @ shared[: n * n_rows].reshape(n, n_rows, -1)
-    left = np.eye(m) - along - beside @ transposed(beside)  # L
+    left = np.eye(m) - along - beside @ beside.mT  # L
     if float(np.linalg.eigvalsh(left).min(initial=1.0)) < ALONE:
         raise too_little()
     alone = np.linalg.inv(left)
     units = _size(held)[..., None] * alone
 
-    found = _without_own(held, linear, reduced, transposed(picks) @ alone @ picks)
+    found = _without_own(held, linear, reduced, picks.mT @ alone @ picks)
     by = _by_machine(held, own, shared[: n * n_rows]).reshape(n, n_rows, -1)
     joints = measurements.joints[held.seen]
     errors = _errors(held.machine, joints, found.T_base_platform[0], found.internal[0])
@@ -162,8 +161,8 @@ def _without_own(held: Held, linear: Linear, reduced: Reduced, alone: Array) -> 
     """
     half = inverse_root(stacked(linear, reduced)[0][0], RANK_TOLERANCE, loose=False)
     moved = alone @ linear.value[0, ..., None]
-    others = half @ (half.T @ (transposed(reduced.rows[0]) @ moved))
-    own = transposed(reduced.q[0]) @ (moved - linear.by_shared[0] @ others)
+    others = half @ (half.T @ (reduced.rows[0].mT @ moved))
+    own = reduced.q[0].mT @ (moved - linear.by_shared[0] @ others)
     own = np.linalg.solve(reduced.r[0], own)[..., 0]
     shared = np.zeros((1, held.problem.unknowns.count))
     return held.problem.moved(held.state, shared, own[None])
@@ -174,7 +173,7 @@ def _by_machine(held: Held, own: Array, shared: Array) -> Array:
     wide, there = held.problem.opened(held.state)
     by = wide.linearize(there).by_shared[0, ..., wide.unknowns.machine]
     by = np.where(np.any(held.problem.free != 0, axis=1), 0.0, by)
-    by = (by - own @ (transposed(own) @ by)).reshape(len(shared), -1)
+    by = (by - own @ (own.mT @ by)).reshape(len(shared), -1)
     return by - shared @ (shared.T @ by)
 
 
@@ -194,7 +193,7 @@ def _noise(along: Array, beside: Array, units: Array, less: float) -> Array:
     flat = (units @ beside).reshape(n * m, -1)
     out = flat @ inner @ flat.T - less * (far @ flat.T + flat @ far.T)
     k = np.arange(n)
-    out.reshape(n, m, n, m)[k, :, k, :] += units @ block @ transposed(units)
+    out.reshape(n, m, n, m)[k, :, k, :] += units @ block @ units.mT
     return 0.5 * (out + out.T)
 
 
@@ -256,7 +255,7 @@ def laid(machine: Machine, joints: Array, poses: Array) -> tuple[Array, Array, i
         jac, value = c.by_pose @ pose_generators(own), c.value
         if machine.layout.n_internal:
             q = np.linalg.qr(c.by_internal)[0]
-            rest = np.eye(q.shape[-2]) - q @ transposed(q)
+            rest = np.eye(q.shape[-2]) - q @ q.mT
             jac, value = rest @ jac, (rest @ value[..., None])[..., 0]
         y, _, rank, _ = np.linalg.lstsq(jac.reshape(-1, 12), -value.reshape(-1), rcond=OPEN)
         used = int(rank)

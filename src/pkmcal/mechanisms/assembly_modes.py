@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.geometry.rigid import pose, pose_difference, rotation
+from pkmcal.geometry.rigid import from_quaternion, pose, pose_difference, rotation
 from pkmcal.mechanisms.closure import LimbLayout, base_ends, platform_ends
 from pkmcal.mechanisms.kinematics import CONVERGED, Closed, close, inverse_result, typical_reach
 from pkmcal.mechanisms.velocities import assembly_sign
@@ -102,8 +102,7 @@ def _starts(
     """
     free = layout.free
     if free[:3].all():
-        four = rng.normal(size=(BATCH, 4))
-        turn = _of_quaternion(four / np.linalg.norm(four, axis=1, keepdims=True))
+        turn = from_quaternion(rng.normal(size=(BATCH, 4)))
     else:
         turn = rotation(rng.uniform(-np.pi, np.pi, (BATCH, 3)) * free[:3])
     rot = turn @ home[:3, :3]
@@ -112,14 +111,6 @@ def _starts(
     shift = rng.normal(size=(BATCH, 3)) * typical_reach(layout, theta, readings)
     position = np.where(free[3:], a - b + shift, home[:3, 3])
     return pose(rot, position), rng.uniform(-np.pi, np.pi, (BATCH, layout.n_internal))
-
-
-def _of_quaternion(q: Array) -> Array:
-    """Rotation matrices (n, 3, 3) of unit quaternions (n, 4), the real part first."""
-    w, v = q[:, :1, None], q[:, 1:]
-    outer = v[:, :, None] * v[:, None, :]
-    skew = np.cross(np.eye(3)[None], -v[:, None, :])
-    return (2 * w * w - 1) * np.eye(3) + 2 * outer + 2 * w * skew
 
 
 def _coordinates(result: Closed) -> Array:

@@ -120,7 +120,7 @@ def angle_rows(layout: AngleLayout, theta: Array, rot: Array, line: Array) -> An
     w = np.where(first & second, cross(v, turned), np.where(first, v, turned))
     by_v = np.where(second, cross(turned, line), line)
     by_turned = np.where(first, cross(line, v), line)
-    by_own = (np.swapaxes(rot, -1, -2)[..., None, :, :] @ by_turned[..., None])[..., 0]
+    by_own = (rot.mT[..., None, :, :] @ by_turned[..., None])[..., 0]
     return AngleRows(
         value=dot(line, w),
         by_line=w,

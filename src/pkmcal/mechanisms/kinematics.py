@@ -433,5 +433,5 @@ def undriven(layout: LimbLayout, c: Rows, by_reading: Array) -> tuple[Array, Arr
         moved = np.concatenate([drives, c.by_internal], axis=-1)
         moved = np.nan_to_num(moved)
         q = np.linalg.qr(moved, mode="complete")[0]
-        blind = np.swapaxes(q[..., moved.shape[-1] :], -1, -2)
+        blind = q[..., moved.shape[-1] :].mT
     return (blind @ c.value[..., None])[..., 0], blind

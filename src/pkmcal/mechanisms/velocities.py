@@ -128,7 +128,7 @@ def _pseudo_inverse(jac: Array) -> Array:
     u, s, vt = np.linalg.svd(np.where(known[..., None, None], jac, 0.0), full_matrices=False)
     usable = known[..., None] & (s[..., -1:] > LOST)
     weights = np.where(usable, 1 / np.where(usable, s, 1.0), np.nan)
-    return np.swapaxes(vt, -1, -2) @ (weights[..., None] * np.swapaxes(u, -1, -2))
+    return vt.mT @ (weights[..., None] * u.mT)
 
 
 @dataclass(frozen=True)

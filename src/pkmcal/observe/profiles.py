@@ -259,7 +259,7 @@ def fit_edges(
     scatter = np.sum(used * off2, axis=-1) / np.maximum(count - 2, 1)
     factor = np.maximum(scatter, 1.0) * np.maximum(count / HALVES, 1.0)
     covariance = np.linalg.inv(normal) * factor[..., None, None]
-    operator = np.linalg.solve(normal, np.swapaxes(rows * weight[..., None], -1, -2))
+    operator = np.linalg.solve(normal, (rows * weight[..., None]).mT)
     good = (count >= FEWEST) & (count >= 0.5 * found.sum(axis=-1))
     good &= np.isfinite(covariance).all(axis=(-1, -2))
     return EdgeFits(turn, basis, covariance, operator, used, good)
@@ -276,7 +276,7 @@ def _squared_misfit(rows: Array, value: Array, turn: Array, base: Array) -> Arra
 
 def _weighted(rows: Array, value: Array, weight: Array) -> tuple[Array, Array]:
     """Weighted least squares of value (..., n) on rows (..., n, 2): solution and normal matrix."""
-    weighted = np.swapaxes(rows * weight[..., None], -1, -2)
+    weighted = (rows * weight[..., None]).mT
     normal = weighted @ rows
     ridge = 1e-12 * np.trace(normal, axis1=-2, axis2=-1)[..., None, None] + 1e-30
     normal = normal + ridge * np.eye(2)

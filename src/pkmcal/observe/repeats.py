@@ -135,11 +135,11 @@ def mean_covariance(stated: Array, scatter: Array, count: Integers) -> Array:
     """
     root = np.linalg.cholesky(stated)
     back = np.linalg.inv(root)
-    share, axes = np.linalg.eigh(back @ scatter @ np.swapaxes(back, -1, -2))
+    share, axes = np.linalg.eigh(back @ scatter @ back.mT)
     share = np.maximum(share, 0.0)
     common = np.maximum(1.0 - share, np.minimum(share, 1.0))
     parts = root @ axes * np.sqrt(common + share / count[:, None])[:, None, :]
-    return parts @ np.swapaxes(parts, -1, -2)
+    return parts @ parts.mT
 
 
 def deviations(edges: EdgeSet, groups: Groups) -> Array:

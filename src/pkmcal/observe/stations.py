@@ -324,7 +324,7 @@ def _look(view: StationView, candidates: Array, photographs: Integers, samples: 
 
 def _step(candidates: Array, look: _Look, reach: float, damping: Array) -> Array:
     """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4); damping (H,)."""
-    weighted = np.swapaxes(look.jac * look.weight(reach)[..., None], -1, -2)
+    weighted = (look.jac * look.weight(reach)[..., None]).mT
     normal = weighted @ look.jac
     diagonal = np.einsum("hii->hi", normal) + 1e-12
     normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)

@@ -79,6 +79,6 @@ def as_edges(axis: Array, sigma: Array, radius: Array) -> tuple[Array, Array]:
     )
     basis = tangent_basis(e.n, np.broadcast_to(point[..., None, :], e.n.shape))
     by_axis = e.dn_da @ dpoint[..., None, :, :] + e.dn_db @ (dpoint + 0.3 * du)[..., None, :, :]
-    jac = np.swapaxes(basis, -1, -2) @ by_axis
+    jac = basis.mT @ by_axis
     jac = jac.reshape(*u.shape[:-1], 4, 4)
     return basis, np.linalg.inv(jac) / sigma[:, None]

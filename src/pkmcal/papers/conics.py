@@ -90,7 +90,7 @@ def plain(rays: Array, leg_ray: Array) -> Array:
 
     leg_ray : (..., 3) decides the sign, normals point away from the leg.
     """
-    normal = np.linalg.svd(np.swapaxes(rays, -1, -2) @ rays)[2][..., -1, :]
+    normal = np.linalg.svd(rays.mT @ rays)[2][..., -1, :]
     return -normal * np.sign(dot(normal, leg_ray))[..., None]
 
 
@@ -110,7 +110,7 @@ def weighted(rays: Array, by_pixel: Array, leg_ray: Array) -> tuple[Array, Array
         slope = (normal[..., None, None, :] @ by_pixel)[..., 0, :]
         weight = 1 / dot(slope, slope)
         rows = rays @ basis
-        moved = np.swapaxes(rows * weight[..., None], -1, -2)
+        moved = (rows * weight[..., None]).mT
         information = moved @ rows
         misfit = dot(rays, normal[..., None, :])
         turn = -np.linalg.solve(information, moved @ misfit[..., None])[..., 0]
@@ -127,7 +127,7 @@ def free_conic(plane: Array, leg_ray: Array) -> Array:
     """
     x, y = plane[..., 0], plane[..., 1]
     rows = np.stack([x * x, 2 * x * y, y * y, 2 * x, 2 * y, np.ones_like(x)], axis=-1)
-    c = np.linalg.svd(np.swapaxes(rows, -1, -2) @ rows)[2][..., -1, :]
+    c = np.linalg.svd(rows.mT @ rows)[2][..., -1, :]
     upper = [[c[..., 0], c[..., 1], c[..., 3]], [c[..., 1], c[..., 2], c[..., 4]]]
     upper.append([c[..., 3], c[..., 4], c[..., 5]])
     conic = np.stack([np.stack(row, axis=-1) for row in upper], axis=-2)

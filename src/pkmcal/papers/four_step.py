@@ -156,7 +156,7 @@ def solve(
     if form == "printed" and legs.motion.shape[1] == 3 and not legs.planar:
         # distances leave a translating platform turned against the base frame
         rot = laid(platform[:, None], b[:, posed], weight[:, posed])[..., :3, :3].mean(axis=1)
-        platform = platform @ np.swapaxes(nearest_rotation(rot), -1, -2)
+        platform = platform @ nearest_rotation(rot).mT
     T = laid(platform[:, None], b, weight, motion=legs.motion)
     if legs.planar:  # the platform frame keeps the height that the drawing gives it
         T[..., 2, 3] = np.mean(legs.base[:, 2] - legs.platform[:, 2])

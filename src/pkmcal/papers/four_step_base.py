@@ -69,7 +69,7 @@ def mean_pose(T: Array, whiten: Array, group: Integers, n_groups: int) -> Array:
     """
     first = np.searchsorted(np.sort(group), np.arange(n_groups))
     mean = T[np.argsort(group, kind="stable")[first]]
-    information = np.swapaxes(whiten, -1, -2) @ whiten
+    information = whiten.mT @ whiten
     for _ in range(5):
         normal, right = np.zeros((n_groups, 6, 6)), np.zeros((n_groups, 6))
         difference = pose_difference(T, mean[group])
@@ -123,7 +123,7 @@ def gathered_directions(v: Array, found: Booleans, views: StationViews) -> tuple
 
     One sign in each view: that of the first station that knows the direction.
     """
-    rot = np.swapaxes(views.T_camera_view[:, None, :3, :3], -1, -2)
+    rot = views.T_camera_view[:, None, :3, :3].mT
     back = np.where(found[..., None], (rot @ v[..., None])[..., 0], 0.0)
     same = views.of_station == views.of_station[:, None]
     first = np.argmax(same[:, :, None] & found[None], axis=1)
@@ -317,7 +317,7 @@ def _by_directions(machine: Machine, axes: Axes, views: StationViews) -> Array:
     b = poses[..., None, :3, :3] @ drawn.platform_centers()[:, :, None]
     d = b[..., 0] + poses[..., None, :3, 3] - drawn.base_centers()
     d = d / np.sqrt(dot(d, d))[..., None]
-    back = np.swapaxes(views.T_camera_view[axes.station, None, :3, :3], -1, -2)
+    back = views.T_camera_view[axes.station, None, :3, :3].mT
     u = np.where(axes.seen[..., None], (back @ axes.u[..., None])[..., 0], 0.0)
     member = (views.of_station[axes.station] == np.arange(views.n)[:, None]).astype(float)
     h = np.einsum("vc,bcli,bclj->bvij", member, u, d, optimize=True)

@@ -124,7 +124,7 @@ def platform_axes(
     cross product, drops the depth (errata).
     """
     rot = T_base_platform[..., None, :3, :3]
-    back = np.swapaxes(rot, -1, -2)
+    back = rot.mT
     info = None if information is None else back @ information @ rot
     none = np.zeros(len(seen), dtype=int)
     v, found = revolute_axes((back @ u[..., None])[..., 0], seen, none, 1, info)
@@ -155,7 +155,7 @@ def torsion(u: Array, rot: Array, v: Array, w: Array) -> tuple[Array, Array, Arr
     """
     turned = (rot @ w[..., None])[..., 0]
     by_v = cross(turned, u)
-    by_w = (np.swapaxes(rot, -1, -2) @ cross(u, v)[..., None])[..., 0]
+    by_w = (rot.mT @ cross(u, v)[..., None])[..., 0]
     return dot(v, by_v), by_v, by_w
 
 
@@ -218,7 +218,7 @@ def _beside_drawing(
         values, vectors = np.linalg.eigh(normal)
         values = np.maximum(values, 0.0)
         right = (normal @ x[..., None])[..., 0] - np.einsum("bkli,bkl->bli", jac, value)
-        along = (np.swapaxes(vectors, -1, -2) @ right[..., None])[..., 0]
+        along = (vectors.mT @ right[..., None])[..., 0]
         # directions that the data do not know at all stay as drawn even without noise
         hold = noise / tolerance**2 + ROUNDING * values[..., -1] + 1e-300
         share = values / (values + hold[..., None])

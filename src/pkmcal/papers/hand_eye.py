@@ -21,12 +21,13 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import (
     dot,
+    from_quaternion,
     inverse,
     perturb,
     pose,
     pose_difference,
+    quaternion,
     register,
-    rotation_vector,
     skew,
 )
 from pkmcal.identify.estimate import State
@@ -146,7 +147,7 @@ def solve_pairs(body: Array, seen: Array, size: float) -> Pair:
 def _check_told(problem: PairProblem, pair: Pair) -> None:
     linear = problem.linearize(pair)
     rows = linear.by_shared.reshape(len(linear.value), -1, 12)
-    normal = np.swapaxes(rows, -1, -2) @ rows + linear.shared_by.T @ linear.shared_by
+    normal = rows.mT @ rows + linear.shared_by.T @ linear.shared_by
     # as loose as a full turn where nothing tells
     normal = normal + np.diag(np.tile(np.repeat([0.1, 1e-3 / problem.size], 3) ** 2, 2))
     turn = np.linalg.inv(normal)[:, :3, :3]
@@ -176,12 +177,12 @@ def _turns(body: Array, seen: Array) -> list[tuple[Array, Array]]:
     each = _left(q_seen) @ _right(q_body @ conjugate) @ conjugate
     u, _, vt = np.linalg.svd(np.sum(sign[..., None, None] * each, axis=1))
     laid = quaternion(register(body[..., :3, 3], seen[..., :3, 3])[..., :3, :3])
-    along = np.swapaxes(u, -1, -2) @ laid[..., None]
+    along = u.mT @ laid[..., None]
     out: list[tuple[Array, Array]] = []
     for rank in RANKS:
         kept = along * (np.arange(4) < rank)[:, None]
-        camera, mount = u @ kept, np.swapaxes(vt, -1, -2) @ kept
-        out.append((matrix(camera[..., 0]), matrix(mount[..., 0])))
+        camera, mount = u @ kept, vt.mT @ kept
+        out.append((from_quaternion(camera[..., 0]), from_quaternion(mount[..., 0])))
     return out
 
 
@@ -200,22 +201,6 @@ def _right(q: Array) -> Array:
     return out
 
 
-def quaternion(rot: Array) -> Array:
-    """Unit quaternions (..., 4), scalar first, of rotations (..., 3, 3)."""
-    omega = rotation_vector(rot)
-    angle = np.sqrt(dot(omega, omega))[..., None]
-    axis = omega / np.where(angle > 0, angle, 1.0)
-    return np.concatenate([np.cos(angle / 2), np.sin(angle / 2) * axis], axis=-1)
-
-
-def matrix(q: Array) -> Array:
-    """Rotations (..., 3, 3) of quaternions (..., 4) of any length but zero."""
-    q = q / np.sqrt(dot(q, q))[..., None]
-    w, v = q[..., :1, None], q[..., 1:]
-    k = skew(v)
-    return np.eye(3) + 2 * (w * k + k @ k)
-
-
 def _placed(body: Array, seen: Array, camera: Array, mount: Array) -> Pair:
     """Places for known turns: ``t_seen = R_camera (R_body t_mount + t_body) + t_camera``, linear;
     t_mount is held to zero within the limbs' length.
@@ -224,8 +209,8 @@ def _placed(body: Array, seen: Array, camera: Array, mount: Array) -> Pair:
     right = seen[..., :3, 3] - (camera[:, None] @ body[..., :3, 3:])[..., 0]
     off_rot = (rot - rot.mean(axis=1, keepdims=True)).reshape(len(body), -1, 3)
     off = (right - right.mean(axis=1, keepdims=True)).reshape(len(body), -1, 1)
-    normal = np.swapaxes(off_rot, -1, -2) @ off_rot + SHIFT**2 * np.eye(3)
-    t_mount = np.linalg.solve(normal, np.swapaxes(off_rot, -1, -2) @ off)
+    normal = off_rot.mT @ off_rot + SHIFT**2 * np.eye(3)
+    t_mount = np.linalg.solve(normal, off_rot.mT @ off)
     t_camera = right.mean(axis=1) - (rot.mean(axis=1) @ t_mount)[..., 0]
     return Pair(pose(camera, t_camera), pose(mount, t_mount[..., 0]))
 

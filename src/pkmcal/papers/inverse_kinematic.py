@@ -46,7 +46,6 @@ from pkmcal.solver import (
     of_runs,
     stacked,
     take,
-    transposed,
 )
 
 Form = Literal["joint", "implicit"]
@@ -187,10 +186,10 @@ class ImplicitProblem:
         """
         rows = self._rows(state)
         by = rows.by_pose @ rows.seen.by_measured
-        covariance = by @ noise @ transposed(by)
+        covariance = by @ noise @ by.mT
         slope = (rows.scale * rows.closure.by_reading)[..., None] * self.layout.of_motor
         e = slope.shape[-2]
-        covariance[..., :e, :e] += joint_noise**2 * (slope @ transposed(slope))
+        covariance[..., :e, :e] += joint_noise**2 * (slope @ slope.mT)
         covariance[..., :e, :e] += PERFECT**2 * np.eye(e) * rows.scale[..., None] ** 2
         return np.linalg.inv(np.linalg.cholesky(covariance))
 
@@ -298,7 +297,7 @@ def fit_session(
         start,
         form,
     )
-    noise = np.linalg.inv(np.swapaxes(poses.whiten, -1, -2) @ poses.whiten)
+    noise = np.linalg.inv(poses.whiten.mT @ poses.whiten)
     prior = whitened if use_drawing is None else use_drawing
     return fit_poses(machine, problem, state, noise if whitened else None,
                      measurements.joint_noise, prior)  # fmt: skip

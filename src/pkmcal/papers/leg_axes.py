@@ -164,7 +164,7 @@ def in_base(axes: Axes, T_camera_base: Array) -> Axes:
     photographs, W their information.
     """
     rot = T_camera_base[:, axes.station, None, :3, :3]
-    back = np.swapaxes(rot, -1, -2)
+    back = rot.mT
     u = np.where(axes.seen[..., None], (back @ axes.u[..., None])[..., 0], 0.0)
     names, first, row = np.unique(axes.configuration, return_index=True, return_inverse=True)
     member = (row == np.arange(len(names))[:, None]).astype(float)
@@ -230,9 +230,9 @@ def through_centres(machine: Machine, edges: EdgeSet, centres: Array) -> EdgeSet
     a = centres[edges.station, edges.leg]
     known: Booleans = np.all(np.isfinite(a), axis=-1)
     a = np.where(known[:, None], a, 0.0)
-    along = np.swapaxes(edges.basis, -1, -2) @ a[..., None]
+    along = edges.basis.mT @ a[..., None]
     gain = edges.covariance @ along
-    spread = np.maximum((np.swapaxes(along, -1, -2) @ gain)[..., 0], 1e-300)
+    spread = np.maximum((along.mT @ gain)[..., 0], 1e-300)
     miss = np.where(known, dot(edges.normal, a) + linear.edge_radii(machine, edges), 0.0)
     change = (edges.basis @ gain)[..., 0] * (miss[:, None] / spread)
     normal = edges.normal - change

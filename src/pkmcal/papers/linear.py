@@ -54,12 +54,12 @@ def weighted(n: Array, radius: Array, weight: Array) -> tuple[Array, Array]:
     # what is not known of a leg leaves it not fixed
     n, weight = (np.where(np.isfinite(x), x, 0.0) for x in (n, weight))
     rows = n * weight[..., None]
-    normal = np.swapaxes(rows, -1, -2) @ n
+    normal = rows.mT @ n
     values, vectors = np.linalg.eigh(normal)
     fixed = values[..., 0] > POORLY_FIXED * np.maximum(values[..., -1], 1e-300)
     safe = np.where(fixed[..., None], values, 1.0)
-    inverse = (vectors / safe[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    right = -np.swapaxes(rows, -1, -2) @ radius[..., None]
+    inverse = (vectors / safe[..., None, :]) @ vectors.mT
+    right = -rows.mT @ radius[..., None]
     a = (inverse @ right)[..., 0]
     return (
         np.where(fixed[..., None], a, np.nan),
@@ -127,7 +127,7 @@ def least_median(
     good = np.abs(det) > 1e-9
     rows = np.where(good[..., None, None], rows, np.eye(3))
     a = np.linalg.solve(rows, -right[..., None])[..., 0]
-    r = np.abs(a @ np.swapaxes(n, -1, -2) + np.broadcast_to(radius, present.shape)[..., None, :])
+    r = np.abs(a @ n.mT + np.broadcast_to(radius, present.shape)[..., None, :])
     r = np.where((present > 0)[..., None, :], r, np.inf)
     # the quantile that LMedS needs counts present edges only, so sort rather than take a median
     half = np.broadcast_to((count[..., 0] + 3) // 2, r.shape[:-1])
@@ -188,7 +188,7 @@ def centres(
     n, present, radius = (
         padded(values) for values in (edges.normal, np.ones(len(edges)), edge_radii(machine, edges))
     )
-    noise = padded(edges.basis @ edges.covariance @ np.swapaxes(edges.basis, -1, -2))
+    noise = padded(edges.basis @ edges.covariance @ edges.basis.mT)
     rng = np.random.default_rng(0) if rng is None else rng
     a, weight, covariance = solve(n, radius, present, noise, method, rng)
     shape = (measurements.n_stations, machine.n_legs)

@@ -41,8 +41,8 @@ class Taken(NamedTuple):
 
 def seen_platform(T_camera_base: Array, T_camera_board: Array, T_platform_board: Array) -> Seen:
     """[C] eq. 6 and its derivatives; (..., 4, 4) each, leading axes broadcast."""
-    back = np.swapaxes(T_camera_base[..., :3, :3], -1, -2)
-    rot = back @ T_camera_board[..., :3, :3] @ np.swapaxes(T_platform_board[..., :3, :3], -1, -2)
+    back = T_camera_base[..., :3, :3].mT
+    rot = back @ T_camera_board[..., :3, :3] @ T_platform_board[..., :3, :3].mT
     board = (back @ (T_camera_board[..., :3, 3:] - T_camera_base[..., :3, 3:]))[..., 0]
     arm = (rot @ T_platform_board[..., :3, 3:])[..., 0]
     place, camera = board - arm, -(back @ T_camera_base[..., :3, 3:])[..., 0]
@@ -90,7 +90,7 @@ def _turn_split(freedoms: int, rot: Array) -> tuple[Array, Array, Array, Array]:
     # the twist about z that leaves the shortest turn, by the quaternion's scalar and z parts
     angle = np.arctan2(rot[..., 1, 0] - rot[..., 0, 1], rot[..., 0, 0] + rot[..., 1, 1])
     own = rotation(angle[..., None] * np.array([0.0, 0.0, 1.0]))
-    rest = rot @ np.swapaxes(own, -1, -2)
+    rest = rot @ own.mT
     s = rotation_vector(rest)
     # a change of s turns by the left Jacobian, a change of the angle by the axis carried along
     columns = np.linalg.inv(turn_jacobian(s))

@@ -139,7 +139,7 @@ def laid(
     target = measured * np.ones(centred.shape)
     centred[..., :n, :] -= mean[..., None, :]
     target[..., :n, :] -= seen[..., None, :]
-    h = np.swapaxes(target, -1, -2) @ (w[..., None] * centred)
+    h = target.mT @ (w[..., None] * centred)
     if motion.shape[1] == 6:
         rot = nearest_rotation(h)
     else:
@@ -169,7 +169,7 @@ def loose(items: Array, seen: Booleans, directions: int = 0, motion: Array = ANY
     # an orthonormal basis of each frame's motions; those that it does not see count as nothing
     u, s, _ = np.linalg.svd(own * mask, full_matrices=False)
     u = u * (s > LOOSE * np.sqrt(len(items)))[:, None, :]
-    normal = np.sum(np.eye(len(own)) * mask - u @ np.swapaxes(u, -1, -2), axis=0)
+    normal = np.sum(np.eye(len(own)) * mask - u @ u.mT, axis=0)
     rigid = np.linalg.qr(own)[0]
     values, vectors = np.linalg.eigh(normal + rigid @ rigid.T)
     return vectors[:, values < LOOSE].reshape(len(items), 3, -1)

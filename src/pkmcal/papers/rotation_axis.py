@@ -95,11 +95,11 @@ def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
 
     Needs one pose more than the hypothesis has unknowns: three to turn about an axis.
     """
-    from scipy.stats import chi2 as distribution
+    from scipy.special import chdtrc
 
     hypothesis = TURNS[int(MOTIONS[motion][:3].any(axis=1).sum())]
     rot = poses.T_station_target[:, :3, :3]
-    noise = np.linalg.inv(np.swapaxes(poses.whiten, -1, -2) @ poses.whiten)[:, :3, :3]
+    noise = np.linalg.inv(poses.whiten.mT @ poses.whiten)[:, :3, :3]
     axis_camera = axis_board = np.full(3, np.nan)
     if hypothesis == "any":
         unknowns, off, covariance = 0, np.zeros((len(rot), 0)), np.zeros((len(rot), 0, 0))
@@ -124,7 +124,7 @@ def rotation_axis(poses: PoseSet, motion: str) -> RotationAxis:
         pairs=pairs,
         chi2=chi2,
         dof=dof,
-        p_value=float(distribution.sf(chi2, dof)) if dof else 1.0,
+        p_value=float(chdtrc(dof, chi2)) if dof else 1.0,
     )
 
 
@@ -143,7 +143,7 @@ def axis_frames(rot: Array) -> Frames:
     """
     u, _, vt = np.linalg.svd(rot.mean(axis=-3))
     camera, board = u[..., :, 0], vt[..., 0, :]
-    return Frames(facing(camera), np.swapaxes(facing(board), -1, -2))
+    return Frames(facing(camera), facing(board).mT)
 
 
 def facing(direction: Array) -> Array:
@@ -174,11 +174,11 @@ def _tilts(rot: Array, noise: Array, frames: Frames) -> tuple[Array, Array, Arra
     """Tilts (N, 2) of turns told in the frames, their change (N, 2, 3) by the turns (N, 3, 3) in
     those, the latter themselves, and the tilts' covariance (N, 2, 2).
     """
-    back = np.swapaxes(frames.camera, -1, -2)
-    own = back @ rot @ np.swapaxes(frames.board, -1, -2)
+    back = frames.camera.mT
+    own = back @ rot @ frames.board.mT
     found = taken(MOTIONS["schoenflies"], pose(own, np.zeros((len(rot), 3))))
     by = found.off_by[..., :3]
-    return found.off, by, own, by @ back @ noise @ frames.camera @ np.swapaxes(by, -1, -2)
+    return found.off, by, own, by @ back @ noise @ frames.camera @ by.mT
 
 
 def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
@@ -191,7 +191,7 @@ def _unturned(rot: Array, noise: Array) -> tuple[Array, Array]:
         mean = rotation(np.linalg.solve(weight.sum(axis=0), total)[:, 0]) @ mean
     off = rotation_vector(rot @ mean.T)
     by = turn_jacobian(off)
-    return off, by @ noise @ np.swapaxes(by, -1, -2)
+    return off, by @ noise @ by.mT
 
 
 def _pairwise(rot: Array, noise: Array) -> tuple[float, float, int]:
@@ -204,7 +204,7 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float, int]:
     if len(i) > MOST_PAIRS:  # an even choice is as good
         pick = np.linspace(0, len(i) - 1, MOST_PAIRS).astype(int)
         i, j = i[pick], j[pick]
-    turn = rotation_vector(rot[j] @ np.swapaxes(rot[i], -1, -2))
+    turn = rotation_vector(rot[j] @ rot[i].mT)
     angle = np.sqrt(dot(turn, turn))
     used = angle > LEAST_TURN
     if used.sum() < 2:
@@ -218,9 +218,9 @@ def _pairwise(rot: Array, noise: Array) -> tuple[float, float, int]:
     apart = np.linalg.norm(skew(mean) @ axis[..., None], axis=(-1, -2))
     by = turn_jacobian(turn)  # of the later pose; of the earlier one, its other half
     across = (np.eye(3) - axis[:, :, None] * axis[:, None, :]) @ by / angle[:, None, None]
-    back = across @ rot[j] @ np.swapaxes(rot[i], -1, -2)
-    covariance = across @ noise[j] @ np.swapaxes(across, -1, -2)
-    covariance = covariance + back @ noise[i] @ np.swapaxes(back, -1, -2)
+    back = across @ rot[j] @ rot[i].mT
+    covariance = across @ noise[j] @ across.mT
+    covariance = covariance + back @ noise[i] @ back.mT
     expected = np.sqrt(np.mean(np.trace(covariance, axis1=-2, axis2=-1)))
     found = np.sqrt(np.mean(np.arctan2(apart, dot(axis, mean)) ** 2))
     return float(found), float(expected), len(axis)

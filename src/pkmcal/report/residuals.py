@@ -147,12 +147,10 @@ def _configurations(session: Session, edges: EdgeSet, estimate: Estimate) -> Bar
 
 
 def expected_rms(n: float) -> tuple[float, float]:
-    """Where the root mean square of n standard normal numbers lies 19 times in 20.
+    """Where the root mean square of n standard normal numbers lies 19 times in 20."""
+    from scipy.special import chdtri
 
-    Wilson and Hilferty's approximation of the chi-square quantiles.
-    """
-    part = 2 / (9 * n)
-    low, high = (max(1 - part + z * np.sqrt(part), 0.0) ** 1.5 for z in (-1.96, 1.96))
+    low, high = np.sqrt(chdtri(n, [0.975, 0.025]) / n)
     return float(low), float(high)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable, closest, read_csv
-from pkmcal.geometry.rigid import pose, register, rotation
+from pkmcal.geometry.rigid import from_quaternion, pose, register, rotation
 from pkmcal.measurements import PoseSet
 from pkmcal.wording import listed
 
@@ -169,9 +169,7 @@ def _turn(table: CsvTable, column: dict[str, Array]) -> Array:
                 found=f"{length[bad[0]]:.4g}",
                 expected="1; the scalar part is qw",
             )
-        q = q / np.where(q[:, 0] < 0, -length, length)[:, None]
-        half = np.arctan2(np.linalg.norm(q[:, 1:], axis=1), q[:, 0])
-        return rotation(2 * q[:, 1:] / np.maximum(np.sinc(half / np.pi), 1e-12)[:, None])
+        return from_quaternion(q)
     if "rx" in column:
         vector = np.stack([column[name] for name in VECTOR], axis=-1)
         size = np.linalg.norm(vector, axis=1)

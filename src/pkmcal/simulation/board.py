@@ -21,8 +21,8 @@ from pkmcal.errors import GeometryError
 from pkmcal.geometry.rigid import apply, cross, inverse, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.session.schema import Body
-from pkmcal.simulation.casting import Part
 from pkmcal.simulation.drives import reaches
+from pkmcal.simulation.render import ScenePart
 from pkmcal.simulation.scene import Discs, Finish, discs_of, machine_parts
 from pkmcal.simulation.shapes import Box, Cylinder, Shape, turned
 from pkmcal.simulation.surfaces import Material, Pattern, SmoothNoise
@@ -48,6 +48,11 @@ ASKEW = 0.25
 """rad; by which a standing board leans, and turns, from the middle of the cameras."""
 LEAST_SEEN = 0.4
 """Share of a board's corners that every station has to see, on average."""
+BETTER_SEEN = {
+    "base": "put the stations higher, or use a wider lens",
+    "platform": "put the stations on one side of the machine, or use one",
+}
+"""What to do where a station sees less."""
 
 
 @dataclass(frozen=True)
@@ -177,15 +182,15 @@ class Printed(Pattern):
         return np.where(dark, BLACK, 1.0)
 
 
-def board_part(board: Board, T_base_board: Array) -> Part:
+def board_part(board: Board, T_base_board: Array) -> ScenePart:
     """The board as a part of the scene, matt."""
     sheet = Sheet.at(board, T_base_board)
-    return Part(sheet, Material(0.75, Printed(sheet.print)))
+    return ScenePart(sheet, Material(0.75, Printed(sheet.print)))
 
 
 def holder_part(
     board: Board, T_platform_board: Array, T_base_platform: Array, discs: Discs
-) -> Part:
+) -> ScenePart:
     """The rod that holds a board on the platform, from under its plate to the board's back."""
     low, high = board.points.min(axis=0), board.points.max(axis=0)
     back = (low + high) / 2 + np.array([0.0, 0.0, THICKNESS])
@@ -194,7 +199,7 @@ def holder_part(
     end = apply(T_base_platform @ T_platform_board, back)
     length = float(np.linalg.norm(end - start))
     shape = Cylinder(start, (end - start) / length, HOLDER * discs.platform_radius, length)
-    return Part(shape, Material(0.05))
+    return ScenePart(shape, Material(0.05))
 
 
 def board_for(machine: Machine, on: Body = "base") -> Board:
@@ -231,27 +236,42 @@ def board_from_fields(fields: dict[str, Any]) -> Board:
 def place_board(
     machine: Machine,
     board: Board,
+    on: Body,
     cameras: tuple[Camera, ...],
     T_camera_base: Array,
     T_base_platform: Array,
     joints: Array,
     rng: np.random.Generator,
 ) -> Array:
-    """T_base_board (4, 4): on the base, beside it or standing behind it, where it is seen best.
+    """The place (4, 4) on the base or the platform, in its frame, where a board is seen best.
 
-    T_camera_base : (S, 4, 4). T_base_platform (K, 4, 4) and joints (K, m) : configurations. The
-    corners seen are counted past the machine's parts; the station that sees least decides.
+    On the base it lies on it or beside it, or stands behind it; on the platform it is held by a
+    bracket above the plate. T_camera_base : (S, 4, 4). T_base_platform (K, 4, 4) and joints (K, m)
+    : configurations. The corners seen are counted past the machine's parts; the station that sees
+    least decides.
     """
     discs = discs_of(machine)
-    eyes = inverse(T_camera_base)[:, :3, 3]
-    places = [*_lying(board, discs, rng), *_standing(board, discs, eyes, rng)]
-    few = np.unique(np.linspace(0, len(joints) - 1, LOOKED_AT).astype(int))
+    places: list[Array] = []
+    if on == "base":
+        eyes = inverse(T_camera_base)[:, :3, 3]
+        places = [*_lying(board, discs, rng), *_standing(board, discs, eyes, rng)]
     finish = Finish.from_noise(SmoothNoise.from_rng(rng))
+    if on == "platform":
+        places = _brackets(board, discs, rng)
+    few = np.unique(np.linspace(0, len(joints) - 1, LOOKED_AT).astype(int))
+    carried = (
+        T_base_platform[few] if on == "platform" else np.broadcast_to(np.eye(4), (few.size, 4, 4))
+    )
     scenes = [machine_parts(machine, discs, finish, T_base_platform[k], joints[k]) for k in few]
     seen = np.array(
         [
             min(
-                np.mean([_share_seen(board, T, parts, eye, place) for parts in scenes])
+                np.mean(
+                    [
+                        _share_seen(board, T, parts, eye, T_base_body @ place)
+                        for parts, T_base_body in zip(scenes, carried, strict=True)
+                    ]
+                )
                 for eye, T in zip(cameras, T_camera_base, strict=True)
             )
             for place in places
@@ -260,50 +280,10 @@ def place_board(
     best = int(np.argmax(seen))
     if seen[best] < LEAST_SEEN:
         raise GeometryError(
-            "there is no place on the base where all stations see the board",
+            f"there is no place on the {on} where all stations see the board",
             found=f"{seen[best]:.0%} of its corners at most",
             expected=f"{LEAST_SEEN:.0%}",
-            next_step="put the stations higher, or use a wider lens",
-        )
-    return places[best]
-
-
-def place_on_platform(
-    machine: Machine,
-    board: Board,
-    cameras: tuple[Camera, ...],
-    T_camera_base: Array,
-    T_base_platform: Array,
-    joints: Array,
-    rng: np.random.Generator,
-) -> Array:
-    """T_platform_board (4, 4): on a bracket above the platform's plate, leaning to where the
-    stations see it best; arguments as of :func:`place_board`.
-    """
-    discs = discs_of(machine)
-    few = np.unique(np.linspace(0, len(joints) - 1, LOOKED_AT).astype(int))
-    finish = Finish.from_noise(SmoothNoise.from_rng(rng))
-    scenes = [
-        (k, machine_parts(machine, discs, finish, T_base_platform[k], joints[k])) for k in few
-    ]
-    places = _brackets(board, discs, rng)
-    seen = np.array(
-        [
-            min(
-                np.mean([_share_seen(board, T, parts, eye, T_base_platform[k] @ place)
-                         for k, parts in scenes])
-                for eye, T in zip(cameras, T_camera_base, strict=True)
-            )
-            for place in places
-        ]
-    )  # fmt: skip
-    best = int(np.argmax(seen))
-    if seen[best] < LEAST_SEEN:
-        raise GeometryError(
-            "there is no place on the platform where all stations see the board",
-            found=f"{seen[best]:.0%} of its corners at most",
-            expected=f"{LEAST_SEEN:.0%}",
-            next_step="put the stations on one side of the machine, or use one",
+            next_step=BETTER_SEEN[on],
         )
     return places[best]
 
@@ -375,7 +355,7 @@ def _standing(board: Board, discs: Discs, eyes: Array, rng: np.random.Generator)
 
 
 def _share_seen(
-    board: Board, T_camera_base: Array, parts: list[Part], camera: Camera, T_base_board: Array
+    board: Board, T_camera_base: Array, parts: list[ScenePart], camera: Camera, T_base_board: Array
 ) -> float:
     """Share of the board's corners that a camera sees past a machine's parts, less on a slant."""
     points = apply(T_base_board, board.points)

@@ -1,4 +1,7 @@
-"""Where motors, guides and side bars of a machine are, and how far its legs' ends go."""
+"""Where motors, guides and side bars of a machine are, and how far its legs' ends go.
+
+A drawing without any visible cylinder, as of machines known from boards alone, gets one a rod.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
-from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.mechanisms.closure import leg_readings, limb_ends, skeletons
+from pkmcal.mechanisms.document import Tube
 from pkmcal.mechanisms.motors import bodies
 
 INSET = 0.1
@@ -21,6 +25,10 @@ PIECES = 16
 """Straight pieces that a bent guide is drawn with."""
 STRAIGHT = 1e-9
 """A guide's way off the line between its ends, m, below which it is one piece."""
+ROD_RADIUS = 0.02
+"""Of a rod, in its length: 10 mm for half a metre, as carbon tubes of such machines have."""
+ROD_MARGIN = 0.07
+"""Share of the rod's length at either end that fork and joint hide."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +86,8 @@ def drives_of(machine: Machine) -> Drives:
     ways = [np.stack([p, p]) for p in foot]
     low, high = _guide_ranges(machine, by_reading).T
     for j in np.flatnonzero(guides):
-        readings = np.where(np.arange(machine.n_legs) == j, _steps(low[j], high[j]), 0.0)
+        steps = np.linspace(low[j], high[j], PIECES + 1)[:, None]
+        readings = np.where(np.arange(machine.n_legs) == j, steps, 0.0)
         way, along = (x[:, j] for x in _placed(machine, readings))
         ways[j] = way if _is_bent(way) else way[[0, -1]]
         foot[j] = way[PIECES // 2] if _is_bent(way) else ways[j].mean(axis=0)
@@ -95,11 +104,6 @@ def _placed(machine: Machine, leg_reading: Array) -> tuple[Array, Array]:
         own = g.of(machine.values), leg_reading[..., g.legs]
         a[..., g.legs, :], by_reading[..., g.legs, :] = g.carrier.place(*own)
     return a, by_reading
-
-
-def _steps(low: float, high: float) -> Array:
-    """Readings (PIECES + 1, 1) from one stop of a guide to the other."""
-    return np.linspace(low, high, PIECES + 1)[:, None]
 
 
 def _is_bent(way: Array) -> bool:
@@ -169,3 +173,33 @@ def side_bars(machine: Machine) -> tuple[Integers, ...]:
     """Legs of each body of an articulated platform, in the order of their numbers."""
     on = bodies(machine.document)
     return tuple(np.flatnonzero(on == body) for body in range(on.max(initial=-1) + 1))
+
+
+def with_forearms(machine: Machine) -> Machine:
+    """The machine with one cylinder a rod where its drawing gives no leg any; else unchanged.
+
+    A forearm is two rods where it is a parallelogram; here it is the one that stands for them.
+    """
+    document = machine.document
+    if any(leg.tubes for leg in document.legs):
+        return machine
+    home = machine.home()
+    readings = machine.inverse(home[None])[0]
+    ends = limb_ends(machine.layout, machine.values, readings, home)
+    lengths = np.linalg.norm(ends.b - ends.a, axis=1)
+    legs = tuple(
+        leg.model_copy(update={"tubes": (_tube(float(length)),)})
+        for leg, length in zip(document.legs, lengths, strict=True)
+    )
+    return machine_from_document(document.model_copy(update={"legs": legs}))
+
+
+def _tube(length: float) -> Tube:
+    """A rod's, in whole millimetres and half ones of the radius."""
+    return Tube.model_validate(
+        {
+            "radius": max(round(2000 * ROD_RADIUS * length) / 2000, 0.001),
+            "from": round(ROD_MARGIN * length, 3),
+            "to": round((1 - ROD_MARGIN) * length, 3),
+        }
+    )

@@ -12,10 +12,10 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import (
+    SIDE_SIGNS,
     contour_point,
-    edge_normal_jacobians,
+    edge_normal,
     leg_is_seen,
     line_through,
     tangent_basis,
@@ -24,6 +24,8 @@ from pkmcal.geometry.rigid import apply, dot
 from pkmcal.measurements import EdgeSet, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.observe.predict import TubeList, tubes_of
+from pkmcal.simulation.placement import one_a_station
 
 PLACES = 48
 """Places looked at along each tube: a hidden stretch is found to a fiftieth of the tube."""
@@ -68,118 +70,72 @@ def simulate_edges(
     pairs when absent. Edges outside the image or hidden behind other legs are left out; an edge
     that is hidden in part keeps its longest visible stretch.
     """
-    cameras = _one_a_station(camera, len(T_camera_base))
+    cameras = one_a_station(camera, len(T_camera_base))
     joints = machine.inverse(T_base_platform)
     if photographs is None:
         photographs = np.argwhere(np.ones((len(cameras), len(joints)), dtype=bool))
-    tubes = _tubes(machine)
+    tubes = tubes_of(machine)
     sets: list[EdgeSet] = []
     for station, one in enumerate(cameras):
         rows = photographs[photographs[:, 0] == station, 1]
         ends = limb_ends(machine.layout, machine.values, joints[rows], T_base_platform[rows])
         a, b = apply(T_camera_base[station], ends.a), apply(T_camera_base[station], ends.b)
-        exact = _exact_edges(one, tubes, a, b, station, rows)
-        sets.append(_with_errors(one, exact, noise, rng))
+        exact, rays = _exact_edges(one, tubes, machine.values[tubes.radius], a, b)
+        exact = replace(
+            exact,
+            station=np.full(len(exact), station),
+            configuration=rows[exact.configuration],
+        )
+        sets.append(_with_errors(one, exact, rays, noise, rng))
     edges = _with_wrong_ones(concatenate(sets), noise.wrong, rng)
     return edges, joints + joint_noise * rng.standard_normal(joints.shape)
 
 
-def _one_a_station(camera: Camera | Sequence[Camera], n_stations: int) -> tuple[Camera, ...]:
-    cameras = (camera,) * n_stations if isinstance(camera, Camera) else tuple(camera)
-    if len(cameras) != n_stations:
-        raise InputError(
-            what="the simulation needs one camera for all stations, or one for each",
-            found=f"{len(cameras)} cameras for {n_stations} stations",
-        )
-    return cameras
-
-
-@dataclass(frozen=True)
-class _Tubes:
-    """The machine's E edges: leg, tube, side (E,), from and to on the leg (m), radius (m)."""
-
-    leg: Integers
-    tube: Integers
-    side: Integers
-    start: Array
-    stop: Array
-    radius: Array
-
-
-@dataclass(frozen=True)
-class _Exact:
-    """Edges that are seen, exact: an edge set without errors, and rays along each, (N, n, 3)."""
-
-    edges: EdgeSet
-    rays: Array
-    pixels: Array
-
-
-def _tubes(machine: Machine) -> _Tubes:
-    rows = [
-        (j, t, side, tube.start, tube.stop, radius)
-        for j, leg in enumerate(machine.document.legs)
-        for t, (tube, radius) in enumerate(zip(leg.tubes, machine.radii()[j], strict=True))
-        for side in (0, 1)
-    ]
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return _Tubes(*columns)
-
-
 def _exact_edges(
-    camera: Camera, tubes: _Tubes, a: Array, b: Array, station: int,
-    configurations: Integers,
-) -> _Exact:  # fmt: skip
-    """All visible edges of a station's photographs; a, b (M, L, 3) in the camera frame."""
+    camera: Camera, tubes: TubeList, radius: Array, a: Array, b: Array
+) -> tuple[EdgeSet, Array]:
+    """All visible edges of a camera's M photographs, and unit rays along each, (N, n, 3).
+
+    radius : (E,) m. a, b : (M, L, 3), camera frame. Stations are all 0, and configurations count
+    the photographs; covariances and shifts are zero.
+    """
     a_e, b_e = a[:, tubes.leg], b[:, tubes.leg]
-    u, _ = line_through(a_e, b_e)
+    u, m = line_through(a_e, b_e)
     length = np.sqrt(dot(b_e - a_e, b_e - a_e))
-    normal = edge_normal_jacobians(a_e, b_e, tubes.radius, tubes.side).n
+    normal = edge_normal(u, m, radius, SIDE_SIGNS[tubes.side])
     first = np.broadcast_to(tubes.start + JOINT_HOUSING, length.shape)
     last = np.minimum(tubes.stop, length) - JOINT_HOUSING
-    along = first[..., None] + (last - first)[..., None] * np.linspace(0, 1, PLACES)
+    where = np.linspace(0, 1, PLACES)
+    along = first[..., None] + (last - first)[..., None] * where
     points = contour_point(
-        a_e[..., None, :], u[..., None, :], normal[..., None, :], tubes.radius[:, None], along
+        a_e[..., None, :], u[..., None, :], normal[..., None, :], radius[:, None], along
     )
     with np.errstate(invalid="ignore"):
         seen = camera.in_image(camera.project(points))
-        seen &= (leg_is_seen(a_e, b_e, tubes.radius) & (last > first))[..., None]
-    seen &= ~_hidden(points, tubes, a, b, _pixel_angle(camera))
+        seen &= (leg_is_seen(a_e, b_e, radius) & (last > first))[..., None]
+    seen &= ~_hidden(points, tubes, radius, a, b, _pixel_angle(camera))
     begin, count = _longest_run(seen)
     photo, edge = np.nonzero(count >= LEAST_SEEN)
     begin, count = begin[photo, edge], count[photo, edge]
     span = np.stack([along[photo, edge, begin], along[photo, edge, begin + count - 1]], axis=-1)
-    axis = _Axis(a_e[photo, edge], u[photo, edge], tubes.radius[edge], normal[photo, edge])
-    rays = axis.rays(span)
+    normal = normal[photo, edge]
+    points = contour_point(
+        a_e[photo, edge][:, None], u[photo, edge][:, None], normal[:, None], radius[edge][:, None],
+        span[:, :1] * (1 - where) + span[:, 1:] * where,
+    )  # fmt: skip
+    rays = points / np.sqrt(dot(points, points))[..., None]
     edges = EdgeSet(
-        station=np.full(len(edge), station), configuration=configurations[photo],
-        leg=tubes.leg[edge], tube=tubes.tube[edge], side=tubes.side[edge], normal=axis.normal,
-        basis=tangent_basis(axis.normal, rays[:, PLACES // 2]),
+        station=np.zeros(len(edge), dtype=int), configuration=photo,
+        leg=tubes.leg[edge], tube=tubes.tube[edge], side=tubes.side[edge], normal=normal,
+        basis=tangent_basis(normal, rays[:, PLACES // 2]),
         covariance=np.zeros((len(edge), 2, 2)), shift=np.zeros((len(edge), 2)), span=span,
     )  # fmt: skip
-    return _Exact(edges, rays, camera.project(rays))
+    return edges, rays
 
 
-@dataclass(frozen=True)
-class _Axis:
-    """Seen edges' axes: point a and direction u (N, 3), radius (N,), edge normal (N, 3)."""
-
-    a: Array
-    u: Array
-    radius: Array
-    normal: Array
-
-    def rays(self, span: Array) -> Array:
-        """Unit rays (N, n, 3) to even places on the edges between the ends of span (N, 2), m."""
-        where = np.linspace(0, 1, PLACES)
-        along = span[:, :1] * (1 - where) + span[:, 1:] * where
-        points = contour_point(
-            self.a[:, None], self.u[:, None], self.normal[:, None], self.radius[:, None], along
-        )
-        return points / np.sqrt(dot(points, points))[..., None]
-
-
-def _hidden(points: Array, tubes: _Tubes, a: Array, b: Array, pixel: float) -> Booleans:
+def _hidden(
+    points: Array, tubes: TubeList, radius: Array, a: Array, b: Array, pixel: float
+) -> Booleans:
     """(M, E, n) True where a tube of another leg, or of the own one, is in front of a point.
 
     pixel : angle of a pixel, rad; another leg hides what comes within CLEARANCE of it, too.
@@ -198,7 +154,7 @@ def _hidden(points: Array, tubes: _Tubes, a: Array, b: Array, pixel: float) -> B
         qa = np.maximum(1 - du**2, 1e-12)
         qb = dot(d, start) - du * au
         other = (tubes.leg != j)[:, None]
-        qc = dot(start, start) - au**2 - (tubes.radius[e] + other * margin) ** 2
+        qc = dot(start, start) - au**2 - (radius[e] + other * margin) ** 2
         disc = qb**2 - qa * qc
         t = (qb - np.sqrt(np.maximum(disc, 0.0))) / qa
         s = t * du - au
@@ -227,42 +183,57 @@ def _longest_run(seen: Booleans) -> tuple[Integers, Integers]:
 
 
 def _with_errors(
-    camera: Camera, exact: _Exact, noise: EdgeNoise, rng: np.random.Generator
+    camera: Camera, edges: EdgeSet, rays: Array, noise: EdgeNoise, rng: np.random.Generator
 ) -> EdgeSet:
-    """Edges with noise, its covariance, and what an outward shift by a pixel does."""
-    edges = exact.edges
-    by_shift, by_tilt = _responses(camera, exact)
-    error = rng.standard_normal((len(edges), 2)) * (noise.shift, noise.tilt)
-    turn = by_shift * (error[:, :1] + noise.outward) + by_tilt * error[:, 1:]
-    normal = edges.normal + (edges.basis @ turn[..., None])[..., 0]
-    normal = normal / np.sqrt(dot(normal, normal))[..., None]
-    basis = tangent_basis(normal, exact.rays[:, PLACES // 2])
+    """Edges with noise, its covariance, and what an outward shift by a pixel does.
+
+    A point at ray s that moves outward by e px turns by e c, c = |J^T n| with J = d ray/d pixel,
+    and the plane follows where s . dn = -c e.
+    """
+    pixels = camera.project(rays)
+    by_pixel, _ = camera.ray_jacobians(pixels)
+    gradient = np.einsum("nkij,ni->nkj", by_pixel, edges.normal)
+    by_turn = -np.einsum("nki,nij->nkj", rays, edges.basis)
+    by_shift, by_tilt = responses(by_turn / np.sqrt(dot(gradient, gradient))[..., None], pixels)
+    normal = disturbed(edges.normal, edges.basis, by_shift, by_tilt, noise, rng)
     parts = np.stack([by_shift * noise.shift, by_tilt * noise.tilt], axis=-1)
     return replace(
-        edges, normal=normal, basis=basis, covariance=parts @ np.swapaxes(parts, -1, -2),
-        shift=by_shift,
+        edges, normal=normal, basis=tangent_basis(normal, rays[:, PLACES // 2]),
+        covariance=parts @ parts.mT, shift=by_shift,
     )  # fmt: skip
 
 
-def _responses(camera: Camera, exact: _Exact) -> tuple[Array, Array]:
-    """Change (N, 2) of the normal, in its basis, when the edge moves outward by one pixel
-    everywhere, and when its far end moves outward by one pixel and its near end inward.
+def responses(by_turn: Array, pixels: Array) -> tuple[Array, Array]:
+    """Turns (..., 2) of edges' normals, in their bases, when an edge moves outward by one pixel
+    everywhere, and when its far end moves out by one pixel and its near end in.
 
-    A point at ray s that moves outward by e px turns by e c, c = |J^T n| with J = d ray/d pixel,
-    and the plane follows where s . dn = -c e: least squares over the places, each in px.
+    by_turn : (..., n, 2) outward motion (px) of n places by a turn. pixels : (..., n, 2). Least
+    squares over the places, each in px; zero where no place of an edge has an image (NaN).
     """
-    n = exact.edges.normal
-    by_pixel, _ = camera.ray_jacobians(exact.pixels)
-    gradient = np.einsum("nkij,ni->nkj", by_pixel, n)
-    c = np.sqrt(dot(gradient, gradient))
-    design = -np.einsum("nki,nij->nkj", exact.rays, exact.edges.basis) / c[..., None]
-    step = np.diff(exact.pixels, axis=1)
-    run = np.concatenate(
-        [np.zeros((len(n), 1)), np.cumsum(np.sqrt(dot(step, step)), axis=1)], axis=1
-    )
-    tilt = 2 * run / np.maximum(run[:, -1:], 1e-300) - 1
-    gain = np.linalg.pinv(design)
-    return gain.sum(axis=-1), np.einsum("njk,nk->nj", gain, tilt)
+    step = np.diff(np.nan_to_num(pixels), axis=-2)
+    run = np.cumsum(np.sqrt(dot(step, step)), axis=-1)
+    run = np.concatenate([np.zeros((*run.shape[:-1], 1)), run], axis=-1)
+    tilt = 2 * run / np.maximum(run[..., -1:], 1e-300) - 1
+    value = np.stack([np.ones(tilt.shape), tilt], axis=-1)
+    rows = np.nan_to_num(by_turn)
+    turned = rows.mT
+    normal = turned @ rows + 1e-300 * np.eye(2)
+    gone = np.abs(np.linalg.det(normal)) < 1e-200  # no place of the edge has an image
+    solved = np.linalg.solve(np.where(gone[..., None, None], np.eye(2), normal), turned @ value)
+    return solved[..., 0], solved[..., 1]
+
+
+def disturbed(
+    normal: Array, basis: Array, by_shift: Array, by_tilt: Array, noise: EdgeNoise,
+    rng: np.random.Generator,
+) -> Array:  # fmt: skip
+    """Normals (..., 3) as measured; basis (..., 3, 2), by_shift and by_tilt (..., 2) as of
+    :func:`responses`.
+    """
+    error = rng.standard_normal((*by_shift.shape[:-1], 2)) * (noise.shift, noise.tilt)
+    turn = by_shift * (error[..., :1] + noise.outward) + by_tilt * error[..., 1:]
+    moved = normal + (basis @ turn[..., None])[..., 0]
+    return moved / np.sqrt(dot(moved, moved))[..., None]
 
 
 def _with_wrong_ones(edges: EdgeSet, fraction: float, rng: np.random.Generator) -> EdgeSet:

@@ -1,5 +1,9 @@
 """Photographs of a scene by any central camera: exact silhouettes, sub-pixel borders, noise.
 
+Rays come in bundles of neighbours, (3, bundles, rays). A bundle lies in a narrow cone, and only
+shapes with a bounding ball in that cone are tried: a leg costs what it covers. What a ray meets
+first is lit by what the point sees of the lamp.
+
 Each pixel is first looked at once, through its centre. Where the label (shape, face, shadow) of a
 pixel differs from a neighbour's, the pixel is looked at again through points spread over its area,
 so its grey level is the mean over the pixel. Then follow the lens's blur, the sensor's noise
@@ -8,14 +12,15 @@ and 8 bits, linear in the light.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.simulation.casting import Bounds, Scene, look
-from pkmcal.simulation.shapes import turned
+from pkmcal.simulation.shapes import Shape, turned
+from pkmcal.simulation.surfaces import Lamp, Lighting, Material, radiance
 
 TILE = 16
 """Pixels along the side of a bundle of neighbouring rays."""
@@ -25,8 +30,143 @@ random from pixel to pixel: a straight edge is then right to 0.02 px in each row
 without bias along the edge, upright ones included."""
 LEAST_STEP = 0.004
 """Steps in light below this (a grey level) need no second look: soft shadows have them."""
-_CHUNK = 256
+CHUNK = 256
 """Bundles at a time: 65 thousand rays, whose arrays stay in the processor's cache."""
+
+
+@dataclass(frozen=True)
+class ScenePart:
+    """A shape with its surface; ``solid`` ones cast shadows."""
+
+    shape: Shape
+    material: Material
+    solid: bool = True
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that a camera sees, base frame."""
+
+    parts: tuple[ScenePart, ...]
+    lighting: Lighting
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounding balls of all shapes: centres (3, b), radii (b,), first ball of each shape (p,)."""
+
+    centre: Array
+    radius: Array
+    first: Integers
+
+    @classmethod
+    def of(cls, shapes: Sequence[Shape]) -> Bounds:
+        """The shapes' own balls in a row."""
+        balls = [shape.balls() for shape in shapes]
+        counts = [len(radius) for _, radius in balls]
+        return cls(
+            np.concatenate([centre for centre, _ in balls], axis=1),
+            np.concatenate([radius for _, radius in balls]),
+            np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int),
+        )
+
+    def reached(self, origin: Array, rays: Array, grow: float = 0.0) -> Booleans:
+        """(bundles, p) True where a ray of a bundle may come within ``grow`` of a shape."""
+        middle = rays.mean(axis=2)
+        middle = middle / np.sqrt(np.einsum("ib,ib->b", middle, middle))
+        spread = np.einsum("ibr,ib->br", rays, middle).min(axis=1)
+        half = np.arccos(np.clip(spread, -1, 1))
+        to_ball = self.centre - origin[:, None]
+        distance = np.sqrt(np.einsum("ib,ib->b", to_ball, to_ball))
+        cosine = np.einsum("ik,ib->kb", middle, to_ball) / np.maximum(distance, 1e-12)
+        radius = self.radius + grow
+        width = np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1.0))
+        # a ball round the origin is met by every ray
+        width = np.where(distance <= radius, np.pi, width)
+        angle = np.arccos(np.clip(cosine, -1, 1))
+        # arccos is coarse near one: a rounding error there is worth 1e-7 rad
+        near = angle <= half[:, None] + width + 1e-6
+        return np.logical_or.reduceat(near, self.first, axis=1)
+
+
+def first_hits(
+    shapes: Sequence[Shape], bounds: Bounds, origin: Array, rays: Array
+) -> tuple[Array, Integers]:
+    """Distance (bundles, rays) to the nearest shape, inf where none, and its number, -1."""
+    distance = np.full(rays.shape[1:], np.inf)
+    owner = np.full(rays.shape[1:], -1, dtype=np.int16)
+    reached = bounds.reached(origin, rays)
+    for k, shape in enumerate(shapes):
+        rows = np.flatnonzero(reached[:, k])
+        if not rows.size:
+            continue
+        found = shape.enter(origin, _flat(rays, rows)).reshape(rows.size, -1)
+        before = distance[rows]
+        closer = found < before
+        distance[rows] = np.where(closer, found, before)
+        owner[rows] = np.where(closer, np.int16(k), owner[rows])
+    return distance, owner
+
+
+def lamp_seen(
+    parts: Sequence[ScenePart], bounds: Bounds, lamp: Lamp, points: Array, owner: Integers
+) -> Array:
+    """Part of the lamp (bundles, rays) that surface points (3, bundles, rays) see.
+
+    A convex shape does not shadow its own lit points, so ``owner`` is left out; that needs no
+    tolerance at the surface.
+    """
+    rays = points - lamp.place[:, None, None]
+    distance = np.sqrt(np.einsum("ibr,ibr->br", rays, rays))
+    rays = rays / distance
+    seen = np.ones(distance.shape)
+    reached = bounds.reached(lamp.place, rays, lamp.radius)
+    for k, part in enumerate(parts):
+        rows = np.flatnonzero(reached[:, k])
+        if not (part.solid and rows.size):
+            continue
+        hidden = part.shape.veil(
+            lamp.place, _flat(rays, rows), distance[rows].ravel(), lamp.radius
+        ).reshape(rows.size, -1)
+        # overlapping parts of one leg hide the same piece of the lamp: the larger share counts
+        seen[rows] = np.minimum(seen[rows], np.where(owner[rows] == k, 1.0, 1.0 - hidden))
+    return seen
+
+
+def look(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> tuple[Array, Integers]:
+    """Light along rays (3, bundles, rays), and labels that change at every visible border.
+
+    Both (bundles, rays). A label counts the shape, its face, and whether it lies in shadow.
+    """
+    shapes = [part.shape for part in scene.parts]
+    distance, owner = first_hits(shapes, bounds, origin, rays)
+    lost = owner < 0
+    points = origin[:, None, None] + np.where(lost, 1.0, distance) * rays
+    seen = np.ones(distance.shape)
+    for lamp in scene.lighting.lamps:
+        if lamp.shadows:
+            seen = lamp_seen(scene.parts, bounds, lamp, points, owner)
+    flat, toward, lit = points.reshape(3, -1), -rays.reshape(3, -1), seen.ravel()
+    numbers = owner.ravel()
+    order = np.argsort(numbers, kind="stable")
+    starts = np.searchsorted(numbers[order], np.arange(len(shapes) + 1))
+    light = np.zeros(numbers.size)
+    face = np.zeros(numbers.size, dtype=np.int16)
+    for k, part in enumerate(scene.parts):
+        at = order[starts[k] : starts[k + 1]]
+        if at.size:
+            face[at] = part.shape.face(flat[:, at])
+            light[at] = radiance(
+                part.shape, part.material, flat[:, at], toward[:, at], lit[at], scene.lighting
+            )
+    label = 6 * owner + 2 * face.reshape(owner.shape) + (seen < 0.5)
+    return light.reshape(distance.shape), np.where(lost, -1, label).astype(np.int16)
+
+
+def _flat(rays: Array, rows: Integers) -> Array:
+    """The rays of some bundles in one row, (3, n); a view where all are wanted."""
+    wanted = rays if rows.size == rays.shape[1] else rays[:, rows]
+    return wanted.reshape(3, -1)
 
 
 @dataclass(frozen=True)
@@ -45,7 +185,7 @@ class Sensor:
 
 
 @dataclass(frozen=True)
-class View:
+class PixelRays:
     """A camera's rays, worked out once: (3, H, W) through pixel centres and (3, H+1, W+1)
     through their corners, camera frame; NaN where no ray meets the pixel.
     """
@@ -54,7 +194,7 @@ class View:
     corner: Array
 
     @classmethod
-    def of(cls, camera: Camera) -> View:
+    def of(cls, camera: Camera) -> PixelRays:
         """All rays of a camera."""
         width, height = camera.image_size
         return cls(
@@ -63,7 +203,7 @@ class View:
         )
 
 
-def render(scene: Scene, view: View, T_camera_base: Array, rng: np.random.Generator) -> Array:
+def render(scene: Scene, view: PixelRays, T_camera_base: Array, rng: np.random.Generator) -> Array:
     """Light (H, W) that falls on each pixel, mean over its area, before blur; 1 is white."""
     rot = T_camera_base[:3, :3].T
     origin = -rot @ T_camera_base[:3, 3]
@@ -98,7 +238,7 @@ def _rays(camera: Camera, x: Array, y: Array) -> Array:
 
 
 def _through_centres(
-    scene: Scene, bounds: Bounds, origin: Array, rot: Array, view: View, blind: Booleans
+    scene: Scene, bounds: Bounds, origin: Array, rot: Array, view: PixelRays, blind: Booleans
 ) -> tuple[Array, Integers]:
     """One ray a pixel: light and labels, both (H, W); meaningless in blind pixels."""
     shape = blind.shape
@@ -115,7 +255,7 @@ def _through_centres(
 
 
 def _over_area(
-    scene: Scene, bounds: Bounds, origin: Array, rot: Array, view: View, border: Booleans,
+    scene: Scene, bounds: Bounds, origin: Array, rot: Array, view: PixelRays, border: Booleans,
     rng: np.random.Generator,
 ) -> Array:  # fmt: skip
     """Mean light (n,) over the area of each border pixel, in the order of the mask."""
@@ -174,7 +314,7 @@ def _tiles(height: int, width: int) -> Integers:
 
 
 def _chunks(rows: Integers) -> list[Integers]:
-    return [rows[k : k + _CHUNK] for k in range(0, len(rows), _CHUNK)]
+    return [rows[k : k + CHUNK] for k in range(0, len(rows), CHUNK)]
 
 
 def _seeing(d: Array) -> Array:

@@ -7,22 +7,16 @@ in a laboratory; only the machine moves. Sizes follow the machine's own.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.geometry.rigid import apply, rotation
+from pkmcal.geometry.rigid import apply, cross, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import leg_readings, limb_ends, skeletons
-from pkmcal.simulation.casting import Part, Scene
-from pkmcal.simulation.driven_parts import (
-    arm_parts,
-    beams,
-    guide_parts,
-    motor_radius,
-    nacelle_parts,
-)
 from pkmcal.simulation.drives import Drives, drives_of, reaches, side_bars
+from pkmcal.simulation.render import Scene, ScenePart
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
 from pkmcal.simulation.surfaces import (
     Checks,
@@ -37,6 +31,28 @@ from pkmcal.simulation.surfaces import (
 )
 
 Z = np.array([0.0, 0.0, 1.0])
+MOTOR = 0.17
+"""Radius of a motor, in its arm's length; three radii of the joint at least."""
+CARRIAGE = (2.4, 1.4, 0.6)
+"""Half a carriage's size along, across and from its guide, in radii of the joint on it."""
+RAIL = 1.2
+"""Half a guide's width, in radii of the joint on its carriage."""
+POSTS = 3.5, 7.5
+"""Heights of the posts on a planar machine's plates, platform and base, in radii of a joint. A
+plate over the legs would hide them; one close below them would show their shadows for edges."""
+COLUMN = 0.12, 12.0
+"""Radius and length of what a hanging machine hangs on, in radii of its base; the room ends it."""
+BED = 4.0
+"""Height of what guides stand on below the platform's lowest joints, in the platform's radius:
+a tool or a board has room under the platform."""
+AROUND = {False: (0.26, 0.13), True: (0.42, 0.28)}
+DIRECT = 0.7
+"""Light from above and below, and the share of the lamps' that is left where it is soft, round
+machines with thin rods: in hard light these end, for a camera, where their lit side does."""
+ASIDE = 1.2
+"""rad; how far a lamp that lights a board stands to either side of the cameras, at most."""
+FLANGE = 0.3
+"""Radius of an articulated platform's tool flange, in that of a rigid one's plate."""
 
 
 @dataclass(frozen=True)
@@ -59,24 +75,6 @@ class Discs:
     drives: Drives
 
 
-_POSTS = 3.5, 7.5
-"""Heights of the posts on a planar machine's plates, platform and base, in radii of a joint. A
-plate over the legs would hide them; one close below them would show their shadows for edges."""
-_COLUMN = 0.12, 12.0
-"""Radius and length of what a hanging machine hangs on, in radii of its base; the room ends it."""
-_BED = 4.0
-"""Height of what guides stand on below the platform's lowest joints, in the platform's radius:
-a tool or a board has room under the platform."""
-_AROUND = {False: (0.26, 0.13), True: (0.42, 0.28)}
-_DIRECT = 0.7
-"""Light from above and below, and the share of the lamps' that is left where it is soft, round
-machines with thin rods: in hard light these end, for a camera, where their lit side does."""
-_ASIDE = 1.2
-"""rad; how far a lamp that lights a board stands to either side of the cameras, at most."""
-_FLANGE = 0.3
-"""Radius of an articulated platform's tool flange, in that of a rigid one's plate."""
-
-
 def discs_of(machine: Machine) -> Discs:
     """Plates outside the joints, along the frames' z, as wide as the joints need.
 
@@ -96,9 +94,9 @@ def discs_of(machine: Machine) -> Discs:
     base, platform = held.mean(axis=0), b.mean(axis=0)
     planar = machine.document.motion == "planar"
     near, far = (p[0, :, 2].mean() for p in reaches(machine))
-    lift, drop = _POSTS if planar else (2.2, 2.2)
+    lift, drop = POSTS if planar else (2.2, 2.2)
     over = -side if planar else -1.0 if far - near < -1e-3 else 1.0
-    drop = max(drop * ball, room, _BED * width_b if drives.upright.any() else 0.0)
+    drop = max(drop * ball, room, BED * width_b if drives.upright.any() else 0.0)
     base[2] = (side * held[:, 2]).min() * side - side * drop
     platform[2] = (over * b[:, 2]).max() * over + over * lift * ball
     thickness = max(0.012, 0.8 * ball)
@@ -126,7 +124,7 @@ def _held(machine: Machine, drives: Drives, balls: Array) -> tuple[Array, float]
 
 def machine_parts(
     machine: Machine, discs: Discs, finish: Finish, T_base_platform: Array, joints: Array
-) -> list[Part]:
+) -> list[ScenePart]:
     """The machine at one pose (4, 4) and its readings (m,)."""
     ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
     balls = _ball_radii(machine)
@@ -142,20 +140,22 @@ def machine_parts(
     return parts
 
 
-def _base(discs: Discs, balls: Array, finish: Finish) -> list[Part]:
+def _base(discs: Discs, balls: Array, finish: Finish) -> list[ScenePart]:
     """The base plate, and what it hangs on; or beams in its place, for guides that lie."""
     up = discs.side * Z
     parts = beams(discs.drives, balls, finish)
     if not parts:
-        parts = [Part(Cylinder(discs.base, -up, discs.base_radius, discs.thickness), finish.base)]
+        parts = [
+            ScenePart(Cylinder(discs.base, -up, discs.base_radius, discs.thickness), finish.base)
+        ]
     if discs.side < 0 and discs.drives.any:
-        radius, length = (size * discs.base_radius for size in _COLUMN)
-        parts.append(Part(Cylinder(discs.base - discs.thickness * up, -up, radius, length),
+        radius, length = (size * discs.base_radius for size in COLUMN)
+        parts.append(ScenePart(Cylinder(discs.base - discs.thickness * up, -up, radius, length),
                           finish.base))  # fmt: skip
     return parts
 
 
-def _base_end(discs: Discs, j: int, chain: Array, balls: Array, finish: Finish) -> list[Part]:
+def _base_end(discs: Discs, j: int, chain: Array, balls: Array, finish: Finish) -> list[ScenePart]:
     """What holds leg j's end on the base, the last point of its chain (k, 3)."""
     drives, up, a = discs.drives, discs.side * Z, chain[-1]
     if drives.arms[j]:
@@ -172,33 +172,37 @@ def _platform(
     balls: Array,
     T_base_platform: Array,
     finish: Finish,
-) -> list[Part]:
+) -> list[ScenePart]:
     """The platform's plate with the tool's holder, and its joints b (L, 3) or the bars to them."""
     up = discs.platform_side * T_base_platform[:3, 2]
     centre = apply(T_base_platform, discs.platform)
-    radius = discs.platform_radius * (_FLANGE if bars else 1.0)
+    radius = discs.platform_radius * (FLANGE if bars else 1.0)
     top = centre + discs.thickness * up
     parts = [
-        Part(Cylinder(centre, up, radius, discs.thickness), finish.platform),
-        Part(Cylinder(top, up, 0.28 * discs.platform_radius, 1.5 * discs.thickness), finish.joint),
+        ScenePart(Cylinder(centre, up, radius, discs.thickness), finish.platform),
+        ScenePart(
+            Cylinder(top, up, 0.28 * discs.platform_radius, 1.5 * discs.thickness), finish.joint
+        ),
     ]
     if bars:
         parts += nacelle_parts(bars, b, balls, centre, up, finish)
-        return parts + [Part(Ball(p, r), finish.joint) for p, r in zip(b, balls, strict=True)]
+        return parts + [ScenePart(Ball(p, r), finish.joint) for p, r in zip(b, balls, strict=True)]
     for p, r in zip(b, balls, strict=True):
         parts += _joint(p, up, float((centre - p) @ up), float(r), finish)
     return parts
 
 
-def _joint(centre: Array, way: Array, height: float, radius: float, finish: Finish) -> list[Part]:
+def _joint(
+    centre: Array, way: Array, height: float, radius: float, finish: Finish
+) -> list[ScenePart]:
     """A ball, and the post from it to its plate."""
     post = Cylinder(centre, way, 0.6 * radius, height)
-    return [Part(Ball(centre, radius), finish.joint), Part(post, finish.joint)]
+    return [ScenePart(Ball(centre, radius), finish.joint), ScenePart(post, finish.joint)]
 
 
 def _leg(
     machine: Machine, j: int, a: Array, b: Array, finish: Finish, bare: Material
-) -> list[Part]:
+) -> list[ScenePart]:
     """The leg's tubes, cut off where the leg ends, and the neck between joint and first tube.
 
     bare : of all but the first of several tubes.
@@ -206,16 +210,16 @@ def _leg(
     length = float(np.linalg.norm(b - a))
     u = (b - a) / length
     tubes = machine.document.legs[j].tubes
-    parts: list[Part] = []
+    parts: list[ScenePart] = []
     for t, (tube, radius) in enumerate(zip(tubes, machine.radii()[j], strict=True)):
         stop = min(tube.stop, length)
         if stop > tube.start:
             material = finish.paint if t == 0 and len(tubes) > 1 else bare
             shape = Cylinder(a + tube.start * u, u, float(radius), stop - tube.start)
-            parts.append(Part(shape, material))
+            parts.append(ScenePart(shape, material))
     if tubes and tubes[0].start > 0:
         neck = Cylinder(a, u, 0.8 * float(machine.radii()[j][0]), tubes[0].start)
-        parts.append(Part(neck, finish.joint))
+        parts.append(ScenePart(neck, finish.joint))
     return parts
 
 
@@ -227,14 +231,182 @@ def _ball_radii(machine: Machine) -> Array:
     )
 
 
+def motor_radius(arm: float, ball: float) -> float:
+    """Of an arm's motor, m."""
+    return max(MOTOR * arm, 2.2 * ball)
+
+
+def arm_parts(
+    drives: Drives, j: int, chain: Array, balls: Array, plate: Array, up: Array, finish: Finish
+) -> list[ScenePart]:
+    """The arm of leg j, the hub, the motor beside it, and its bracket.
+
+    chain : (k, 3) along the arm, from its motor to the leg's end. balls : (L,) radii of the joints.
+    plate : (3,) on the base plate's face; up : unit, to the legs.
+    """
+    foot, v, ball = drives.foot[j], drives.axis[j], float(balls[j])
+    wide = motor_radius(float(np.linalg.norm(chain[-1] - foot)), ball)
+    length = min(2.4 * wide, 0.6 * _room(drives.foot, j))
+    way = _motor_side(drives, j) * v
+    first = foot + 1.1 * ball * way
+    post = float((foot - plate) @ up)
+    middle = first + 0.5 * length * way
+    return [
+        *(
+            ScenePart(_web(start, stop, v, ball), finish.platform)
+            for start, stop in pairwise(chain)
+        ),
+        ScenePart(Cylinder(foot - 1.1 * ball * v, v, 1.7 * ball, 2.2 * ball), finish.steel),
+        ScenePart(Cylinder(first, way, wide, length), finish.joint),
+        ScenePart(Cylinder(middle, -up, 0.6 * wide, max(post, 1e-4)), finish.joint),
+        ScenePart(Ball(chain[-1], ball), finish.joint),
+    ]
+
+
+def _web(start: Array, stop: Array, v: Array, ball: float) -> Box:
+    """A straight piece of an arm, flat along its motor's axis v."""
+    length = float(np.linalg.norm(stop - start))
+    e = (stop - start) / length
+    across = v - float(v @ e) * e
+    if np.linalg.norm(across) < 1e-6:
+        across = cross(e, np.eye(3)[np.abs(e).argmin()])
+    across = across / float(np.linalg.norm(across))
+    half = np.array([length / 2, 0.7 * ball, 1.1 * ball])
+    return Box((start + stop) / 2, np.stack([e, across, np.cross(e, across)]), half)
+
+
+def _room(feet: Array, j: int) -> float:
+    """Distance to the nearest other motor, m."""
+    apart = np.linalg.norm(np.delete(feet, j, axis=0) - feet[j], axis=1)
+    # arms on one motor stand in one place
+    apart = apart[apart > 1e-2 * apart.max(initial=0.0)]
+    return float(apart.min(initial=np.inf))
+
+
+def _motor_side(drives: Drives, j: int) -> float:
+    """+1 or -1: along the axis or against it, away from the other arms where that says much."""
+    off = drives.foot[j] - drives.foot[drives.arms].mean(axis=0)
+    outward = float(off @ drives.axis[j])
+    return -1.0 if outward < -0.1 * np.linalg.norm(off) else 1.0
+
+
+def guide_parts(
+    drives: Drives, j: int, a: Array, balls: Array, plate: Array, finish: Finish
+) -> list[ScenePart]:
+    """The guide of leg j and the carriage with the leg's end ``a`` (3,); as :func:`arm_parts`.
+
+    A straight guide that stands reaches down, or up, to the base plate; a bent one is drawn in
+    straight pieces.
+    """
+    foot, away, ball = drives.foot[j], drives.away[j], float(balls[j])
+    along, across, deep = (ball * size for size in CARRIAGE)
+    width, spare, back = RAIL * ball, 1.2 * along, ball + 2 * deep + RAIL * ball
+    way = drives.ways[j]
+    rails: list[Box] = []
+    if len(way) == 2:
+        v = drives.axis[j]
+        low, high = (float((end - foot) @ v) for end in way)
+        low, high = min(low, high) - spare, max(low, high) + spare
+        if drives.upright[j]:
+            base = float(plate[2] - foot[2]) / v[2]
+            low, high = min(low, base), max(high, base)
+        rot = np.stack([v, np.cross(away, v), away])
+        centre = foot + (low + high) / 2 * v + back * away
+        rails.append(Box(centre, rot, np.array([(high - low) / 2, width, width])))
+    else:
+        for start, stop in pairwise(way):
+            rot = _turned_along(stop - start, away)
+            half = (float(np.linalg.norm(stop - start)) + width) / 2
+            rails.append(
+                Box((start + stop) / 2 + back * rot[2], rot, np.array([half, width, width]))
+            )
+        middles = (way[1:] + way[:-1]) / 2
+        nearest = int(np.argmin(np.linalg.norm(middles - a, axis=1)))
+        rot = _turned_along(way[nearest + 1] - way[nearest], away)
+    block = Box(a + (ball + deep) * rot[2], rot, np.array([along, across, deep]))
+    return [
+        *(ScenePart(rail, finish.platform) for rail in rails),
+        ScenePart(block, finish.joint),
+        ScenePart(Cylinder(a, rot[2], 0.6 * ball, ball), finish.joint),
+        ScenePart(Ball(a, ball), finish.joint),
+    ]
+
+
+def _turned_along(piece: Array, away: Array) -> Array:
+    """Rows (3, 3) along a piece of a guide, across it, and from it, nearest to ``away``."""
+    v = piece / np.linalg.norm(piece)
+    back = away - (away @ v) * v
+    back = back / np.linalg.norm(back)
+    return np.stack([v, np.cross(back, v), back])
+
+
+def beams(drives: Drives, balls: Array, finish: Finish) -> list[ScenePart]:
+    """Two beams across guides that lie side by side, and one that joins them; none where the
+    guides are not parallel.
+    """
+    rows = np.flatnonzero(drives.guides & ~drives.upright)
+    if rows.size < 2 or np.abs(drives.axis[rows] @ drives.axis[rows[0]]).min() < 0.99:
+        return []
+    u, away = drives.axis[rows[0]], drives.away[rows].mean(axis=0)
+    away = away - (away @ u) * u
+    away = away / np.linalg.norm(away)
+    side, ball = np.cross(u, away), float(balls[rows].max())
+    # on the far side of the guides, whose own depth is that of carriage and rail
+    clear = ball * (1 + 2 * CARRIAGE[2] + 2 * RAIL)
+    points = drives.ends[rows].reshape(-1, 3)
+    t, s, h = points @ u, points @ side, (points @ away).max() + clear
+    width = 2 * RAIL * ball
+    half = np.array([np.ptp(s) / 2 + 2 * width, width, width])
+    middle = (s.min() + s.max()) / 2 * side + (h + width) * away
+    rot, ends = np.stack([side, u, away]), (t.min() + width, t.max() - width)
+    spine = np.array([1.5 * width, (ends[1] - ends[0]) / 2, width])
+    parts = [Box(middle + end * u, rot, half) for end in ends]
+    parts.append(Box(middle + sum(ends) / 2 * u + 1e-3 * away, rot, spine))
+    return [ScenePart(part, finish.base) for part in parts]
+
+
+def nacelle_parts(
+    bars: tuple[Integers, ...], b: Array, balls: Array, centre: Array, up: Array, finish: Finish
+) -> list[ScenePart]:
+    """Side bars between the joints of their legs, each on a pivot, and the bar that joins them.
+
+    bars : legs of each. b : (L, 3) legs' ends. centre : (3,) of the tool's flange, m; up : unit,
+    away from the joints.
+    """
+    ball = float(balls.max())
+    parts: list[ScenePart] = []
+    pivots: list[Array] = []
+    drop = 1.6 * ball
+    for legs in bars:
+        ends = b[legs]
+        apart = np.linalg.norm(ends[:, None] - ends, axis=-1)
+        first, last = np.unravel_index(int(np.argmax(apart)), apart.shape)
+        parts.append(_rod(ends[first], ends[last], 0.7 * ball, finish.steel))
+        pivots.append(ends.mean(axis=0))
+        pin = Cylinder(pivots[-1] - 0.9 * ball * up, up, ball, 0.9 * ball + drop)
+        parts.append(ScenePart(pin, finish.joint))
+    joined = np.array(pivots) + drop * up
+    if len(joined) > 1:
+        parts += [_rod(one, joined[0], 0.9 * ball, finish.platform) for one in joined[1:]]
+    hub = joined.mean(axis=0)
+    height = float((centre - hub) @ up)
+    parts.append(ScenePart(Cylinder(hub, up, 0.8 * ball, max(height, 1e-4)), finish.joint))
+    return parts
+
+
+def _rod(start: Array, stop: Array, radius: float, material: Material) -> ScenePart:
+    length = float(np.linalg.norm(stop - start))
+    return ScenePart(Cylinder(start, (stop - start) / length, radius, length), material)
+
+
 @dataclass(frozen=True)
 class Room:
     """Everything but the machine: parts and lamps."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[ScenePart, ...]
     lighting: Lighting
 
-    def with_machine(self, parts: list[Part]) -> Scene:
+    def with_machine(self, parts: list[ScenePart]) -> Scene:
         """The scene with the machine in one pose."""
         return Scene((*parts, *self.parts), self.lighting)
 
@@ -262,26 +434,29 @@ def room_of(
         parts.append(_furniture(middle, floor, size, reach, azimuth, noise, rng))
     lamps = _lamps(middle, size, reach, rng, lit_from, discs.drives.any)
     bulbs = [
-        Part(Ball(lamp.place, lamp.radius), Material(0.0, emission=3.0), False) for lamp in lamps
+        ScenePart(Ball(lamp.place, lamp.radius), Material(0.0, emission=3.0), False)
+        for lamp in lamps
     ]
-    return Room((*parts, *bulbs), Lighting(lamps, *_AROUND[discs.drives.any]))
+    return Room((*parts, *bulbs), Lighting(lamps, *AROUND[discs.drives.any]))
 
 
-def _table(middle: Array, size: float, noise: SmoothNoise, rng: np.random.Generator) -> list[Part]:
+def _table(
+    middle: Array, size: float, noise: SmoothNoise, rng: np.random.Generator
+) -> list[ScenePart]:
     half = np.array([1.75, 1.6, 0.05]) * size
     turn = rotation(rng.uniform(-np.pi, np.pi) * Z)
     pattern = WavyStripes(noise, 0.42 * size, 0.42)
     top = Box(middle - half[2] * Z, turn, half)
     leg = Box(middle - size * Z, turn, np.array([0.5, 0.5, 0.9]) * size)
     return [
-        Part(top, Material(0.30, pattern, gloss=0.04, sharpness=8.0)),
-        Part(leg, Material(0.05)),
+        ScenePart(top, Material(0.30, pattern, gloss=0.04, sharpness=8.0)),
+        ScenePart(leg, Material(0.05)),
     ]
 
 
 def _walls(
     middle: Array, floor: float, reach: float, noise: SmoothNoise, rng: np.random.Generator
-) -> list[Part]:
+) -> list[ScenePart]:
     """Floor, ceiling and four walls, none of them plain."""
     patterns = [
         Slats(0.17 * reach, np.inf, 0.35),
@@ -291,12 +466,12 @@ def _walls(
     ]
     turn = rng.uniform(0, 2 * np.pi)
     parts = [
-        Part(
+        ScenePart(
             Wall(np.array([*middle[:2], floor]), Z),
             Material(0.32, Slats(0.12 * reach, 0.06 * reach, 0.3)),
             False,
         ),
-        Part(
+        ScenePart(
             Wall(np.array([*middle[:2], floor + 4.5 * reach]), -Z),
             Material(0.6, Slats(0.6 * reach, 0.6 * reach, 0.7)),
             False,
@@ -306,7 +481,7 @@ def _walls(
         angle = turn + np.pi / 2 * k
         inward = -np.array([np.cos(angle), np.sin(angle), 0.0])
         wall = Wall(middle - inward * reach * rng.uniform(2.6, 3.4), inward)
-        parts.append(Part(wall, Material(rng.uniform(0.12, 0.3), pattern), False))
+        parts.append(ScenePart(wall, Material(rng.uniform(0.12, 0.3), pattern), False))
     return parts
 
 
@@ -318,7 +493,7 @@ def _furniture(
     azimuth: float,
     noise: SmoothNoise,
     rng: np.random.Generator,
-) -> Part:
+) -> ScenePart:
     """A box or a post behind the cameras' ring, which the camera opposite sees."""
     distance = reach * rng.uniform(1.45, 2.3)
     place = middle + distance * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -332,10 +507,10 @@ def _furniture(
         Material(0.6, Clouds(noise, 0.2 * size, 0.1)),
     ][rng.integers(5)]
     if rng.random() < 0.25:
-        return Part(Cylinder(place, Z, size * rng.uniform(0.06, 0.2), height), material, False)
+        return ScenePart(Cylinder(place, Z, size * rng.uniform(0.06, 0.2), height), material, False)
     lean = rotation(np.array([*rng.normal(0, 0.03, 2), rng.uniform(-np.pi, np.pi)]))
     half = np.array([*rng.uniform(0.1, 0.45, 2) * size, height / 2])
-    return Part(Box(place + lean.T @ (half[2] * Z), lean, half), material, False)
+    return ScenePart(Box(place + lean.T @ (half[2] * Z), lean, half), material, False)
 
 
 def _lamps(
@@ -349,8 +524,8 @@ def _lamps(
     """A key lamp with shadows, a weaker one across, one from above and behind."""
     azimuth = rng.uniform(0, 2 * np.pi)
     if lit_from is not None:
-        azimuth = lit_from + _ASIDE * (azimuth / np.pi - 1)
-    share = _DIRECT if soft else 1.0
+        azimuth = lit_from + ASIDE * (azimuth / np.pi - 1)
+    share = DIRECT if soft else 1.0
     lamps: list[Lamp] = []
     for turn, elevation, distance, power in (
         (0.0, rng.uniform(40, 60), 1.8, 1.25),

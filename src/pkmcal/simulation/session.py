@@ -19,8 +19,8 @@ from pkmcal.files import csv_text, staged_folder, yaml_text
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.simulation.board import board_part, holder_part
-from pkmcal.simulation.casting import Part
-from pkmcal.simulation.render import Sensor, View, photograph, render
+from pkmcal.simulation.placement import one_a_station
+from pkmcal.simulation.render import PixelRays, ScenePart, Sensor, photograph, render
 from pkmcal.simulation.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
 from pkmcal.simulation.surfaces import SmoothNoise
 from pkmcal.simulation.truth import FILE, Settings, Truth, draw_truth, stream, truth_document
@@ -46,7 +46,7 @@ def simulate_session(
     """
     settings = settings or Settings()
     folder = Path(folder)
-    cameras = _cameras(camera, settings)
+    cameras = one_a_station(camera, settings.n_stations)
     _check(folder, drawing)
     truth = draw_truth(drawing, cameras, settings, seed)
     with staged_folder(folder) as stage:
@@ -63,9 +63,9 @@ class Studio:
     discs: Discs
     finish: Finish
     room: Room
-    views: tuple[View, ...]
+    views: tuple[PixelRays, ...]
     sensor: Sensor
-    fixed: tuple[Part, ...] = ()
+    fixed: tuple[ScenePart, ...] = ()
     board: Board | None = None
 
     @classmethod
@@ -80,9 +80,11 @@ class Studio:
         read = truth.T_platform_board is not None and discs.drives.any
         lit_from = float(np.arctan2(way[1], way[0])) if read else None
         room = room_of(discs, reach, noise, np.random.default_rng(seeds[1]), lit_from)
-        known = {id(camera): View.of(camera) for camera in {id(c): c for c in cameras}.values()}
+        known = {
+            id(camera): PixelRays.of(camera) for camera in {id(c): c for c in cameras}.values()
+        }
         views = tuple(known[id(camera)] for camera in cameras)
-        fixed: tuple[Part, ...] = ()
+        fixed: tuple[ScenePart, ...] = ()
         if settings.board is not None and truth.T_base_board is not None:
             fixed = (board_part(settings.board, truth.T_base_board),)
         finish = Finish.from_noise(noise, flat=truth.machine.document.motion == "planar")
@@ -122,19 +124,6 @@ def _shaken(shake: tuple[float, float], rng: np.random.Generator) -> Array:
     """Motion (4, 4) of a camera about its own place; shake : standard deviations, m and rad."""
     turn, move = rng.standard_normal((2, 3))
     return pose(rotation(shake[1] * turn), shake[0] * move)
-
-
-def _cameras(camera: Camera | Sequence[Camera], settings: Settings) -> tuple[Camera, ...]:
-    """One camera for each station."""
-    n = settings.n_stations
-    cameras = (camera,) * n if isinstance(camera, Camera) else tuple(camera)
-    if len(cameras) != n or n == 0:
-        raise InputError(
-            what="the simulation needs one camera for all stations, or one for each",
-            found=f"{len(cameras)} cameras for {n} stations",
-            expected=f"1 or {n}",
-        )
-    return cameras
 
 
 def _check(folder: Path, drawing: Machine) -> None:

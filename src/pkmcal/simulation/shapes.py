@@ -15,7 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 
-_BALLS_ALONG = 8
+BALLS_ALONG = 8
 """Bounding balls in a row over a long shape: one ball over a leg would cover the picture."""
 
 
@@ -115,7 +115,7 @@ class Cylinder(Shape):
 
     def balls(self) -> tuple[Array, Array]:
         """A row along the axis, or one ball round a disc."""
-        n = _BALLS_ALONG if self.length > 4 * self.radius else 1
+        n = BALLS_ALONG if self.length > 4 * self.radius else 1
         s = (np.arange(n) + 0.5) * self.length / n
         radius = np.hypot(self.radius, self.length / (2 * n))
         return self.start[:, None] + self.axis[:, None] * s, np.full(n, radius)
@@ -230,7 +230,7 @@ class Box(Shape):
         """A row along the longest axis."""
         k = int(np.argmax(self.half))
         across = float(np.linalg.norm(np.delete(self.half, k)))
-        n = _BALLS_ALONG if self.half[k] > 2 * across else 1
+        n = BALLS_ALONG if self.half[k] > 2 * across else 1
         s = (2 * (np.arange(n) + 0.5) / n - 1) * self.half[k]
         radius = np.hypot(across, self.half[k] / n)
         return self.centre[:, None] + self.rot[k][:, None] * s, np.full(n, radius)

@@ -12,6 +12,8 @@ from pkmcal.arrays import Array
 from pkmcal.simulation.shapes import Cylinder, Shape, inner
 
 NOISE_SIZE = 256
+BRUSH_ACROSS, BRUSH_ALONG = 0.13, 0.75
+"""Ward roughness of turned steel across and along the axis."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +36,9 @@ class SmoothNoise:
 
     def at(self, u: Array, v: Array) -> Array:
         """Bilinear values (n,) at positions (n,) in cells."""
-        fu, fv = np.floor(u), np.floor(v)
-        i, j = fu.astype(np.int64) % NOISE_SIZE, fv.astype(np.int64) % NOISE_SIZE
-        i1, j1 = (i + 1) % NOISE_SIZE, (j + 1) % NOISE_SIZE
-        du, dv = u - fu, v - fv
-        t = self.table
-        top = t[i, j] * (1 - dv) + t[i, j1] * dv
-        bottom = t[i1, j] * (1 - dv) + t[i1, j1] * dv
-        return top * (1 - du) + bottom * du
+        from scipy.ndimage import map_coordinates
+
+        return map_coordinates(self.table, (u, v), output=float, order=1, mode="grid-wrap")
 
 
 class Pattern(ABC):
@@ -193,10 +190,6 @@ class Lighting:
     ground: float
 
 
-_BRUSH_ACROSS, _BRUSH_ALONG = 0.13, 0.75
-"""Ward roughness of turned steel across and along the axis."""
-
-
 def radiance(
     shape: Shape, material: Material, points: Array, to_camera: Array, lit: Array, light: Lighting
 ) -> Array:
@@ -238,7 +231,7 @@ def _highlight(
         return hn**material.sharpness
     along = inner(h, axis)
     across2 = np.maximum(1 - along**2 - hn**2, 0.0)
-    return np.exp(-(across2 / _BRUSH_ACROSS**2 + along**2 / _BRUSH_ALONG**2) / hn**2)
+    return np.exp(-(across2 / BRUSH_ACROSS**2 + along**2 / BRUSH_ALONG**2) / hn**2)
 
 
 def _surroundings(n: Array, to_camera: Array, light: Lighting) -> Array:

@@ -19,16 +19,21 @@ from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
-from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.session.schema import Body
-from pkmcal.simulation.board import place_board, place_on_platform
-from pkmcal.simulation.configurations import draw_configurations, unfolded
+from pkmcal.simulation.board import place_board
+from pkmcal.simulation.placement import (
+    StationPlace,
+    default_stations,
+    draw_configurations,
+    rough_pose,
+    share_in_image,
+    unfolded,
+)
 from pkmcal.simulation.render import Sensor
-from pkmcal.simulation.stations import StationPose, default_stations, rough_pose, share_in_image
 
 FILE = "truth.json"
-_STREAMS = ("machine", "stations", "configurations", "readings", "room", "photographs", "board")
+STREAMS = ("machine", "stations", "configurations", "readings", "room", "photographs", "board")
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,7 @@ class Settings:
     standard deviations (m, rad) by which the camera moves between them.
     """
 
-    stations: int | tuple[StationPose, ...] = 3
+    stations: int | tuple[StationPlace, ...] = 3
     configurations: int = 15
     shared: bool = False
     tolerance: float = 1.0
@@ -83,7 +88,7 @@ class Truth:
     stations: tuple[str, ...]
     configurations: tuple[str, ...]
     T_camera_base: Array
-    rough: tuple[StationPose, ...]
+    rough: tuple[StationPlace, ...]
     T_base_platform: Array
     joints: Array
     readings: Array
@@ -96,7 +101,7 @@ class Truth:
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
     """The seed of one of the session's streams of random numbers."""
-    return np.random.SeedSequence(seed).spawn(len(_STREAMS))[_STREAMS.index(name)]
+    return np.random.SeedSequence(seed).spawn(len(STREAMS))[STREAMS.index(name)]
 
 
 def true_machine(drawing: Machine, scale: float, rng: np.random.Generator) -> Machine:
@@ -114,7 +119,7 @@ def draw_truth(
     drawing: Machine, cameras: tuple[Camera, ...], settings: Settings, seed: int
 ) -> Truth:
     """A true machine, stations, configurations and readings; cameras : one a station."""
-    rngs = {name: np.random.default_rng(stream(seed, name)) for name in _STREAMS}
+    rngs = {name: np.random.default_rng(stream(seed, name)) for name in STREAMS}
     machine = true_machine(drawing, settings.tolerance, rngs["machine"])
     poses = settings.stations
     if isinstance(poses, int):
@@ -136,9 +141,16 @@ def draw_truth(
     )
     board = None
     if settings.board is not None:
-        place = place_board if settings.board_on == "base" else place_on_platform
-        seen = (T_camera_base, T_base_platform, joints, rngs["board"])
-        board = place(machine, settings.board, cameras, *seen)
+        board = place_board(
+            machine,
+            settings.board,
+            settings.board_on,
+            cameras,
+            T_camera_base,
+            T_base_platform,
+            joints,
+            rngs["board"],
+        )
     noise = settings.joint_noise * rngs["readings"].standard_normal(joints.shape)
     return Truth(
         machine=machine,
@@ -189,7 +201,12 @@ def _configurations(
     for k, good in enumerate(groups):
         rows = np.flatnonzero(good & ~taken)[:n]
         if rows.size < n:
-            raise _out_of_sight(k, int(rows.size), n)
+            raise GeometryError(
+                what=f"station {k + 1} does not see the legs in enough configurations",
+                found=str(rows.size),
+                expected=str(n),
+                next_step="move the station back, or use a wider lens",
+            )
         taken[rows] = True
         chosen.append(rows)
     stations = range(len(cameras))
@@ -200,15 +217,6 @@ def _configurations(
     )
     rows = np.concatenate(chosen)
     return poses[rows], joints[rows], np.array(pairs, dtype=int).reshape(-1, 2)
-
-
-def _out_of_sight(station: int, found: int, wanted: int) -> GeometryError:
-    return GeometryError(
-        what=f"station {station + 1} does not see the legs in enough configurations",
-        found=str(found),
-        expected=str(wanted),
-        next_step="move the station back, or use a wider lens",
-    )
 
 
 def truth_document(truth: Truth) -> dict[str, Any]:
@@ -268,7 +276,7 @@ def load_truth(folder: Path | str, drawing: Machine) -> Truth:
         stations=stations,
         configurations=configurations,
         T_camera_base=T_camera_base,
-        rough=tuple(_as_pose(T) for T in T_camera_base),
+        rough=tuple(StationPlace.of(T) for T in T_camera_base),
         T_base_platform=np.array([c["T_base_platform"] for c in data["configurations"].values()]),
         joints=joints,
         readings=joints,
@@ -280,9 +288,3 @@ def load_truth(folder: Path | str, drawing: Machine) -> Truth:
         repeats=data.get("repeats", 1),
         T_platform_board=np.array(data["T_platform_board"]) if "T_platform_board" in data else None,
     )
-
-
-def _as_pose(T_camera_base: Array) -> StationPose:
-    T = inverse(T_camera_base)
-    position, forward, up = T[:3, 3], T[:3, 2], -T[:3, 1]
-    return StationPose(*(tuple(v.tolist()) for v in (position, position + forward, up)))

@@ -72,7 +72,7 @@ def drawn_from_bound(problem: Problem, state: BatchState, rng: np.random.Generat
     spread = np.where(known, 1 / np.where(known, s, 1.0), 0.0)
     # the symmetric root, as singular vectors' signs are rounding's
     draw = spread[..., None] * (vt @ rng.normal(size=s.shape)[..., None])
-    return (np.swapaxes(vt, -1, -2) @ draw)[..., 0] / scale
+    return (vt.mT @ draw)[..., 0] / scale
 
 
 class ToolPlaces(NamedTuple):

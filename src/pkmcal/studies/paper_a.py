@@ -324,7 +324,7 @@ def joint_estimate(data: SimulatedRuns, start: Start) -> Fitted:
     theta, nz = problem.theta(found.solution.state), z.shape[1]
     dof = freedom(data, machine.layout, known=nz - 12 + 6 * STATIONS)  # the gauge fixes twelve
     spread = in_frames(machine, problem, theta)
-    stated = spread @ found.info.covariance[:, :nz, :nz] @ np.swapaxes(spread, -1, -2)
+    stated = spread @ found.info.covariance[:, :nz, :nz] @ spread.mT
     rows = thirty(machine).rows
     variance = np.einsum("ip,bpq,iq->bi", rows, stated, rows)
     return Fitted(
@@ -358,7 +358,7 @@ def bound(machine: Machine, problem: Problem, data: SimulatedRuns) -> Array:
     covariance = information(problem, state).covariance[:, :nz, :nz]
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-    root = root @ np.swapaxes(vectors, -1, -2)  # the symmetric root is unique
+    root = root @ vectors.mT  # the symmetric root is unique
     return in_frames(machine, problem, data.theta) @ root
 
 
@@ -379,6 +379,6 @@ def effector_errors(data: SimulatedRuns, theta: Array, rng: np.random.Generator)
     columns: list[Array] = []
     for moved in (T, e @ T @ inverse(f)):
         columns.append(np.linalg.norm(apply(moved, b1) - apply(T_true, b1), axis=-1).mean(axis=1))
-        turn = moved[..., :3, :3] @ np.swapaxes(T_true[..., :3, :3], -1, -2)
+        turn = moved[..., :3, :3] @ T_true[..., :3, :3].mT
         columns.append(np.linalg.norm(rotation_vector(turn), axis=-1).mean(axis=1))
     return np.stack(columns, axis=-1)

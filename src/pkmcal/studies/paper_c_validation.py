@@ -62,7 +62,7 @@ def before(count: int = 400) -> Before:
     readings = inverse(machine.layout, table_2_values(machine, IDENTIFIED), poses)
     found = forward(machine.layout, machine.parameters.drawing, readings, poses).T_base_platform
     shift = np.linalg.norm(found[:, :3, 3] - poses[:, :3, 3], axis=1)
-    turn = rotation_vector(found[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], -1, -2))
+    turn = rotation_vector(found[:, :3, :3] @ poses[:, :3, :3].mT)
     return Before(float(shift.mean()), float(np.linalg.norm(turn, axis=1).mean()))
 
 

@@ -54,9 +54,9 @@ def ratio(found: Summary, bound: Summary) -> Summary:
 
 def coverage(errors: Array, sigma: Array, share: float = 0.95) -> Summary:
     """Part of the errors (B, n) that lie in the intervals that their stated sigma promises."""
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
-    inside = np.abs(errors) <= norm.ppf(0.5 + share / 2) * sigma
+    inside = np.abs(errors) <= ndtri(0.5 + share / 2) * sigma
     return mean(inside.reshape(len(errors), -1).mean(axis=1))
 
 

@@ -15,7 +15,7 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import Schema
 from pkmcal.geometry.batches import turned
-from pkmcal.geometry.rigid import cross, dot, rotation, skew
+from pkmcal.geometry.rigid import axial, cross, dot, rotation, skew
 from pkmcal.mechanisms.carriers.contract import (
     Chain,
     Direction,
@@ -210,15 +210,7 @@ class HingedBar(PlatformCarrier):
     def upright(parameters: Array, T_base_platform: Array) -> Array:
         """Minus the platform's turn about the hinge: of the turn's quaternion the part about w."""
         axis, rot = parameters[..., 6:], T_base_platform[..., :3, :3]
-        axial = np.stack(
-            [
-                rot[..., 2, 1] - rot[..., 1, 2],
-                rot[..., 0, 2] - rot[..., 2, 0],
-                rot[..., 1, 0] - rot[..., 0, 1],
-            ],
-            axis=-1,
-        )
-        along = dot(axial, axis) / np.sqrt(dot(axis, axis))
+        along = dot(axial(rot), axis) / np.sqrt(dot(axis, axis))
         return -2 * np.arctan2(along, 1 + np.trace(rot, axis1=-2, axis2=-1))
 
     @staticmethod

@@ -1,0 +1,343 @@
+"""Where machine and cameras stand for a session: configurations and stations.
+
+Configurations are within the joints' ranges, reachable, and away from singular poses. Cameras stand
+round the machine, or in its middle for a mirror.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import apply, dot, inverse, look_at, perturb, rotation
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import closure, limb_ends
+from pkmcal.mechanisms.kinematics import on_manifold, singularity
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.session.schema import Body
+from pkmcal.simulation.drives import drives_of, reaches
+
+FARTHEST_TILT = np.deg2rad(35)
+"""More than universal joints of this kind allow."""
+FARTHEST_TURN = 7 / 9
+"""Of an articulated platform about z, in the turn at which its own parts are in the way."""
+LEAST_SINGULAR = 0.12
+"""Smallest singular value of the scaled inverse Jacobian: a reading's error grows by eight."""
+GUIDE = 4.0
+"""What a guide and its carriage need on the side of the leg, in radii of the leg on it."""
+SIDE_BY_SIDE = 0.9
+"""Cosine of the angle between two guides' backs above which they lie side by side."""
+INSIDE = (0.03, 0.97)
+"""Share of a range from which readings are drawn: a drive at its stop reads nothing new."""
+PANORAMIC = np.deg2rad(95)
+"""A camera that sees more than this off its axis sees all legs from their middle."""
+NEAREST = np.deg2rad(35)
+"""Half the angle under which the machine is seen at most; nearer, legs hide each other."""
+TRIED = 24
+"""Places round the machine of which a single camera takes the best."""
+CLEAR = 0.03
+"""Gap to another leg at home, in image widths, that keeps a leg free of it elsewhere."""
+ARC = np.deg2rad(80)
+"""Between the first and the last camera that see the same face of a board."""
+WITH_BOARD = {False: 1.45, True: 1.6}
+"""Distance that leaves room for a board, in the machine's own, upright and flat."""
+SPARE = 1.18
+"""Distance in the machine's own at home: platforms move, and plates reach beyond joints."""
+FULL = 1.1
+"""The same where the machine's own takes in where its motors move it."""
+
+Vector = tuple[float, float, float]
+
+
+def draw_configurations(
+    machine: Machine, count: int, extreme: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Usable poses (n, 4, 4) with their exact readings (n, m), n >= count where possible.
+
+    extreme : share with every leg near one of its ends, which measure offsets best; the other
+    configurations are spread evenly over the ranges.
+    """
+    found, tried = 0, 0
+    for attempt in range(6):
+        tried = 8 * count * 3**attempt + 60
+        poses, joints = _candidates(machine, tried, extreme, rng)
+        keep = usable(machine, poses, joints)
+        found = int(np.count_nonzero(keep))
+        if found >= count:
+            return poses[keep], joints[keep]
+        if attempt and not found:  # a thousand in vain: more would only keep the user waiting
+            break
+    raise InputError(
+        what=f"mechanism {machine.name!r} has too few usable configurations in its joint ranges",
+        found=f"{found} of {tried} tried",
+        expected=f"{count}",
+        next_step="check the ranges and centres in the mechanism file",
+    )
+
+
+def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
+    """(n,) True where closed, in the home's assembly, not tilted far, legs clear of each other."""
+    layout, values, home = machine.layout, machine.values, machine.home()
+    at_home = closure(layout, values, machine.inverse(home[None])[0], home)
+    c = closure(layout, values, joints, T_base_platform)
+    jac, home_jac = (x.by_pose @ layout.motion for x in (c, at_home))
+    good = np.abs(c.value).max(axis=-1) < 1e-9
+    # a machine that is weak at home is weak everywhere; it is not refused for that
+    least = min(LEAST_SINGULAR, 0.4 * float(singularity(layout, values, at_home.by_pose)))
+    good &= singularity(layout, values, c.by_pose) > least
+    if jac.shape[-1] == jac.shape[-2]:
+        good &= np.sign(np.linalg.det(jac)) == np.sign(np.linalg.det(home_jac))
+    good &= T_base_platform[..., 2, 2] * np.sign(home[2, 2]) > np.cos(FARTHEST_TILT)
+    good &= unfolded(machine, T_base_platform)
+    return good & _legs_apart(machine, T_base_platform, joints)
+
+
+def unfolded(machine: Machine, T_base_platform: Array) -> Booleans:
+    """(n,) True where the parts of an articulated platform, if it is one, stand apart."""
+    turn = np.arctan2(T_base_platform[..., 1, 0], T_base_platform[..., 0, 0])
+    return np.abs(turn) < FARTHEST_TURN * machine.most_turn[0]
+
+
+def _candidates(
+    machine: Machine, n: int, extreme: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Poses and readings that close the machine, usable or not."""
+    ranges = machine.joint_ranges
+    share = rng.uniform(*INSIDE, (n, machine.n_joints))
+    ends = np.where(rng.random(share.shape) < 0.5, *INSIDE)
+    share = np.where(rng.random((n, 1)) < extreme, ends, share)
+    if ranges.size and np.isfinite(ranges).all():
+        wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
+        found = machine.forward_result(wanted)
+        poses = found.T_base_platform[found.converged]
+    else:
+        poses = _around_home(machine, n, rng)
+    joints = machine.inverse(poses)
+    finite = np.isfinite(joints).all(axis=-1)
+    return poses[finite], joints[finite]
+
+
+def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:
+    """Poses near home, for machines whose file gives no ranges: 15 degrees, an eighth of size.
+
+    Only those that constant rods and joints' axes allow.
+    """
+    a, b = (ends[0] for ends in reaches(machine))
+    size = float(np.linalg.norm(np.concatenate([a, b]) - a.mean(axis=0), axis=1).max())
+    scale = np.array([0.26, 0.26, 0.26, *np.full(3, 0.125 * size)])
+    motion = machine.layout.motion
+    delta = rng.uniform(-1, 1, (n, 6)) * scale @ motion @ motion.T
+    found = on_manifold(machine.layout, machine.values, perturb(machine.home(), delta))
+    return found.T_base_platform[found.converged]
+
+
+def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
+    """(n,) True where no two legs come nearer than their tubes are thick, nor a leg to a guide of
+    another.
+    """
+    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    along = np.linspace(0.06, 0.97, 24)[:, None]
+    points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
+    widths = np.array([r.max() if len(r) else 0.0 for r in machine.radii()])
+    drives = drives_of(machine)
+    apart = np.ones(T_base_platform.shape[0], dtype=bool)
+    for i, j in np.ndindex(machine.n_legs, machine.n_legs):
+        if j < i:
+            gap = points[:, i, :, None] - points[:, j, None, :]
+            apart &= np.sqrt(dot(gap, gap).min(axis=(-1, -2))) > widths[i] + widths[j]
+        # carriages side by side on one guide have their own legs beside it
+        if j != i and drives.guides[j] and drives.away[i] @ drives.away[j] <= SIDE_BY_SIDE:
+            for start, stop in pairwise(drives.ways[j]):
+                axis = (stop - start) / np.linalg.norm(stop - start)
+                s = np.clip((points[:, i] - start) @ axis, 0, (stop - start) @ axis)
+                gap = points[:, i] - start - s[..., None] * axis
+                apart &= np.sqrt(dot(gap, gap).min(axis=-1)) > widths[i] + GUIDE * widths[j]
+    return apart
+
+
+@dataclass(frozen=True)
+class StationPlace:
+    """A camera's place as people give it, base frame, m: as ``pose`` in session.yaml."""
+
+    position: Vector
+    look_at: Vector
+    up: Vector = (0.0, 0.0, 1.0)
+
+    @classmethod
+    def of(cls, T_camera_base: Array) -> StationPlace:
+        """A camera at a pose (4, 4), looking at a point one metre before it."""
+        T = inverse(T_camera_base)
+        position, forward, up = T[:3, 3], T[:3, 2], -T[:3, 1]
+        return cls(*(tuple(v.tolist()) for v in (position, position + forward, up)))
+
+    def T_camera_base(self) -> Array:
+        """(4, 4), base to camera coordinates."""
+        return look_at(np.array(self.position), np.array(self.look_at), np.array(self.up))
+
+
+def one_a_station(camera: Camera | Sequence[Camera], n_stations: int) -> tuple[Camera, ...]:
+    """A camera for each station, of one for all or one for each. Raises InputError for others."""
+    cameras = (camera,) * n_stations if isinstance(camera, Camera) else tuple(camera)
+    if len(cameras) != n_stations or n_stations == 0:
+        raise InputError(
+            what="the simulation needs one camera for all stations, or one for each",
+            found=f"{len(cameras)} cameras for {n_stations} stations",
+            expected=f"1 or {n_stations}",
+        )
+    return cameras
+
+
+def default_stations(
+    machine: Machine,
+    cameras: tuple[Camera, ...],
+    rng: np.random.Generator,
+    board: Body | None = None,
+) -> tuple[StationPlace, ...]:
+    """One place for each camera: evenly round the machine, not quite regular, as by hand.
+
+    A camera that is alone goes where it sees most of every leg, unless it sees a board on the base.
+    board : what a board is fixed to that all see: they stand to one side of a machine that stands,
+    round one that lies flat, and with room beside the machine for a board on the base.
+    """
+    space = np.concatenate(_space(machine))
+    start = rng.uniform(0, 2 * np.pi)
+    poses: list[StationPlace] = []
+    arc = board is not None and not _is_flat(space)
+    for k, camera in enumerate(cameras):
+        half = view_angle(camera)
+        away = _distance(machine, min(half, NEAREST), board)
+        if half > PANORAMIC:
+            poses.append(_inside(*_space(machine), rng))
+        elif len(cameras) == 1 and board != "base":
+            poses.append(_clearest(machine, camera, away, start, rng))
+        else:
+            turn = (
+                ARC * (k / max(len(cameras) - 1, 1) - 0.5) if arc else 2 * np.pi * k / len(cameras)
+            )
+            azimuth = start + turn + np.deg2rad(rng.uniform(-8, 8))
+            poses.append(_outside(space, away, azimuth, rng))
+    return tuple(poses)
+
+
+def _space(machine: Machine) -> tuple[Array, Array]:
+    """Legs' ends A and B (n, 3), base frame, m, that a picture of the machine has to hold."""
+    a, b = reaches(machine)
+    return a.reshape(-1, 3), b.reshape(-1, 3)
+
+
+def _clearest(
+    machine: Machine, camera: Camera, away: float, start: float, rng: np.random.Generator
+) -> StationPlace:
+    """The place on the ring, ``away`` from the machine in its own radius, from which the leg that
+    is seen least is seen best.
+    """
+    space = np.concatenate(_space(machine))
+    azimuths = start + 2 * np.pi * np.arange(TRIED) / TRIED
+    poses = [_outside(space, away, azimuth, rng) for azimuth in azimuths]
+    tubes, home = tubes_of(machine), machine.home()[None]
+    T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
+    legs = legs_in_camera(machine, T_camera_base, home, machine.inverse(home))
+    points = edge_points(machine, camera, legs, tubes, 12)
+    # legs move: what comes near another one at home is behind it elsewhere
+    clear = CLEAR * camera.image_size[0]
+    seen = unobstructed(machine, camera, legs, tubes, points, clear).mean(axis=-1)
+    share = np.stack([seen[:, tubes.leg == j].mean(axis=1) for j in np.unique(tubes.leg)])
+    return poses[int(np.argmax(share.min(axis=0)))]
+
+
+def _is_flat(points: Array) -> bool:
+    """Whether joints (n, 3) lie in about one level."""
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return bool(np.ptp(points[:, 2]) < 0.25 * np.linalg.norm(points - centre, axis=1).max())
+
+
+def view_angle(camera: Camera) -> float:
+    """Smallest angle (rad) from the image's middle to its border, or to the field's rim."""
+    width, height = camera.image_size
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    borders = np.array([[0, middle[1]], [width - 1, middle[1]], [middle[0], 0]])
+    borders = np.concatenate([borders, [[middle[0], height - 1]]])
+    steps = np.linspace(0, 1, 60)[:, None, None]
+    rays = camera.ray(middle + steps * (borders - middle))
+    cosine = np.clip(rays @ camera.ray(middle), -1, 1)
+    return float(np.nanmax(np.arccos(cosine), axis=0).min())
+
+
+def rough_pose(
+    T_camera_base: Array, distance: float, shift: float, turn: float, rng: np.random.Generator
+) -> StationPlace:
+    """A pose by hand: off by ``shift`` (m) and ``turn`` (rad) in random directions.
+
+    distance : from the camera to what it looks at, m.
+    """
+    T_base_camera = inverse(T_camera_base)
+    axis, way = rng.normal(size=(2, 3))
+    rot = rotation(turn * axis / np.linalg.norm(axis)) @ T_base_camera[:3, :3]
+    position = T_base_camera[:3, 3] + shift * way / np.linalg.norm(way)
+    # nobody writes more digits than a tenth of a millimetre by hand
+    return StationPlace(
+        _rounded(position), _rounded(position + distance * rot[:, 2]), _rounded(-rot[:, 1])
+    )
+
+
+def _rounded(v: Array) -> Vector:
+    x, y, z = (round(float(c), 4) for c in v)
+    return x, y, z
+
+
+def _distance(machine: Machine, half: float, board: Body | None) -> float:
+    """From which the machine, and the board, fill the picture, in the machine's own radius.
+
+    half : of the view, rad.
+    """
+    if len(reaches(machine)[0]) > 1 and board != "base":
+        share = FULL
+    else:
+        share = SPARE if board is None else WITH_BOARD[_is_flat(np.concatenate(_space(machine)))]
+    return float(share / np.sin(half))
+
+
+def _outside(
+    points: Array, distance: float, azimuth: float, rng: np.random.Generator
+) -> StationPlace:
+    """On a ring round the machine's points (n, 3), low, or high for a flat machine."""
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    flat = _is_flat(points)
+    elevation = np.deg2rad(rng.uniform(42, 55) if flat else rng.uniform(7, 17))
+    way = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
+         np.sin(elevation)]
+    )  # fmt: skip
+    target = centre + rng.uniform(-0.03, 0.03, 3) * radius
+    up = np.array([*rng.normal(0, 0.04, 2), 1.0])
+    position = centre + distance * radius * way
+    return StationPlace(_rounded(position), _rounded(target), _rounded(up))
+
+
+def _inside(a: Array, b: Array, rng: np.random.Generator) -> StationPlace:
+    """Between the legs, a little above the base joints, looking at the platform."""
+    middle, rise = a.mean(axis=0), b.mean(axis=0) - a.mean(axis=0)
+    width = float(np.linalg.norm(a - middle, axis=1).max())
+    position = middle + 0.15 * rise + np.array([*rng.uniform(-0.15, 0.15, 2), 0.0]) * width
+    angle = rng.uniform(0, 2 * np.pi)
+    target = position + rise + np.array([*rng.uniform(-0.03, 0.03, 2), 0.0]) * width
+    up = (float(np.cos(angle)), float(np.sin(angle)), 0.0)
+    return StationPlace(_rounded(position), _rounded(target), _rounded(np.array(up)))
+
+
+def share_in_image(
+    machine: Machine, camera: Camera, T_camera_base: Array, T_base_platform: Array, joints: Array
+) -> Array:
+    """Part of each leg that lies in the image, (K, L), for poses (K, 4, 4) and readings (K, m)."""
+    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    along = np.linspace(0.06, 0.96, 12)[:, None]
+    points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
+    pixels = camera.project(apply(T_camera_base, points))
+    return camera.in_image(pixels, margin=6.0).mean(axis=-1)
