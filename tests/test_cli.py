@@ -115,8 +115,8 @@ def test_demo_finds_the_same_without_the_truth(demo, session):
 
 
 def test_demo_in_words(demo, tmp_path, monkeypatch, calibrated):
-    monkeypatch.setattr("pkmcal.commands.demo._simulate", lambda *_: None)
-    monkeypatch.setattr("pkmcal.commands.demo._calibrate", lambda *_: calibrated)
+    monkeypatch.setattr("pkmcal.simulation.simulate_session", lambda *_, **_more: None)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", lambda *_, **_more: calibrated)
     monkeypatch.setattr("pkmcal.commands.demo.SESSION", str(demo.session))
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)

@@ -9,7 +9,13 @@ import pytest
 
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import perturb, pose, pose_difference, rotation
-from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate
+from pkmcal.measurements import (
+    EdgeSet,
+    Measurements,
+    Mount,
+    PoseSet,
+    concatenate,
+)
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.papers.hand_eye import size_of, solve_pairs, start_from_poses

@@ -136,7 +136,8 @@ def test_whitening_makes_the_noise_standard():
     """Residuals at the truth are the noise itself: unit covariance, [0] by [1] uncorrelated."""
     rng = np.random.default_rng(6)
     assembled, truth = make_scene(rng, runs=40).batch(rng)
-    rows = assembled.problem.block_residuals(truth)[:, assembled.edges.row, assembled.edges.place]
+    at = assembled.places.edges
+    rows = assembled.problem.unweighted(truth).edges[:, at.row, at.place]
     rows = rows.reshape(-1, 2)
     bound = 5 / np.sqrt(len(rows))
     np.testing.assert_allclose(rows.T @ rows / len(rows), np.eye(2), atol=2 * bound)

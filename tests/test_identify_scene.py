@@ -15,7 +15,7 @@ from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.identify.assembly import Assembled, assemble
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.rows import Data
+from pkmcal.identify.rows import EdgeData
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine, load_mechanism
@@ -90,10 +90,11 @@ class Scene:
         assembled = assemble(self.machine, self.measurements(rng), ThreeCentres(), **options)
         normal = self.noisy(rng)
         basis = np.zeros((len(normal), *assembled.problem.blocks.leg.shape, 1, 3, 2))
-        basis[:, assembled.edges.row, assembled.edges.place, 0] = tangent_basis(normal, self.middle)
+        at = assembled.places.edges
+        basis[:, at.row, at.place, 0] = tangent_basis(normal, self.middle)
         old = assembled.problem.data
         joints = self.joints + JOINT_NOISE * rng.normal(size=self.joints.shape)
-        data = Data(basis, old.whiten, old.optics, joints, old.weight)
+        data = EdgeData(basis, old.whiten, old.optics, joints, old.weight)
         problem = replace(assembled.problem, data=data)
         z = (self.theta - self.machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
         stations = np.broadcast_to(self.T_camera_base, (len(z), *self.T_camera_base.shape))

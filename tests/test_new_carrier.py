@@ -28,6 +28,7 @@ from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unidentified import explain
+from pkmcal.judge.causes import single_causes
 from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.carriers.contract import base_carriers
 from pkmcal.mechanisms.carriers.crank import Crank
@@ -71,7 +72,7 @@ class LeaningCrank(BaseCarrier):
     parameters = (
         *vectors("center", "m", "center"),
         *vectors("axis", "1", "axis"),
-        *vectors("arm", "m", "arm"),
+        *vectors("arm", "m", "arm", part="arm"),
     )
 
     @staticmethod
@@ -185,6 +186,8 @@ def test_it_is_a_machine_with_the_carriers_parameters(machine, folder):
     own = [n for n in machine.parameters.names if n.startswith("legs[1].base")]
     assert own == [f"legs[1].base.{f}.{c}" for f in ("center", "axis", "arm") for c in "xyz"]
     assert machine.joint_units == ("rad",) * 6
+    parts = {cause.part for cause in single_causes(machine)}  # what a watch can tell apart
+    assert parts == {"base", "arm", "rod", "platform", "scale"}
     (folder / "again.yaml").write_text(mechanism_text(machine))
     np.testing.assert_array_equal(load_mechanism(folder / "again.yaml").values, machine.values)
 

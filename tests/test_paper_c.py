@@ -14,7 +14,6 @@ from pkmcal.report.page import page_html
 from pkmcal.studies import engine
 from pkmcal.studies import paper_c_expected as expected
 from pkmcal.studies.engine import Sample
-from pkmcal.studies.expected import Compared
 from pkmcal.studies.paper_c import (
     AXIS,
     BOUND,
@@ -35,6 +34,7 @@ from pkmcal.studies.paper_c_machine import (
 )
 from pkmcal.studies.paper_c_report import reproduced
 from pkmcal.studies.paper_c_validation import before
+from pkmcal.studies.reproduction import Compared
 from pkmcal.studies.statistics import Summary
 from test_report_page import Found, browse
 

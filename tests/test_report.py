@@ -226,10 +226,10 @@ def test_a_group_that_stands_out_is_named(case):
     white[edges.station == 2] *= 4
     estimate = replace(case.estimate, edge_residuals=white)
     shifts = np.zeros(len(edges))
-    remarks = residuals.residual_charts(case.session, edges, estimate, shifts).remarks
+    remarks = residuals.remarks(case.session, edges, estimate, shifts)
     assert any("station front2" in text for text in remarks)
     shifts[(edges.leg == 1) & (edges.tube == 0) & (edges.side == 1)] = -0.2
-    (text,) = residuals.residual_charts(case.session, edges, case.estimate, shifts).remarks
+    (text,) = residuals.remarks(case.session, edges, case.estimate, shifts)
     assert "leg 2 tube 1 left by −0.20 px" in text
 
 

@@ -12,7 +12,7 @@ from pkmcal.identify.unidentified import explain, seen_legs
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.outcome import Verdict
 from pkmcal.papers.conditions import conditions
-from pkmcal.report.identifiability import STUB, section
+from pkmcal.report.identifiability import STUB, headline, held, spectrum, tied
 from test_report_case import make_case, report_html
 from test_report_page import Found
 from test_words import heaved, make, told_of
@@ -75,17 +75,18 @@ def test_without_findings_there_is_no_section(case):
 
 
 def test_a_whole_session_has_nothing_to_list():
-    view = section(findings_of(make("gough-stewart")), load_mechanism("gough-stewart").parameters)
-    assert (view.rank, view.possible) == (42, 42)
-    assert view.headline.endswith("Each is known better from the data than from the drawing.")
-    assert view.unidentified == view.weak == ()
-    assert (view.fixed, view.tied) == ("", "")
+    findings = findings_of(make("gough-stewart"))
+    table = load_mechanism("gough-stewart").parameters
+    assert headline(findings).startswith("The data fix 42 of 42 directions (")
+    assert headline(findings).endswith("Each is known better from the data than from the drawing.")
+    assert findings.unidentified == findings.weak == ()
+    assert (held(findings, table), tied(table)) == ("", "")
 
 
 def test_the_spectrum_shows_lost_directions_as_stubs(apart):
-    view = section(apart, load_mechanism("gough-stewart").parameters)
-    assert view.spectrum is not None
-    bars = view.spectrum.bars
+    drawn = spectrum(apart)
+    assert drawn is not None
+    bars = drawn.bars
     assert len(bars) == 42
     assert [bar.value > STUB for bar in bars] == [True] * 34 + [False] * 8
     assert bars[-1].tip == "Direction 42: the data say nothing"
@@ -93,7 +94,7 @@ def test_the_spectrum_shows_lost_directions_as_stubs(apart):
     assert bars[0].quiet
     assert "times better than the drawing" in bars[0].tip
     # the line where data and drawing know as much is the tick that says 1
-    assert (view.spectrum.curve[0][1], "1") in view.spectrum.ticks
+    assert (drawn.curve[0][1], "1") in drawn.ticks
 
 
 def test_what_was_held_is_said_with_its_reason(apart):
@@ -101,13 +102,12 @@ def test_what_was_held_is_said_with_its_reason(apart):
         ("legs[1].base.center", "legs[2].length.offset"),
         (("legs[3].length.offset", "legs[4].length.offset"),),
     )
-    view = section(apart, table)
-    assert view.fixed.startswith(
-        "Leg 1 base centre x, leg 1 base centre y, leg 1 base centre z and"
-    )
-    assert "under fixed, so the drawing's value counts as exact" in view.fixed
+    said = held(apart, table)
+    assert said.startswith("Leg 1 base centre x, leg 1 base centre y, leg 1 base centre z and")
+    assert "under fixed, so the drawing's value counts as exact" in said
     assert (
-        view.tied == "Changes together, as one value: leg 3 length offset and leg 4 length offset."
+        tied(table)
+        == "Changes together, as one value: leg 3 length offset and leg 4 length offset."
     )
 
 

@@ -16,11 +16,10 @@ from pkmcal.report.page import page_html
 from pkmcal.studies import engine
 from pkmcal.studies import paper_a_expected as expected
 from pkmcal.studies.engine import Sample
-from pkmcal.studies.expected import Compared
 from pkmcal.studies.paper_a import BOUND, JOINT, METHODS, PRINTED, HexapodByAxes
 from pkmcal.studies.paper_a_photographs import MeasuredNoise
 from pkmcal.studies.paper_a_report import table_1
-from pkmcal.studies.reproduction import PAPERS, Options, reproduce
+from pkmcal.studies.reproduction import PAPERS, Compared, Options, reproduce
 from pkmcal.studies.statistics import Summary
 from test_report_page import Found, browse
 

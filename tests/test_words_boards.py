@@ -19,7 +19,8 @@ from pkmcal.identify.verdict import judge
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.report.identifiability import section
+from pkmcal.report.identifiability import held as held_in_words
+from pkmcal.report.identifiability import tied as tied_in_words
 from pkmcal.report.parameters import bound_together, grouped, tight_pairs
 from pkmcal.solver import Stop
 from pose_sessions import estimated, measured, papers_poses, upright
@@ -208,7 +209,7 @@ def test_a_search_that_has_not_settled_is_refused():
 def test_what_the_calibration_model_holds_is_convention():
     _, findings, estimate = told_of("h4")
     assert set(findings.conventional) == set(estimate.machine.parameters.fixed)
-    said = section(findings, estimate.machine.parameters).fixed
+    said = held_in_words(findings, estimate.machine.parameters)
     assert "are held by convention" in said
     assert "held by the model" not in said
     assert said.startswith("Crank axis distance of legs 1 to 4,")
@@ -217,8 +218,8 @@ def test_what_the_calibration_model_holds_is_convention():
 
 
 def test_ties_are_said_once_with_their_signs():
-    _, findings, estimate = told_of("h4")
-    assert section(findings, estimate.machine.parameters).tied == (
+    _, _, estimate = told_of("h4")
+    assert tied_in_words(estimate.machine.parameters) == (
         "Changes together, as one value: platform centre y of legs 1 to 4 (by opposite amounts); "
         "hinge x of legs 1 to 4 (by opposite amounts)."
     )
@@ -237,7 +238,7 @@ def test_the_design_models_assumptions_are_no_conventions():
     _, findings, estimate = told_of("h4", "design")
     assert not any(".axis." in name for name in findings.conventional)
     assert findings.also_conventional > 0  # the heights' sum among them
-    said = section(findings, estimate.machine.parameters).fixed
+    said = held_in_words(findings, estimate.machine.parameters)
     assert "held by the model that the mechanism file describes" in said
     assert "of which with a camera and a board only the sum is seen" in said
 

@@ -196,9 +196,11 @@ def positions(case: Case) -> Shot:
 
 def residuals(case: Case) -> Shot:
     """The report's histogram of the edges' residuals, and the boxes by leg."""
-    found = shown.residual_charts(
-        case.session, case.result.observation.edges, case.result.estimate, outward(case)
-    )
+    edges, estimate = case.result.observation.edges, case.result.estimate
+    found = {
+        "histogram": shown.histogram(estimate.edge_residuals),
+        "by_leg": shown.by_leg(case.session, edges, estimate),
+    }
     template = page.environment().from_string(
         '{% import "charts.html.j2" as draw %}<div class="two">'
         "<div><h3>{{ r.histogram.title }}</h3>{{ draw.bars(r.histogram) }}</div>"

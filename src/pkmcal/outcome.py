@@ -42,6 +42,20 @@ class Level(StrEnum):
 
 Mark = Literal["good"] | Level
 """What to think of something: that all is well, or how bad it is."""
+LOOKS: dict[str, Any] = {
+    "paper_bgcolor": "--card",
+    "plot_bgcolor": "rgba(0,0,0,0)",
+    "font": {"color": "--ink", "family": "system-ui, sans-serif", "size": 12},
+    "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
+}
+"""What the layouts of all plots have in common."""
+AXIS: dict[str, Any] = {
+    "color": "--muted",
+    "gridcolor": "--rule",
+    "zerolinecolor": "--rule",
+    "linecolor": "--rule",
+}
+"""And their axes."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +127,10 @@ class Table:
 
 @dataclass(frozen=True)
 class Plot:
-    """A Plotly figure (data, layout, config) with colours named as in :mod:`report.scene`.
+    """A Plotly figure (data, layout, config): plain data, drawn by the page's script.
+
+    Its colours are names of the page's CSS variables; the script puts in the values of the light
+    or the dark theme.
 
     width : px below which it is scrolled sideways. alt : what it shows, for who cannot see it.
     frames : of an animation.

@@ -141,14 +141,11 @@ def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
     """A function of the arrays of states, array by array."""
     if isinstance(first, np.ndarray):
         return cast(Runs, function(first, *others))
-    parts = zip(*(_arrays(state) for state in (first, *others)), strict=True)
-    return type(first)(*(function(*part) for part in parts))
-
-
-def _arrays(state: Any) -> tuple[Array, ...]:
-    if isinstance(state, tuple):
-        return cast("tuple[Array, ...]", state)
-    return tuple(getattr(state, field.name) for field in fields(state))
+    states: tuple[Any, ...] = (first, *others)
+    if not isinstance(first, tuple):
+        names = [field.name for field in fields(states[0])]
+        states = tuple(tuple(getattr(state, name) for name in names) for state in states)
+    return type(first)(*(function(*part) for part in zip(*states, strict=True)))
 
 
 class Reduced(NamedTuple):
@@ -345,23 +342,17 @@ def column_space(columns: Array, least: float = RANK_TOLERANCE) -> Array:
     return u[:, s > least * s.max(initial=0.0)]
 
 
-class Directions(NamedTuple):
-    """Of rows (..., n, m) with columns of length one: singular values s (..., m), right vectors vt
-    (..., m, m), and the columns' lengths scale (..., m), 1 for those that are zero.
+def directions(rows: Array) -> tuple[Array, Array, Array]:
+    """How well rows (..., n, m) know each direction of their unknowns, columns made of length one.
+
+    Singular values s (..., m), right vectors vt (..., m, m), and the columns' lengths scale
+    (..., m), 1 for those that are zero.
     """
-
-    s: Array
-    vt: Array
-    scale: Array
-
-
-def directions(rows: Array) -> Directions:
-    """How well rows (..., n, m) know each direction of their unknowns, columns scaled."""
     scale = np.sqrt(np.sum(rows**2, axis=-2))
     scale = np.where(scale > 0, scale, 1.0)
     _, s, vt = np.linalg.svd(np.linalg.qr(rows / scale[..., None, :], mode="r"))
     spare = [(0, 0)] * (s.ndim - 1) + [(0, vt.shape[-1] - s.shape[-1])]  # fewer rows than unknowns
-    return Directions(np.pad(s, spare), vt, scale)
+    return np.pad(s, spare), vt, scale
 
 
 def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:

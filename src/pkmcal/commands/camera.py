@@ -97,7 +97,12 @@ def of_session(folder: Path) -> tuple[list[Path], Path]:
     stations: dict[str, Any] = session.data.get("stations") or {}
     board = session.data.get("board")
     board = board.get("file") if isinstance(board, dict) else board
-    seen = {name: s for name, s in stations.items() if "board" in _words(s.get("observe"))}
+    seen = {
+        name: s
+        for name, s in stations.items()
+        for observed in [s.get("observe")]  # a word or a list of them
+        if observed == "board" or (isinstance(observed, list) and "board" in observed)
+    }
     if not seen or not board:
         raise InputError(
             "no station of this session observes a board",
@@ -120,11 +125,6 @@ def of_session(folder: Path) -> tuple[list[Path], Path]:
     if not paths:
         raise InputError("no photographs found", where=session.where("stations"), found=wild[0])
     return paths, folder / str(board)
-
-
-def _words(observe: Any) -> list[Any]:
-    """What a station observes, a word or a list of them."""
-    return observe if isinstance(observe, list) else [observe]
 
 
 def photographs(images: list[Path]) -> list[Path]:

@@ -98,7 +98,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
         sys.stdout.flush()
     except (BrokenPipeError, SystemExit):  # typer and Rich leave by the latter
-        return _reader_left()
+        # The reader of a pipe, such as head, has gone: nobody is left to tell anything, and Python
+        # would complain at exit, when it flushes what is left.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Exception as error:  # noqa: BLE001 - the last resort, which tells defects from mistakes
@@ -125,50 +128,29 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
     if isinstance(error, PkmcalError):
         return error, error.exit_code
     if isinstance(error, _UsageError):
-        return _misused(error, words), InputError.exit_code
+        message = " ".join(getattr(error, "format_message", error.__str__)().split())
+        message = message.replace(". Did you mean", ", did you mean").rstrip("?.")
+        command = words[0] + " " if words and words[0] in COMMANDS else ""
+        said = InputError(message, next_step=f"See pkmcal {command}--help")
+        return said, said.exit_code
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return PkmcalError("interrupted; what was not finished was not written"), INTERRUPTED
     if isinstance(error, MemoryError):
-        return _too_large(), InputError.exit_code
-    if isinstance(error, OSError):
-        return _refused(error), InputError.exit_code
-    return _defect(error), DEFECT
-
-
-def _misused(error: Exception, words: list[str]) -> InputError:
-    """A wrong option or argument."""
-    message = " ".join(getattr(error, "format_message", error.__str__)().split())
-    message = message.replace(". Did you mean", ", did you mean").rstrip("?.")
-    command = words[0] + " " if words and words[0] in COMMANDS else ""
-    return InputError(message, next_step=f"See pkmcal {command}--help")
-
-
-def _too_large() -> InputError:
-    return InputError(
-        "there is not enough memory",
-        next_step="Close other programs, or use fewer or smaller photographs",
-    )
-
-
-def _refused(error: OSError) -> InputError:
-    """The operating system would not: no space, no permission, a disk taken away."""
-    reason = (error.strerror or str(error) or type(error).__name__).lower()
-    return InputError(
-        f"the operating system refused: {reason}",
-        where=str(error.filename) if error.filename else None,
-        next_step="Make room, change the permissions, or name another folder",
-    )
-
-
-def _defect(error: BaseException) -> PkmcalError:
-    return PkmcalError(
+        said = InputError(
+            "there is not enough memory",
+            next_step="Close other programs, or use fewer or smaller photographs",
+        )
+        return said, said.exit_code
+    if isinstance(error, OSError):  # no space, no permission, a disk taken away
+        reason = (error.strerror or str(error) or type(error).__name__).lower()
+        said = InputError(
+            f"the operating system refused: {reason}",
+            where=str(error.filename) if error.filename else None,
+            next_step="Make room, change the permissions, or name another folder",
+        )
+        return said, said.exit_code
+    defect = PkmcalError(
         f"this is a defect of pkmcal, not of your session: {type(error).__name__}: {error}",
         next_step=f"Set {DEBUG}=1, run the command again, and report what it then prints",
     )
-
-
-def _reader_left() -> int:
-    """The reader of a pipe, such as head, has gone: nobody is left to tell anything."""
-    # Python would complain at exit, when it flushes what is left.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
+    return defect, DEFECT

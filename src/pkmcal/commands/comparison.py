@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -47,10 +47,6 @@ class AgainstTruth:
     calibrated: Errors
     count: int
     within: int
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything under its name."""
-        return asdict(self)
 
 
 def compare(calibration: Calibration, session_folder: Path) -> AgainstTruth:

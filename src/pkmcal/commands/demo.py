@@ -19,7 +19,6 @@ from pkmcal.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.calibration.calibrate import Calibration
     from pkmcal.commands.comparison import AgainstTruth
 
 HERE = Path("pkmcal-demo")
@@ -39,18 +38,32 @@ def demo(
     as_json: console.Json = False,
 ) -> int:
     """Simulate, calibrate, compare with the truth, open the report."""
-    from dataclasses import replace
+    from dataclasses import asdict, replace
 
+    from pkmcal.calibration.calibrate import calibrate
     from pkmcal.calibration.results import check_output
     from pkmcal.commands.comparison import compare
+    from pkmcal.mechanisms import load_mechanism
     from pkmcal.report.calibration import outcome_of
+    from pkmcal.simulation import simulate_session
+    from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, camera_of_size, demo_camera
 
     session, result = out / SESSION, out / CALIBRATION
     _make_room(out)
     check_output(result)
     with console.progress() as told:
-        _simulate(session, fast, told)
-        calibration = _calibrate(session, told)
+        simulate_session(
+            session,
+            load_mechanism(MECHANISM),
+            camera_of_size(FAST_SIZE) if fast else demo_camera(),
+            replace(SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else SETTINGS,
+            seed=SEED,
+            progress=console.counted(told, upto=SIMULATING),
+        )
+        rest = 0.97 - SIMULATING
+        calibration = calibrate(
+            session, progress=lambda text, share: told(text, SIMULATING + rest * share)
+        )
         told("Writing the report", 0.98)
         found = outcome_of(calibration)
         write(found, result, FILES)
@@ -64,7 +77,7 @@ def demo(
         summary={
             **(found.summary or {}),
             "session": session,
-            "comparison": comparison.as_dict(),
+            "comparison": asdict(comparison),
         },
     )
     code = answer(found, result, FILES, as_json=as_json)
@@ -92,32 +105,6 @@ def _make_room(out: Path) -> None:
         )
     for name in entries:
         shutil.rmtree(out / name)
-
-
-def _simulate(session: Path, fast: bool, told: console.Progress) -> None:
-    from dataclasses import replace
-
-    from pkmcal.mechanisms import load_mechanism
-    from pkmcal.simulation import simulate_session
-    from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, camera_of_size, demo_camera
-
-    settings = replace(SETTINGS, configurations=FAST_CONFIGURATIONS) if fast else SETTINGS
-    camera = camera_of_size(FAST_SIZE) if fast else demo_camera()
-    simulate_session(
-        session,
-        load_mechanism(MECHANISM),
-        camera,
-        settings,
-        seed=SEED,
-        progress=console.counted(told, upto=SIMULATING),
-    )
-
-
-def _calibrate(session: Path, told: console.Progress) -> Calibration:
-    from pkmcal.calibration.calibrate import calibrate
-
-    rest = 0.97 - SIMULATING
-    return calibrate(session, progress=lambda text, share: told(text, SIMULATING + rest * share))
 
 
 def _tell_comparison(out: Console, found: AgainstTruth) -> None:

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pkmcal.commands import console
+from pkmcal.wording import with_unit
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pkmcal.outcome import Figure, Outcome
+    from pkmcal.outcome import Outcome
 
 PAGE = "open it in a browser"
 NUMBERS = "everything, for programs"
@@ -100,8 +101,13 @@ def tell(out: Console, outcome: Outcome) -> None:
         out.print()
     console.print_points(out, [(console.MARKS[outcome.mark], verdict.headline)])
     console.print_points(out, [("  [red]•[/]", reason) for reason in verdict.reasons])
-    if not any(table.brief for part in outcome.parts for table in part.tables):
-        _tell_figures(out, outcome.figures)
+    brief = any(table.brief for part in outcome.parts for table in part.tables)
+    if outcome.figures and not brief:
+        out.print()
+        widest = max(len(card.question) for card in outcome.figures)
+        for card in outcome.figures:
+            values = ", ".join(with_unit(value, unit) for value, unit in card.values)
+            out.print(f"  {card.question:{widest}}  [bold]{values}[/]", soft_wrap=True)
     for part in outcome.parts:
         for table in part.tables:
             if table.brief:
@@ -124,13 +130,3 @@ def tell(out: Console, outcome: Outcome) -> None:
     if outcome.closing:
         out.print()
         out.print(outcome.closing, style="yellow", markup=False)
-
-
-def _tell_figures(out: Console, figures: tuple[Figure, ...]) -> None:
-    if not figures:
-        return
-    out.print()
-    widest = max(len(card.question) for card in figures)
-    for card in figures:
-        values = ", ".join(v + unit if unit == "°" else f"{v} {unit}" for v, unit in card.values)
-        out.print(f"  {card.question:{widest}}  [bold]{values}[/]", soft_wrap=True)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS, PAGE, finish
 from pkmcal.errors import InputError
-
-if TYPE_CHECKING:
-    from pkmcal.control.study import Plan
 
 FILES = {"servo.html": PAGE, "servo.json": NUMBERS}
 MOST_SAMPLES = 5000
@@ -84,49 +81,14 @@ def servo(
     as_json: console.Json = False,
 ) -> int:
     """Simulate control by the legs in the image."""
-    from pkmcal.control.source import controlled, legs_of
-    from pkmcal.control.study import study
-    from pkmcal.files import check_own_folder
-    from pkmcal.report.servo import outcome_of
-
-    plan = _plan(
-        law=law, runs=runs, gain=gain, rate=rate, delay=delay, noise=noise,
-        joint_noise=joint_noise, speed=speed, duration=duration, seed=seed,
-        hand=(hand_position, hand_rotation), ends=(start, goal),
-    )  # fmt: skip
-    folder = out or Path("servo")
-    check_own_folder(folder, FILES, "a study of servoing", "an earlier study")
-    numbers = None if legs is None else legs_of(legs)
-    subject = controlled(
-        machine, session=session, station=station, camera=camera, legs=numbers, seed=seed
-    )
-    with console.progress(as_json) as told:
-        outcome = outcome_of(subject, study(subject.scene, plan, told))
-    return finish(outcome, folder, FILES, as_json=as_json)
-
-
-def _plan(
-    *,
-    law: str,
-    runs: int,
-    gain: float,
-    rate: float,
-    delay: int,
-    noise: float,
-    joint_noise: float,
-    speed: float | None,
-    duration: float | None,
-    seed: int,
-    hand: tuple[float, float],
-    ends: tuple[str | None, str | None],
-) -> Plan:
-    """The options as one plan."""
     import numpy as np
 
     from pkmcal.control.laws import law_named
     from pkmcal.control.simulation import LoopSettings
-    from pkmcal.control.source import pose_of
-    from pkmcal.control.study import Plan
+    from pkmcal.control.source import controlled, legs_of, pose_of
+    from pkmcal.control.study import Plan, study
+    from pkmcal.files import check_own_folder
+    from pkmcal.report.servo import outcome_of
     from pkmcal.simulation.edges import EdgeNoise
 
     law_named(law)
@@ -149,11 +111,20 @@ def _plan(
             "the runs would have too many samples", where="--duration",
             found=str(loop.samples), expected=f"at most {MOST_SAMPLES}, a rate times a duration",
         )  # fmt: skip
-    start, goal = (
+    first, last = (
         None if text is None else pose_of(text, where)
-        for text, where in zip(ends, ("--start", "--goal"), strict=True)
+        for text, where in ((start, "--start"), (goal, "--goal"))
     )
-    return Plan(loop, runs, seed, hand[0], float(np.deg2rad(hand[1])), start, goal)
+    plan = Plan(loop, runs, seed, hand_position, float(np.deg2rad(hand_rotation)), first, last)
+    folder = out or Path("servo")
+    check_own_folder(folder, FILES, "a study of servoing", "an earlier study")
+    numbers = None if legs is None else legs_of(legs)
+    subject = controlled(
+        machine, session=session, station=station, camera=camera, legs=numbers, seed=seed
+    )
+    with console.progress(as_json) as told:
+        outcome = outcome_of(subject, study(subject.scene, plan, told))
+    return finish(outcome, folder, FILES, as_json=as_json)
 
 
 def _positive(where: str, value: float, most: float) -> None:

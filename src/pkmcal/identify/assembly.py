@@ -12,7 +12,7 @@ from pkmcal.errors import InputError
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import Blocks, Data, PoseBlocks, PoseData
+from pkmcal.identify.rows import EdgeBlocks, EdgeData, Kinds, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -57,21 +57,21 @@ class Assembled:
     """A problem and where its rows come from.
 
     seen : (K,) configurations with at least one edge, or pose of a board on the platform; only
-    they are in the problem. edges, poses : where each stands among the seen ones.
+    they are in the problem. places : where each kind's measurements stand among the seen ones.
     priors : names of the kinds of the prior rows, (c,): drawing, camera, shading, mount or gauge.
     """
 
     problem: Problem
     seen: Booleans
-    edges: Places
-    poses: Places
+    places: Kinds[Places]
     priors: tuple[str, ...]
 
-    def trusting(self, edges: Array, poses: Array) -> Problem:
-        """The problem with weights (N,) of its edges and of its poses; see
+    def trusting(self, weights: Kinds[Array]) -> Problem:
+        """The problem with weights (N,) of its measurements; see
         :meth:`~pkmcal.identify.problem.Problem.weighted`.
         """
-        return self.problem.weighted(self.edges.filled(edges)[None], self.poses.filled(poses)[None])
+        placed = zip(self.places, weights, strict=True)
+        return self.problem.weighted(Kinds(*(at.filled(weight)[None] for at, weight in placed)))
 
 
 def assemble(
@@ -123,7 +123,7 @@ def assemble(
         pose_blocks=pose_blocks,
         pose_data=pose_data,
     )
-    return Assembled(problem, seen, edges, poses, kinds)
+    return Assembled(problem, seen, Kinds(edges, poses), kinds)
 
 
 def seen_configurations(measurements: Measurements) -> Booleans:
@@ -179,7 +179,7 @@ def _lines(measurements: Measurements) -> Integers:
 
 def _edges(
     machine: Machine, measurements: Measurements, at: Places, line: Integers, seen: Booleans
-) -> tuple[Blocks, Data]:
+) -> tuple[EdgeBlocks, EdgeData]:
     """The edges at their places, and the readings of the seen configurations."""
     edges, factor = measurements.edges, measurements.intrinsics_factor
     tubes = zip(edges.leg, edges.tube, strict=True)
@@ -190,7 +190,7 @@ def _edges(
     if factor.shape[-1] and len(edges):
         # the measured normals move with the intrinsics; residuals are predicted less measured
         optics[..., 1:] = -edges.by_intrinsics @ factor[camera]
-    blocks = Blocks(
+    blocks = EdgeBlocks(
         leg=at.filled(edges.leg),
         station=at.filled(edges.station),
         camera=at.filled(camera),
@@ -200,7 +200,7 @@ def _edges(
         present=at.present,
         line=at.filled(line) if len(line) else np.zeros((0, 0), dtype=int),
     )
-    data = Data(
+    data = EdgeData(
         basis=at.filled(edges.basis)[None, :, :, None],
         whiten=at.filled(np.linalg.inv(np.linalg.cholesky(edges.covariance)))[None],
         optics=at.filled(optics)[None],

@@ -13,7 +13,6 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import ResultError
-from pkmcal.identify import robust as robust_weights
 from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
     Identifiability,
@@ -27,7 +26,8 @@ from pkmcal.identify.covariance import (
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge, told_unknowns
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.robust import Both
+from pkmcal.identify.robust import anneal, settled_weights
+from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -52,18 +52,16 @@ class BatchResult:
     """The joint estimate of B runs.
 
     problem : with the weights in use, noise scale included. solution : states, cost, stops.
-    weight, pose_weight : (B, K, G) robust weights 0..1 of edges and poses. noise_scale,
-    pose_scale : (B,). steps : (B,). info : rows and covariance at the solution.
+    weight : (B, K, G) robust weights 0..1 of each kind of measurement. scale : (B,) factor on its
+    stated noise. steps : (B,). info : rows and covariance at the solution.
     """
 
     problem: Problem
     solution: Solution
-    weight: Array
-    noise_scale: Array
+    weight: Kinds[Array]
+    scale: Kinds[Array]
     steps: Integers
     info: Information
-    pose_weight: Array
-    pose_scale: Array
 
 
 def solve_batch(
@@ -79,10 +77,12 @@ def solve_batch(
     damping : the search's first; less where the start is near, as after the four steps.
     """
     n_runs = start.z.shape[0]
-    ones = Both(np.ones(n_runs), np.ones(n_runs))
-    fit = _Fit(problem, start, _all(problem, n_runs), ones, np.zeros(n_runs, dtype=int), ())
+    ones: Kinds[Array] = Kinds(np.ones(n_runs), np.ones(n_runs))
+    present = (kind.present.astype(float) for kind in problem.kinds)
+    every = Kinds(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
+    fit = _Fit(problem, start, every, ones, np.zeros(n_runs, dtype=int), ())
     if robust:
-        found = robust_weights.anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
+        found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
         scale = found.scale if scale_noise else fit.scale
         fit = fit._replace(state=found.state, weight=found.weight, scale=scale, steps=found.steps)
     fit = _solved(problem, fit, RESTART_DAMPING if robust else damping)
@@ -90,22 +90,13 @@ def solve_batch(
         scale = _noise_scale(fit) if scale_noise else fit.scale
         weight = fit.weight
         if robust:
-            weight = robust_weights.settled_weights(problem, fit.state, scale)
-        if _same(scale, fit.scale, weight, fit.weight):
+            weight = settled_weights(problem, fit.state, scale)
+        if _settled(scale, fit.scale, weight, fit.weight):
             break
         fit = _solved(problem, fit._replace(weight=weight, scale=scale), RESTART_DAMPING)
     info = information(fit.problem, fit.state)
     solution = Solution(fit.state, info.cost(), fit.steps, fit.stop)
-    return BatchResult(
-        fit.problem,
-        solution,
-        fit.weight.edges,
-        fit.scale.edges,
-        fit.steps,
-        info,
-        fit.weight.poses,
-        fit.scale.poses,
-    )
+    return BatchResult(fit.problem, solution, fit.weight, fit.scale, fit.steps, info)
 
 
 class _Fit(NamedTuple):
@@ -113,20 +104,16 @@ class _Fit(NamedTuple):
 
     problem: Problem
     state: BatchState
-    weight: Both
-    scale: Both
+    weight: Kinds[Array]
+    scale: Kinds[Array]
     steps: Integers
     stop: tuple[Stop, ...]
 
 
-def _all(problem: Problem, n_runs: int) -> Both:
-    """Weights of 1 for all that is measured."""
-    present = (problem.blocks.present, problem.pose_blocks.present)
-    return Both(*(np.broadcast_to(p.astype(float), (n_runs, *p.shape)) for p in present))
-
-
-def _same(scale: Both, old_scale: Both, weight: Both, old_weight: Both) -> bool:
-    """Whether scales and weights have settled."""
+def _settled(
+    scale: Kinds[Array], old_scale: Kinds[Array], weight: Kinds[Array], old_weight: Kinds[Array]
+) -> bool:
+    """Whether scales change by less than a thousandth, and weights by less than a hundredth."""
     change = [np.abs(new / old - 1).max() for new, old in zip(scale, old_scale, strict=True)]
     change += [
         0.1 * np.abs(new - old).max(initial=0.0)
@@ -138,36 +125,34 @@ def _same(scale: Both, old_scale: Both, weight: Both, old_weight: Both) -> bool:
 def _solved(problem: Problem, fit: _Fit, damping: float) -> _Fit:
     """The problem solved with the fit's weights, from its state."""
     parts = zip(fit.weight, fit.scale, strict=True)
-    used = problem.weighted(*(weight / scale[:, None, None] ** 2 for weight, scale in parts))
+    used = problem.weighted(Kinds(*(weight / scale[:, None, None] ** 2 for weight, scale in parts)))
     found = minimise(used, fit.state, damping=damping)
     steps = fit.steps + found.steps
     return fit._replace(problem=used, state=found.state, steps=steps, stop=found.stop)
 
 
-def _noise_scale(fit: _Fit) -> Both:
-    """Factors on the stated noise of edges, and of poses, that make their chi2 equal its degrees
-    of freedom, (B,) each.
+def _noise_scale(fit: _Fit) -> Kinds[Array]:
+    """Factors on the stated noise of each kind that make its chi2 equal its degrees of freedom,
+    (B,) each.
 
     The variance component of a group with redundancies as weights; kept as it is where fewer
     than five degrees of freedom remain to judge it.
     """
-    problem = fit.problem
-    linear = problem.linearize(fit.state)
+    linear = fit.problem.linearize(fit.state)
     reduced = eliminate(linear, np.zeros(len(fit.steps)))
-    rows = problem.edge_rows, problem.pose_rows
-    out = []
-    for part, number, scale in zip(rows, counts(problem, fit.weight), fit.scale, strict=True):
-        chi2, freedom = group_fit(linear, reduced, part, number)
+    used = counts(fit.problem, fit.weight)
+    out: list[Array] = []
+    for kind, number, scale in zip(fit.problem.kinds, used, fit.scale, strict=True):
+        chi2, freedom = group_fit(linear, reduced, kind.rows, number)
         new = scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
         out.append(np.where(freedom > 5, np.maximum(new, LEAST_SCALE), scale))
-    return Both(*out)
+    return Kinds(*out)
 
 
-def counts(problem: Problem, weight: Both) -> Both:
-    """Residuals of edges and of poses in use, each counted by its robust weight, (B,) each."""
-    poses = weight.poses * robust_weights.measured_rows(problem)
-    edges = np.sum(weight.edges, axis=(1, 2)) * problem.data.whiten.shape[-1]
-    return Both(edges, np.sum(poses, axis=(1, 2)))
+def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:
+    """Residuals of each kind in use, each counted by its robust weight, (B,)."""
+    parts = zip(problem.kinds, weight, strict=True)
+    return Kinds(*(np.sum(part * kind.count, axis=(1, 2)) for kind, part in parts))
 
 
 def bundle(
@@ -213,8 +198,10 @@ def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiab
     machine = estimate.machine
     assembled = assemble(machine, measurements, default_gauge(machine))
     problem = assembled.trusting(
-        estimate.edge_weights / estimate.statistics.noise_scale**2,
-        estimate.pose_weights / estimate.statistics.pose_scale**2,
+        Kinds(
+            estimate.edge_weights / estimate.statistics.noise_scale**2,
+            estimate.pose_weights / estimate.statistics.pose_scale**2,
+        )
     )
     state = batch_of(machine, assembled, estimate.state)
     return identifiability(problem, machine, state)
@@ -240,8 +227,10 @@ def _estimate(
     problem, u = result.problem, result.problem.unknowns
     optics = own_blocks(result.info.covariance[0], u.optics, u.n_optics)
     factor = measurements.intrinsics_factor
-    edges = problem.block_residuals(found)[0] / result.noise_scale[0]
-    poses = problem.pose_residuals(found)[0] / result.pose_scale[0]
+    measured = zip(assembled.places, problem.unweighted(found), result.scale, strict=True)
+    residuals = Kinds(*(at.taken(rows[0] / scale[0]) for at, rows, scale in measured))
+    weighted = zip(assembled.places, result.weight, strict=True)
+    weights = Kinds(*(at.taken(weight[0]) for at, weight in weighted))
     closures = result.info.linear.value[..., problem.closure_rows]
     joints = np.zeros(measurements.joints.shape)  # where no pose was fitted
     joints[assembled.seen] = problem.joint_rows(closures, found)[0]
@@ -251,16 +240,16 @@ def _estimate(
         covariance=covariance,
         station_covariance=own_blocks(full, told.stations, 6),
         edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
-        edge_residuals=assembled.edges.taken(edges),
-        edge_weights=assembled.edges.taken(result.weight[0]),
+        edge_residuals=residuals.edges,
+        edge_weights=weights.edges,
         joint_residuals=joints,
         data_share=data_share(machine, state.theta, covariance, gauge),
         configurations=assembled.seen,
         statistics=_statistics(result, assembled),
         gauge=gauge.name,
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
-        pose_residuals=assembled.poses.taken(poses),
-        pose_weights=assembled.poses.taken(result.pose_weight[0]),
+        pose_residuals=residuals.poses,
+        pose_weights=weights.poses,
         mount_covariance=own_blocks(full, told.mounts, 6),
     )
 
@@ -281,12 +270,11 @@ def _with_unseen_poses(
 def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     problem, linear = result.problem, result.info.linear
     kinds = np.array(assembled.priors)
-    rows = problem.edge_rows, problem.closure_rows, problem.pose_rows
+    rows = problem.kinds.edges.rows, problem.closure_rows, problem.kinds.poses.rows
     chi2 = [float(np.sum(linear.value[0, :, part] ** 2)) for part in rows]
     drawn = ~np.isin(kinds, ("gauge", "mount"))
     chi2_drawing = float(np.sum(linear.shared_value[0, drawn] ** 2))
-    used = counts(problem, Both(result.weight, result.pose_weight))
-    n_edges, n_poses = float(used.edges[0]), float(used.poses[0])
+    n_edges, n_poses = (float(number[0]) for number in counts(problem, result.weight))
     n_joints = linear.value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))
@@ -306,10 +294,10 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
         n_drawing=n_drawing,
         steps=int(result.steps[0]),
         stopped=result.solution.stop[0].value,
-        noise_scale=float(result.noise_scale[0]),
+        noise_scale=float(result.scale.edges[0]),
         chi2_poses=chi2[2],
         n_poses=n_poses,
-        pose_scale=float(result.pose_scale[0]),
+        pose_scale=float(result.scale.poses[0]),
         dof_edges=freedom[0],
         dof_joints=freedom[1],
         dof_poses=freedom[2],

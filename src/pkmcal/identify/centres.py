@@ -60,10 +60,12 @@ def joint_centres(drawing: Machine, calibrated: Machine, covariance: Array) -> t
         ("base", before.a, after.a, after.a_by, after.a_index),
         ("platform", before.b, after.b, after.b_by, after.b_index),
     )
-    return tuple(
-        _centres(side, np.array(old), np.array(new), _spread(by, index, covariance))
-        for side, old, new, by, index in sides
-    )
+    found: list[Centres] = []
+    for side, old, new, by, index in sides:
+        over = laid_over(np.array(old), np.array(new))
+        known = _spread(by, index, covariance)
+        found.append(Centres(side, np.array(new), apply(over, np.array(old)), over, known))
+    return tuple(found)
 
 
 def free_of_gauge(estimate: Estimate) -> Array:
@@ -92,8 +94,3 @@ def _spread(by: Array, index: Integers, covariance: Array) -> Array:
     n = len(covariance)
     flat = (by @ np.eye(n + 1)[index, :n]).reshape(-1, n)
     return flat @ covariance @ flat.T
-
-
-def _centres(side: str, old: Array, new: Array, covariance: Array) -> Centres:
-    transform = laid_over(old, new)
-    return Centres(side, new, apply(transform, old), transform, covariance)

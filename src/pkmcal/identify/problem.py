@@ -7,7 +7,7 @@ known beforehand of cameras, shading and mounts, the gauge (:mod:`pkmcal.identif
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,16 +25,17 @@ from pkmcal.identify.gauge import (
     turned_back,
 )
 from pkmcal.identify.rows import (
-    Blocks,
-    Data,
+    EdgeBlocks,
+    EdgeData,
     EdgeRows,
+    Kind,
+    Kinds,
     PoseBlocks,
     PoseData,
     PoseRows,
     by_noise,
     edge_rows,
     joint_rows,
-    no_poses,
     pose_rows,
 )
 from pkmcal.identify.unknowns import BatchState, Unknowns
@@ -60,42 +61,42 @@ class Problem:
     drawing: Array
     free: Array
     unknowns: Unknowns
-    blocks: Blocks
-    data: Data
+    blocks: EdgeBlocks
+    data: EdgeData
     joint_noise: float
     prior: Array
     prior_target: Array
     frames: Array
-    pose_blocks: PoseBlocks = field(default_factory=no_poses)
-    pose_data: PoseData = field(default_factory=PoseData)
+    pose_blocks: PoseBlocks
+    pose_data: PoseData
 
-    @property
-    def edge_rows(self) -> slice:
-        """Rows of a configuration that are edges'; they come first."""
-        return slice(0, self.blocks.side.size // len(self.blocks.side) * 2)
+    @cached_property
+    def kinds(self) -> Kinds[Kind]:
+        """The kinds of measurement: edges' rows come first in a configuration, poses' last."""
+        edges, poses = self.data, self.pose_data
+        closures = self.closure_rows
+        return Kinds(
+            Kind(slice(0, closures.start), self.blocks.present, edges.weight, edges.whiten),
+            Kind(slice(closures.stop, None), self.pose_blocks.present, poses.weight, poses.whiten),
+        )
 
     @property
     def closure_rows(self) -> slice:
         """Rows of a configuration that are the closure's."""
-        return slice(self.edge_rows.stop, self.edge_rows.stop + self.layout.n_equations)
-
-    @property
-    def pose_rows(self) -> slice:
-        """Rows of a configuration that are boards' poses; they come last."""
-        return slice(self.closure_rows.stop, None)
+        n_edge_rows = self.data.whiten.shape[2] * self.data.whiten.shape[3]
+        return slice(n_edge_rows, n_edge_rows + self.layout.n_equations)
 
     def select(self, runs: Integers) -> Problem:
         """The problem of some runs only."""
         return replace(self, data=of_runs(self.data, runs), pose_data=of_runs(self.pose_data, runs))
 
-    def weighted(self, weight: Array, poses: Array | None = None) -> Problem:
-        """The same problem with other weights of the edges' blocks, and of the boards' poses where
-        given, (B, K, G) each.
-        """
-        changed = replace(self, data=replace(self.data, weight=weight))
-        if poses is None:
-            return changed
-        return replace(changed, pose_data=replace(self.pose_data, weight=poses))
+    def weighted(self, weight: Kinds[Array]) -> Problem:
+        """The same problem with other weights (B, K, G) of each kind's measurements."""
+        return replace(
+            self,
+            data=replace(self.data, weight=weight.edges),
+            pose_data=replace(self.pose_data, weight=weight.poses),
+        )
 
     def opened(self, state: BatchState) -> tuple[Problem, BatchState]:
         """The same problem and state with every parameter of the machine an unknown of its own.
@@ -175,16 +176,11 @@ class Problem:
             self.prior,
         )
 
-    def block_residuals(self, state: BatchState) -> Array:
-        """Whitened residuals of the blocks without their weights, (B, K, G, 2g)."""
-        plain = self.weighted(self.blocks.present[None].astype(float))
+    def unweighted(self, state: BatchState) -> Kinds[Array]:
+        """Whitened residuals of each kind of measurement without their weights, (B, K, G, n)."""
+        plain = self.weighted(Kinds(*(kind.present[None].astype(float) for kind in self.kinds)))
         edges = plain._edges(state, plain.closure(state))
-        return edges.value(state.optics, state.shading)
-
-    def pose_residuals(self, state: BatchState) -> Array:
-        """Whitened errors of the measured boards' poses without their weights, (B, K, G, 6)."""
-        present = self.pose_blocks.present[None].astype(float)
-        return self.weighted(self.data.weight, present)._poses(state).value
+        return Kinds(edges.value(state.optics, state.shading), plain._poses(state).value)
 
     def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
         """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""
@@ -230,13 +226,13 @@ class Problem:
 
     def _in_use(self) -> Booleans:
         """Rows that are not padding and not weighted away, (B or 1, K, r)."""
-        edges = np.repeat(self.data.weight > 0, self.data.whiten.shape[-1], axis=-1)
-        poses = np.repeat(self.pose_data.weight > 0, 6, axis=-1)
-        n_rows = edges.shape[-1] + self.layout.n_equations + poses.shape[-1]
-        runs = max(len(edges), len(poses))
-        used = np.ones((runs, edges.shape[1], n_rows), dtype=bool)
-        used[..., self.edge_rows], used[..., self.pose_rows] = edges, poses
-        return used
+        edges, poses = (
+            np.repeat(kind.weight > 0, kind.whiten.shape[-1], axis=-1) for kind in self.kinds
+        )
+        runs, n = max(len(edges), len(poses)), edges.shape[1]
+        parts = (edges, np.ones((1, n, self.layout.n_equations), dtype=bool), poses)
+        parts = [np.broadcast_to(part, (runs, n, part.shape[-1])) for part in parts]
+        return np.concatenate(parts, axis=-1)
 
     def _columns(self, machine: Array, *others: tuple[slice, Integers, Array]) -> Array:
         """Derivatives put into the columns of the shared unknowns, rows in one, (B, K, G n, na).

@@ -2,9 +2,9 @@
 
 A wrong edge (another leg's, a shadow's) is wrong as a whole, so the weight belongs to the whole
 edge and judges the Mahalanobis norm d of its two residuals; so does that of a board's pose, of its
-six. The search begins with a scale so wide that everything counts and narrows it while the
-estimate settles (graduated non-convexity, Geman-McClure weights); it ends with weights that are 1
-for all that is clean.
+six, and that of any other kind of measurement, of as many as it has. The search begins with a scale
+so wide that everything counts and narrows it while the estimate settles (graduated non-convexity,
+Geman-McClure weights); it ends with weights that are 1 for all that is clean.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.identify.problem import Problem
+from pkmcal.identify.rows import Kind, Kinds
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.solver import (
     FIRST_DAMPING,
@@ -25,10 +26,8 @@ from pkmcal.solver import (
     soft_weights,
 )
 
-TAIL = np.exp(-(FULL**2) / 2)
+TAIL = float(np.exp(-(FULL**2) / 2))
 """Share of two clean residuals' norms beyond FULL, where weights begin to fall."""
-MEDIAN = float(np.sqrt(2 * np.log(2)))
-"""Of the norm of two residuals that are noise."""
 POSE_STEPS = 10
 """Steps of a stage where there are poses: against readings a hundred times sharper they allow
 short steps only at first, and one that is refused would look as if all had settled."""
@@ -37,59 +36,45 @@ WIDE = 4.0
 """Geman-McClure scale in units of the residuals' robust scale."""
 
 
-class Both(NamedTuple):
-    """A number for the edges and one for the poses, or an array for each of their blocks."""
-
-    edges: Array
-    poses: Array
-
-
 class Anneal(NamedTuple):
     """Where the annealing ended: state, weights (B, K, G), robust scale (B,), solver steps."""
 
     state: BatchState
-    weight: Both
-    scale: Both
+    weight: Kinds[Array]
+    scale: Kinds[Array]
     steps: int
 
 
-def norms(problem: Problem, state: BatchState) -> Array:
-    """Mahalanobis norms of the blocks by their stated noise, (B, K, G); NaN for padding.
-
-    A block of g edges has 2g residuals; the norm is scaled so that its mean square is 2.
-    """
-    rows = problem.block_residuals(state)
-    d = np.sqrt(np.sum(rows**2, axis=-1) * (2 / rows.shape[-1]))
-    return np.where(problem.blocks.present, d, np.nan)
-
-
-def measured_rows(problem: Problem) -> Integers:
-    """How many of its six numbers each pose has, (K, G): a point has three, padding none."""
-    return np.any(problem.pose_data.whiten[0] != 0, axis=-1).sum(axis=-1)
-
-
-def pose_norms(problem: Problem, state: BatchState) -> Array:
-    """The same of the poses, scaled so that as many clean ones lie beyond FULL as of edges."""
-    d = np.sqrt(np.sum(problem.pose_residuals(state) ** 2, axis=-1))
-    return np.where(problem.pose_blocks.present, d * _pose_factor(problem), np.nan)
-
-
-def _pose_factor(problem: Problem) -> Array:
+def clean_norm(share: float, count: Integers) -> Array:
+    """The norm beyond which a share of those of ``count`` clean residuals lies."""
     from scipy.special import chdtri
 
-    rows = np.maximum(measured_rows(problem), 1)
-    return FULL / np.sqrt(chdtri(rows, TAIL))
+    pair = np.sqrt(-2 * np.log(share))  # the closed form of two residuals: most are edges
+    return np.where(count == 2, pair, np.sqrt(chdtri(np.maximum(count, 1), share)))
 
 
-def distances(problem: Problem, state: BatchState) -> Both:
-    """Both kinds of norms."""
-    return Both(norms(problem, state), pose_norms(problem, state))
+def as_pairs(kind: Kind) -> Array:
+    """Factors (K, G) on a kind's norms, so that as many clean ones lie beyond FULL as of pairs."""
+    return FULL / clean_norm(TAIL, kind.count)
 
 
-def robust_scale(d: Array, usual: Array | float = MEDIAN) -> Array:
+def distances(problem: Problem, state: BatchState) -> Kinds[Array]:
+    """Mahalanobis norms of each kind by its stated noise, as those of pairs (:func:`as_pairs`),
+    (B, K, G); NaN for padding.
+    """
+    parts = zip(problem.kinds, problem.unweighted(state), strict=True)
+    return Kinds(
+        *(
+            np.where(kind.present, np.sqrt(np.sum(rows**2, axis=-1)) * as_pairs(kind), np.nan)
+            for kind, rows in parts
+        )
+    )
+
+
+def robust_scale(d: Array, usual: Array) -> Array:
     """Factor by which the noise seems to differ from the stated one, from the median, (B,).
 
-    usual : the median of clean norms, by default of two residuals'.
+    d : (B, K, G) norms. usual : (K, G) the medians of clean ones.
     """
     flat = np.sort((d / usual).reshape(d.shape[0], -1), axis=1)  # NaN last
     count = np.sum(np.isfinite(flat), axis=1)
@@ -98,21 +83,17 @@ def robust_scale(d: Array, usual: Array | float = MEDIAN) -> Array:
     return flat[np.arange(len(flat)), count // 2]
 
 
-def scales(problem: Problem, d: Both, least: float) -> Both:
-    """Both kinds' factors, (B,) each, not below the least."""
-    from scipy.special import chdtri
-
-    rows = np.maximum(measured_rows(problem), 1)
-    usual = np.sqrt(chdtri(rows, 0.5)) * _pose_factor(problem)
-    both = robust_scale(d.edges), robust_scale(d.poses, usual)
-    return Both(*(np.maximum(scale, least) for scale in both))
+def scales(problem: Problem, d: Kinds[Array], least: float) -> Kinds[Array]:
+    """Each kind's factor, (B,), not below the least."""
+    parts = zip(problem.kinds, d, strict=True)
+    found = (robust_scale(part, clean_norm(0.5, k.count) * as_pairs(k)) for k, part in parts)
+    return Kinds(*(np.maximum(scale, least) for scale in found))
 
 
-def settled_weights(problem: Problem, state: BatchState, scale: Both) -> Both:
-    """Both kinds' weights at a state."""
-    d = distances(problem, state)
-    parts = zip(d, scale, strict=True)
-    return Both(*(final_weights(part / each[:, None, None]) for part, each in parts))
+def settled_weights(problem: Problem, state: BatchState, scale: Kinds[Array]) -> Kinds[Array]:
+    """Each kind's weights at a state."""
+    parts = zip(distances(problem, state), scale, strict=True)
+    return Kinds(*(final_weights(part / each[:, None, None]) for part, each in parts))
 
 
 def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
@@ -121,7 +102,7 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
     least_scale : the robust scale is not believed below this (1: stated noise is a floor).
     """
     state, steps = start, 0
-    most = POSE_STEPS if problem.pose_blocks.present.size else 1
+    most = POSE_STEPS if problem.kinds.poses.present.size else 1
     d = distances(problem, state)
     cut = [4 * WIDE * scale for scale in scales(problem, d, least_scale)]
     for _ in range(STAGES):
@@ -129,9 +110,9 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
         new = [np.minimum(c, np.maximum(a, c / 4)) for c, a in zip(cut, aim, strict=True)]
         settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
         cut = new
-        weight = Both(*(soft_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True)))
+        weight = Kinds(*(soft_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True)))
         damping = RESTART_DAMPING if steps else FIRST_DAMPING
-        found = minimise(problem.weighted(*weight), state, max_steps=most, damping=damping)
+        found = minimise(problem.weighted(weight), state, max_steps=most, damping=damping)
         state, steps = found.state, steps + int(found.steps.max())
         d = distances(problem, state)
         if settled:

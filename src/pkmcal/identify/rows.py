@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -34,9 +34,43 @@ PERFECT = 1e-6
 """Standard deviation (m) of closures without a reading: joints and rods without play. A third of
 a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
 
+Item = TypeVar("Item", covariant=True)
+
+
+class Kinds(NamedTuple, Generic[Item]):
+    """Something of each kind of measurement: of the edges, and of the boards' poses.
+
+    An estimate weighs, counts and scales all kinds alike. Readings are none: no robust weight lets
+    them go.
+    """
+
+    edges: Item
+    poses: Item
+
 
 @dataclass(frozen=True)
-class Blocks:
+class Kind:
+    """One kind of measurement in a problem.
+
+    rows : those of a configuration that are its. present : (K, G) False for padding. weight :
+    (B or 1, K, G). whiten : (B or 1, K, G, n, n).
+    """
+
+    rows: slice
+    present: Booleans
+    weight: Array
+    whiten: Array
+
+    @property
+    def count(self) -> Integers:
+        """Residuals of each measurement, (K, G): a board's pose has six, a point's three of them,
+        padding none.
+        """
+        return np.any(self.whiten[0] != 0, axis=-1).sum(axis=-1)
+
+
+@dataclass(frozen=True)
+class EdgeBlocks:
     """Where the edges are: K configurations of G blocks, padded; the same for all runs.
 
     Edges that share their noise are whitened together: a *block* is g edges (g = 1 for edges
@@ -58,7 +92,7 @@ class Blocks:
 
 
 @dataclass(frozen=True)
-class Data:
+class EdgeData:
     """Numbers measured in each run; leading axis B, or 1 where all runs share them.
 
     basis : (B, K, G, g, 3, 2). whiten : (B, K, G, 2g, 2g). optics : (B, K, G, 2g, w) change of
@@ -83,8 +117,8 @@ class EdgeRows:
     axes (K, G, g).
     """
 
-    blocks: Blocks
-    data: Data
+    blocks: EdgeBlocks
+    data: EdgeData
     ends: LimbEnds
     rot: Array
     origin: Array
@@ -151,7 +185,7 @@ class EdgeRows:
 
 
 def edge_rows(
-    blocks: Blocks, data: Data, ends: LimbEnds, radius: Array, T_camera_base: Array
+    blocks: EdgeBlocks, data: EdgeData, ends: LimbEnds, radius: Array, T_camera_base: Array
 ) -> EdgeRows:
     """Rows of the edges from both ends of the limbs, the blocks' radii (B, K, G) and the stations
     (B, S, 4, 4).
@@ -223,12 +257,6 @@ class PoseBlocks:
     camera: Integers
 
 
-def no_poses() -> PoseBlocks:
-    """A session without boards."""
-    none = np.zeros((1, 0), dtype=int)
-    return PoseBlocks(none, none, none.astype(bool), np.zeros(0, dtype=bool), none)
-
-
 @dataclass(frozen=True)
 class PoseData:
     """Numbers measured in each run; leading axis B, or 1 where all runs share them.
@@ -237,10 +265,10 @@ class PoseData:
     (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'.
     """
 
-    T_station_target: Array = field(default_factory=lambda: np.zeros((1, 1, 0, 4, 4)))
-    whiten: Array = field(default_factory=lambda: np.zeros((1, 1, 0, 6, 6)))
-    weight: Array = field(default_factory=lambda: np.zeros((1, 1, 0)))
-    optics: Array = field(default_factory=lambda: np.zeros((1, 1, 0, 6, 1)))
+    T_station_target: Array
+    whiten: Array
+    weight: Array
+    optics: Array
 
 
 class PoseRows(NamedTuple):

@@ -9,7 +9,7 @@ from pkmcal.geometry.rigid import inverse, pose
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.identify.robust import norms
+from pkmcal.identify.robust import distances
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
@@ -71,6 +71,6 @@ def mean_pose(poses: Array) -> Array:
 def misfit(machine: Machine, measurements: Measurements, state: State) -> float:
     """Median Mahalanobis distance of the edges from their prediction; infinite where none is."""
     assembled = assemble(machine, measurements, default_gauge(machine))
-    distance = norms(assembled.problem, batch_of(machine, assembled, state))
+    distance = distances(assembled.problem, batch_of(machine, assembled, state)).edges
     found = distance[np.isfinite(distance)]
     return float(np.median(found)) if found.size else np.inf

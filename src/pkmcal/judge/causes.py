@@ -21,21 +21,8 @@ from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import split_name
 
-LegPart = Literal["zero", "rod", "arm", "base", "platform", "hinge", "all", "scale", "camera"]
 Side = Literal["base", "platform"]
 SIDES: tuple[Side, Side] = ("base", "platform")
-
-PARTS: dict[str, LegPart] = {
-    "length.offset": "zero",
-    "base.angle": "zero",
-    "base.along": "zero",
-    "length.constant": "rod",
-    "base.arm": "arm",
-    "base.": "base",
-    "platform.hinge": "hinge",
-    "platform.": "platform",
-}
-"""The part of a leg by how a parameter's path begins; the first that fits."""
 
 FOCAL = ("focal.x", "focal.y")
 
@@ -44,12 +31,13 @@ FOCAL = ("focal.x", "focal.y")
 class Cause:
     """A change that is looked for.
 
+    part : of a leg (:class:`~pkmcal.mechanisms.ParameterTable`), or ``all``, ``scale``, ``camera``.
     columns : (P, k), the change of the machine's parameters (m, rad) by k numbers; or (P + C, k),
     then of the cameras' magnification. sizes : (k,) usual ones: a drawing's tolerance, or RATIO.
     legs : from 0. unit : of the k numbers: m, rad, or nothing for a ratio.
     """
 
-    part: LegPart
+    part: str
     legs: tuple[int, ...]
     columns: Array
     sizes: Array
@@ -107,11 +95,13 @@ def single_causes(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
     out = [
         cause
         for legs in arms(machine)
-        for part in dict.fromkeys(PARTS.values())
+        for part in dict.fromkeys(machine.parameters.parts)
         if (cause := _of_names(machine, part, legs)).sizes.size
     ]
     for side in SIDES:
-        out += [_together(machine, side, pair) for pair in _neighbours(machine, side)]
+        for pair in _neighbours(machine, side):  # a mount that both share
+            one, other = (joint_of(machine, side, leg) for leg in pair)
+            out.append(Cause(side, pair, one.columns + other.columns, one.sizes, "m"))
     cameras = [magnification(machine, c) for c in range(n_cameras)]
     return (*out, common_scale(machine), *cameras)
 
@@ -129,12 +119,6 @@ def joined(causes: Sequence[Cause]) -> Cause:
     )
 
 
-def part_of(name: str) -> LegPart | None:
-    """The part of a leg that a parameter belongs to; None for its tubes' radii."""
-    path = split_name(name)[1]
-    return next((part for start, part in PARTS.items() if path.startswith(start)), None)
-
-
 def joint_of(machine: Machine, side: Side, leg: int) -> Cause:
     """A leg's joint on one side, base or platform, moved by a vector."""
     index = centre_index(machine.layout)[side == "platform"][leg]
@@ -142,7 +126,7 @@ def joint_of(machine: Machine, side: Side, leg: int) -> Cause:
     return Cause(side, (leg,), columns, machine.parameters.tolerance[index], "m")
 
 
-def _of_names(machine: Machine, part: LegPart, legs: tuple[int, ...]) -> Cause:
+def _of_names(machine: Machine, part: str, legs: tuple[int, ...]) -> Cause:
     """The parameters of some legs' part, each changed by itself; two rods of an arm as well.
 
     A motor's zero is one number, however many rods hang on it.
@@ -150,10 +134,8 @@ def _of_names(machine: Machine, part: LegPart, legs: tuple[int, ...]) -> Cause:
     table = machine.parameters
     rows = [
         k
-        for k, name in enumerate(table.names)
-        if (split_name(name)[0] or 0) - 1 in legs
-        and (own := part_of(name)) is not None
-        and part in (own, "all")
+        for k, (name, own) in enumerate(zip(table.names, table.parts, strict=True))
+        if (split_name(name)[0] or 0) - 1 in legs and own and part in (own, "all")
     ]
     tolerance = table.tolerance[rows]
     columns = np.eye(len(table))[:, rows]
@@ -177,12 +159,6 @@ def _neighbours(machine: Machine, side: Side) -> list[tuple[int, int]]:
     # a mount that two joints share is shorter than the way to the next one
     close = [p for p in pairs if apart[p] < 0.7 * np.sort(apart[p[0]])[1]]
     return sorted(set(close) - own)
-
-
-def _together(machine: Machine, side: Side, pair: tuple[int, int]) -> Cause:
-    """Two neighbouring joints moved by the same vector."""
-    one, other = (joint_of(machine, side, leg) for leg in pair)
-    return Cause(side, pair, one.columns + other.columns, one.sizes, "m")
 
 
 def magnified(

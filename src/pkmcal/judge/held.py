@@ -26,7 +26,7 @@ from pkmcal.identify.covariance import reduced_rows
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.robust import measured_rows
+from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
@@ -34,40 +34,38 @@ from pkmcal.solver import RANK_TOLERANCE, RESTART_DAMPING, Stop, minimise
 
 RATIO = 1e-3
 """Of a magnification, or another ratio: the size against which it counts as seen."""
+UNSCALED = Kinds(1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Trust:
-    """How far new data are believed: robust weights (N,) of edges and of poses, 0..1, and factors
-    on their stated noise.
+    """How far new data are believed: robust weights (N,) 0..1 of each kind, and factors on its
+    stated noise.
 
     Weights come from an estimate whose machine could move: with the machine held, a leg that has
     changed would be taken for an error of its edges, and be let go.
     """
 
-    edges: Array
-    poses: Array
-    noise_scale: float = 1.0
-    pose_scale: float = 1.0
+    robust: Kinds[Array]
+    scale: Kinds[float] = UNSCALED
 
     @property
-    def weights(self) -> tuple[Array, Array]:
-        """Of the edges and of the poses, by their noise as scaled."""
-        return self.edges / self.noise_scale**2, self.poses / self.pose_scale**2
+    def weights(self) -> Kinds[Array]:
+        """The weights by the noise as scaled."""
+        return Kinds(*(w / scale**2 for w, scale in zip(self.robust, self.scale, strict=True)))
 
     @classmethod
     def full(cls, measurements: Measurements) -> Trust:
         """All data as they are stated."""
-        return cls(np.ones(len(measurements.edges)), np.ones(len(measurements.poses)))
+        return cls(Kinds(np.ones(len(measurements.edges)), np.ones(len(measurements.poses))))
 
     @classmethod
-    def of(cls, estimate: Estimate, noise_scale: float = 1.0, pose_scale: float = 1.0) -> Trust:
+    def of(cls, estimate: Estimate, scale: Kinds[float] = UNSCALED) -> Trust:
         """An estimate's weights, and the larger of its factors and of the calibration's."""
+        own = Kinds(estimate.statistics.noise_scale, estimate.statistics.pose_scale)
         return cls(
-            estimate.edge_weights,
-            estimate.pose_weights,
-            max(estimate.statistics.noise_scale, noise_scale),
-            max(estimate.statistics.pose_scale, pose_scale),
+            Kinds(estimate.edge_weights, estimate.pose_weights),
+            Kinds(*(max(pair) for pair in zip(own, scale, strict=True))),
         )
 
 
@@ -92,11 +90,8 @@ class Held:
         Its own pose takes up as many rows as it has freedoms; NaN where nothing was seen.
         """
         problem, linear = self.problem, self.problem.linearize(self.state)
-        rows = problem.data.whiten.shape[-1] * np.sum(problem.data.weight[0] > 0, axis=1)
-        count = rows + problem.layout.n_equations
-        if problem.pose_blocks.present.size:
-            used = problem.pose_data.weight[0] > 0
-            count = count + np.sum(used * measured_rows(problem), axis=1)
+        used = (np.sum((k.weight[0] > 0) * k.count, axis=1) for k in problem.kinds)
+        count = sum(used, start=np.full(len(linear.value[0]), problem.layout.n_equations))
         free = np.maximum(count - linear.by_own.shape[-1], 1)
         out = np.full(len(self.seen), np.nan)
         out[self.seen] = np.sqrt(np.sum(linear.value[0] ** 2, axis=1) / free)
@@ -145,7 +140,7 @@ def hold(
         result = solve_batch(assembled.problem, begin)
         problem, found = result.problem, result.solution
     else:
-        problem = assembled.trusting(*trust.weights)
+        problem = assembled.trusting(trust.weights)
         found = minimise(problem, begin, damping=RESTART_DAMPING)
     if found.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(
@@ -156,7 +151,7 @@ def hold(
     still = still.with_values(problem.theta(state)[0])
     if trust is None or magnified is None:
         return Held(still, assembled.seen, problem, state, ("machine",))
-    problem = assemble(still, magnified, default_gauge(still)).trusting(*trust.weights)
+    problem = assemble(still, magnified, default_gauge(still)).trusting(trust.weights)
     state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))
     return Held(still, assembled.seen, problem, state, ("machine", "intrinsics"))
 

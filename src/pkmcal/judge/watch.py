@@ -8,7 +8,7 @@ is tested for a change of each leg. Nothing is calibrated anew.
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from pkmcal.calibration.results import SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import plain
 from pkmcal.identify.assembly import seen_configurations
+from pkmcal.identify.rows import Kinds
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import ChangeTests, look_for_changes
 from pkmcal.judge.held import Held, Trust, evidence, hold
@@ -105,15 +106,15 @@ def watch(
 
         told("Testing for changes", 0.9)
         old = saved.document.get("statistics") or {}
-        before = float(old.get("noise_scale", 1.0))
-        trust = Trust.of(looked.estimate, before, float(old.get("pose_scale", 1.0)))
+        before = Kinds(float(old.get("noise_scale", 1.0)), float(old.get("pose_scale", 1.0)))
+        trust = Trust.of(looked.estimate, before)
         held = _hold_new(saved, session, looked, trust, ~known)
         judged = look_for_changes(evidence(held, saved.covariance), saved.machine, alpha)
         around = LookedAt(
             session.configurations,
             known,
             seen,
-            trust.noise_scale / before,
+            trust.scale.edges / before.edges,
             cameras_of(session),
         )
         return Watch(
@@ -124,8 +125,8 @@ def watch(
             residuals=held.residuals(),
             known=known,
             seen=seen & ~known,
-            noise_scale=trust.noise_scale,
-            pose_scale=trust.pose_scale,
+            noise_scale=trust.scale.edges,
+            pose_scale=trust.scale.poses,
             timings={**looked.timings, "all": time.perf_counter() - began},
         )
 
@@ -153,17 +154,15 @@ def _hold_new(
     data = looked.measurements
     cameras = [station.camera for station in session.stations]
     wide = magnified(data, looked.observation, cameras) if cameras else None
-    kept = Trust(
-        trust.edges[keep[data.edges.configuration]],
-        trust.poses[keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]],
-        trust.noise_scale,
-        trust.pose_scale,
+    kept = Kinds(
+        trust.robust.edges[keep[data.edges.configuration]],
+        trust.robust.poses[keep[data.poses.configuration] | ~data.on_platform[data.poses.mount]],
     )
     return hold(
         saved.machine,
         select(data, keep),
         looked.estimate.state,
-        kept,
+        replace(trust, robust=kept),
         select(wide, keep) if wide else None,
     )
 

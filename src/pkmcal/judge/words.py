@@ -202,7 +202,9 @@ def watch_verdict(judged: ChangeTests, around: LookedAt) -> Verdict:
         f"Still as calibrated, as far as {count(new, 'new configuration')} can tell:"
         f" {_would_have(judged)}."
     )
-    return Verdict(True, headline, (), warnings, _advice(judged))
+    silent = [leg for leg in judged.legs if leg.zero is None and leg.whole.dof]
+    advice = f"Of {_of(silent)}, which has no reading, only the joints are tested."
+    return Verdict(True, headline, (), warnings, (advice,) if silent else ())
 
 
 def is_blind(leg: LegTest) -> bool:
@@ -228,13 +230,8 @@ def said(suspect: Suspect, cameras: Sequence[str] = (), short: bool = False) -> 
         joint = f"the {cause.part} joint{'s' if len(cause.legs) > 1 else ''} of {who}"
         together = " together" if len(cause.legs) > 1 else ""
         return f"{joint}{together}{_vector(suspect, short)}"
-    names = {
-        "zero": "the zero of {}'s reading",
-        "rod": "the rod length of {}",
-        "arm": "the arm of {}",
-        "hinge": "the hinge of {}",
-    }
-    what = names[cause.part].format(who)
+    names = {"zero": f"the zero of {who}'s reading", "rod": f"the rod length of {who}"}
+    what = names.get(cause.part, f"the {cause.part} of {who}")
     if len(value) > 1:
         return f"{what}{_vector(suspect, short)}"
     return f"{what} by {signed(value[0], sigma[0], cause.unit)}"
@@ -341,8 +338,7 @@ def _unnamed(judged: ChangeTests) -> str:
     """Something changed, and no single cause stands out."""
     legs = [leg for leg in judged.legs if leg.chance < judged.alpha]
     if legs:
-        which = named(j for leg in legs for j in leg.legs)
-        return f"The test of {which} fails, but which part of it changed cannot be told."
+        return f"The test of {_of(legs)} fails, but which part of it changed cannot be told."
     return (
         f"All legs' numbers together fit the new data badly (χ² {judged.machine.chi2:.0f} for"
         f" {count(judged.machine.dof, 'degree')} of freedom), but no single leg stands out."
@@ -391,10 +387,10 @@ def _blind(legs: Sequence[LegTest]) -> tuple[str, ...]:
     little = [leg for leg in legs if np.isfinite(leg.detects_zero)]
     out: list[str] = []
     if nothing:
-        out.append(f"Of {named(j for leg in nothing for j in leg.legs)} these data tell nothing.")
+        out.append(f"Of {_of(nothing)} these data tell nothing.")
     if little:
         out.append(
-            f"In {named(j for leg in little for j in leg.legs)} only a change of the reading's zero"
+            f"In {_of(little)} only a change of the reading's zero"
             f" by {with_unit(*found_from(little))} would be found, which is more than the drawing's"
             " tolerance."
         )
@@ -419,9 +415,6 @@ def _warnings(around: LookedAt) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _advice(judged: ChangeTests) -> tuple[str, ...]:
-    wide = [leg for leg in judged.legs if leg.zero is None and leg.whole.dof]
-    if wide:
-        who = named(j for leg in wide for j in leg.legs)
-        return (f"Of {who}, which has no reading, only the joints are tested.",)
-    return ()
+def _of(tests: Sequence[LegTest]) -> str:
+    """The legs that tests are of."""
+    return named(j for test in tests for j in test.legs)

@@ -75,8 +75,8 @@ Rod = Annotated[
     Discriminator(rod_kind),
 ]
 
-OFFSET = ParameterKind("offset", "m", "offset")
-CONSTANT = ParameterKind("constant", "m", "offset", label="rod length")
+OFFSET = ParameterKind("offset", "m", "offset", part="zero")
+CONSTANT = ParameterKind("constant", "m", "offset", label="rod length", part="rod")
 
 
 Motion = Literal["spatial", "planar", "translation", "schoenflies"]

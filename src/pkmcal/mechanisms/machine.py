@@ -302,6 +302,7 @@ def machine_from_document(
         units=tuple(row[1] for row in rows),
         kinds=tuple(row[2] for row in rows),
         labels=tuple(row[4] for row in rows),
+        parts=tuple(row[5] for row in rows),
         drawing=np.array([row[3] for row in rows]),
         tolerance=np.array([getattr(document.tolerance, row[2]) for row in rows]),
     ).with_roles((*document.fixed, *built_in_fixed(document)), ties)
@@ -310,7 +311,7 @@ def machine_from_document(
 
 
 def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator of plain rows
-    """Rows (name, unit, tolerance's name, drawing value, label), leg by leg."""
+    """Rows (name, unit, tolerance's name, drawing value, label, part), leg by leg."""
     axes = axes_in_use(document)
     for j, leg in enumerate(document.legs):
         path = f"legs[{j + 1}]"
@@ -322,7 +323,7 @@ def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator 
             kind = OFFSET if isinstance(leg.length, ActuatedLength) else CONSTANT
             yield from _rows_of(f"{path}.length", leg.length, (kind,))
         for t, tube in enumerate(leg.tubes, start=1):
-            yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius, f"tube {t} radius"
+            yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius, f"tube {t} radius", ""
 
 
 def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]):  # noqa: ANN202 - as above
@@ -334,7 +335,8 @@ def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]):  # noqa: A
             label = kind.label or name.partition(".")[2].replace(".", " ").replace(
                 "center", "centre"
             )
-            yield name, kind.unit, kind.tolerance, value, label
+            part = kind.part or path.rpartition(".")[2]
+            yield name, kind.unit, kind.tolerance, value, label, part
 
 
 def _assign(document: dict[str, Any], name: str, value: float) -> None:

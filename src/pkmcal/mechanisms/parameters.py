@@ -27,6 +27,9 @@ class ParameterTable:
 
     names, units, kinds : P entries; ``kinds`` is the tolerance's name: center, offset, radius,
     axis, arm, angle. labels : what people call them, the leg apart: ``base centre z``.
+    parts : what of its leg each changes: its ``base`` or ``platform`` joint, its ``rod``, the
+    ``zero`` of its reading, or what its carrier names; empty for a tube's radius, which is no part
+    of the mechanism.
     drawing, tolerance : (P,) drawing values and their standard deviations.
     fixed : names that keep their drawing value.
     tied : groups of names that change by the same amount. opposed : for each group, the names that
@@ -37,6 +40,7 @@ class ParameterTable:
     units: tuple[str, ...]
     kinds: tuple[str, ...]
     labels: tuple[str, ...]
+    parts: tuple[str, ...]
     drawing: Array
     tolerance: Array
     fixed: tuple[str, ...] = ()

@@ -5,22 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from markupsafe import Markup
+import numpy as np
 
-from pkmcal.arrays import Array, Integers
-from pkmcal.calibration.results import REPORT, check_output, texts_of, versions
+from pkmcal.arrays import Array
+from pkmcal.calibration.results import REPORT, check_output, texts_of
 from pkmcal.files import write_folder
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import centres_and_tool
+from pkmcal.identify.tool import ToolPoint, centres_and_tool
 from pkmcal.judge.holdouts import holdout_of
-from pkmcal.measurements import EdgeSet, Observation
-from pkmcal.outcome import Finding, Level, Outcome, Part, Plot, Verdict
+from pkmcal.measurements import Observation
+from pkmcal.outcome import Figure, Finding, Level, Outcome, Verdict
 from pkmcal.report import (
-    charts,
-    headline,
     identifiability,
     page,
     parameters,
@@ -31,26 +29,17 @@ from pkmcal.report import (
     scene,
     validation,
 )
+from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session
+from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.unidentified import Findings
     from pkmcal.judge.holdouts import HoldOut
 
-MODEL_ERROR = Markup(
-    "<strong>What σ means here.</strong> The standard deviations say how much the result would"
-    " scatter if the same photographs and readings were taken again. They know the noise of the"
-    " measurement and nothing of what the model leaves out: legs that bend, joints with play, a"
-    " lens that its file does not describe. Photographs that the calibration has not seen are the"
-    " test for those."
-)
-RESIDUALS = (
-    "Measured against predicted, in standard deviations. Bars hold the middle half of the values,"
-    " lines nine tenths; the grey band is where nine tenths belong if noise is all that is left."
-    " Longer lines mean that something other than the stated noise is at work; a box off zero,"
-    " that it always pulls the same way."
-)
+NO_TURN = 1e-9
+"""rad; what rounding leaves."""
 
 
 def outcome_of(calibration: Calibration) -> Outcome:
@@ -67,16 +56,16 @@ def outcome_of(calibration: Calibration) -> Outcome:
     )
     groups = parameters.parameter_groups(c.session.machine, c.estimate)
     open_ = parameters.unidentified(groups, c.estimate, c.findings)
-    numbers = held_out and held_out.document(c.session.configurations)
+    predicted = held_out and held_out.document(c.session.configurations)
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, open_, numbers),
+        texts=texts_of(c, open_, predicted),
         summary={
             "verdict": asdict(c.verdict),
             **(told.summary or {}),
             "session_warnings": c.session.warnings,
-            "holdout": numbers,
+            "holdout": predicted,
             "timings": c.timings,
         },
     )
@@ -109,134 +98,192 @@ def report_of(
     camera = residuals.camera_numbers(session)
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
-    measured = poses.section(session, observation, estimate)
     # boards and trackers alone have no edges to show; legs without any do have a question
     photographed = len(edges) > 0 or not len(observation.poses)
     parts = (
-        _geometry(session, observation, estimate, centres),
-        _parameters(session, estimate),
-        findings and _identifiability(findings, estimate),
-        _photographs(session, edges, estimate, shifts, centres) if photographed else None,
-        measured and measured.part,
+        scene.section(session, estimate, centres, poses.places(observation, estimate)),
+        parameters.section(session.machine, estimate),
+        findings and identifiability.section(findings, estimate.machine.parameters),
+        pictures.section(session, edges, estimate, shifts, centres) if photographed else None,
+        poses.section(session, observation, estimate),
         holdout and validation.held_out(holdout, session),
-        _residuals(session, edges, estimate, shifts, measured and measured.axes),
-        _left_out(session, observation, estimate, findings),
-        _stations(session, estimate, camera),
-        _how(session, estimate, timings or {}),
+        residuals.section(
+            session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
+        ),
+        provenance.left_out(session, observation.rejected, estimate, findings),
+        provenance.stations(session, estimate, camera),
+        provenance.how(session, estimate, timings or {}),
     )
     return Outcome(
         command="calibrate",
         title=f"Calibration of {session.machine.name}",
         verdict=verdict,
         kicker=f"session {session.folder.name}",
-        figures=headline.cards(session, observation, estimate, centres, tool),
+        figures=cards(session, observation, estimate, centres, tool),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
-        summary={"figures": headline.numbers(observation, estimate, centres, tool)},
+        summary={"figures": numbers(observation, estimate, centres, tool)},
     )
 
 
-def _geometry(
-    session: Session, observation: Observation, estimate: Estimate, centres: tuple[Centres, ...]
-) -> Part:
-    drawn = scene.scene_of(session, estimate, centres)
-    seen = poses.places(observation, estimate)
-    return Part(
-        "geometry",
-        "Geometry before and after",
-        (page.render("geometry.html.j2", scene=drawn),),
-        plots=(
-            Plot(
-                "space",
-                "In space",
-                "Drag to turn, wheel or pinch to come nearer.",
-                "The machine in three dimensions: joint centres by the drawing and as calibrated."
-                " The two plane views show the same.",
-                scene.figure_of(drawn, seen, session.configurations),
-                height=420,
-            ),
-        ),
-        html=page.render("views.html.j2", views=scene.views(drawn)),
-        menu="Geometry",
-    )
+# ------------------------------------------------------------------ the main numbers
 
 
-def _parameters(session: Session, estimate: Estimate) -> Part:
-    groups = parameters.parameter_groups(session.machine, estimate)
-    html = page.render("parameters.html.j2", groups=groups, gauge=estimate.gauge)
-    return Part("parameters", "Parameters", html=html)
-
-
-def _identifiability(findings: Findings, estimate: Estimate) -> Part:
-    told = identifiability.section(findings, estimate.machine.parameters)
-    html = page.render("identifiability.html.j2", told=told)
-    return Part("identifiability", "What the data can tell", html=html, menu="What the data tell")
-
-
-def _photographs(
+def cards(
     session: Session,
-    edges: EdgeSet,
+    observation: Observation,
     estimate: Estimate,
-    shifts: Array,
     centres: tuple[Centres, ...],
-) -> Part:
-    html = page.render(
-        "photographs.html.j2",
-        n_legs=session.machine.n_legs,
-        pictures=pictures.pictures(session, edges, estimate, shifts, centres),
+    tool: ToolPoint,
+) -> tuple[Figure, ...]:
+    """The cards in their order; those that have nothing to tell are left out."""
+    sigma = np.concatenate([side.sigma for side in centres]) * 1e3
+    worst = int(np.argmax(sigma))
+    joints = Figure(
+        "How well are the joint centres known?",
+        ((brief(float(np.median(sigma))), "mm"),),
+        f"1σ of a coordinate, median of {len(sigma)} centres; the least certain, "
+        f"{_centre_name(centres, worst)}, {brief(float(sigma[worst]))} mm",
     )
-    return Part("photographs", "Photographs", html=html)
-
-
-def _residuals(
-    session: Session,
-    edges: EdgeSet,
-    estimate: Estimate,
-    shifts: Array,
-    axes: charts.RowChart | None,
-) -> Part:
-    found = residuals.residual_charts(session, edges, estimate, shifts)
-    shown = charts.panels(
-        found.by_leg,
-        found.by_station,
-        found.joints,
-        axes,
-        found.histogram,
-        found.by_configuration,
-        found.outward,
-        remarks=found.remarks,
+    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres]) * 1e3
+    farthest = int(np.argmax(change))
+    moved = Figure(
+        "How far is the machine from its drawing?",
+        ((brief(float(change.mean())), "mm"),),
+        "mean distance of the joint centres, drawing and result laid over each other; largest "
+        f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
     )
-    return Part("residuals", "Residuals", (RESIDUALS,), html=shown)
-
-
-def _left_out(
-    session: Session, observation: Observation, estimate: Estimate, findings: Findings | None
-) -> Part:
-    groups = parameters.parameter_groups(session.machine, estimate)
-    html = page.render(
-        "rejected.html.j2",
-        reasons=provenance.reasons(session, observation.rejected),
-        told=bool(findings),
-        unidentified=parameters.bound_together(estimate)
-        if findings
-        else parameters.unidentified(groups, estimate),
+    found = (
+        joints if len(observation.edges) else None,
+        _tool_sigma(session, tool),
+        moved,
+        _tool_change(session, tool),
+        _data(session, observation, estimate),
+        _fit(estimate),
     )
-    return Part("rejected", "What was left out, and what stays open", html=html, menu="Left out")
+    return tuple(card for card in found if card)
 
 
-def _stations(session: Session, estimate: Estimate, camera: Integers) -> Part:
-    table = provenance.stations_table(session, estimate, camera)
-    return Part("stations", "Where the cameras stood", tables=(table,), menu="Cameras")
+def numbers(
+    observation: Observation, estimate: Estimate, centres: tuple[Centres, ...], tool: ToolPoint
+) -> dict[str, Any]:
+    """In m and rad; means over joint centres and configurations, sigma of one coordinate."""
+    statistics, table = estimate.statistics, estimate.machine.parameters
+    offsets = np.sqrt(np.diag(estimate.covariance)[table.of_kind("offset")])
+    sigma = np.concatenate([side.sigma for side in centres])
+    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres])
+    return {
+        "joint_centre_sigma": float(np.median(sigma)),
+        "joint_offset_sigma": float(np.median(offsets)) if offsets.size else None,
+        "joint_centre_change": float(change.mean()),
+        "platform_position_sigma": _mean(tool.position),
+        "platform_orientation_sigma": _mean(tool.orientation),
+        "platform_position_change": _mean(tool.off_position),
+        "platform_orientation_change": _mean(tool.off_orientation),
+        "edges": len(observation.edges),
+        "rejected": len(observation.rejected),
+        "chi2_per_freedom": statistics.chi2 / statistics.dof if statistics.dof > 0 else None,
+        "edge_noise_scale": statistics.noise_scale,
+    }
 
 
-def _how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> Part:
-    html = page.render(
-        "how.html.j2",
-        model_error=MODEL_ERROR,
-        lists=(
-            ("Settings and solver", provenance.settings(session, estimate)),
-            ("Time", [(name, f"{seconds:.2f} s") for name, seconds in timings.items()]),
-            ("Versions", versions().items()),
-        ),
+def _mean(values: Array) -> float | None:
+    """Of the finite ones."""
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if values.size else None
+
+
+def _tool_sigma(session: Session, tool: ToolPoint) -> Figure | None:
+    """Uncertainty of the platform's pose from that of the geometry."""
+    if not tool.configurations.size:
+        return None
+    where = session.configurations[tool.configurations[int(np.argmax(tool.position))]]
+    return Figure(
+        "How well is the platform's pose known?",
+        _pose_values(tool.position.mean(), tool.orientation.mean()),
+        f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
+        f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where})"
+        f"{_turned(float(tool.orientation.max()))}",
     )
-    return Part("how", "How it was computed", html=html)
+
+
+def _tool_change(session: Session, tool: ToolPoint) -> Figure | None:
+    """What the drawing's errors did to the platform's pose."""
+    good = np.isfinite(tool.off_position)
+    if not good.any():
+        return None
+    off, turn = tool.off_position[good], tool.off_orientation[good]
+    where = session.configurations[tool.configurations[good][int(np.argmax(off))]]
+    return Figure(
+        "What did the drawing do to the platform's pose?",
+        _pose_values(off.mean(), turn.mean()),
+        "mean error of the drawing's pose at the same readings; worst "
+        f"{brief(off.max() * 1e3)} mm (configuration {where}){_turned(float(turn.max()))}",
+    )
+
+
+def _data(session: Session, observation: Observation, estimate: Estimate) -> Figure:
+    """Photographs and edges, used and not; of a session without any, the trackers' poses."""
+    taken = sum(len(station.photographs) for station in session.stations)
+    if not taken:
+        quiet, n = int(np.sum(estimate.pose_weights < KEPT)), len(observation.poses)
+        kinds = sorted({table.kind for table in session.trackers})
+        return Figure(
+            "What is it based on?",
+            ((f"{n - quiet} of {n}", " and ".join(kinds)),),
+            f"measured without a camera; {quiet} of them given less than half their weight",
+        )
+    seen = {
+        pair
+        for found in (observation.edges, observation.poses)
+        for pair in zip(found.station.tolist(), found.configuration.tolist(), strict=True)
+    }
+    used = sum(
+        (s, photo.configuration) in seen
+        for s, station in enumerate(session.stations)
+        for photo in station.photographs
+    )
+    parts = [
+        f"{count(len(weights), thing)} measured, {int(np.sum(weights < KEPT))} of them given less "
+        "than half their weight"
+        for thing, weights in (("edge", estimate.edge_weights), ("pose", estimate.pose_weights))
+        if len(weights)
+    ]
+    return Figure(
+        "What is it based on?",
+        ((f"{used} of {taken}", "photographs"),),
+        f"{'; '.join(parts)}; {count(len(observation.rejected), 'finding')} rejected",
+    )
+
+
+def _fit(estimate: Estimate) -> Figure:
+    """Chi-square per degree of freedom."""
+    s = estimate.statistics
+    value = s.chi2 / s.dof if s.dof > 0 else float("nan")
+    scaled = [
+        f"the {what}' stated noise was multiplied by {number(scale, 2)}"
+        for what, scale in (("edges", s.noise_scale), ("poses", s.pose_scale))
+        if np.isfinite(scale) and abs(scale - 1) > 0.005
+    ]
+    return Figure(
+        "Does the model explain the data?",
+        ((number(value, 2), "χ² per degree of freedom"),),
+        f"1 is expected, over {count(s.dof, 'degree')} of freedom"
+        + (f"; reached after {' and '.join(scaled)}" if scaled else ""),
+    )
+
+
+def _pose_values(position: float, orientation: float) -> tuple[tuple[str, str], ...]:
+    turn = ((brief(float(np.rad2deg(orientation))), "°"),) if orientation > NO_TURN else ()
+    return ((brief(position * 1e3), "mm"), *turn)
+
+
+def _turned(orientation: float) -> str:
+    """A turn (rad) as a further part; nothing of a platform that only shifts."""
+    return f", {brief(float(np.rad2deg(orientation)))}°" if orientation > NO_TURN else ""
+
+
+def _centre_name(centres: tuple[Centres, ...], position: int) -> str:
+    """``leg 3, platform`` of a position in the list of all base, then all platform centres."""
+    legs = len(centres[0].calibrated)
+    return f"leg {position % legs + 1}, {centres[position // legs].side}"

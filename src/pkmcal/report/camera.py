@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from pkmcal.arrays import Array
 from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
@@ -56,19 +57,6 @@ class Shot:
     caption: str
 
 
-@dataclass(frozen=True)
-class Field:
-    """The picture in cells: (x, y, width, height, corners, share of the most) and mean residuals
-    (x, y, dx, dy), enlarged by `factor`, which is larger than that of single corners.
-    """
-
-    width: int
-    height: int
-    cells: tuple[tuple[float, float, float, float, int, float], ...]
-    arrows: tuple[tuple[float, float, float, float], ...]
-    factor: int
-
-
 def outcome_of(
     calibration: CameraCalibration,
     paths: Sequence[Path | str] = (),
@@ -81,6 +69,8 @@ def outcome_of(
     """
     c = calibration
     factor = _factor(c.residuals[c.kept], c.camera.image_size[0])
+    together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
+    hardly = f"Hardly told apart, and so to be used together only: {together}."
     # with its covariance, so that `calibrate --refine-camera` knows how far to move it
     measured = replace(c.camera, covariance=c.covariance)
     return Outcome(
@@ -89,13 +79,17 @@ def outcome_of(
         verdict=Verdict(True, headline(c), warnings=c.warnings),
         figures=_cards(c),
         parts=(
-            Part("intrinsics", "Intrinsics", tables=(_intrinsics(c),), notes=_correlations(c)),
+            Part(
+                "intrinsics",
+                "Intrinsics",
+                tables=(_intrinsics(c),),
+                notes=(hardly,) if together else (),
+            ),
             Part("models", "Models compared", (COMPARED,), tables=(_compared(c),), menu="Models"),
             Part(
                 "field",
                 "Field",
-                html=page.render("field.html.j2", field=_field(c))
-                + charts.panels(_angles_chart(c), _views_chart(c)),
+                html=_field(c) + charts.panels(_angles_chart(c), _views_chart(c)),
             ),
             Part(
                 "photographs",
@@ -145,13 +139,6 @@ def _intrinsics(c: CameraCalibration) -> Table:
     return Table("", ("Parameter", "Value", "σ", "Unit"), tuple(rows), words=(3,))
 
 
-def _correlations(c: CameraCalibration) -> tuple[str, ...]:
-    pairs = [f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations]
-    if not pairs:
-        return ()
-    return (f"Hardly told apart, and so to be used together only: {'; '.join(pairs)}.",)
-
-
 def _compared(c: CameraCalibration) -> Table:
     rows = [
         Row(
@@ -171,8 +158,10 @@ def _compared(c: CameraCalibration) -> Table:
 
 
 def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
-    focal, sigma = c.camera.parameters[:2], c.sigma[:2]
-    share = float(np.max(sigma / focal)) * 100
+    share = float(np.max(c.sigma[:2] / c.camera.parameters[:2])) * 100
+    tilt = tilts(c.T_camera_board, c.board.points)
+    covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
+    seen = int(np.isfinite(c.residuals).all(axis=-1).sum())
     return (
         Figure(
             "How sure is the focal length?",
@@ -196,15 +185,6 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
             "distance of corners from their board line's great circle, on held-out views; no pose"
             " takes part in this",
         ),
-        *_data_cards(c),
-    )
-
-
-def _data_cards(c: CameraCalibration) -> tuple[Figure, ...]:
-    tilt = tilts(c.T_camera_board, c.board.points)
-    covered = 100 * float(np.mean(coverage(c.pixels, c.camera.image_size) > 0))
-    seen = int(np.isfinite(c.residuals).all(axis=-1).sum())
-    return (
         Figure(
             "What is it based on?",
             ((f"{len(c.views)} of {len(c.detections)}", "photographs"),),
@@ -257,8 +237,10 @@ def _shot(c: CameraCalibration, v: int, jpeg: str, factor: int) -> Shot:
     return Shot(c.views[v], width, height, jpeg, tuple(corners), caption)
 
 
-def _field(c: CameraCalibration) -> Field:
-    """Corners a cell, and the mean residual of cells with three or more."""
+def _field(c: CameraCalibration) -> Markup:
+    """Corners a cell, and the mean residual of cells with three or more, enlarged by a factor of
+    their own: they are smaller than single corners' residuals.
+    """
     width, height = c.camera.image_size
     columns, rows = FIELD_CELLS
     pixels, off = c.pixels[c.kept], c.residuals[c.kept]
@@ -278,7 +260,9 @@ def _field(c: CameraCalibration) -> Field:
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     factor = _factor(means, width)
     arrows = np.concatenate([roots, means * factor], axis=1).tolist()
-    return Field(width, height, tuple(cells), tuple((x, y, u, v) for x, y, u, v in arrows), factor)
+    return page.render(
+        "field.html.j2", width=width, height=height, cells=cells, arrows=arrows, factor=factor
+    )
 
 
 def _views_chart(c: CameraCalibration) -> charts.BarChart | None:

@@ -6,6 +6,7 @@ Coordinates are SVG units in a box ``WIDTH`` wide, so that text keeps its size o
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -163,20 +164,25 @@ def box(label: str, values: Array, unit: str, places: int, leg: int | None = Non
 
 
 def row_chart(
-    title: str, unit: str, boxes: list[Spread], band: float | None, alt: str, note: str = ""
+    title: str,
+    unit: str,
+    boxes: Sequence[Spread | None],
+    band: float | None,
+    alt: str,
+    note: str = "",
 ) -> RowChart | None:
     """A chart symmetric about zero that holds the boxes and the band; None without boxes.
 
     Lines far longer than the usual one end at the border: one bad group should not flatten all.
     """
-    if not boxes:
+    there = tuple(box for box in boxes if box)
+    if not there:
         return None
-    reaches = [max(abs(b.quantiles[0]), abs(b.quantiles[4])) for b in boxes]
+    reaches = [max(abs(b.quantiles[0]), abs(b.quantiles[4])) for b in there]
     reach = min(max(reaches), OVER * float(np.median(reaches)))
     high = 1.08 * max(reach, (band or 0.0) * 1.3, 1e-12)
-    return RowChart(
-        title, unit, alt, tuple(boxes), -high, high, ticks_between(-high, high), band, note
-    )
+    ticks = ticks_between(-high, high)
+    return RowChart(title, unit, alt, there, -high, high, ticks, band, note)
 
 
 def bar_chart(
@@ -196,6 +202,12 @@ def bar_chart(
     high = 1.06 * max(*tops, 1e-12)
     ticks = ticks_between(0.0, high, 4)
     return BarChart(title, unit, alt, tuple(bars), high, ticks, labels, curve, note=note)
+
+
+def six_labels(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:
+    """Labels of at most six bars, evenly apart, each under its own."""
+    every = max(1, -(-len(bars) // 6))
+    return tuple((k + 0.5, bars[k].label) for k in range(0, len(bars), every))
 
 
 def ends_and_middle(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import ParameterTable
-from pkmcal.papers.conditions import Condition
+from pkmcal.outcome import Part
+from pkmcal.report import page
 from pkmcal.report.charts import BarChart, UprightBar
 from pkmcal.report.parameters import grouped
 from pkmcal.wording import brief, count, joined
@@ -22,44 +21,23 @@ STUB = 0.06
 MOST_NAMES = 6
 
 
-@dataclass(frozen=True)
-class Section:
-    """The section's content.
-
-    rank, possible : directions that the data fix, of those that exist. headline : in words.
-    spectrum : how well each direction is known. fixed, tied : values not estimated, and why.
-    """
-
-    rank: int
-    possible: int
-    headline: str
-    spectrum: BarChart | None
-    unidentified: tuple[Sentence, ...]
-    weak: tuple[Sentence, ...]
-    conditions: tuple[Condition, ...]
-    fixed: str
-    tied: str
-
-
-def section(findings: Findings, table: ParameterTable) -> Section:
+def section(findings: Findings, table: ParameterTable) -> Part:
     """The section of the findings of a machine with these parameters."""
+    html = page.render(
+        "identifiability.html.j2",
+        headline=headline(findings),
+        told=findings,
+        fixed=held(findings, table),
+        tied=tied(table),
+        spectrum=spectrum(findings),
+    )
+    return Part("identifiability", "What the data can tell", html=html, menu="What the data tell")
+
+
+def headline(findings: Findings) -> str:
+    """How many of the directions that exist the data fix."""
     told = findings.told
     possible = told.n_parameters - told.n_frames
-    return Section(
-        rank=told.rank,
-        possible=possible,
-        headline=_headline(findings, possible),
-        spectrum=_spectrum(findings),
-        unidentified=findings.unidentified,
-        weak=findings.weak,
-        conditions=findings.conditions,
-        fixed=_fixed(table, findings),
-        tied=_tied(table),
-    )
-
-
-def _headline(findings: Findings, possible: int) -> str:
-    told = findings.told
     frames = f"{told.n_parameters} free values less {told.n_frames} that only place the frames"
     lost = possible - told.rank
     start = f"The data fix {told.rank} of {possible} directions ({frames})."
@@ -73,7 +51,7 @@ def _headline(findings: Findings, possible: int) -> str:
     return f"{start} {joined(parts)[0].upper()}{joined(parts)[1:]}."
 
 
-def _spectrum(findings: Findings) -> BarChart | None:
+def spectrum(findings: Findings) -> BarChart | None:
     """Bars of all directions, best known first, on a logarithmic scale from ``FLOOR``."""
     values = np.asarray(findings.told.singular_values, dtype=float)
     if values.size == 0:
@@ -82,8 +60,15 @@ def _spectrum(findings: Findings) -> BarChart | None:
     heights = np.maximum(np.log10(np.maximum(values, FLOOR)) + decades, STUB)
     high = 1.06 * max(float(heights.max()), decades + 1)
     bars = tuple(
-        UprightBar(str(k + 1), _tip(k, value, findings.told.rank), float(height), quiet=value >= 1)
+        UprightBar(str(k + 1), f"Direction {k + 1}: {known}", float(height), quiet=bool(value >= 1))
         for k, (value, height) in enumerate(zip(values, heights, strict=True))
+        for known in [
+            "the data say nothing"
+            if k >= findings.told.rank
+            else f"the drawing knows it {brief(1 / value)} times better"
+            if value < 1
+            else f"the data know it {brief(value)} times better than the drawing"
+        ]
     )
     tops = range(math.floor(high) + 1)
     ticks = tuple((float(t), _power(t - round(decades))) for t in tops)
@@ -108,31 +93,18 @@ def _power(exponent: int) -> str:
     return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
-def _tip(k: int, value: float, rank: int) -> str:
-    if k >= rank:
-        return f"Direction {k + 1}: the data say nothing"
-    if value < 1:
-        return f"Direction {k + 1}: the drawing knows it {brief(1 / value)} times better"
-    return f"Direction {k + 1}: the data know it {brief(value)} times better than the drawing"
-
-
-def _fixed(table: ParameterTable, findings: Findings) -> str:
+def held(findings: Findings, table: ParameterTable) -> str:
     """What the mechanism file holds, in a sentence; empty where it holds nothing."""
     if not table.fixed:
         return ""
     told = [name for name in table.fixed if name in findings.conventional]
-    if told or findings.also_conventional:
-        return _by_convention(table, findings, told)
-    verb = "was" if len(table.fixed) == 1 else "were"
-    return (
-        f"{_listed(table, table.fixed)} {verb} not estimated: the mechanism file lists "
-        f"{'it' if len(table.fixed) == 1 else 'them'} under fixed, so the drawing's value counts "
-        "as exact and no direction belongs to it."
-    )
-
-
-def _by_convention(table: ParameterTable, findings: Findings, told: list[str]) -> str:
-    """The same where some of what is held only chooses frames, or repeats what is free."""
+    if not told and not findings.also_conventional:
+        verb, them = ("was", "it") if len(table.fixed) == 1 else ("were", "them")
+        return (
+            f"{_listed(table, table.fixed)} {verb} not estimated: the mechanism file lists {them}"
+            " under fixed, so the drawing's value counts as exact and no direction belongs to it."
+        )
+    # some of what is held only chooses frames, or repeats what is free
     others = [name for name in table.fixed if name not in told]
     parts: list[str] = []
     if told:
@@ -161,7 +133,8 @@ def _by_convention(table: ParameterTable, findings: Findings, told: list[str]) -
     return " ".join(parts)
 
 
-def _tied(table: ParameterTable) -> str:
+def tied(table: ParameterTable) -> str:
+    """What changes together, in a sentence; empty where nothing does."""
     groups = [names for names in _together(table) if not names & set(table.fixed)]
     if not groups:
         return ""

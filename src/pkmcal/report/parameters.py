@@ -12,6 +12,8 @@ from pkmcal.identify.decided import EXACT, Decider, decided_by
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import Machine, ParameterTable
+from pkmcal.outcome import Part
+from pkmcal.report import page
 from pkmcal.wording import (
     SCALES,
     decimals,
@@ -74,6 +76,14 @@ class ParameterGroup:
     rows: tuple[ParameterRow, ...]
 
 
+def section(drawing: Machine, estimate: Estimate) -> Part:
+    """The table."""
+    html = page.render(
+        "parameters.html.j2", groups=parameter_groups(drawing, estimate), gauge=estimate.gauge
+    )
+    return Part("parameters", "Parameters", html=html)
+
+
 def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[ParameterGroup, ...]:
     """All parameters, grouped by leg in the order of the file."""
     table = estimate.machine.parameters
@@ -94,6 +104,7 @@ def _row(
     numbers = (before * factor, after * factor, (after - before) * factor, sigma * factor)
     places = decimals(numbers[3])
     name = table.names[k]
+    others = [n for group in table.tied if name in group for n in group if n != name]
     return ParameterRow(
         name=name,
         leg=split_name(name)[0],
@@ -106,13 +117,8 @@ def _row(
         numbers=numbers,
         source=source,
         share=float(estimate.data_share[k]) if sigma else float("nan"),
-        note=_tie(table, name),
+        note=f"changes together with {joined(others)}" if others else "",
     )
-
-
-def _tie(table: ParameterTable, name: str) -> str:
-    others = [n for group in table.tied if name in group for n in group if n != name]
-    return f"changes together with {joined(others)}" if others else ""
 
 
 def unidentified(
@@ -123,7 +129,11 @@ def unidentified(
     findings : what is open, in words; without them, the values that stayed the drawing's.
     """
     if findings is None:
-        out = _by_kind(groups, estimate)
+        kinds: dict[str, list[ParameterRow]] = {}
+        for row in (row for group in groups for row in group.rows if row.source == "drawing"):
+            kinds.setdefault(re.sub(r"tube \d+", "tube", row.label), []).append(row)
+        n_legs = estimate.machine.n_legs
+        out = [_kind_text(kind, rows, n_legs) for kind, rows in kinds.items()]
     else:
         out = [f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak)]
     return (*out, *bound_together(estimate, findings))
@@ -150,18 +160,8 @@ def _whole_axis(name: str) -> str:
     return whole if whole.endswith("axis") else name
 
 
-def _by_kind(groups: tuple[ParameterGroup, ...], estimate: Estimate) -> list[str]:
-    """Sentences on the values that stayed the drawing's."""
-    kinds: dict[str, list[ParameterRow]] = {}
-    for group in groups:
-        for row in group.rows:
-            if row.source == "drawing":
-                kinds.setdefault(re.sub(r"tube \d+", "tube", row.label), []).append(row)
-    return [_kind_text(kind, rows, estimate.machine.n_legs) for kind, rows in kinds.items()]
-
-
 def _kind_text(kind: str, rows: list[ParameterRow], all_legs: int) -> str:
-    """One sentence for parameters of one kind."""
+    """A sentence on values of one kind that stayed the drawing's."""
     legs = [row.leg for row in rows if row.leg is not None]
     where = f" of {legs_named(legs, all_legs)}" if legs else ""
     shares = sorted(row.share for row in rows)

@@ -19,6 +19,8 @@ from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
 from pkmcal.observe.predict import legs_in_camera
+from pkmcal.outcome import Part
+from pkmcal.report import page
 from pkmcal.report.residuals import KEPT, SIDES, radius_positions, rms
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import Photograph
@@ -92,6 +94,22 @@ class Picture:
         return f"{text}; residuals {number(self.rms, 2)} σ"
 
 
+def section(
+    session: Session,
+    edges: EdgeSet,
+    estimate: Estimate,
+    shifts: Array,
+    centres: tuple[Centres, ...],
+) -> Part:
+    """The section; as :func:`pictures`."""
+    html = page.render(
+        "photographs.html.j2",
+        n_legs=session.machine.n_legs,
+        pictures=pictures(session, edges, estimate, shifts, centres),
+    )
+    return Part("photographs", "Photographs", html=html)
+
+
 def pictures(
     session: Session,
     edges: EdgeSet,
@@ -103,11 +121,26 @@ def pictures(
     chosen = choose(session, edges, estimate.edge_residuals, estimate.configurations)
     with ThreadPoolExecutor(THREADS) as pool:
         sizes = (session.stations[s].camera.image_size for s, _, _ in chosen)
-        shots = pool.map(jpeg, (photo.path for _, photo, _ in chosen), sizes)
-        return tuple(
-            _picture(session, edges, estimate, shifts, centres, item, jpeg)
-            for item, jpeg in zip(chosen, shots, strict=True)
+        shots = list(pool.map(jpeg, (photo.path for _, photo, _ in chosen), sizes))
+    out: list[Picture] = []
+    for (s, photo, why), shot in zip(chosen, shots, strict=True):
+        k, station = photo.configuration, session.stations[s]
+        mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
+        width, height = station.camera.image_size
+        out.append(
+            Picture(
+                station=station.name,
+                configuration=session.configurations[k],
+                why=why,
+                width=width,
+                height=height,
+                jpeg=shot,
+                edges=_drawn(session, edges, estimate, shifts, mine, s, k),
+                spots=_spots(session, estimate, centres, s, k),
+                rms=rms(estimate.edge_residuals[mine], estimate.edge_weights[mine]),
+            )
         )
+    return tuple(out)
 
 
 Choice = tuple[int, Photograph, str]
@@ -169,33 +202,6 @@ def jpeg(path: Path | None, size: tuple[int, int]) -> str:
     return base64.b64encode(packed.tobytes()).decode("ascii")
 
 
-def _picture(
-    session: Session,
-    edges: EdgeSet,
-    estimate: Estimate,
-    shifts: Array,
-    centres: tuple[Centres, ...],
-    choice: Choice,
-    jpeg: str,
-) -> Picture:
-    s, photo, why = choice
-    k = photo.configuration
-    station = session.stations[s]
-    mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
-    width, height = station.camera.image_size
-    return Picture(
-        station=station.name,
-        configuration=session.configurations[k],
-        why=why,
-        width=width,
-        height=height,
-        jpeg=jpeg,
-        edges=_drawn(session, edges, estimate, shifts, mine, s, k),
-        spots=_spots(session, estimate, centres, s, k),
-        rms=rms(estimate.edge_residuals[mine], estimate.edge_weights[mine]),
-    )
-
-
 def _drawn(
     session: Session,
     edges: EdgeSet,
@@ -213,8 +219,16 @@ def _drawn(
         if len(points) > 1:
             quiet = bool(estimate.edge_weights[n] < KEPT)
             leg = int(edges.leg[n]) + 1
+            across, tilt = estimate.edge_residuals[n]
+            tip = (
+                f"Leg {leg}, tube {edges.tube[n] + 1}, {SIDES[edges.side[n]]} edge: "
+                f"{number(float(shifts[n]), 2, signed=True)} px outward; residual "
+                f"{number(float(across), 1, signed=True)} σ across, "
+                f"{number(float(tilt), 1, signed=True)} σ tilt; "
+                f"weight {number(float(estimate.edge_weights[n]), 2)}"
+            )
             line = tuple((float(x), float(y)) for x, y in points)
-            out.append(Drawn(leg, line, quiet, _edge_tip(edges, estimate, shifts, n)))
+            out.append(Drawn(leg, line, quiet, tip))
     return tuple(out)
 
 
@@ -249,17 +263,6 @@ def straightened(curve: Array) -> Array:
     area = chord[0] * off[:, 1] - chord[1] * off[:, 0]
     straight = np.abs(area).max() <= STRAIGHT * np.hypot(*chord)
     return curve[[0, -1]] if straight else curve
-
-
-def _edge_tip(edges: EdgeSet, estimate: Estimate, shifts: Array, n: int) -> str:
-    across, tilt = estimate.edge_residuals[n]
-    return (
-        f"Leg {edges.leg[n] + 1}, tube {edges.tube[n] + 1}, {SIDES[edges.side[n]]} edge: "
-        f"{number(float(shifts[n]), 2, signed=True)} px outward; residual "
-        f"{number(float(across), 1, signed=True)} σ across, "
-        f"{number(float(tilt), 1, signed=True)} σ tilt; "
-        f"weight {number(float(estimate.edge_weights[n]), 2)}"
-    )
 
 
 def _spots(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
@@ -12,6 +10,7 @@ from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Observation, PoseSet
 from pkmcal.outcome import Part, Row, Table
+from pkmcal.report import charts
 from pkmcal.report.charts import (
     NORMAL_90,
     BarChart,
@@ -19,10 +18,9 @@ from pkmcal.report.charts import (
     UprightBar,
     bar_chart,
     box,
-    panels,
     row_chart,
 )
-from pkmcal.report.residuals import KEPT, SIGMAS, expected_rms
+from pkmcal.report.residuals import KEPT, SIGMAS, level_bar
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
@@ -36,33 +34,24 @@ JUMPS = (
 )
 
 
-@dataclass(frozen=True)
-class Poses:
-    """The section, and for the one on residuals a chart of the poses' six numbers."""
-
-    part: Part
-    axes: RowChart | None
-
-
-def section(session: Session, observation: Observation, estimate: Estimate) -> Poses | None:
+def section(session: Session, observation: Observation, estimate: Estimate) -> Part | None:
     """The section; None in a session without boards and trackers on the platform."""
     poses = observation.poses
     if not len(poses):
         return None
     error = errors(poses, estimate)
     turns = (text for _, text in turning(session, poses, estimate.state.on_platform))
-    part = Part(
+    return Part(
         "poses",
         "Board" if session.board else "Measured poses",
         (f"{' '.join([*_summary(poses, estimate, error), *turns])} {JUMPS}",),
-        html=panels(
+        html=charts.panels(
             _by_configuration(session, poses, estimate),
             _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off, mm"),
             _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned, degrees"),
         ),
         tables=(_mounts(session, estimate), _worst(session, poses, estimate, error)),
     )
-    return Poses(part, _axes(poses, estimate))
 
 
 def errors(poses: PoseSet, estimate: Estimate) -> Array:
@@ -139,15 +128,9 @@ def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> B
         mine = poses.configuration == k
         n = float(poses.rows[mine].sum())
         level = float(np.sqrt(np.sum(estimate.pose_residuals[mine] ** 2) / n))
-        low, high = expected_rms(n)
-        name = session.configurations[k]
-        tip = (
-            f"configuration {name}: {number(level, 2)} σ, {number(low, 2)} to {number(high, 2)}"
-            " expected of noise alone"
-        )
-        bars.append(UprightBar(name, tip, level, (low, high), level <= high))
+        bars.append(level_bar(session.configurations[k], level, n))
     alt = "Bars of the poses' residuals by configuration"
-    return bar_chart("Poses, by configuration", SIGMAS, bars, _labels(bars), alt)
+    return bar_chart("Poses, by configuration", SIGMAS, bars, charts.six_labels(bars), alt)
 
 
 def _bars(session: Session, poses: PoseSet, error: Array, unit: str, title: str) -> BarChart | None:
@@ -162,16 +145,12 @@ def _bars(session: Session, poses: PoseSet, error: Array, unit: str, title: str)
         bars.append(
             UprightBar(name, f"configuration {name}: {brief(value)} {unit}", value, None, True)
         )
-    return bar_chart(title, unit, bars, _labels(bars), f"Bars of the poses' errors in {unit}")
+    alt = f"Bars of the poses' errors in {unit}"
+    return bar_chart(title, unit, bars, charts.six_labels(bars), alt)
 
 
-def _labels(bars: list[UprightBar]) -> tuple[tuple[float, str], ...]:
-    every = max(1, -(-len(bars) // 6))
-    return tuple((i + 0.5, bars[i].label) for i in range(0, len(bars), every))
-
-
-def _axes(poses: PoseSet, estimate: Estimate) -> RowChart | None:
-    """Boxes of the whitened residuals, by what they are of."""
+def axes(poses: PoseSet, estimate: Estimate) -> RowChart | None:
+    """Boxes of the poses' six numbers, whitened residuals; for the section on residuals."""
     names = ("turn 1", "turn 2", "turn 3", "place 1", "place 2", "place 3")
     measured = np.any(poses.whiten != 0, axis=-1)
     boxes = [
@@ -181,7 +160,7 @@ def _axes(poses: PoseSet, estimate: Estimate) -> RowChart | None:
     alt = "Boxes of the poses' residuals by their six numbers"
     title = "Poses, by the six numbers"
     note = "about and along the station's x, y and z"
-    return row_chart(title, SIGMAS, [b for b in boxes if b], NORMAL_90, alt, note)
+    return row_chart(title, SIGMAS, boxes, NORMAL_90, alt, note)
 
 
 def _worst(session: Session, poses: PoseSet, estimate: Estimate, error: Array) -> Table:

@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.calibration.results import base_camera_covariance
+from pkmcal.calibration.results import base_camera_covariance, versions
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.unidentified import Findings
 from pkmcal.measurements import Rejection
-from pkmcal.outcome import Row, Table
+from pkmcal.outcome import Part, Row, Table
+from pkmcal.report import page, parameters
 from pkmcal.report.residuals import SIDES
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 
 OPEN = 1e3
 """mm; a place that is known no better is not told by the data."""
+MODEL_ERROR = Markup(
+    "<strong>What σ means here.</strong> The standard deviations say how much the result would"
+    " scatter if the same photographs and readings were taken again. They know the noise of the"
+    " measurement and nothing of what the model leaves out: legs that bend, joints with play, a"
+    " lens that its file does not describe. Photographs that the calibration has not seen are the"
+    " test for those."
+)
 MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
 
-def stations_table(session: Session, estimate: Estimate, camera: Integers) -> Table:
-    """One row a station; camera (S,) is the number of its camera file."""
+def stations(session: Session, estimate: Estimate, camera: Integers) -> Part:
+    """Where the cameras stood, one row a station; camera (S,) is the number of its camera file."""
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
     for s, station in enumerate(session.stations):
@@ -45,7 +56,8 @@ def stations_table(session: Session, estimate: Estimate, camera: Integers) -> Ta
     columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of its turn")
     columns += ("Edge shift, px",) if edges else ()
     columns += ("Away from the pose by hand", "Camera")
-    return Table("", columns, tuple(rows), brief=False, words=(len(columns) - 1,))
+    table = Table("", columns, tuple(rows), brief=False, words=(len(columns) - 1,))
+    return Part("stations", "Where the cameras stood", tables=(table,), menu="Cameras")
 
 
 def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
@@ -69,7 +81,21 @@ def _moved(rough: Array | None, found: Array) -> str:
     return f"{number(float(way), 0)} mm, {number(float(turn), 1)}°"
 
 
-def settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ...]:
+def how(session: Session, estimate: Estimate, timings: Mapping[str, float]) -> Part:
+    """How it was computed. timings : seconds by step."""
+    html = page.render(
+        "how.html.j2",
+        model_error=MODEL_ERROR,
+        lists=(
+            ("Settings and solver", _settings(session, estimate)),
+            ("Time", [(name, f"{seconds:.2f} s") for name, seconds in timings.items()]),
+            ("Versions", versions().items()),
+        ),
+    )
+    return Part("how", "How it was computed", html=html)
+
+
+def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ...]:
     """(what, value) of everything that the result depends on besides the photographs."""
     s = estimate.statistics
     tolerance = session.machine.document.tolerance
@@ -85,7 +111,12 @@ def settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ...
         ),
         ("Solver", f"{count(s.steps, 'step')}; {s.stopped}"),
         *(
-            (f"χ² of the {name}", f"{number(chi2, 0)} over {number(n, 0)} numbers{_left(freedom)}")
+            (
+                f"χ² of the {name}",
+                f"{number(chi2, 0)} over {number(n, 0)} numbers"
+                # degrees of freedom that the numbers leave, where they were counted
+                + (f", {number(freedom, 0)} degrees of freedom" if freedom >= 0.5 else ""),
+            )
             for name, chi2, n, freedom in (
                 ("edges", s.chi2_edges, s.n_edges, s.dof_edges),
                 ("poses", s.chi2_poses, s.n_poses, s.dof_poses),
@@ -105,11 +136,6 @@ def settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ...
     )
 
 
-def _left(freedom: float) -> str:
-    """Degrees of freedom that the numbers leave, where they were counted."""
-    return f", {number(freedom, 0)} degrees of freedom" if freedom >= 0.5 else ""
-
-
 @dataclass(frozen=True)
 class Reason:
     """One reason. cases : (photograph, what) for the first of ``count`` findings."""
@@ -125,35 +151,50 @@ class Reason:
         return self.count - len(self.cases)
 
 
+def left_out(
+    session: Session,
+    rejected: tuple[Rejection, ...],
+    estimate: Estimate,
+    findings: Findings | None = None,
+) -> Part:
+    """What was rejected, and, unless the findings tell it, what the data leave open."""
+    groups = parameters.parameter_groups(session.machine, estimate)
+    html = page.render(
+        "rejected.html.j2",
+        reasons=reasons(session, rejected),
+        told=bool(findings),
+        unidentified=parameters.bound_together(estimate)
+        if findings
+        else parameters.unidentified(groups, estimate),
+    )
+    return Part("rejected", "What was left out, and what stays open", html=html, menu="Left out")
+
+
 def reasons(session: Session, rejected: tuple[Rejection, ...]) -> tuple[Reason, ...]:
     """Grouped by reason, the most frequent first; numbers in a reason do not part groups."""
     groups: dict[str, list[Rejection]] = {}
     for item in rejected:
-        groups.setdefault(_kind(item.reason), []).append(item)
+        kind = re.sub(r"[-+−]?\d+(\.\d+)?([eE][-+]?\d+)?", "…", item.reason)
+        groups.setdefault(kind, []).append(item)
     ordered = sorted(groups.items(), key=lambda pair: -len(pair[1]))
     return tuple(_reason(session, text, items) for text, items in ordered)
 
 
-def _kind(reason: str) -> str:
-    """The reason without its measured numbers, which differ from case to case."""
-    return re.sub(r"[-+−]?\d+(\.\d+)?([eE][-+]?\d+)?", "…", reason)
-
-
 def _reason(session: Session, text: str, items: list[Rejection]) -> Reason:
     same = len({item.reason for item in items}) == 1
+    stations, configurations = session.station_names, session.configurations
     return Reason(
         text=items[0].reason if same else text,
         count=len(items),
         photographs=len({(i.station, i.configuration) for i in items}),
         cases=tuple(
-            (_photograph(session, i), _what(i) if same else f"{_what(i)}: {i.reason}")
+            (
+                f"{stations[i.station]} / {configurations[i.configuration]}",
+                _what(i) if same else f"{_what(i)}: {i.reason}",
+            )
             for i in items[:MOST_CASES]
         ),
     )
-
-
-def _photograph(session: Session, item: Rejection) -> str:
-    return f"{session.station_names[item.station]} / {session.configurations[item.configuration]}"
 
 
 def _what(item: Rejection) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,11 +13,12 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import legs_in_camera
+from pkmcal.outcome import Part
+from pkmcal.report import charts
 from pkmcal.report.charts import (
     NORMAL_90,
     BarChart,
     RowChart,
-    Spread,
     UprightBar,
     bar_chart,
     box,
@@ -37,37 +38,36 @@ HISTOGRAM = 5.0
 """Standard deviations that the histogram spans to either side."""
 SIDES = ("right", "left")
 """The two edges of a leg as a picture shows them, looking along the leg from A to B."""
+READING = (
+    "Measured against predicted, in standard deviations. Bars hold the middle half of the values,"
+    " lines nine tenths; the grey band is where nine tenths belong if noise is all that is left."
+    " Longer lines mean that something other than the stated noise is at work; a box off zero,"
+    " that it always pulls the same way."
+)
 
 
-@dataclass(frozen=True)
-class Residuals:
-    """The section's charts, and sentences about what stands out in them."""
+def section(
+    session: Session,
+    edges: EdgeSet,
+    estimate: Estimate,
+    shifts: Array,
+    poses: charts.RowChart | None = None,
+) -> Part:
+    """The section's charts, under sentences about what stands out in them.
 
-    by_leg: RowChart | None
-    by_station: RowChart | None
-    by_configuration: BarChart | None
-    histogram: BarChart | None
-    outward: RowChart | None
-    joints: RowChart | None
-    remarks: tuple[str, ...]
-
-
-def residual_charts(
-    session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array
-) -> Residuals:
-    """All charts of the section. shifts : (N,) px, of :func:`outward_shift`."""
-    white = estimate.edge_residuals
-    stations = [s.name for s in session.stations]
-    legs = [f"leg {j + 1}" for j in range(session.machine.n_legs)]
-    return Residuals(
-        by_leg=_edge_boxes("leg", _groups(legs, edges.leg, white, True)),
-        by_station=_edge_boxes("station", _groups(stations, edges.station, white)),
-        by_configuration=_configurations(session, edges, estimate),
-        histogram=_histogram(white),
-        outward=_outward(edges, shifts),
-        joints=_joints(session, estimate),
-        remarks=_remarks(session, edges, estimate, shifts),
+    shifts : (N,) px, of :func:`outward_shift`. poses : a chart of the poses' residuals.
+    """
+    shown = charts.panels(
+        by_leg(session, edges, estimate),
+        _edge_boxes("station", session.station_names, edges.station, estimate),
+        _joints(session, estimate),
+        poses,
+        histogram(estimate.edge_residuals),
+        _configurations(session, edges, estimate),
+        _outward(edges, shifts),
+        remarks=remarks(session, edges, estimate, shifts),
     )
+    return Part("residuals", "Residuals", (READING,), html=shown)
 
 
 def camera_numbers(session: Session) -> Integers:
@@ -111,18 +111,23 @@ def rms(white: Array, weights: Array) -> float:
     return float(np.sqrt(np.sum(weights[:, None] * white**2) / total)) if total else float("nan")
 
 
-def _edge_boxes(by: str, boxes: list[Spread]) -> RowChart | None:
-    alt = f"Boxes of the whitened edge residuals by {by}"
-    return row_chart(f"Edges, by {by}", SIGMAS, boxes, NORMAL_90, alt)
+def by_leg(session: Session, edges: EdgeSet, estimate: Estimate) -> RowChart | None:
+    """The edges' residuals by leg, in the legs' colours."""
+    legs = [f"leg {j + 1}" for j in range(session.machine.n_legs)]
+    return _edge_boxes("leg", legs, edges.leg, estimate)
 
 
-def _groups(names: list[str], group: Integers, white: Array, legs: bool = False) -> list[Spread]:
+def _edge_boxes(
+    by: str, names: Sequence[str], group: Integers, estimate: Estimate
+) -> RowChart | None:
     """A box for each group that has edges; both numbers of a residual count."""
-    found = [
-        box(name, white[group == g], "σ", 2, g + 1 if legs else None)
+    white = estimate.edge_residuals
+    boxes = [
+        box(name, white[group == g], "σ", 2, g + 1 if by == "leg" else None)
         for g, name in enumerate(names)
     ]
-    return [b for b in found if b]
+    alt = f"Boxes of the whitened edge residuals by {by}"
+    return row_chart(f"Edges, by {by}", SIGMAS, boxes, NORMAL_90, alt)
 
 
 def _configurations(session: Session, edges: EdgeSet, estimate: Estimate) -> BarChart | None:
@@ -134,16 +139,21 @@ def _configurations(session: Session, edges: EdgeSet, estimate: Estimate) -> Bar
         level = rms(estimate.edge_residuals[mine], weights)
         if not np.isfinite(level):
             continue
-        low, high = expected_rms(2 * float(weights.sum()))
-        tip = (
-            f"configuration {name}: {number(level, 2)} σ over {count(len(weights), 'edge')}, "
-            f"{number(low, 2)} to {number(high, 2)} expected of noise alone"
-        )
-        bars.append(UprightBar(name, tip, level, (low, high), level <= high))
-    every = max(1, -(-len(bars) // 6))
-    labels = tuple((i + 0.5, bars[i].label) for i in range(0, len(bars), every))
+        of = f" over {count(len(weights), 'edge')}"
+        bars.append(level_bar(name, level, 2 * float(weights.sum()), of))
     title, unit = "Edges, by configuration", "root mean square, standard deviations"
-    return bar_chart(title, unit, bars, labels, "Bars of the residuals by configuration")
+    alt = "Bars of the residuals by configuration"
+    return bar_chart(title, unit, bars, charts.six_labels(bars), alt)
+
+
+def level_bar(name: str, level: float, n: float, of: str = "") -> UprightBar:
+    """A configuration's root mean square, in σ, beside where that of n numbers of noise lies."""
+    low, high = expected_rms(n)
+    tip = (
+        f"configuration {name}: {number(level, 2)} σ{of}, {number(low, 2)} to {number(high, 2)}"
+        " expected of noise alone"
+    )
+    return UprightBar(name, tip, level, (low, high), level <= high)
 
 
 def expected_rms(n: float) -> tuple[float, float]:
@@ -154,7 +164,7 @@ def expected_rms(n: float) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _histogram(white: Array) -> BarChart | None:
+def histogram(white: Array) -> BarChart | None:
     """Counts of all residuals beside the normal density; the outermost bars hold the rest."""
     values = white[np.isfinite(white)]
     if not values.size:
@@ -177,24 +187,23 @@ def _histogram(white: Array) -> BarChart | None:
 
 def _outward(edges: EdgeSet, shifts: Array) -> RowChart | None:
     """Outward shift of every leg's edges: shading and wrong radii show here."""
-    boxes: list[Spread | None] = []
-    for leg, tube, side in _edge_kinds(edges):
-        values = shifts[_is_kind(edges, leg, tube, side)]
-        name = f"leg {leg + 1}, tube {tube + 1}, {SIDES[side]}"
-        boxes.append(box(name, values, "px", 3, leg + 1))
+    boxes = [
+        box(f"leg {j + 1}, tube {t + 1}, {SIDES[s]}", shifts[mine], "px", 3, j + 1)
+        for (j, t, s), mine in _edge_kinds(edges)
+    ]
     alt = "Boxes of the outward shift in pixels by leg, tube and side"
     title = "Edges too far out (+) or in (−), by leg, tube and side"
     note = "looking along the leg from base to platform"
-    return row_chart(title, "pixels", [b for b in boxes if b], None, alt, note)
+    return row_chart(title, "pixels", boxes, None, alt, note)
 
 
-def _edge_kinds(edges: EdgeSet) -> list[tuple[int, int, int]]:
+def _edge_kinds(edges: EdgeSet) -> list[tuple[tuple[int, int, int], Booleans]]:
+    """Leg, tube and side of the edges, and which edges (N,) are of them."""
     kinds = np.stack([edges.leg, edges.tube, edges.side], axis=-1)
-    return [(int(j), int(t), int(s)) for j, t, s in np.unique(kinds, axis=0)]
-
-
-def _is_kind(edges: EdgeSet, leg: int, tube: int, side: int) -> Booleans:
-    return (edges.leg == leg) & (edges.tube == tube) & (edges.side == side)
+    return [
+        ((int(j), int(t), int(s)), (kinds == (j, t, s)).all(axis=-1))
+        for j, t, s in np.unique(kinds, axis=0)
+    ]
 
 
 def _joints(session: Session, estimate: Estimate) -> RowChart | None:
@@ -206,14 +215,12 @@ def _joints(session: Session, estimate: Estimate) -> RowChart | None:
         box(named(legs), white[:, column], "σ", 2, legs[0] + 1) for column, legs in enumerate(moved)
     ]
     alt = "Boxes of the readings' residuals by joint"
-    return row_chart("Joint readings, by leg", SIGMAS, [b for b in boxes if b], NORMAL_90, alt)
+    return row_chart("Joint readings, by leg", SIGMAS, boxes, NORMAL_90, alt)
 
 
-def _remarks(
-    session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array
-) -> tuple[str, ...]:
+def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array) -> tuple[str, ...]:
     """Sentences about groups that stand out."""
-    stations = [f"station {s.name}" for s in session.stations]
+    stations = [f"station {name}" for name in session.station_names]
     configurations = [f"configuration {name}" for name in session.configurations]
     legs = [f"leg {j + 1}" for j in range(session.machine.n_legs)]
     out: list[str] = []
@@ -250,9 +257,8 @@ def _outstanding(names: list[str], group: Integers, estimate: Estimate) -> list[
 def _shaded(edges: EdgeSet, estimate: Estimate, shifts: Array) -> list[str]:
     """Legs' edges whose mean shift is large and sure, the largest first, in words."""
     found: list[tuple[float, str]] = []
-    for leg, tube, side in _edge_kinds(edges):
-        keep = _is_kind(edges, leg, tube, side) & (estimate.edge_weights >= KEPT)
-        values = shifts[keep & np.isfinite(shifts)]
+    for (leg, tube, side), mine in _edge_kinds(edges):
+        values = shifts[mine & (estimate.edge_weights >= KEPT) & np.isfinite(shifts)]
         if len(values) < 4:
             continue
         mean, error = values.mean(), values.std(ddof=1) / np.sqrt(len(values))

@@ -1,8 +1,6 @@
 """The geometry before and after, [B] Fig. 7: joint centres at home, errors drawn enlarged.
 
-Two plane views as SVG, and one in space as a Plotly figure: plain data, drawn by the page's
-script. Its colours are names of the page's CSS variables; the script puts in the values of the
-light or the dark theme. Lengths in it are millimetres.
+Two plane views as SVG, and one in space as a Plotly figure, whose lengths are millimetres.
 """
 
 from __future__ import annotations
@@ -19,6 +17,8 @@ from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
+from pkmcal.outcome import AXIS, LOOKS, Part, Plot
+from pkmcal.report import page
 from pkmcal.report.charts import WIDTH
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
@@ -32,13 +32,6 @@ NEAR = 9.0
 """SVG units within which two labels are written as one."""
 RING = 25
 """Points of an ellipsoid's ring."""
-LOOKS = {
-    "paper_bgcolor": "--card",
-    "plot_bgcolor": "rgba(0,0,0,0)",
-    "font": {"color": "--ink", "family": "system-ui, sans-serif", "size": 12},
-    "hoverlabel": {"bgcolor": "--card", "font": {"color": "--ink"}},
-}
-AXIS = {"color": "--muted", "gridcolor": "--rule", "zerolinecolor": "--rule", "linecolor": "--rule"}
 
 
 @dataclass(frozen=True)
@@ -104,9 +97,40 @@ class Projection:
     labels: tuple[tuple[float, float, str], ...]
 
 
+def section(
+    session: Session,
+    estimate: Estimate,
+    centres: tuple[Centres, ...],
+    places: tuple[Array, Integers],
+) -> Part:
+    """The section. places : of measured targets, as :func:`figure_of` takes them."""
+    drawn = scene_of(session, estimate, centres)
+    return Part(
+        "geometry",
+        "Geometry before and after",
+        (page.render("geometry.html.j2", scene=drawn),),
+        plots=(
+            Plot(
+                "space",
+                "In space",
+                "Drag to turn, wheel or pinch to come nearer.",
+                "The machine in three dimensions: joint centres by the drawing and as calibrated."
+                " The two plane views show the same.",
+                figure_of(drawn, places, session.configurations),
+                height=420,
+            ),
+        ),
+        html=page.render("views.html.j2", views=views(drawn)),
+        menu="Geometry",
+    )
+
+
 def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...]) -> BeforeAfter:
     """Joint centres at home with their errors enlarged by a round factor."""
-    home = _home(session, estimate)
+    try:
+        home = session.machine.home()
+    except PkmcalError:  # the drawing has none: the first pose that was seen
+        home = estimate.state.T_base_platform[int(np.argmax(estimate.configurations))]
     placed = {"base": np.eye(4), "platform": home}
     size = float(np.ptp(np.concatenate([c.drawing for c in centres]), axis=0).max()) / 2
     change = np.concatenate([np.linalg.norm(c.change, axis=-1) for c in centres])
@@ -120,7 +144,11 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
         shown = drawing + factor * (apply(T, side.calibrated) - drawing)
         spread = spread_factor**2 * T[:3, :3] @ side.blocks @ T[:3, :3].T
         for j in range(len(drawing)):
-            tip = _tip(j + 1, side, j)
+            dx, dy, dz = (number(float(v) * 1e3, 3, signed=True) for v in side.change[j])
+            tip = (
+                f"Leg {j + 1}, {side.side}: {dx}, {dy}, {dz} mm from the drawing (x, y, z); "
+                f"σ {brief(float(side.sigma[j]) * 1e3)} mm"
+            )
             joints.append(Joint(j + 1, side.side, drawing[j], shown[j], spread[j], tip))
     return BeforeAfter(factor, spread_factor, tuple(joints))
 
@@ -140,22 +168,6 @@ def views(scene: BeforeAfter) -> tuple[Projection, Projection]:
     return (
         _view(scene, "From above", (0, 1)),
         _view(scene, "From the side", (across, 2)),
-    )
-
-
-def _home(session: Session, estimate: Estimate) -> Array:
-    """The drawing's home pose; where the drawing has none, the first pose that was seen."""
-    try:
-        return session.machine.home()
-    except PkmcalError:
-        return estimate.state.T_base_platform[int(np.argmax(estimate.configurations))]
-
-
-def _tip(leg: int, side: Centres, j: int) -> str:
-    dx, dy, dz = (number(float(v) * 1e3, 3, signed=True) for v in side.change[j])
-    return (
-        f"Leg {leg}, {side.side}: {dx}, {dy}, {dz} mm from the drawing (x, y, z); "
-        f"σ {brief(float(side.sigma[j]) * 1e3)} mm"
     )
 
 
@@ -181,6 +193,7 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
         )
         for j, d, s in zip(scene.joints, drawn, shown, strict=True)
     )
+    half = len(marks) // 2  # base joints first, then the platform's
     return Projection(
         title=title,
         alt=f"{title}: joint centres by the drawing and as calibrated, errors enlarged "
@@ -189,16 +202,12 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
         height=height,
         axes=(names[axes[0]], names[axes[1]]),
         marks=marks,
-        limbs=_limbs(marks),
+        limbs=tuple(
+            (a.drawing, b.drawing) for a, b in zip(marks[:half], marks[half:], strict=True)
+        ),
         grid=_grid(low, high, place),
         labels=_labels(marks, (width / 2, height / 2)),
     )
-
-
-def _limbs(marks: tuple[Mark, ...]) -> tuple[tuple[tuple[float, float], ...], ...]:
-    """Ends of each leg by the drawing."""
-    half = len(marks) // 2
-    return tuple((a.drawing, b.drawing) for a, b in zip(marks[:half], marks[half:], strict=True))
 
 
 def _ellipse(spread: Array, scale: float) -> tuple[float, float, float]:

@@ -1,7 +1,4 @@
-"""What a study of servoing found, as an outcome, [B] Fig. 10: curves, an animation, the image.
-
-Plotly's colours are names of the page's CSS variables.
-"""
+"""What a study of servoing found, as an outcome, [B] Fig. 10: curves, an animation, the image."""
 
 from __future__ import annotations
 
@@ -17,8 +14,20 @@ from pkmcal.control.words import judgement, named
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
-from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Plot, Row, Table, Verdict
-from pkmcal.report.scene import AXIS, LOOKS, coordinates, line, markers, ring, space_layout
+from pkmcal.outcome import (
+    AXIS,
+    LOOKS,
+    Figure,
+    Finding,
+    Level,
+    Outcome,
+    Part,
+    Plot,
+    Row,
+    Table,
+    Verdict,
+)
+from pkmcal.report.scene import coordinates, line, markers, ring, space_layout
 from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2
@@ -167,10 +176,18 @@ def document_of(subject: Controlled, found: Study, verdict: Verdict) -> dict[str
                 for c in s.choices
             ],
         },
-        "equilibria": _equilibria(s),
+        "equilibria": {
+            "reached": s.equilibria.reached,
+            "alike": s.equilibria.alike,
+            "cancelled": s.equilibria.cancelled,
+            "outside": s.equilibria.out,
+            "distance": s.equilibria.distance,
+            "looks_alike": s.equilibria.looks_alike,
+            "T_base_platform": s.equilibria.T_base_platform,
+        },
         "curves": {
             "time": s.outcomes[0].runs.time,
-            **{o.estimate.name: np.median(shares(o), axis=0) for o in s.outcomes},
+            **{o.estimate.name: np.median(shares(o, o.runs.error), axis=0) for o in s.outcomes},
         },
     }
 
@@ -344,19 +361,6 @@ def _settings(s: Study) -> dict[str, Any]:
     }
 
 
-def _equilibria(s: Study) -> dict[str, Any]:
-    found = s.equilibria
-    return {
-        "reached": found.reached,
-        "alike": found.alike,
-        "cancelled": found.cancelled,
-        "outside": found.out,
-        "distance": found.distance,
-        "looks_alike": found.looks_alike,
-        "T_base_platform": found.T_base_platform,
-    }
-
-
 def _outcome_document(o: Trials) -> dict[str, Any]:
     return {
         "title": o.estimate.title,
@@ -403,14 +407,10 @@ def _magnitude(value: float) -> str:
 # ------------------------------------------------------------------ against time
 
 
-def shares(o: Trials) -> Array:
-    """Norms of the error (R, K) as parts of the start's, of the runs that reached the goal; of all
-    where none did.
+def shares(o: Trials, values: Array) -> Array:
+    """Values (R, K) as parts of the start's, of the runs that reached the goal; of all where none
+    did.
     """
-    return _parts(o, o.runs.error)
-
-
-def _parts(o: Trials, values: Array) -> Array:
     rows = o.runs.reached if o.reached else np.ones(len(values), dtype=bool)
     return values[rows] / np.maximum(values[rows, :1], 1e-300)
 
@@ -429,12 +429,12 @@ def curves(s: Study) -> dict[str, Any]:
     time = s.outcomes[0].runs.time
     rows = _every(len(time), POINTS)
     for o in s.outcomes:
-        values = np.maximum(shares(o)[:, rows], LEAST)
+        values = np.maximum(shares(o, o.runs.error)[:, rows], LEAST)
         name = o.estimate.name
         if name in SHADES:
             data.append(_band(time[rows], values, SHADES[name], name))
     for o in s.outcomes:
-        values = np.maximum(np.median(shares(o)[:, rows], axis=0), LEAST)
+        values = np.maximum(np.median(shares(o, o.runs.error)[:, rows], axis=0), LEAST)
         data.append(_curve(o, time[rows], values, "%{y:.2g} after %{x:.2f} s"))
     layout = _plane("time, s", "error / error at the start")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
@@ -447,7 +447,7 @@ def tail(s: Study) -> dict[str, Any]:
     time = s.outcomes[0].runs.time
     rows = _every(len(time), POINTS)
     for o in s.outcomes:
-        values = 100 * np.median(_parts(o, o.runs.way)[:, rows], axis=0)
+        values = 100 * np.median(shares(o, o.runs.way)[:, rows], axis=0)
         data.append(_curve(o, time[rows], values, "%{y:.2f} % after %{x:.2f} s"))
     layout = _plane("time, s", "% of the way")
     layout["yaxis"] |= {"range": [0, 10]}
@@ -594,7 +594,9 @@ def _player() -> dict[str, Any]:
 def image(s: Study, run: int) -> dict[str, Any]:
     """Edges at start and goal, the ways of their ends, and the image's frame."""
     width, height = s.eye.camera.image_size
-    data = [_frame(width, height)]
+    right, bottom = width - 0.5, height - 0.5
+    x, y = [-0.5, right, right, -0.5, -0.5], [-0.5, -0.5, bottom, bottom, -0.5]
+    data = [_flat("image", x, y, {"color": "--muted", "width": 1.5}, showlegend=False)]
     runs = s.outcome("identified").runs
     first, goal = runs.T_base_platform[run, :1], runs.goals[run : run + 1]
     data += _edges(s, first, 1.2, "at the start", "dot")
@@ -614,13 +616,6 @@ def image(s: Study, run: int) -> dict[str, Any]:
         },
     }
     return {"data": data, "layout": layout, "config": {}}
-
-
-def _frame(width: int, height: int) -> dict[str, Any]:
-    right, bottom = width - 0.5, height - 0.5
-    look = {"color": "--muted", "width": 1.5}
-    x, y = [-0.5, right, right, -0.5, -0.5], [-0.5, -0.5, bottom, bottom, -0.5]
-    return _flat("image", x, y, look, showlegend=False)
 
 
 def _pixels(s: Study, poses: Array, places: int) -> Array:

@@ -290,7 +290,7 @@ def _by_joint(judged: BesideDrawing, session: Session) -> charts.RowChart | None
     return charts.row_chart(
         "Residuals by joint",
         "promised standard deviations",
-        [box for box in boxes if box],
+        boxes,
         charts.NORMAL_90,
         "Residuals of the readings by joint, in the standard deviations that are promised",
         "shaded: where nine tenths are expected",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkmcal.judge.changes import POWER, ChiSquare, LegTest, Suspect
+from pkmcal.judge.changes import POWER, ChiSquare, LegTest
 from pkmcal.judge.watch import Watch, cameras_of
 from pkmcal.judge.words import found_from, said, signed
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
@@ -174,13 +174,20 @@ def _others_table(w: Watch) -> Table:
 
 def _findings_table(w: Watch) -> Table | None:
     """What explains a change, best first, with what these data cannot tell from it."""
-    rows: list[Row] = []
-    cameras = cameras_of(w.session)
-    for place, finding in enumerate(w.judged.findings, start=1):
-        rows.append(_cause(f"{place}.", finding.suspect, cameras))
-        rows += [_cause("or", other, cameras) for other in finding.others]
-    if not rows:
+    if not w.judged.findings:
         return None
+    cameras = cameras_of(w.session)
+    rows = [
+        Row(
+            f"{mark} {said(suspect, cameras)}",
+            (number(suspect.chi2, 1), str(len(suspect.cause.sizes))),
+        )
+        for place, finding in enumerate(w.judged.findings, start=1)
+        for mark, suspect in [
+            (f"{place}.", finding.suspect),
+            *(("or", other) for other in finding.others),
+        ]
+    ]
     return Table(
         "What explains it",
         ("Cause", "χ² explained", "numbers"),
@@ -189,11 +196,6 @@ def _findings_table(w: Watch) -> Table | None:
         " usual; those that a hundred to one does not separate stand under the best with “or”.",
         brief=False,
     )
-
-
-def _cause(mark: str, suspect: Suspect, cameras: tuple[str, ...]) -> Row:
-    text = said(suspect, cameras)
-    return Row(f"{mark} {text}", (number(suspect.chi2, 1), str(len(suspect.cause.sizes))))
 
 
 def chance_text(chance: float) -> str:

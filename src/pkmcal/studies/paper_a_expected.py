@@ -7,7 +7,6 @@ import numpy as np
 from pkmcal.outcome import Check
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import Key, StudyResult
-from pkmcal.studies.expected import ASIDE, Compared, at_most, compared, prototype_check
 from pkmcal.studies.paper_a import (
     BOUND,
     CORRECTED,
@@ -18,6 +17,7 @@ from pkmcal.studies.paper_a import (
     HexapodByAxes,
     converged,
 )
+from pkmcal.studies.reproduction import ASIDE, Compared, at_most, compared, prototype_check
 from pkmcal.studies.statistics import ratio
 from pkmcal.wording import number
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import Outcome, Part, Row, Table
+from pkmcal.outcome import AXIS, LOOKS, Outcome, Part, Row, Table
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.studies.engine import StudyResult, run
-from pkmcal.studies.expected import Compared
 from pkmcal.studies.paper_a import (
     BOUND,
     CORRECTED,
@@ -39,8 +39,16 @@ from pkmcal.studies.paper_a_expected import (
     checks,
     figures_compared,
 )
-from pkmcal.studies.plots import AXIS, LOOKS, TICKS, bars, log_log, series
-from pkmcal.studies.reproduction import Column, Options, Shown, Words, accuracy_rows, deg, mm
+from pkmcal.studies.reproduction import (
+    Column,
+    Compared,
+    Options,
+    Shown,
+    Words,
+    accuracy_rows,
+    deg,
+    mm,
+)
 from pkmcal.studies.statistics import Summary, coverage, ratio
 from pkmcal.wording import joined, number
 
@@ -68,6 +76,8 @@ QUANTITIES = {
 }
 REMARKS = ("printed", "before", "agree", "of_drawing", "others")
 """The last two where there is something to tell."""
+TICKS = [0.01, 0.03, 0.1, 0.3, 1, 3]
+"""mm that logarithmic axes tell."""
 RANGE = (0.005, 5.0)
 """mm that Fig. 4's logarithmic axis of errors holds."""
 
@@ -90,7 +100,15 @@ def reproduce(options: Options) -> Outcome:
             (HexapodByAxes(drawing_error=NARROW), done + share),
         )
     )
-    by_poses = _by_poses(options, found, done + 2 * share) if options.long else {}
+    done += 2 * share
+    by_poses: dict[int, Found] = {}  # with other numbers of poses a station
+    for poses in PROTOTYPE_POSES if options.long else ():
+        upto = done + (1 - done) * poses / sum(PROTOTYPE_POSES)
+        told = options.within(done, upto)
+        same = poses == found.setting.poses
+        setting = replace(found.setting, poses=poses)
+        by_poses[poses] = found if same else run(setting, options.runs, options.seed, told)
+        done = upto
     figures = figures_compared(found)
     words = _words(found, narrow, figures, measured)
     return words.reproduction(
@@ -98,7 +116,14 @@ def reproduce(options: Options) -> Outcome:
             words.part("noise", table_1(measured), more=["measured"] if measured else []),
             _figure_part(words, found),
             words.part("effector", _effector_table(found), _readings_table(found, narrow)),
-            words.part("groups", _group_table(found)),
+            words.part(
+                "groups",
+                Table(
+                    "RMSE, mm",
+                    ("", *(QUANTITIES[g] for g in GROUPS)),
+                    tuple(_by_method(found, [Column(name, 3, 4) for name in GROUPS])),
+                ),
+            ),
             *([_poses_part(words, by_poses)] if by_poses else []),
             words.part("how"),
         ),
@@ -108,18 +133,13 @@ def reproduce(options: Options) -> Outcome:
     )
 
 
-def _by_poses(options: Options, found: Found, done: float) -> dict[int, Found]:
-    """Studies with other numbers of poses a station."""
-    total = sum(PROTOTYPE_POSES)
-    out: dict[int, Found] = {}
-    for poses in PROTOTYPE_POSES:
-        upto = done + (1 - done) * poses / total
-        told = options.within(done, upto)
-        same = poses == found.setting.poses
-        setting = replace(found.setting, poses=poses)
-        out[poses] = found if same else run(setting, options.runs, options.seed, told)
-        done = upto
-    return out
+def _by_method(s: Found, columns: Sequence[Column]) -> list[Row]:
+    """Every method's accuracy, beside the prototype's."""
+    return [
+        row
+        for m in METHODS
+        for row in accuracy_rows(s, (m,), _name(m), columns, PROTOTYPE.get((m,)))
+    ]
 
 
 def _name(method: str) -> str:
@@ -243,16 +263,16 @@ def figure_4(names: tuple[str, ...], values: Array, errors: dict[str, Array]) ->
     in_mm = {method: np.round(1e3 * error, 4).tolist() for method, error in errors.items()}
     colours = {PRINTED: "--quiet", CORRECTED: "--drawing", JOINT: "--calibrated"}
     data = [
-        *(bars(LABELS[m], names, in_mm[m], "mm", color=colour) for m, colour in colours.items()),
-        bars(LABELS[BOUND], names, in_mm[BOUND], "mm",  # no estimate, so not filled
+        *(_bars(LABELS[m], names, in_mm[m], "mm", color=colour) for m, colour in colours.items()),
+        _bars(LABELS[BOUND], names, in_mm[BOUND], "mm",  # no estimate, so not filled
              color="rgba(0,0,0,0)", line={"color": "--ink", "width": 1.2}),
-        series(
+        _series(
             LABELS[DRAWING], names, in_mm[DRAWING], "--muted", "markers",
             marker={"symbol": "line-ew-open", "size": 22, "color": "--muted",
                     "line": {"width": 2, "color": "--muted"}},
             hovertemplate="%{x}: %{y:.3f} mm",
         ),
-        series(
+        _series(
             "true value", names, (1e3 * values).tolist(), "--leg3", "lines+markers", yaxis="y2",
             marker={"size": 5, "color": "--leg3"}, hovertemplate="%{x}: %{y:.1f} mm",
         ),
@@ -295,9 +315,8 @@ def _effector_table(s: Found) -> Table:
     rows = [
         Row("The paper, before", (mm(BEFORE[0], 2), deg(BEFORE[1], 3), ""), "paper"),
         Row("The paper, after", (mm(AFTER[0], 2), deg(AFTER[1], 3), ""), "paper"),
+        *_by_method(s, columns),
     ]
-    for m in METHODS:
-        rows += accuracy_rows(s, (m,), _name(m), columns, PROTOTYPE.get((m,)))
     note = "The paper's angles are printed in rad; degrees are meant, as in Table 1."
     heads = ("", "mm", "°", "mm, all joints")
     return Table("Errors of the end-effector", heads, tuple(rows), note)
@@ -321,15 +340,6 @@ def _readings_table(wide: Found, narrow: Found) -> Table:
         ),
         "End-effector, and mean |error| in z of the four steps as printed; mm.",
     )
-
-
-def _group_table(s: Found) -> Table:
-    """RMSE by kind of parameter, beside the prototype's."""
-    columns = [Column(name, 3, 4) for name in GROUPS]
-    rows: list[Row] = []
-    for m in METHODS:
-        rows += accuracy_rows(s, (m,), _name(m), columns, PROTOTYPE.get((m,)))
-    return Table("RMSE, mm", ("", *(QUANTITIES[g] for g in GROUPS)), tuple(rows))
 
 
 def _poses_part(words: Words, studies: dict[int, Found]) -> Part:
@@ -360,17 +370,53 @@ def _falling(poses: list[int], found: list[Summary], least: list[float]) -> dict
     as_root = [least[-1] * (poses[-1] / n) ** 0.5 for n in poses]
     two_sigma = [round(2 * s.error, 4) for s in found]
     data = [
-        series("Cramér-Rao bound", poses, least, "--ink", "lines",
+        _series("Cramér-Rao bound", poses, least, "--ink", "lines",
                line={"color": "--ink", "dash": "dot", "width": 1.5}),
-        series("as N to the power of −½", poses, as_root, "--quiet", "lines",
+        _series("as N to the power of −½", poses, as_root, "--quiet", "lines",
                line={"color": "--quiet", "dash": "dash", "width": 1.5}),
-        series("joint estimate", poses, [s.value for s in found], "--calibrated", "lines+markers",
+        _series("joint estimate", poses, [s.value for s in found], "--calibrated", "lines+markers",
                error_y={"array": two_sigma, "color": "--calibrated"}),
-        series("independent prototype", [*PROTOTYPE_POSES], [*PROTOTYPE_POSES.values()],
+        _series("independent prototype", [*PROTOTYPE_POSES], [*PROTOTYPE_POSES.values()],
                "--drawing", "markers",
                marker={"color": "--drawing", "size": 9, "symbol": "diamond-open"}),
     ]  # fmt: skip
-    return log_log(data, poses, "poses a station, N", "displacement, mm")
+    axis = {**AXIS, "type": "log", "fixedrange": True}
+    layout = {
+        **LOOKS,
+        "margin": {"l": 64, "r": 12, "t": 8, "b": 48},
+        "legend": {"x": 1, "xanchor": "right", "y": 1, "bgcolor": "rgba(0,0,0,0)"},
+        "xaxis": {**axis, "tickvals": poses, "title": {"text": "poses a station, N"}},
+        "yaxis": {**axis, "tickvals": TICKS, "title": {"text": "displacement, mm"}},
+    }
+    return {"data": data, "layout": layout, "config": {}}
+
+
+def _bars(name: str, x: Sequence[str], y: Sequence[float], unit: str, **marker: Any) -> Any:
+    """One method's bars."""
+    return {
+        "type": "bar",
+        "name": name,
+        "x": list(x),
+        "y": list(y),
+        "marker": marker,
+        "hovertemplate": f"%{{x}}: %{{y:.3f}} {unit}",
+    }
+
+
+def _series(
+    name: str, x: Sequence[Any], y: Sequence[float], colour: str, mode: str, **more: Any
+) -> dict[str, Any]:
+    """A line, marks, or both. more : of Plotly's scatter trace, over what stands here."""
+    return {
+        "type": "scatter",
+        "mode": mode,
+        "name": name,
+        "x": list(x),
+        "y": [round(v, 4) for v in y],
+        "line": {"color": colour, "width": 1.5},
+        "marker": {"color": colour, "size": 8},
+        **more,
+    }
 
 
 # ------------------------------------------------------------------ for programs

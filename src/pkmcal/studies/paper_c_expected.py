@@ -6,7 +6,6 @@ import numpy as np
 
 from pkmcal.outcome import Check
 from pkmcal.studies.engine import Key, StudyResult
-from pkmcal.studies.expected import Compared, at_most, compared, prototype_check
 from pkmcal.studies.paper_c import (
     AXIS,
     BOUND,
@@ -22,6 +21,7 @@ from pkmcal.studies.paper_c import (
 )
 from pkmcal.studies.paper_c_machine import Kind
 from pkmcal.studies.paper_c_validation import Before
+from pkmcal.studies.reproduction import Compared, at_most, compared, prototype_check
 from pkmcal.studies.statistics import ratio
 from pkmcal.wording import number
 
@@ -97,92 +97,70 @@ def figures_compared(study: StudyResult[H4ByBoard]) -> list[Compared]:
 
 def checks(study: StudyResult[H4ByBoard], start: Before) -> tuple[Check, ...]:
     """What must hold, or the reproduction has failed."""
+    place, turn = start.shift, start.turn
+    before = study.values("control_mean", "design", "design", DRAWING).mean(axis=0)
+    old, new = (largest_side(study, ("design", method)) for method in (DRAWING, EQ3))
+    every = ranks(study)
+    found = {key: every[key] for key in RANKS}
+    told_ranks, wanted = (
+        ", ".join(f"{rank} ({count})" for rank, count in values.values())
+        for values in (found, RANKS)
+    )
+    axis, dof = study.of("design", AXIS)["chi2"].value, study.values("dof", "design", AXIS)
+    allowed = 0.01 + 3 * float(np.sqrt(2 / dof[0] / len(dof)))
+    over = [
+        ratio(*(study.of(kind, kind, method)["larger_shift"] for method in (JOINT, BOUND)))
+        for kind in KINDS[:2]
+    ]
+    right = [study.of(kind, kind, JOINT)["chi2"].value for kind in KINDS]
+    poor = [study.of(*pair, JOINT)["chi2"].value for pair in FOLLOWS_MACHINE]
     return (
-        _before_check(start),
-        _table_3_check(study),
-        _square_check(study),
-        _rank_check(study),
-        _axis_check(study),
-        _bound_check(study),
-        _chi2_check(study),
+        Check(
+            "mean error of the nacelle with the a priori parameters",
+            f"{number(1e3 * place, 1)} mm, {number(turn, 4)} rad",
+            "26 mm, 0.022 rad, the paper's",
+            abs(place - BEFORE.shift) < 5e-4 and abs(turn - BEFORE.turn) < 1e-3,
+        ),
+        Check(
+            "Table 3, means before, 10⁻² rad",
+            ", ".join(number(100 * float(v), 1) for v in before),
+            "9.4, 3.6, 7.6, 8.5",
+            bool(np.abs(before - JOINT_MEANS).max() < 1.5e-3),
+        ),
+        Check(
+            "largest error of the square's sides, before and after",
+            f"{number(1e3 * old, 1)} and {number(1e3 * new, 3)} mm",
+            "4 to 6 mm, and below 0.5 mm",
+            4e-3 < old < 6e-3 and new < SQUARE_AFTER,
+        ),
+        Check("ranks, Models 12 and 31 (unknowns estimated)", told_ranks, wanted, found == RANKS),
+        Check(
+            "χ² per degree of freedom of one axis of rotation, mean",
+            number(axis, 3),
+            f"1 ± {number(allowed, 2)}",
+            abs(axis - 1) <= allowed,
+        ),
+        Check(
+            "joint estimate over the Cramér-Rao bound, Models 12 and 31",
+            ", ".join(number(r.value, 3) for r in over),
+            f"≤ {OVER_BOUND}, Monte-Carlo error aside",
+            all(r.value <= OVER_BOUND + 2 * r.error / r.value for r in over),
+        ),
+        Check(
+            "χ² per degree of freedom: right models, and models too poor",
+            f"{number(min(right), 2)} to {number(max(right), 2)}, and"
+            f" {number(min(poor), 1)} to {number(max(poor), 1)}",
+            f"1 ± 0.1, and above {TOO_POOR}",
+            max(abs(c - 1) for c in right) < 0.1 and min(poor) > TOO_POOR,
+        ),
         at_most(
-            "model with rods on a machine with rods 0.3 mm apart", "mm",
-            study.of("rods", "rods", JOINT)["larger_shift"].times(1e3), MOST_RODS, 3,
+            "model with rods on a machine with rods 0.3 mm apart",
+            "mm",
+            study.of("rods", "rods", JOINT)["larger_shift"].times(1e3),
+            MOST_RODS,
+            3,
         ),
         prototype_check(
             figures_compared(study), f"within {TOLERANCE:.0%}, Monte-Carlo error aside"
         ),
-    )  # fmt: skip
-
-
-def _before_check(start: Before) -> Check:
-    good = abs(start.shift - BEFORE.shift) < 5e-4 and abs(start.turn - BEFORE.turn) < 1e-3
-    return Check(
-        "mean error of the nacelle with the a priori parameters",
-        f"{number(1e3 * start.shift, 1)} mm, {number(start.turn, 4)} rad",
-        "26 mm, 0.022 rad, the paper's",
-        good,
-    )
-
-
-def _table_3_check(study: StudyResult[H4ByBoard]) -> Check:
-    mean = study.values("control_mean", "design", "design", DRAWING).mean(axis=0)
-    text = ", ".join(number(100 * float(v), 1) for v in mean)
-    good = bool(np.abs(mean - JOINT_MEANS).max() < 1.5e-3)
-    return Check("Table 3, means before, 10⁻² rad", text, "9.4, 3.6, 7.6, 8.5", good)
-
-
-def _square_check(study: StudyResult[H4ByBoard]) -> Check:
-    old, new = (largest_side(study, ("design", method)) for method in (DRAWING, EQ3))
-    return Check(
-        "largest error of the square's sides, before and after",
-        f"{number(1e3 * old, 1)} and {number(1e3 * new, 3)} mm",
-        "4 to 6 mm, and below 0.5 mm",
-        4e-3 < old < 6e-3 and new < SQUARE_AFTER,
-    )
-
-
-def _rank_check(study: StudyResult[H4ByBoard]) -> Check:
-    every = ranks(study)
-    found = {key: every[key] for key in RANKS}
-    text, wanted = (
-        ", ".join(f"{rank} ({count})" for rank, count in values.values())
-        for values in (found, RANKS)
-    )
-    return Check("ranks, Models 12 and 31 (unknowns estimated)", text, wanted, found == RANKS)
-
-
-def _axis_check(study: StudyResult[H4ByBoard]) -> Check:
-    found, dof = study.of("design", AXIS)["chi2"].value, study.values("dof", "design", AXIS)
-    allowed = 0.01 + 3 * float(np.sqrt(2 / dof[0] / len(dof)))
-    return Check(
-        "χ² per degree of freedom of one axis of rotation, mean",
-        number(found, 3),
-        f"1 ± {number(allowed, 2)}",
-        abs(found - 1) <= allowed,
-    )
-
-
-def _bound_check(study: StudyResult[H4ByBoard]) -> Check:
-    ratios = [
-        ratio(*(study.of(kind, kind, method)["larger_shift"] for method in (JOINT, BOUND)))
-        for kind in KINDS[:2]
-    ]
-    return Check(
-        "joint estimate over the Cramér-Rao bound, Models 12 and 31",
-        ", ".join(number(r.value, 3) for r in ratios),
-        f"≤ {OVER_BOUND}, Monte-Carlo error aside",
-        all(r.value <= OVER_BOUND + 2 * r.error / r.value for r in ratios),
-    )
-
-
-def _chi2_check(study: StudyResult[H4ByBoard]) -> Check:
-    right = [study.of(kind, kind, JOINT)["chi2"].value for kind in KINDS]
-    poor = [study.of(*pair, JOINT)["chi2"].value for pair in FOLLOWS_MACHINE]
-    return Check(
-        "χ² per degree of freedom: right models, and models too poor",
-        f"{number(min(right), 2)} to {number(max(right), 2)}, and"
-        f" {number(min(poor), 1)} to {number(max(poor), 1)}",
-        f"1 ± 0.1, and above {TOO_POOR}",
-        max(abs(c - 1) for c in right) < 0.1 and min(poor) > TOO_POOR,
     )

@@ -80,7 +80,17 @@ def reproduced(found: Found) -> Outcome:
         (
             words.part("accuracy", *_accuracy_tables(found)),
             words.part("table-2", *_tables_2(found)),
-            words.part("before", _before_table(start)),
+            words.part(
+                "before",
+                Table(
+                    "Mean error with the a priori parameters",
+                    ("", "mm", "rad"),
+                    (
+                        Row("The paper", (mm(BEFORE.shift, 0), number(BEFORE.turn, 3)), "paper"),
+                        Row("Found", (mm(start.shift, 1), number(start.turn, 4))),
+                    ),
+                ),
+            ),
             words.part("table-3", _table_3(found)),
             words.part("table-4", _table_4(found), _square_table(found)),
             words.part("axis", _axis_table(found)),
@@ -164,15 +174,6 @@ def _tables_2(s: Found) -> tuple[Table, Table]:
         Table("Table 2: sizes, m", ("", "h", "arm", "R", "forearm"), sizes),
         Table("Table 2: angles, rad", ("", *ANGLES), angles, brief=False),
     )
-
-
-def _before_table(start: Before) -> Table:
-    """[C] IV.C: 26 mm and 0.022 rad."""
-    rows = (
-        Row("The paper", (mm(BEFORE.shift, 0), number(BEFORE.turn, 3)), "paper"),
-        Row("Found", (mm(start.shift, 1), number(start.turn, 4))),
-    )
-    return Table("Mean error with the a priori parameters", ("", "mm", "rad"), rows)
 
 
 def _control_mean(s: Found, model_and_method: tuple[str, str]) -> Array:

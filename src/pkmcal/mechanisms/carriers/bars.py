@@ -74,7 +74,7 @@ class Bar(PlatformCarrier):
     called: ClassVar = "side bars' joints (half a bar's width)"
     parameters: ClassVar = (
         *vectors("center", "m", "center"),
-        *vectors("hinge", "m", "center", label="hinge"),
+        *vectors("hinge", "m", "center", label="hinge", part="hinge"),
     )
 
     @classmethod
@@ -156,7 +156,7 @@ class HingedBar(PlatformCarrier):
     called: ClassVar = "side bars' joints"
     parameters: ClassVar = (
         *vectors("center", "m", "center"),
-        *vectors("hinge", "m", "center", label="hinge"),
+        *vectors("hinge", "m", "center", label="hinge", part="hinge"),
         *vectors("axis", "1", "axis"),
     )
 

@@ -73,7 +73,9 @@ class ParameterKind(NamedTuple):
 
     Where the file may leave the field out, ``otherwise`` is its value, and it is no parameter of
     a machine whose file does. Without a tolerance's name it is a constant of the drawing.
-    label : what people call it, where its side and path say too little.
+    label : what people call it, where its side and path say too little. part : what of a leg it
+    changes, where that is not simply the joint on its side: ``zero`` of the reading (added to it),
+    or an ``arm``, a ``hinge``, any word for a piece that can slip or be exchanged by itself.
     """
 
     path: str
@@ -81,6 +83,7 @@ class ParameterKind(NamedTuple):
     tolerance: str
     otherwise: float = 0.0
     label: str = ""
+    part: str = ""
 
 
 class NamedMotion(NamedTuple):
@@ -395,10 +398,14 @@ def by_pose(arm: Array) -> Array:
     return out
 
 
-def vectors(name: str, unit: str, tolerance: str, label: str = "") -> tuple[ParameterKind, ...]:
+def vectors(
+    name: str, unit: str, tolerance: str, label: str = "", part: str = ""
+) -> tuple[ParameterKind, ...]:
     """The three components of a field."""
     return tuple(
-        ParameterKind(f"{name}.{axis}", unit, tolerance, label=label and f"{label} {axis}")
+        ParameterKind(
+            f"{name}.{axis}", unit, tolerance, label=label and f"{label} {axis}", part=part
+        )
         for axis in "xyz"
     )
 

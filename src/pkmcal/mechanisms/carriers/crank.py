@@ -84,8 +84,8 @@ class Crank(BaseCarrier):
     parameters: ClassVar = (
         *vectors("center", "m", "center"),
         *vectors("axis", "1", "axis"),
-        ParameterKind("arm", "m", "arm", label="arm length"),
-        ParameterKind("angle", "rad", "angle", label="crank angle"),
+        ParameterKind("arm", "m", "arm", label="arm length", part="arm"),
+        ParameterKind("angle", "rad", "angle", label="crank angle", part="zero"),
         ParameterKind("along", "m", "center", label="place along the crank axis"),
         ParameterKind("radial", "m", "center", label="crank axis distance"),
         *ZERO,
