@@ -100,24 +100,17 @@ def texts_of(
 
     not_identified, holdout : as for :func:`document_of`.
     """
-    return {
-        MECHANISM: calibrated_mechanism_text(calibration),
-        EVERYTHING: json_text(document_of(calibration, not_identified, holdout)),
-        **_refined_cameras(calibration),
-    }
-
-
-def _refined_cameras(calibration: Calibration) -> dict[str, str]:
-    """Camera files as refined with the machine, by their place in the folder."""
     from pkmcal.cameras.files import camera_text
 
-    cameras = calibration.cameras
-    if not cameras.active:
-        return {}
-    return {
-        f"camera-{Path(file).stem}.yaml": camera_text(cameras.result(calibration.estimate, file))
-        for file in cameras.files
+    texts = {
+        MECHANISM: calibrated_mechanism_text(calibration),
+        EVERYTHING: json_text(document_of(calibration, not_identified, holdout)),
     }
+    cameras = calibration.cameras
+    for file in cameras.files if cameras.active else ():
+        camera = cameras.result(calibration.estimate, file)
+        texts[f"camera-{Path(file).stem}.yaml"] = camera_text(camera)
+    return texts
 
 
 def calibrated_mechanism_text(calibration: Calibration) -> str:

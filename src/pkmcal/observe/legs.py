@@ -221,9 +221,7 @@ def search(
 
     poses : T_base_platform (K, 4, 4) of the photographs.
     """
-    tubes, points, clear = _predict(
-        photographs, machine, T_camera_base, poses, SEARCH_SAMPLES, CLEARANCE
-    )
+    tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
     places = search_legs(photographs.images, tubes, points, clear)
     found = clear & places.clear[:, tubes.leg][..., None]
     position = places.outward(points, clear, tubes)
@@ -253,7 +251,7 @@ def measure(
     blur : px, from an earlier look; estimated from these profiles when absent. refine_camera :
     also how the edges depend on the camera's parameters.
     """
-    tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, PLACES, CLEARANCE)
+    tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, PLACES)
     grey = sample(photographs.images, _profile_pixels(photographs.camera, points))
     middles = np.arange(SEGMENTS) * 5 + 2  # of the segments, among the points
     per_point = (f.name for f in fields(points) if f.name != "normal")
@@ -279,17 +277,13 @@ def measure(
 
 
 def _predict(
-    photographs: Photographs,
-    machine: Machine,
-    T_camera_base: Array,
-    poses: Array,
-    samples: int,
-    clearance: float,
+    photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array, samples: int
 ) -> tuple[TubeList, EdgePoints, Booleans]:
+    """The tubes' edges, some samples on each, and which of these (K, E, n) nothing obstructs."""
     tubes = tubes_of(machine)
     legs = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
     points = edge_points(machine, photographs.camera, legs, tubes, samples)
-    clear = unobstructed(machine, photographs.camera, legs, tubes, points, clearance)
+    clear = unobstructed(machine, photographs.camera, legs, tubes, points, CLEARANCE)
     return tubes, points, clear
 
 

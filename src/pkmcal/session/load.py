@@ -26,7 +26,6 @@ from pkmcal.session.schema import (
     Body,
     SessionDocument,
     StationDocument,
-    TrackerStationDocument,
     Vector,
 )
 from pkmcal.wording import listed
@@ -124,12 +123,14 @@ def load_session(folder: Path | str, model: str | None = None) -> Session:
         _station(folder, document, name, station, table.names)
         for name, station in schema.cameras.items()
     )
-    trackers = tuple(
-        _tracker(folder, document, name, station, table.names)
-        for name, station in schema.trackers.items()
-    )
+    trackers: list[PoseTable] = []
+    for name, station in schema.trackers.items():
+        given, keys = station.tracker, ("stations", name, "tracker", "poses")
+        path, noise = _existing(folder, document, given.poses, keys), given.noise
+        measured = read_poses(path, given.poses, table.names, noise.position, noise.rotation, name)
+        trackers.append(measured)
     _check_distinct(document, stations)
-    warnings += _unphotographed(table, stations, trackers)
+    warnings += _unphotographed(table, stations, tuple(trackers))
     return Session(
         folder=folder,
         machine=machine,
@@ -141,7 +142,7 @@ def load_session(folder: Path | str, model: str | None = None) -> Session:
         document=_resolved(folder, schema, table, stations),
         warnings=tuple(warnings),
         board_body=schema.board.fixed_to if schema.board else "platform",
-        trackers=trackers,
+        trackers=tuple(trackers),
         model=model,
         mechanism=source,
     )
@@ -296,20 +297,6 @@ def _station(
     for photo in photographs:
         _check_size(folder, photo, camera, station.camera)
     return Station(name, camera, station.camera, T_camera_base, photographs, station.observe)
-
-
-def _tracker(
-    folder: Path,
-    document: Document,
-    name: str,
-    station: TrackerStationDocument,
-    names: tuple[str, ...],
-) -> PoseTable:
-    """One tracker's table."""
-    given = station.tracker
-    path = _existing(folder, document, given.poses, ("stations", name, "tracker", "poses"))
-    noise = given.noise
-    return read_poses(path, given.poses, names, noise.position, noise.rotation, name)
 
 
 def _check_size(folder: Path, photo: Photograph, camera: Camera, camera_file: str) -> None:
