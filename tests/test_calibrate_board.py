@@ -21,10 +21,10 @@ from pkmcal.simulation import load_truth
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """One station, ten configurations, by the command; nobody writes into it."""
+    """One station, twelve configurations, by the command; nobody writes into it."""
     folder = tmp_path_factory.mktemp("platform") / "session"
     done = run(
-        "simulate", folder, "--on-platform", "--stations", "1", "--configurations", "10",
+        "simulate", folder, "--on-platform", "--stations", "1", "--configurations", "12",
         "--size", "640x480",
     )  # fmt: skip
     assert done.code == 0

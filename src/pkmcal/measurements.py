@@ -116,8 +116,14 @@ class EdgeSet:
 
     def rejection(self, k: int, reason: str) -> Rejection:
         """The edge at k, left out for a reason."""
-        place = (self.station, self.configuration, self.leg, self.tube, self.side)
-        return Rejection(*(int(index[k]) for index in place), reason)
+        return Rejection(
+            station=int(self.station[k]),
+            configuration=int(self.configuration[k]),
+            leg=int(self.leg[k]),
+            tube=int(self.tube[k]),
+            side=int(self.side[k]),
+            reason=reason,
+        )
 
 
 @dataclass(frozen=True)
