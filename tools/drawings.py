@@ -23,7 +23,7 @@ from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobst
 from pkmcal.simulation import Truth
 
 if TYPE_CHECKING:
-    from pictures import Case
+    from case import Case
 
 LEGS = ("#c77f00", "#2a94cc", "#008f68", "#bd5f95", "#0a62a6", "#c8500a")
 Box = tuple[int, int, int, int]

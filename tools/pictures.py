@@ -15,7 +15,6 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -23,23 +22,20 @@ import numpy as np
 
 import pkmcal
 from pkmcal.arrays import Array
-from pkmcal.calibration.calibrate import Calibration
-from pkmcal.calibration.recognise import platform_poses, read_photographs, recognise
 from pkmcal.commands.comparison import compare
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
-from pkmcal.observe import legs
 from pkmcal.report import page, pictures, scene
 from pkmcal.report import residuals as shown
 from pkmcal.report.calibration import save
-from pkmcal.session.load import Session, load_session
-from pkmcal.simulation import EdgeNoise, Truth, load_truth, simulate_edges, simulate_session
+from pkmcal.simulation import EdgeNoise, load_truth, simulate_edges, simulate_session
 from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera
 
 sys.path.insert(0, str(Path(__file__).parent))
 import drawings
+from case import Case, simulated
 
 HERE = Path(__file__).resolve().parents[1]
 LARGEST = 200_000
@@ -55,54 +51,6 @@ class Shot:
     html: str
     width: int
     height: int
-
-
-class Case:
-    """The demonstration's session with its truth and its calibration."""
-
-    def __init__(self, work: Path) -> None:
-        self.work = work
-
-    @cached_property
-    def folder(self) -> Path:
-        """The session's folder."""
-        return simulated(self.work / "demo", SEED)
-
-    @cached_property
-    def session(self) -> Session:
-        """The session as a user would load it."""
-        return load_session(self.folder)
-
-    @cached_property
-    def truth(self) -> Truth:
-        """What the simulation drew."""
-        return load_truth(self.folder, self.session.machine)
-
-    @cached_property
-    def photographs(self) -> list[legs.Photographs]:
-        """Decoded photographs by station."""
-        return read_photographs(self.session)
-
-    @cached_property
-    def result(self) -> Calibration:
-        """The calibration."""
-        return pkmcal.calibrate(self.session)
-
-    @cached_property
-    def looks(self) -> list[Array]:
-        """Stations by hand and as recognised, T_camera_base (S, 4, 4) each."""
-        poses = platform_poses(self.session)
-        rngs = np.random.default_rng(0).spawn(len(self.photographs) + 1)
-        found = recognise(self.session, self.photographs, poses, rngs[1:])
-        return [np.stack(found.rough), np.stack([f.T_camera_base for f in found.found])]
-
-
-def simulated(folder: Path, seed: int) -> Path:
-    """A session like the demonstration's, made where it is not there yet."""
-    if not folder.exists():
-        machine = pkmcal.load_mechanism(MECHANISM)
-        simulate_session(folder, machine, demo_camera(), SETTINGS, seed=seed)
-    return folder
 
 
 def whole_page(body: str, width: int, height: int, more_style: str = "") -> Shot:
