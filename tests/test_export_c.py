@@ -63,7 +63,7 @@ def compiled(machine, folder, *flags):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return SimpleNamespace(library=ctypes.CDLL(str(path)), machine=machine)
+    return SimpleNamespace(compiled=ctypes.CDLL(str(path)), machine=machine)
 
 
 def doubles(values):
@@ -74,13 +74,13 @@ def doubles(values):
 def forward(c, joints, start):
     """Status, pose and report."""
     pose, report = Pose.of(start), Report()
-    status = c.library.pkmcal_forward(doubles(joints), ctypes.byref(pose), ctypes.byref(report))
+    status = c.compiled.pkmcal_forward(doubles(joints), ctypes.byref(pose), ctypes.byref(report))
     return status, pose.matrix(), report
 
 
 def inverse(c, T):
     out = doubles(np.zeros(c.machine.n_joints))
-    status = c.library.pkmcal_inverse(ctypes.byref(Pose.of(T)), out)
+    status = c.compiled.pkmcal_inverse(ctypes.byref(Pose.of(T)), out)
     return status, np.array(out)
 
 
@@ -118,7 +118,7 @@ def test_c_is_our_own_kinematics(name, library):
             np.testing.assert_allclose(pose, T, atol=1e-12, rtol=0)
             assert report.error < 1e-13
             assert report.pivot > 0
-        assert c.library.pkmcal_out_of_range(doubles(q)) == 0
+        assert c.compiled.pkmcal_out_of_range(doubles(q)) == 0
 
 
 @needs_compiler
@@ -127,7 +127,7 @@ def test_c_jacobian_is_ours(name, library):
     c = library(name)
     for T in samples(c.machine, 5)[0]:
         out = doubles(np.zeros(6 * c.machine.n_joints))
-        assert c.library.pkmcal_inverse_jacobian(ctypes.byref(Pose.of(T)), out) == OK
+        assert c.compiled.pkmcal_inverse_jacobian(ctypes.byref(Pose.of(T)), out) == OK
         found = np.reshape(out, (-1, 6))
         np.testing.assert_allclose(found, c.machine.inverse_jacobian(T[None])[0], atol=1e-11)
 
@@ -135,7 +135,7 @@ def test_c_jacobian_is_ours(name, library):
 @needs_compiler
 @pytest.mark.parametrize("name", ["gough-stewart", "3-upu", "h4-rods"])
 def test_the_self_test_passes(name, library, capfd):
-    assert library(name).library.main() == 0
+    assert library(name).compiled.main() == 0
     ctypes.CDLL(None).fflush(None)
     assert f"PASS: 12 reference poses of {name}" in capfd.readouterr().out
 
@@ -185,12 +185,12 @@ def test_statuses(library):
     assert status == OUT_OF_REACH
     assert report.error > 1e-3
     np.testing.assert_array_equal(pose, home)  # the start stays
-    assert c.library.pkmcal_out_of_range(doubles(q + np.eye(6)[3])) == 4
-    assert c.library.pkmcal_out_of_range(doubles(q - np.eye(6)[1])) == 2
-    assert c.library.pkmcal_out_of_range(doubles(np.full(6, np.nan))) == 1
+    assert c.compiled.pkmcal_out_of_range(doubles(q + np.eye(6)[3])) == 4
+    assert c.compiled.pkmcal_out_of_range(doubles(q - np.eye(6)[1])) == 2
+    assert c.compiled.pkmcal_out_of_range(doubles(np.full(6, np.nan))) == 1
     # a null report is none
     pose = Pose.of(home)
-    assert c.library.pkmcal_forward(doubles(q), ctypes.byref(pose), None) == OK
+    assert c.compiled.pkmcal_forward(doubles(q), ctypes.byref(pose), None) == OK
 
 
 @needs_compiler
@@ -243,7 +243,7 @@ def test_the_limit_of_steps_and_a_name_that_cannot_leave_its_comment(tmp_path):
     readings = samples(machine, 20)[1]
     statuses = {forward(c, q, machine.home())[0] for q in readings}
     assert statuses == {NOT_CONVERGED}
-    text = c.library.pkmcal_status_text
+    text = c.compiled.pkmcal_status_text
     text.restype = ctypes.c_char_p
     told = [text(k) for k in range(6)]
     assert told[0] == b"ok"
