@@ -19,8 +19,10 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference, rotation_vector
+from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.start import mean_pose, start_state
 from pkmcal.identify.verdict import POOR, RicherModel
 from pkmcal.measurements import Measurements, PoseSet
@@ -47,6 +49,9 @@ CERTAIN = 12.0
 """Standard deviations by which a board has to have moved, all six numbers together."""
 ENOUGH = 4.0
 """Standard deviations that it may leave: a drawing's own errors are in them."""
+HOPELESS = 50.0
+"""Factor on the poses' noise beyond which, after a first search, a mistake put right is none, and a
+richer model no help: what is believed ends below ENOUGH."""
 FEWEST_POSES = 4
 """Whole poses of one station from which the platform's turning is tested."""
 KEPT = {"one axis": "turn about one axis", "none": "do not turn"}
@@ -77,11 +82,14 @@ def misfit(estimate: Estimate) -> float:
     """How far off the poses are, in their standard deviations, root mean square of the better
     BELIEVED of them, given up or not: outliers of another cause should hide nothing.
     """
-    error = estimate.pose_residuals * estimate.statistics.pose_scale
-    if not error.size:
-        return 0.0
+    return _usual(estimate.pose_residuals * estimate.statistics.pose_scale)
+
+
+def _usual(error: Array) -> float:
+    """Root mean square of the better BELIEVED of errors (N, 6), 0 of none."""
     each = np.sort(np.mean(error**2, axis=1))
-    return float(np.sqrt(np.mean(each[: max(int(np.ceil(BELIEVED * len(each))), 1)])))
+    few = each[: max(int(np.ceil(BELIEVED * len(each))), 1)]
+    return float(np.sqrt(np.mean(few))) if few.size else 0.0
 
 
 def in_doubt(estimate: Estimate) -> bool:
@@ -122,9 +130,8 @@ def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate)
     found: Doubt | None = None
     for doubt in chain(
         _movements(machine, measurements, estimate),
-        _signs(machine, measurements),
+        _other_readings(machine, measurements),
         _sizes(machine, measurements, estimate),
-        _orders(machine, measurements),
     ):
         if found is None or doubt.misfit < found.misfit:
             found = doubt
@@ -134,31 +141,52 @@ def find_doubt(machine: Machine, measurements: Measurements, estimate: Estimate)
     return found if found and found.misfit < min(CURED * before, ENOUGH) else None
 
 
-def _signs(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
-    """Each motor's readings with the other sign."""
-    for motor in range(machine.n_joints):
-        sign = np.where(np.arange(machine.n_joints) == motor, -1.0, 1.0)
-        other = replace(measurements, joints=measurements.joints * sign)
-        low, high = machine.joint_ranges[motor]
-        inside = other.joints[:, motor]
-        slack = 0.2 * (high - low)
-        if np.any(inside < low - slack) or np.any(inside > high + slack):
-            continue
-        estimate = _tried(machine, other, None)
-        if estimate is not None:
-            yield Doubt("sign", misfit(estimate), motor=motor)
+def _other_readings(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
+    """One motor's readings with the other sign, or two motors' exchanged, the likeliest first.
 
-
-def _orders(machine: Machine, measurements: Measurements) -> Iterator[Doubt]:
-    """Two motors' readings exchanged."""
-    for one, other in combinations(range(machine.n_joints), 2):
-        order = np.arange(machine.n_joints)
+    Such a mistake put right leaves no more than the drawing's errors where an estimate starts, and
+    one that is not there a misfit as large as before, after many steps: only what halves it at the
+    start is estimated.
+    """
+    n = machine.n_joints
+    low, high = machine.joint_ranges.T
+    slack = 0.2 * (high - low)
+    mistakes: list[tuple[Doubt, Array]] = []
+    for motor in range(n):
+        joints = measurements.joints * np.where(np.arange(n) == motor, -1.0, 1.0)
+        outside = (joints < low - slack) | (joints > high + slack)
+        if not outside[:, motor].any():
+            mistakes.append((Doubt("sign", np.inf, motor=motor), joints))
+    for one, other in combinations(range(n), 2):
+        order = np.arange(n)
         order[[one, other]] = order[[other, one]]
-        estimate = _tried(
-            machine, replace(measurements, joints=measurements.joints[:, order]), None
-        )
+        doubt = Doubt("order", np.inf, motor=one, other=other)
+        mistakes.append((doubt, measurements.joints[:, order]))
+    limit = CURED * _first_misfit(machine, measurements)
+    ranked = [
+        (_first_misfit(machine, replace(measurements, joints=joints)), k)
+        for k, (_, joints) in enumerate(mistakes)
+    ]
+    for first, k in sorted(ranked):
+        doubt, joints = mistakes[k]
+        if first > limit:
+            break
+        estimate = _tried(machine, replace(measurements, joints=joints), None)
         if estimate is not None:
-            yield Doubt("order", misfit(estimate), motor=one, other=other)
+            yield replace(doubt, misfit=misfit(estimate))
+
+
+def _first_misfit(machine: Machine, measurements: Measurements) -> float:
+    """:func:`misfit` where an estimate would start, platform poses by the drawing and readings;
+    infinite where it cannot.
+    """
+    try:
+        assembled = assemble(machine, measurements, default_gauge(machine))
+        start = batch_of(machine, assembled, start_from_poses(machine, measurements))
+    except (PkmcalError, np.linalg.LinAlgError):
+        return np.inf
+    rows = assembled.places.poses.taken(assembled.problem.unweighted(start).poses[0])
+    return _usual(np.nan_to_num(rows, nan=np.inf))
 
 
 def _tried(machine: Machine, measurements: Measurements, start: State | None) -> Estimate | None:
@@ -166,7 +194,7 @@ def _tried(machine: Machine, measurements: Measurements, start: State | None) ->
     try:
         if start is None:
             start = start_from_poses(machine, measurements)
-        return bundle(machine, measurements, start)
+        return bundle(machine, measurements, start, hopeless=HOPELESS)
     except (PkmcalError, np.linalg.LinAlgError):
         return None
 
@@ -330,7 +358,7 @@ def richer_models(
             if other.parameters.free_matrix().shape[1] <= unknowns or not alike:
                 continue
             start = start_state(other, measurements, estimate.state.T_camera_base)
-            found = bundle(other, measurements, start)
+            found = bundle(other, measurements, start, hopeless=HOPELESS)
         except (PkmcalError, np.linalg.LinAlgError):
             continue
         out.append(RicherModel(name, found.statistics.pose_scale))

@@ -71,10 +71,13 @@ def solve_batch(
     robust: bool = True,
     scale_noise: bool = True,
     damping: float = FIRST_DAMPING,
+    hopeless: float = np.inf,
 ) -> BatchResult:
     """All runs of a problem from their starts; see :func:`bundle` for the options.
 
     damping : the search's first; less where the start is near, as after the four steps.
+    hopeless : all runs are left as they are where, after a search, the poses' noise has to be
+    larger than stated by more than this factor.
     """
     n_runs = start.z.shape[0]
     ones: Kinds[Array] = Kinds(np.ones(n_runs), np.ones(n_runs))
@@ -88,6 +91,9 @@ def solve_batch(
     fit = _solved(problem, fit, RESTART_DAMPING if robust else damping)
     for _ in range(ROUNDS if robust or scale_noise else 0):
         scale = _noise_scale(fit) if scale_noise else fit.scale
+        if scale.poses.min() > hopeless:
+            fit = fit._replace(scale=scale)
+            break
         weight = fit.weight
         if robust:
             weight = settled_weights(problem, fit.state, scale)
@@ -164,6 +170,7 @@ def bundle(
     robust: bool = True,
     scale_noise: bool = True,
     gauge: Gauge | None = None,
+    hopeless: float = np.inf,
 ) -> Estimate:
     """The joint estimate of one session.
 
@@ -172,8 +179,9 @@ def bundle(
         and edge shifts keep theirs in any case.
     robust : let go of edges and poses that do not fit. scale_noise : where the residuals
         ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each.
-    gauge : frames of the result, three centres by default.
-    Raises ResultError where the search cannot start or ends without an answer.
+    gauge : frames of the result, three centres by default. hopeless : for what is only tried,
+    the factor on the poses' noise beyond which it is given up.
+    Raises ResultError where the search cannot start, is given up, or ends without an answer.
     """
     gauge = gauge or default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=use_drawing)
@@ -182,7 +190,12 @@ def bundle(
     # mounts are known to be near their start, as far as nothing else tells
     mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
     problem = replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
-    result = solve_batch(problem, batch, robust=robust, scale_noise=scale_noise)
+    result = solve_batch(problem, batch, robust=robust, scale_noise=scale_noise, hopeless=hopeless)
+    if result.scale.poses[0] > hopeless:
+        raise ResultError(
+            what="the measured poses do not fit the machine",
+            found=f"{result.scale.poses[0]:.0f} times their noise after a first search",
+        )
     stop = result.solution.stop[0]
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(what=f"the joint estimate failed: {stop.value}")
