@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -133,19 +134,30 @@ def lamp_seen(
     return seen
 
 
-def look(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> tuple[Array, Integers]:
-    """Light along rays (3, bundles, rays), and labels that change at every visible border.
-
-    Both (bundles, rays). A label counts the shape, its face, and whether it lies in shadow.
+class Sight(NamedTuple):
+    """What rays meet, (bundles, rays) each: light, labels that change at every visible border, and
+    the part of the lamp that the place sees. A label counts the shape, its face, and whether it
+    lies in shadow.
     """
+
+    light: Array
+    label: Integers
+    seen: Array
+
+
+def look(
+    scene: Scene, bounds: Bounds, origin: Array, rays: Array, seen: Array | None = None
+) -> Sight:
+    """What rays (3, bundles, rays) meet. seen : (bundles, rays) of the lamp, where that is known."""
     shapes = [part.shape for part in scene.parts]
     distance, owner = first_hits(shapes, bounds, origin, rays)
     lost = owner < 0
     points = origin[:, None, None] + np.where(lost, 1.0, distance) * rays
-    seen = np.ones(distance.shape)
-    for lamp in scene.lighting.lamps:
-        if lamp.shadows:
-            seen = lamp_seen(scene.parts, bounds, lamp, points, owner)
+    if seen is None:
+        seen = np.ones(distance.shape)
+        for lamp in scene.lighting.lamps:
+            if lamp.shadows:
+                seen = lamp_seen(scene.parts, bounds, lamp, points, owner)
     flat, toward, lit = points.reshape(3, -1), -rays.reshape(3, -1), seen.ravel()
     numbers = owner.ravel()
     order = np.argsort(numbers, kind="stable")
@@ -160,7 +172,7 @@ def look(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> tuple[Arra
                 part.shape, part.material, flat[:, at], toward[:, at], lit[at], scene.lighting
             )
     label = 6 * owner + 2 * face.reshape(owner.shape) + (seen < 0.5)
-    return light.reshape(distance.shape), np.where(lost, -1, label).astype(np.int16)
+    return Sight(light.reshape(distance.shape), np.where(lost, -1, label).astype(np.int16), seen)
 
 
 def _flat(rays: Array, rows: Integers) -> Array:
@@ -209,9 +221,9 @@ def render(scene: Scene, view: PixelRays, T_camera_base: Array, rng: np.random.G
     origin = -rot @ T_camera_base[:3, 3]
     bounds = Bounds.of([part.shape for part in scene.parts])
     blind = np.isnan(view.centre[0])
-    light, label = _through_centres(scene, bounds, origin, rot, view, blind)
+    light, label, seen = _through_centres(scene, bounds, origin, rot, view, blind)
     border = _borders(label, light) & ~blind
-    light[border] = _over_area(scene, bounds, origin, rot, view, border, rng)
+    light[border] = _over_area(scene, bounds, origin, rot, view, border, seen, rng)
     light[blind] = 0.0
     return light
 
@@ -239,26 +251,32 @@ def _rays(camera: Camera, x: Array, y: Array) -> Array:
 
 def _through_centres(
     scene: Scene, bounds: Bounds, origin: Array, rot: Array, view: PixelRays, blind: Booleans
-) -> tuple[Array, Integers]:
-    """One ray a pixel: light and labels, both (H, W); meaningless in blind pixels."""
+) -> Sight:
+    """One ray a pixel, (H, W); meaningless in blind pixels."""
     shape = blind.shape
     light, label = np.zeros(blind.size), np.full(blind.size, -2, dtype=np.int16)
+    seen = np.ones(blind.size)
     pixels = _tiles(*shape)
     seeing = ~blind.ravel()[pixels].all(axis=1)
     rays = view.centre.reshape(3, -1)
     for rows in _chunks(pixels[seeing]):
         d = _seeing(rays[:, rows])
-        found, labels = look(scene, bounds, origin, turned(rot, d))
-        light[rows], label[rows] = found, labels
+        light[rows], label[rows], seen[rows] = look(scene, bounds, origin, turned(rot, d))
     label[blind.ravel()] = -2
-    return light.reshape(shape), label.reshape(shape)
+    return Sight(light.reshape(shape), label.reshape(shape), seen.reshape(shape))
 
 
 def _over_area(
     scene: Scene, bounds: Bounds, origin: Array, rot: Array, view: PixelRays, border: Booleans,
-    rng: np.random.Generator,
+    seen: Array, rng: np.random.Generator,
 ) -> Array:  # fmt: skip
-    """Mean light (n,) over the area of each border pixel, in the order of the mask."""
+    """Mean light (n,) over the area of each border pixel, in the order of the mask.
+
+    seen : (H, W) of the lamp through the pixels' centres. Where a pixel and all its neighbours see
+    the same whole lamp, or none of it, so does every point between; most borders are such.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
     width = border.shape[1]
     wanted = np.flatnonzero(border)
     # neighbours together, for narrow bundles
@@ -268,18 +286,22 @@ def _over_area(
     out = np.empty(at.size)
     corner = view.corner.reshape(3, -1)
     first = at // width * (width + 1) + at % width
-    group = np.arange(at.size + -at.size % TILE).clip(max=max(at.size - 1, 0)).reshape(-1, TILE)
-    for rows in _chunks(group):
-        fx, fy = offsets[rows][..., 0], offsets[rows][..., 1]
-        c = [corner[:, first[rows] + s][..., None] for s in (0, 1, width + 1, width + 2)]
-        d = (c[0] * (1 - fx) + c[1] * fx) * (1 - fy) + (c[2] * (1 - fx) + c[3] * fx) * fy
-        # at the rim of the field a corner may see nothing where the centre still does
-        centre = view.centre.reshape(3, -1)[:, at[rows]][..., None]
-        d = np.where(np.isfinite(d).all(axis=0), d, centre)
-        d = d / np.sqrt(np.einsum("i...,i...->...", d, d))
-        d = turned(rot, d.reshape(3, rows.shape[0], -1))
-        light, _ = look(scene, bounds, origin, d)
-        out[rows] = light.reshape(*rows.shape, SAMPLES).mean(axis=-1)
+    alike = (maximum_filter(seen, 3) == minimum_filter(seen, 3)).ravel()[at]
+    for known in (True, False):
+        part = np.flatnonzero(alike == known)
+        group = part[np.arange(part.size + -part.size % TILE).clip(max=part.size - 1)]
+        for rows in _chunks(group.reshape(-1, TILE)) if part.size else []:
+            fx, fy = offsets[rows][..., 0], offsets[rows][..., 1]
+            c = [corner[:, first[rows] + s][..., None] for s in (0, 1, width + 1, width + 2)]
+            d = (c[0] * (1 - fx) + c[1] * fx) * (1 - fy) + (c[2] * (1 - fx) + c[3] * fx) * fy
+            # at the rim of the field a corner may see nothing where the centre still does
+            centre = view.centre.reshape(3, -1)[:, at[rows]][..., None]
+            d = np.where(np.isfinite(d).all(axis=0), d, centre)
+            d = d / np.sqrt(np.einsum("i...,i...->...", d, d))
+            d = turned(rot, d.reshape(3, rows.shape[0], -1))
+            lit = np.repeat(seen.ravel()[at[rows]], SAMPLES, axis=1) if known else None
+            light = look(scene, bounds, origin, d, lit).light
+            out[rows] = light.reshape(*rows.shape, SAMPLES).mean(axis=-1)
     result = np.empty(at.size)
     result[order] = out
     return result
