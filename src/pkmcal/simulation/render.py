@@ -148,7 +148,7 @@ class Sight(NamedTuple):
 def look(
     scene: Scene, bounds: Bounds, origin: Array, rays: Array, seen: Array | None = None
 ) -> Sight:
-    """What rays (3, bundles, rays) meet. seen : (bundles, rays) of the lamp, where that is known."""
+    """What rays (3, bundles, rays) meet; seen : (bundles, rays) of the lamp, where it is known."""
     shapes = [part.shape for part in scene.parts]
     distance, owner = first_hits(shapes, bounds, origin, rays)
     lost = owner < 0
