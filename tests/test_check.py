@@ -61,7 +61,7 @@ def test_progress_is_told_in_order(session):
     told = []
     check_session(session, progress=lambda text, share: told.append((share, text)))
     assert told == sorted(told)
-    assert told[-1][1] == "Recognising the machine"
+    assert told[-1][1] == "What such photographs will give"
 
 
 def test_blurred_photographs(session):

@@ -206,7 +206,7 @@ def test_check_of_a_good_session(session):
     done = run("check", session)
     assert done.code == 0
     assert "Nothing is wrong. Next: pkmcal calibrate" in done.out
-    rows = [line for line in done.out.splitlines() if " station" in line]
+    rows = [line for line in done.out.splitlines() if line[1:].startswith("  station")]
     assert len(rows) == 3
     assert all(row.startswith("✓") for row in rows)
     assert max(map(len, done.out.splitlines())) <= 80 + len(str(session))

@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -34,6 +34,9 @@ from pkmcal.calibration.recognise import (
     why_unrecognised,
 )
 from pkmcal.calibration.turns import identify_poses
+from pkmcal.check.advice import advice, forecast_figure, forecast_part
+from pkmcal.check.forecast import Forecast, forecast
+from pkmcal.check.look import Look, StationLook
 from pkmcal.check.repeats import RepeatStudy, part_of
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import plain
@@ -152,7 +155,9 @@ class StationCheck:
 class SessionCheck:
     """All that was found. singularity : least over the configurations, 1 good, 0 singular.
 
-    assemblies : ways to assemble the machine at the first configuration's readings.
+    assemblies : ways to assemble the machine at the first configuration's readings. forecast : what
+    a full capture would give, where the first photographs tell. advice : what would make it better.
+    look : where the machine was looked for, for pictures; None where it could not be.
     """
 
     folder: str
@@ -164,6 +169,9 @@ class SessionCheck:
     joints: tuple[JointCheck, ...] = ()
     singularity: float = math.nan
     assemblies: int = 0
+    forecast: Forecast | None = None
+    advice: tuple[str, ...] = ()
+    look: Look | None = None
 
     @property
     def exit_code(self) -> int:
@@ -172,7 +180,12 @@ class SessionCheck:
 
     def as_dict(self) -> dict[str, Any]:
         """Everything under its name, for ``--json``."""
-        return plain(asdict(self))
+        kept = replace(self, look=None, forecast=self.forecast and replace(self.forecast, edges=()))
+        out = plain(asdict(kept))
+        out.pop("look")
+        if self.forecast:
+            out["forecast"].pop("edges")
+        return out
 
 
 def _exit_code(findings: Sequence[Finding]) -> int:
@@ -206,9 +219,11 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
     told("Recognising the machine", 0.4)
     motion = _kinematics(session, np.random.default_rng(seed))
     rng = np.random.default_rng(seed)
-    stations, seen = _observed(session, photographs, motion.poses, rng)
-    joints = joint_checks(session)
-    findings += [*broken, *motion.findings, *seen, *joint_findings(session, joints)]
+    seen = _observed(session, photographs, motion.poses, rng)
+    stations, joints = seen.stations, joint_checks(session)
+    findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
+    told("What such photographs will give", 0.8)
+    expected = forecast(seen.look) if seen.look else None
     for station in stations:
         findings += _station_findings(station, session.machine.n_legs)
     return SessionCheck(
@@ -221,6 +236,9 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
         joints=joints,
         singularity=motion.singularity,
         assemblies=motion.assemblies,
+        forecast=expected,
+        advice=advice(seen.look, expected) if seen.look else (),
+        look=seen.look,
     )
 
 
@@ -287,12 +305,20 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
     return _Motion(poses, float(found.singularity.min()), len(modes), tuple(findings))
 
 
+class _Observed(NamedTuple):
+    """look : None where the machine could not be looked for."""
+
+    stations: tuple[StationCheck, ...]
+    findings: tuple[Finding, ...]
+    look: Look | None = None
+
+
 def _observed(
     session: Session,
     photographs: list[legs.Photographs | None],
     poses: Array | None,
     rng: np.random.Generator,
-) -> tuple[tuple[StationCheck, ...], tuple[Finding, ...]]:
+) -> _Observed:
     """What the photographs of every station show, and what is to be said of it."""
     whole = [p for p in photographs if p is not None]
 
@@ -307,9 +333,9 @@ def _observed(
     try:
         check_observable(session)
     except InputError as error:
-        return unlooked(), (wrong(error),)
+        return _Observed(unlooked(), (wrong(error),))
     if poses is None or len(whole) < len(legs_stations(session)):
-        return unlooked(), ()
+        return _Observed(unlooked(), ())
     # Of photographs that are broken is told already.
     lost = any(len(p.images) < len(session.stations[p.station].photographs) for p in whole)
     boards = BoardsCheck()
@@ -317,48 +343,55 @@ def _observed(
         boards = check_boards(session, board_images(session, whole))
         lost = any(finding.level is Level.WRONG for finding in boards.findings)
     if lost and any(station.T_camera_base is None for station in session.stations):
-        return unlooked(), boards.findings
+        return _Observed(unlooked(), boards.findings)
     told = (*boards.findings, *(() if lost else pose_findings(session, boards.boards)))
     rngs = rng.spawn(len(whole) + 1)
     try:
         starts = None if lost else known_stations(session, boards.boards)
     except PkmcalError as error:
-        return unlooked(), (wrong(error), *boards.findings)
+        return _Observed(unlooked(), (wrong(error), *boards.findings))
     found = recognise(session, whole, poses, rngs[1:], boards.boards, starts)
     stations = [  # as it is known of one that observes no legs
         StationCheck(station.name, len(station.photographs), k in boards.checks)
         for k, station in enumerate(session.stations)
     ]
+    looks: list[StationLook] = []
     for p in whole:
-        stations[p.station] = _station(session, p, found, poses)
+        stations[p.station], look = _station(session, p, found, poses)
+        looks.append(look)
     stations = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
+    look = Look(session, poses, tuple(looks)) if looks else None
     if found.complete:
-        return stations, told
+        return _Observed(stations, told, look)
     why = why_unrecognised(session, whole, found, rngs[0])
-    return stations, (wrong(why), *told)
+    return _Observed(stations, (wrong(why), *told), look)
 
 
 def _station(
     session: Session, photographs: legs.Photographs, recognition: Recognition, poses: Array
-) -> StationCheck:
+) -> tuple[StationCheck, StationLook]:
     """One station in which the machine was looked for."""
     number = photographs.station
     pose = recognition.found[legs_stations(session).index(number)]
     station, machine = session.stations[number], session.machine
+    by_hand = station.T_camera_base
+    look = StationLook(station.name, photographs, by_hand, pose.T_camera_base, None)
     if not pose.good:
         what = unrecognised_quality(photographs.images, machine.n_legs)
-        return replace(_summary(station, what, recognised=False), mismatch=pose.score)
+        return replace(_summary(station, what, recognised=False), mismatch=pose.score), look
     what = quality(photographs, machine, pose.T_camera_base, poses[photographs.configuration])
     summary = replace(_summary(station, what, recognised=True), mismatch=pose.score)
-    if station.T_camera_base is None:
-        return summary
-    T_base_camera, by_hand = inverse(pose.T_camera_base), inverse(station.T_camera_base)
+    look = replace(look, quality=what)
+    if by_hand is None:
+        return summary, look
+    T_base_camera, by_hand = inverse(pose.T_camera_base), inverse(by_hand)
     change = pose_difference(T_base_camera, by_hand)
-    return replace(
+    summary = replace(
         summary,
         moved=float(np.linalg.norm(change[3:])),
         turned=float(np.linalg.norm(change[:3])),
     )
+    return summary, look
 
 
 def _summary(station: Station, what: Quality, recognised: bool) -> StationCheck:
@@ -586,6 +619,8 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
                 tables=tuple(table for table in tables if table.rows),
             ),
         )
+    if found.forecast:
+        parts = (*parts, forecast_part(found.forecast))
     photographs = sum(station.photographs for station in found.stations)
     return Outcome(
         command="check",
@@ -594,8 +629,10 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         f" {found.configurations} configurations, {photographs} photographs"
         if found.machine
         else "",
-        verdict=Verdict(code == 0, headlines[code]),
+        verdict=Verdict(code == 0, headlines[code], advice=found.advice),
+        stamp=("Ready", "Doubtful", "Not yet")[code],
         level=Level.WRONG if code == 2 else Level.DOUBTFUL,
+        figures=(forecast_figure(found.forecast),) if found.forecast else (),
         parts=(*parts, part_of(study)) if study else parts,
         findings=findings,
         document=found.as_dict(),
@@ -623,7 +660,7 @@ def _stations_table(found: SessionCheck) -> Table:
         )
         rows.append(Row(station.name, cells, mark=mark))
     columns = ("Station", "Photos", "Mismatch", "Moved", "Legs", "White", "Black", "Blur")
-    return Table("", columns, tuple(rows), legend=STATION_LEGEND)
+    return Table("", columns, tuple(rows), " ".join(STATION_LEGEND), legend=STATION_LEGEND)
 
 
 def _boards_table(found: SessionCheck) -> Table:

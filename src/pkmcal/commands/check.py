@@ -9,11 +9,24 @@ from typing import Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.finish import answer
+from pkmcal.commands.finish import NUMBERS, PAGE, answer, write
+
+FILES = {"check.html": PAGE, "check.json": NUMBERS}
+DRAWN = "the drawing over each photograph"
 
 
 def check(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="Write a page with photographs there."),
+    ] = None,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(
+            "--pictures", metavar="DIR", help="Write the drawing over each photograph, as PNG."
+        ),
+    ] = None,
     repeat: Annotated[
         bool,
         typer.Option("--repeat", help="Measure the accuracy by repeated photographs as well."),
@@ -23,16 +36,38 @@ def check(
 ) -> int:
     """Find what is wrong with a session before any work is spent."""
     from pkmcal.check.check import check_session, outcome_of
+    from pkmcal.files import check_own_folder, check_writable
 
+    if out is not None:
+        check_own_folder(out, FILES, "a check")
+    if pictures is not None:
+        check_writable(pictures)
     study = None
-    with console.progress() as told:
+    with console.progress(as_json) as told:
         found = check_session(session, seed=seed, progress=told)
         if repeat and found.exit_code < 2:
             from pkmcal.check.repeats import study_repeats
 
             study = study_repeats(session, seed=seed, progress=told)
-    outcome = outcome_of(found, study)
-    if repeat:
-        repeats = study and study.as_dict()
-        outcome = replace(outcome, document={**outcome.document, "repeats": repeats})
-    return answer(outcome, session, {}, as_json=as_json)
+        outcome = outcome_of(found, study)
+        if repeat:
+            repeats = study and study.as_dict()
+            outcome = replace(outcome, document={**outcome.document, "repeats": repeats})
+        files: dict[str, str] = {}
+        if pictures is not None and found.look:
+            from pkmcal.report.check import picture_names, write_pictures
+
+            told("Drawing", 0.95)
+            names = picture_names(found.look).values()
+            check_own_folder(pictures, names, "pictures of a check", "an earlier check's")
+            write_pictures(found.look, pictures)
+            files[str(pictures)] = DRAWN
+        if out is not None:
+            if found.look:
+                from pkmcal.report.check import with_pictures
+
+                told("Writing the page", 0.97)
+                outcome = replace(outcome, parts=(*outcome.parts, with_pictures(found.look)))
+            write(outcome, out, FILES)
+            files |= {str(out / name): what for name, what in FILES.items()}
+    return answer(outcome, Path(), files, as_json=as_json)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +24,9 @@ CONTRAST = 30.0
 """Grey levels that an edge needs to tell the blur in spite of noise."""
 SHARPEST = 25.0
 """Percentile of the edges' widths that is the lens's: shading makes the others wider."""
+BESIDE = (1.5, 4.0)
+"""Pixels to each side of an edge between which its two levels are looked at: beyond the blur, and
+before what lies next."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +36,23 @@ class Quality:
     legs : (K, L) True where a leg was found; all False where the machine was not recognised.
     saturated, black : share of the legs' pixels that are so; of all pixels where there are no
     legs. blur : standard deviation of the sharper edges, px; NaN where no edge tells.
+    hidden : (K, L) share of a leg's edges behind other legs or outside the photograph, NaN of legs
+    without tubes. level, behind : (K, E) grey levels beside each edge, on the leg and on what lies
+    behind it, in the order of ``tubes_of``; NaN where nothing of it is seen.
     """
 
     legs: Booleans
     saturated: Array
     black: Array
     blur: Array
+    hidden: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    level: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    behind: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def contrast(self) -> Array:
+        """Grey levels (K, E) by which each leg stands out at its edges."""
+        return np.abs(self.level - self.behind)
 
 
 def quality(
@@ -58,13 +72,21 @@ def quality(
         return sample(photographs.images, pixel, cubic=False)
 
     inside = look(edge - ACROSS * half_width)
-    across = look(edge + np.arange(-REACH, REACH + PITCH / 2, PITCH)).astype(float)
+    offsets = np.arange(-REACH, REACH + PITCH / 2, PITCH)
+    across = look(edge + offsets).astype(float)
     found = clear & places.clear[:, tubes.leg][..., None]
+    near = (np.abs(offsets) >= BESIDE[0]) & (np.abs(offsets) <= BESIDE[1])
+    hidden = np.full((len(clear), machine.n_legs), np.nan)
+    for leg in np.unique(tubes.leg):
+        hidden[:, leg] = 1 - clear[:, tubes.leg == leg].mean(axis=(1, 2))
     return Quality(
         legs=places.clear,
         saturated=_share(inside >= SATURATED, clear),
         black=_share(inside <= BLACK, clear),
         blur=np.array([_blur(a[f]) for a, f in zip(across, found, strict=True)]),
+        hidden=hidden,
+        level=_middle(across[..., near & (offsets < 0)].mean(axis=-1), clear),
+        behind=_middle(across[..., near & (offsets > 0)].mean(axis=-1), clear),
     )
 
 
@@ -77,6 +99,14 @@ def unrecognised_quality(images: list[Integers], n_legs: int) -> Quality:
         black=np.array([float(np.mean(image <= BLACK)) for image in images]),
         blur=np.full(count, np.nan),
     )
+
+
+def _middle(values: Array, clear: Booleans) -> Array:
+    """Median (K, E) of values (K, E, n) at the clear points; NaN where there are none."""
+    some = clear.any(axis=-1)
+    out = np.full(some.shape, np.nan)
+    out[some] = np.nanmedian(np.where(clear, values, np.nan)[some], axis=-1)
+    return out
 
 
 def _share(is_so: Booleans, clear: Booleans) -> Array:

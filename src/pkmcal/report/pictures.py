@@ -72,7 +72,9 @@ class Spot:
 
 @dataclass(frozen=True)
 class Picture:
-    """One photograph. jpeg : base64, empty where the file could not be read."""
+    """One photograph. jpeg : base64, empty where the file could not be read. kind : of its edges,
+    measured or predicted.
+    """
 
     station: str
     configuration: str
@@ -83,6 +85,7 @@ class Picture:
     edges: tuple[Drawn, ...]
     spots: tuple[Spot, ...]
     rms: float
+    kind: str = "measured"
 
     @property
     def caption(self) -> str:

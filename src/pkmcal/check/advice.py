@@ -1,0 +1,262 @@
+"""What would make the photographs better, and what they promise, in words.
+
+Advice is given from what is measured: where legs are hidden, where edges that ought to be seen are
+lost and what is the matter with them, and from where the stations look.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pkmcal.check.forecast import EdgesOf, Forecast, LegForecast
+from pkmcal.check.look import Look, StationLook
+from pkmcal.geometry.rigid import inverse
+from pkmcal.observe.predict import tubes_of
+from pkmcal.observe.profiles import SATURATED
+from pkmcal.observe.quality import BLACK
+from pkmcal.outcome import Figure, Level, Part, Row, Table
+from pkmcal.simulation.placement import PANORAMIC, view_angle
+from pkmcal.wording import brief, count, legs_named, listed
+
+WORTH = 1.2
+"""Factor on a standard deviation from which its cause is worth advice: as much as half as many
+photographs again would gain."""
+LOST = 1 - 1 / WORTH**2
+"""Share of the information that is lost by then."""
+POOR_LEG = 0.5
+"""Share of what legs tell on average below which one of them is named."""
+LEGEND = (
+    "Shares of what all edges tell about the machine, by leg and station.",
+    "Variance: of the platform's position, what comes from the leg's edges: where",
+    "it is large, a better view of that leg gains most.",
+)
+ONE_LEGEND = (
+    "Seen: of its edges, what nothing hides. Found: of these, measured, agreeing",
+    "with the others. Sigma: of an edge, across. Tells: of what all edges tell about",
+    "the machine. Variance: of the platform's position, what comes from its edges:",
+    "where it is large, a better view of that leg gains most.",
+)
+
+
+def advice(look: Look, forecast: Forecast | None) -> tuple[str, ...]:
+    """Sentences, the most useful first."""
+    out = [*_second_place(forecast), *_from_one_side(look), *_hidden(look)]
+    if forecast is not None:
+        for station, edges in zip(look.stations, forecast.edges, strict=True):
+            out += _lost(look, station, edges)
+    return tuple(out)
+
+
+def _second_place(forecast: Forecast | None) -> list[str]:
+    """Whether another place would do more than more photographs from this one."""
+    if forecast is None or not forecast.second * WORTH < forecast.position:
+        return []
+    return [
+        f"Take half of the photographs from a second place, a quarter round the machine:"
+        f" {forecast.photographs} in all then tell the platform's position to"
+        f" {brief(forecast.second * 1e3)} mm, not {brief(forecast.position * 1e3)} mm. A camera"
+        " sees badly along its line of sight, and how shading falls on one side is told by another."
+    ]
+
+
+def _from_one_side(look: Look) -> list[str]:
+    """Whether the stations look along nearly the same line.
+
+    What one camera sees badly, along its line of sight, another sees by the sine of the angle
+    between the two.
+    """
+    cameras = [station.photographs.camera for station in look.stations]
+    if len(cameras) < 2 or any(view_angle(camera) >= PANORAMIC for camera in cameras):
+        return []
+    centres = look.session.machine.base_centers()
+    middle = np.concatenate([centres, look.poses[:, :3, 3]]).mean(axis=0)
+    eyes = inverse(np.stack([station.found for station in look.stations]))[:, :3, 3]
+    way = (middle - eyes) / np.linalg.norm(middle - eyes, axis=-1, keepdims=True)
+    sine = np.linalg.norm(np.cross(way[:, None], way), axis=-1)
+    if not all(station.recognised for station in look.stations) or sine.max() * WORTH > 1:
+        return []
+    angle = math.degrees(math.asin(float(sine.max())))
+    return [
+        f"The stations see the machine along lines that are {angle:.0f}° apart at most: what one"
+        " sees badly, along its line of sight, the others hardly see better. Put one of them a"
+        " quarter round the machine."
+    ]
+
+
+def _hidden(look: Look) -> list[str]:
+    """Legs that no station sees well."""
+    seen = [station for station in look.stations if station.quality is not None]
+    if not seen or len(seen) < len(look.stations):
+        return []
+    hidden = np.stack([s.quality.hidden.mean(axis=0) for s in seen if s.quality is not None])
+    best = np.argmin(np.nan_to_num(hidden, nan=np.inf), axis=0)
+    least = hidden[best, np.arange(hidden.shape[1])]
+    out: list[str] = []
+    for s, station in enumerate(seen):
+        bad = np.flatnonzero((least > LOST) & (best == s))
+        if not bad.size:
+            continue
+        share = f"{least[bad].mean():.0%}"
+        where = f" (best from {station.name})" if len(seen) > 1 else ""
+        out.append(
+            f"{_capital(legs_named(bad + 1))} {'is' if bad.size == 1 else 'are'} hidden for"
+            f" {share}{where}, behind other legs or outside the photograph. Move the camera aside"
+            " until the legs stand one beside the other, or back, or add a place that sees"
+            f" {'it' if bad.size == 1 else 'them'}."
+        )
+    return out
+
+
+def _lost(look: Look, station: StationLook, edges: EdgesOf) -> list[str]:
+    """Why edges that ought to be seen are lost, where these are many."""
+    expected, lost = int(edges.expected.sum()), edges.expected & ~edges.found
+    if station.quality is None or not expected or lost.sum() <= LOST * expected:
+        return []
+    level, behind = (
+        part[edges.photographs] for part in (station.quality.level, station.quality.behind)
+    )
+    contrast = np.abs(level - behind)
+    usual = contrast[edges.found & np.isfinite(contrast)]
+    usual = float(np.median(usual)) if usual.size else math.nan
+    known = lost & np.isfinite(contrast)
+    brighter = np.fmax(level, behind)
+    kinds = {"white": brighter >= SATURATED, "black": brighter <= BLACK}
+    kinds["faint"] = ~kinds["white"] & ~kinds["black"] & (contrast < usual / 2)
+    kinds["clear"] = ~(kinds["white"] | kinds["black"] | kinds["faint"])
+    number = {name: int(np.sum(known & of)) for name, of in kinds.items()}
+    kind = max(number, key=lambda name: number[name])
+    said = (
+        f"{station.name}: {lost.sum() / expected:.0%} of the edges that ought to be seen are"
+        " lost, or disagree with the rest."
+    )
+    faint = contrast[known & kinds["faint"]]
+    why = {
+        "white": "Most of these lie beside white: expose more shortly, with softer light.",
+        "black": "Most of these lie in the dark: expose longer, or bring light.",
+        "faint": (
+            f"Most of these stand out by some {np.median(faint) if faint.size else 0:.0f} grey"
+            f" levels, the others by {usual:.0f}: hang a plain {_sheet(station)} sheet behind the"
+            " machine."
+        ),
+        "clear": (
+            "Most of these stand out as well as the others, so another line lies beside them: a"
+            " highlight, a shadow, a cable, a part on the leg. Soften the light (against a wall or"
+            " the ceiling), clear what is behind, and let tubes in the mechanism file be the clean"
+            " part of each leg only."
+        ),
+    }
+    tubes = tubes_of(look.session.machine)
+    by_leg = [int((lost[:, tubes.leg == j]).sum()) for j in range(look.session.machine.n_legs)]
+    worst = np.flatnonzero(np.array(by_leg) > 2 * lost.sum() / len(by_leg)) + 1
+    where = f" {_capital(legs_named(worst))} lose most." if worst.size > 1 else ""
+    if worst.size == 1:
+        where = f" {_capital(legs_named(worst))} loses most."
+    return [f"{said} {why[kind]}{where}"]
+
+
+def _sheet(station: StationLook) -> str:
+    """Before which the darker and the brighter legs stand out more, those that do least."""
+    if station.quality is None:
+        return "white"
+    level = station.quality.level[np.isfinite(station.quality.level)]
+    return "white" if np.quantile(255 - level, 0.25) >= np.quantile(level, 0.25) else "dark"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+# ------------------------------------------------------------------ the forecast
+
+
+def forecast_figure(told: Forecast) -> Figure:
+    """The card."""
+    return Figure(
+        f"What would {told.photographs} such photographs a station give?",
+        ((brief(told.position * 1e3), "mm"), (brief(math.degrees(told.orientation)), "°")),
+        "1σ of the platform's pose at given readings, mean over the joints' ranges",
+    )
+
+
+def forecast_part(told: Forecast) -> Part:
+    """What a capture would give, and which legs tell it."""
+    stations = tuple(dict.fromkeys(leg.station for leg in told.legs))
+    numbers = tuple(dict.fromkeys(leg.leg for leg in told.legs))
+    by = {(leg.station, leg.leg): leg for leg in told.legs}
+    total = {j: sum(by[s, j].tells for s in stations) for j in numbers}
+    mean = sum(total.values()) / len(total)
+    poor = [j for j in numbers if total[j] < POOR_LEG * mean]
+    columns = ("Seen", "Found", "Sigma", "Tells", "Variance")
+    details = Table(
+        "By station and leg",
+        ("Station, leg", *columns),
+        tuple(Row(f"{leg.station}, {leg.leg}", _cells(leg)) for leg in told.legs),
+        note=" ".join(ONE_LEGEND),
+        brief=False,
+        folded=True,
+    )
+    if len(stations) == 1:
+        rows = tuple(
+            Row(str(leg.leg), _cells(leg), mark=Level.NOTE if leg.leg in poor else "good")
+            for leg in told.legs
+        )
+        tables = (Table("", ("Leg", *columns), rows, " ".join(ONE_LEGEND), legend=ONE_LEGEND),)
+    else:
+        rows = tuple(
+            Row(
+                str(j),
+                (
+                    *(_part(by[s, j].tells) for s in stations),
+                    _part(total[j]),
+                    _part(sum(by[s, j].variance for s in stations)),
+                ),
+                mark=Level.NOTE if j in poor else "good",
+            )
+            for j in numbers
+        )
+        together = [sum(by[s, j].tells for j in numbers) for s in stations]
+        variance = sum(leg.variance for leg in told.legs)
+        all_ = Row(
+            "all", tuple(_part(x) for x in (*together, sum(together), variance)), mark="good"
+        )
+        head = ("Leg", *stations, "Together", "Variance")
+        shares = Table("", head, (*rows, all_), " ".join(LEGEND), legend=LEGEND)
+        tables = (shares, details)
+    return Part("forecast", "What a full capture would give", said=_said(told, poor), tables=tables)
+
+
+def _said(told: Forecast, poor: list[int]) -> tuple[str, ...]:
+    """The forecast, and the legs that tell least, with what is the matter with them."""
+    photographs = sum(len(edges.photographs) for edges in told.edges)
+    out = [
+        f"{told.photographs} such photographs a station, over the joints' ranges, would tell the"
+        f" platform's position to {brief(told.position * 1e3)} mm and its orientation to"
+        f" {brief(math.degrees(told.orientation))}° (standard deviations at given readings, by the"
+        f" edges of {count(photographs, 'photograph')}). Of its variance"
+        f" {sum(leg.variance for leg in told.legs):.0%} comes from the edges,"
+        f" {told.readings:.0%} from the readings, {told.drawing:.0%} from what is known beforehand,"
+        " of the drawing and of shading."
+    ]
+    for j in poor:
+        mine = [leg for leg in told.legs if leg.leg == j]
+        why: list[str] = []
+        for leg in mine:
+            if leg.seen < 1 - LOST:
+                why.append(f"{1 - leg.seen:.0%} hidden from {leg.station}")
+            elif leg.found < 1 - LOST:
+                why.append(f"{1 - leg.found:.0%} of its edges lost at {leg.station}")
+        because = f": {listed(why, 3)}" if why else ""
+        share = f"{sum(leg.tells for leg in mine):.0%}"
+        out.append(f"Leg {j} tells little, {share} of what all edges tell{because}.")
+    return tuple(out)
+
+
+def _cells(leg: LegForecast) -> tuple[str, ...]:
+    sigma = f"{leg.sigma:.2f} px" if math.isfinite(leg.sigma) else "–"
+    return _part(leg.seen), _part(leg.found), sigma, _part(leg.tells), _part(leg.variance)
+
+
+def _part(share: float) -> str:
+    return f"{share:.0%}" if math.isfinite(share) else "–"

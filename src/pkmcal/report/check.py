@@ -1,0 +1,219 @@
+"""A check's photographs with the drawing laid over, before and after the station's pose was found.
+
+On the page, and as PNG files in full size.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.check.look import Look, StationLook
+from pkmcal.files import staged_folder
+from pkmcal.geometry.rigid import apply
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.outcome import Part
+from pkmcal.report import page
+from pkmcal.report.page import N_COLOURS
+from pkmcal.report.pictures import Drawn, Picture, Spot, jpeg, straightened
+
+SAMPLES = 65
+"""Points of an edge's curve: where another leg hides it is found to a hundredth of a leg."""
+SHIFT = 4
+"""Binary digits of a pixel to which cv2 draws."""
+BAR = 26
+"""Height (px) of the line above each picture that says what it shows."""
+NUMBER = 0.04
+"""Width of a leg's number with its joint, in picture widths."""
+GAP = 6
+"""Pixels between the two."""
+
+
+class Laid(NamedTuple):
+    """The drawing over a station's photographs by one pose. said : which pose, in words."""
+
+    said: str
+    T_camera_base: Array
+
+
+def with_pictures(look: Look) -> Part:
+    """The page's section: the stations' first photographs, each by every pose that there is."""
+    pairs: list[tuple[Picture, ...]] = []
+    for station in look.stations:
+        for k in station.few():
+            configuration = int(station.photographs.configuration[k])
+            photo = look.session.stations[station.photographs.station].photographs[k]
+            width, height = station.photographs.camera.image_size
+            shot = jpeg(photo.path, (width, height))
+            pictures: list[Picture] = []
+            for laid in poses_of(station):
+                edges, spots = overlay(look, station, laid, int(k))
+                pictures.append(
+                    Picture(
+                        station=station.name,
+                        configuration=look.session.configurations[configuration],
+                        why=laid.said,
+                        width=width,
+                        height=height,
+                        jpeg=shot,
+                        edges=edges,
+                        spots=spots,
+                        rms=float("nan"),
+                        kind="predicted",
+                    )
+                )
+            pairs.append(tuple(pictures))
+    html = page.render("overlay.html.j2", n_legs=look.session.machine.n_legs, pairs=pairs)
+    return Part("photographs", "The drawing over the photographs", html=html, menu="Photographs")
+
+
+def poses_of(station: StationLook) -> tuple[Laid, ...]:
+    """The poses by which the drawing is laid over, first that by hand."""
+    after = "pose found" if station.recognised else "best pose found, not recognised"
+    found = Laid(after, station.found)
+    if station.by_hand is None:
+        return (found,)
+    return Laid("pose by hand", station.by_hand), found
+
+
+def overlay(
+    look: Look, station: StationLook, laid: Laid, k: int
+) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
+    """Silhouettes of the drawing's tubes in photograph k, where no other leg hides them, and its
+    joint centres.
+    """
+    machine, camera = look.session.machine, station.photographs.camera
+    tubes = tubes_of(machine)
+    configuration = station.photographs.configuration[k : k + 1]
+    joints, poses = look.session.joints[configuration], look.poses[configuration]
+    legs = legs_in_camera(machine, laid.T_camera_base, poses, joints)
+    points = edge_points(machine, camera, legs, tubes, SAMPLES)
+    clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
+    edges: list[Drawn] = []
+    for e, (curve, seen) in enumerate(zip(points.pixel[0], clear, strict=True)):
+        leg, tip = int(tubes.leg[e]) + 1, f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
+        for start, stop in _runs(seen):
+            line = straightened(curve[start:stop])
+            edges.append(Drawn(leg, tuple((float(x), float(y)) for x, y in line), False, tip))
+    ends = limb_ends(machine.layout, machine.values, joints[0], poses[0])
+    both = camera.project(apply(laid.T_camera_base, np.stack([ends.a, ends.b])))
+    return tuple(edges), _spots(both, camera.in_image(both), camera.image_size[0])
+
+
+def _spots(pixel: Array, seen: Booleans, width: int) -> tuple[Spot, ...]:
+    """Joints (2, L) on base and platform; each leg's number at one of its own that is not beside
+    another number.
+    """
+    room, labels, spots = width * NUMBER, list[Array](), list[Spot]()
+    for j in range(pixel.shape[1]):
+        free = [min((np.hypot(*(p - q)) for q in labels), default=np.inf) for p in pixel[:, j]]
+        at = [end for end in (0, 1) if seen[end, j]]
+        # at the base, where there is room
+        best = max(at, key=lambda end: (min(free[end], room), -end), default=None)
+        for end in at:
+            x, y = pixel[end, j]
+            place = round(float(x), 1), round(float(y), 1)
+            spots.append(Spot(j + 1, ("base", "platform")[end], place, None, end == best))
+        if best is not None:
+            labels.append(pixel[best, j])
+    return tuple(spots)
+
+
+def _runs(seen: Booleans) -> list[tuple[int, int]]:
+    """Stretches (n,) of True that are longer than a point, first and one after the last."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
+    return [(a, b) for a, b in pairwise(ends.tolist()) if seen[a] and b - a > 1]
+
+
+# ------------------------------------------------------------------ as files
+
+
+def picture_names(look: Look) -> dict[tuple[int, int], str]:
+    """File names by station and photograph."""
+    out: dict[tuple[int, int], str] = {}
+    for s, station in enumerate(look.stations):
+        photographs = look.session.stations[station.photographs.station].photographs
+        for k in range(len(photographs)):
+            out[s, k] = f"{station.name}-{photographs[k].path.stem}.png"
+    return out
+
+
+def write_pictures(look: Look, folder: Path) -> None:
+    """All photographs as PNG, by hand to the left and as found to the right; all or none."""
+    import cv2
+
+    with staged_folder(folder) as stage:
+        for (s, k), name in picture_names(look).items():
+            done, packed = cv2.imencode(".png", picture(look, look.stations[s], k))
+            if not done:
+                raise OSError(f"{name} could not be encoded as PNG")
+            (stage / name).write_bytes(packed.tobytes())
+
+
+def picture(look: Look, station: StationLook, k: int) -> Any:
+    """Photograph k in colour, (h, w, 3) uint8, blue first as cv2 has it."""
+    import cv2
+
+    name = look.session.configurations[int(station.photographs.configuration[k])]
+    panes: list[Any] = []
+    for laid in poses_of(station):
+        pane: Any = cv2.cvtColor(np.asarray(station.photographs.images[k]), cv2.COLOR_GRAY2BGR)
+        edges, spots = overlay(look, station, laid, k)
+        _draw(pane, edges, spots)
+        bar = np.full((BAR, pane.shape[1], 3), 32, dtype=np.uint8)
+        text = f"{station.name} / {name}: {laid.said}"
+        cv2.putText(bar, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (235,) * 3, 1, cv2.LINE_AA)
+        panes.append(np.concatenate([bar, pane]))
+    gap = np.full((len(panes[0]), GAP, 3), 32, dtype=np.uint8)
+    joined = [part for pane in panes for part in (gap, pane)][1:]
+    return np.concatenate(joined, axis=1)
+
+
+def _draw(pane: Any, edges: tuple[Drawn, ...], spots: tuple[Spot, ...]) -> None:
+    """Lines and joints into a picture, each on a dark one so that it shows on white, too."""
+    import cv2
+
+    def fixed(points: Any) -> Any:
+        return np.rint(np.asarray(points) * 2**SHIFT).astype(np.int32)
+
+    radius = pane.shape[1] / 110
+    for width, dark in ((3, True), (1, False)):
+        for edge in edges:
+            colour = (0, 0, 0) if dark else _colour(edge.leg)
+            line = [fixed(edge.points)[:, None]]
+            cv2.polylines(pane, line, False, colour, width, cv2.LINE_AA, SHIFT)
+        for spot in spots:
+            colour = (0, 0, 0) if dark else _colour(spot.leg)
+            x, y = fixed(spot.calibrated).tolist()
+            size = round(radius * 2**SHIFT)
+            cv2.circle(pane, (x, y), size, colour, width, cv2.LINE_AA, SHIFT)
+            if spot.labelled:
+                at = (
+                    round(spot.calibrated[0] + 1.4 * radius),
+                    round(spot.calibrated[1] + 2.4 * radius),
+                )
+                font, scale = cv2.FONT_HERSHEY_SIMPLEX, radius / 14
+                cv2.putText(pane, str(spot.leg), at, font, scale, colour, width + 1, cv2.LINE_AA)
+
+
+def _colour(leg: int) -> tuple[int, int, int]:
+    """The leg's colour on photographs, blue first."""
+    return leg_colours()[(leg - 1) % N_COLOURS]
+
+
+@cache
+def leg_colours() -> tuple[tuple[int, int, int], ...]:
+    """What the page's style sheet gives legs on photographs: it stands once, there."""
+    style = (resources.files("pkmcal.report") / "templates" / "style.css").read_text("utf-8")
+    (rule,) = re.findall(r"^\.shot, \.chip\.photo \{([^}]*)\}", style, flags=re.MULTILINE)
+    found = dict(re.findall(r"--leg(\d): #([0-9a-f]{6})", rule))
+    numbers = [int(found[str(k + 1)], 16) for k in range(N_COLOURS)]
+    return tuple((n & 255, n >> 8 & 255, n >> 16) for n in numbers)

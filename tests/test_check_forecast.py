@@ -1,0 +1,285 @@
+"""What the check foretells of a full capture, what it advises, and the pictures that it draws."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+import pkmcal.report
+from conftest import run
+from pkmcal.check import advice as words
+from pkmcal.check.check import check_session, outcome_of
+from pkmcal.check.forecast import EdgesOf, Forecast, LegForecast, forecast
+from pkmcal.geometry.rigid import inverse, pose, rotation
+from pkmcal.identify.tool import centres_and_tool
+from pkmcal.outcome import Level
+from pkmcal.report.check import BAR, GAP, leg_colours, picture_names, with_pictures, write_pictures
+
+
+@pytest.fixture(scope="module")
+def found(demo, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("check") / "session"
+    shutil.copytree(demo.session, folder)
+    (folder / "truth.json").unlink()
+    return check_session(folder)
+
+
+@pytest.fixture(scope="module")
+def alone(demo, tmp_path_factory):
+    """Three photographs of one station."""
+    folder = tmp_path_factory.mktemp("alone") / "session"
+    shutil.copytree(demo.session, folder)
+    (folder / "truth.json").unlink()
+    document = yaml.safe_load((folder / "session.yaml").read_text())
+    document["stations"] = {"station1": document["stations"]["station1"]}
+    (folder / "session.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+    rows = (folder / "joints.csv").read_text().splitlines()
+    (folder / "joints.csv").write_text("\n".join(rows[:4]) + "\n")
+    kept = {row.split(",")[0] for row in rows[1:4]}
+    for path in (folder / "images").glob("*/*.png"):
+        if path.stem not in kept:
+            path.unlink()
+    return folder
+
+
+# ------------------------------------------------------------------ the forecast
+
+
+def test_the_forecast_is_what_calibrate_then_states(found, calibrated):
+    """From two photographs of each of three stations, for the four of each that there are."""
+    each = len(calibrated.session.stations[0].photographs)
+    told = forecast(found.look, each)
+    _, tool = centres_and_tool(
+        calibrated.session.machine, calibrated.estimate, calibrated.session.joints
+    )
+    # four configurations a station are few: which they are makes a third of it
+    assert told.position == pytest.approx(tool.position.mean(), rel=0.5)
+    assert told.orientation == pytest.approx(tool.orientation.mean(), rel=0.5)
+
+
+def test_more_photographs_tell_more(found):
+    few, many = forecast(found.look, 8), forecast(found.look, 32)
+    # independent errors would halve; what shading does to a side stays
+    assert 0.4 < many.position / few.position < 0.85
+
+
+def test_shares_are_parts_of_a_whole(found):
+    told = found.forecast
+    assert sum(leg.tells for leg in told.legs) == pytest.approx(1)
+    legs = sum(leg.variance for leg in told.legs)
+    assert legs + told.readings + told.drawing == pytest.approx(1)
+    assert legs > 0.5
+    assert [(leg.station, leg.leg) for leg in told.legs[:2]] == [("station1", 1), ("station1", 2)]
+    assert len(told.legs) == 18
+    for leg in told.legs:
+        assert 0 <= leg.tells < 1
+        assert 0 <= leg.seen <= 1
+    assert np.isnan(told.second)
+    assert "edges" not in found.as_dict()["forecast"]
+    assert "look" not in found.as_dict()
+
+
+def test_three_photographs_of_one_station(alone):
+    found = check_session(alone)
+    assert not [f for f in found.findings if f.level is Level.WRONG]
+    told = found.forecast
+    assert [leg.leg for leg in told.legs] == [1, 2, 3, 4, 5, 6]
+    # from one place the line of sight is told badly
+    assert told.second < told.position
+    said = outcome_of(found).parts[-1].said
+    assert "by the edges of 3 photographs" in said[0]
+
+
+def test_no_forecast_where_a_station_is_not_recognised(found):
+    look = found.look
+    lost = replace(look, stations=(*look.stations[:2], replace(look.stations[2], quality=None)))
+    assert forecast(lost) is None
+
+
+def test_no_forecast_of_photographs_without_edges(found):
+    look = found.look
+    grey = [replace(s.photographs, images=[np.full_like(i, 90) for i in s.photographs.images])
+            for s in look.stations]  # fmt: skip
+    stations = [replace(s, photographs=p) for s, p in zip(look.stations, grey, strict=True)]
+    assert forecast(replace(look, stations=tuple(stations))) is None
+
+
+def test_a_leg_that_tells_little_is_named_with_its_reason():
+    legs = [LegForecast("front", j, 0.9, 0.95, 0.1, 0.19, 0.1) for j in range(1, 6)]
+    legs.append(LegForecast("front", 6, 0.3, 0.9, 0.2, 0.02, 0.4))
+    told = Forecast(15, 2e-4, 1e-3, 0.0, 0.03, float("nan"), tuple(legs))
+    part = words.forecast_part(told)
+    assert part.said[1] == "Leg 6 tells little, 2% of what all edges tell: 70% hidden from front."
+    marks = [row.mark for row in part.tables[0].rows]
+    assert marks == ["good"] * 5 + [Level.NOTE]
+
+
+# ------------------------------------------------------------------ advice
+
+
+def test_a_second_place_is_advised_where_it_is_worth_it(found):
+    told = replace(found.forecast, position=2e-4, second=1e-4)
+    (said,) = words._second_place(told)
+    assert "15 in all then tell the platform's position to 0.10 mm, not 0.20 mm" in said
+    assert words._second_place(replace(told, second=1.8e-4)) == []
+    assert words._second_place(replace(told, second=float("nan"))) == []
+
+
+def test_stations_on_one_side_are_told(found):
+    first = found.look.stations[0]
+    middle = found.look.poses[:, :3, 3].mean(axis=0)
+    turn = rotation(np.array([0, 0, np.deg2rad(25)]))
+    beside = first.found @ inverse(pose(turn, middle - turn @ middle))
+    near = replace(found.look, stations=(first, replace(first, name="b", found=beside)))
+    (said,) = words._from_one_side(near)
+    angle = int(re.search(r"lines that are (\d+)° apart", said)[1])
+    assert 20 < angle <= 25
+    assert words._from_one_side(found.look) == []
+
+
+def test_hidden_legs_are_told_where_no_station_sees_them(found):
+    def hiding(station, leg, share):
+        hidden = np.full(station.quality.hidden.shape, 0.1)
+        hidden[:, leg] = share
+        return replace(station, quality=replace(station.quality, hidden=hidden))
+
+    stations = found.look.stations
+    one = replace(found.look, stations=(hiding(stations[0], 3, 0.8), hiding(stations[1], 0, 0.8)))
+    assert words._hidden(one) == []
+    every = replace(found.look, stations=tuple(hiding(s, 3, 0.8) for s in stations))
+    (said,) = words._hidden(every)
+    assert said.startswith("Leg 4 is hidden for 80% (best from station1), behind other legs")
+
+
+@pytest.mark.parametrize(
+    ("level", "behind", "said"),
+    [
+        (255.0, 100.0, "beside white"),
+        (4.0, 2.0, "in the dark"),
+        (200.0, 195.0, "hang a plain dark sheet behind"),
+        (200.0, 90.0, "another line lies beside them"),
+    ],
+)
+def test_why_edges_are_lost(found, level, behind, said):
+    """Half of all edges lost, which look so; the others are white legs before a grey wall."""
+    station = found.look.stations[0]
+    shape = station.quality.level.shape
+    lost = np.zeros((1, shape[1]), dtype=bool)
+    lost[:, ::2] = True
+    own, other = np.full(shape, 200.0), np.full(shape, 90.0)
+    own[:, ::2], other[:, ::2] = level, behind
+    station = replace(station, quality=replace(station.quality, level=own, behind=other))
+    edges = EdgesOf(np.array([0]), np.ones_like(lost), ~lost)
+    (text,) = words._lost(found.look, station, edges)
+    assert text.startswith("station1: 50% of the edges that ought to be seen are lost")
+    assert said in text
+    assert words._lost(found.look, station, replace(edges, found=np.ones_like(lost))) == []
+
+
+# ------------------------------------------------------------------ pictures
+
+
+def test_pictures_of_all_photographs(found, tmp_path):
+    write_pictures(found.look, tmp_path / "pictures")
+    names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
+    assert names == sorted(picture_names(found.look).values())
+    assert len(names) == sum(station.photographs for station in found.stations)
+    station = found.look.stations[0]
+    width, height = station.photographs.camera.image_size
+    drawn = cv2.imread(str(tmp_path / "pictures" / names[0]))
+    assert drawn.shape == (height + BAR, 2 * width + GAP, 3)
+    # beside the lines the photograph is as it was, and all legs' colours are in it
+    after = drawn[BAR:, width + GAP :]
+    plain = cv2.cvtColor(station.photographs.images[0], cv2.COLOR_GRAY2BGR)
+    assert np.mean(np.any(after != plain, axis=-1)) < 0.2
+    for colour in leg_colours()[:6]:  # thin lines are blended with what they cross
+        assert np.abs(after.astype(int) - colour).max(axis=-1).min() < 60
+
+
+def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
+    """Under its lines the photograph changes; under those by hand, that are off, it does less."""
+    from pkmcal.report.check import overlay, poses_of
+
+    def strength(laid, k):
+        image = station.photographs.images[k].astype(np.float32)
+        slope = np.hypot(cv2.Sobel(image, cv2.CV_32F, 1, 0), cv2.Sobel(image, cv2.CV_32F, 0, 1))
+        slope = cv2.dilate(slope, np.ones((5, 5)))
+        mask = np.zeros(image.shape, np.uint8)
+        for edge in overlay(found.look, station, laid, k)[0]:
+            cv2.polylines(mask, [np.rint(edge.points).astype(np.int32)], False, 255)
+        return float(np.median(slope[mask > 0]))
+
+    for station in found.look.stations:
+        by_hand, after = poses_of(station)
+        assert strength(after, 0) > 1.15 * strength(by_hand, 0)
+
+
+def test_each_number_stands_once_and_apart(found):
+    from pkmcal.report.check import overlay, poses_of
+
+    station = found.look.stations[0]
+    _, spots = overlay(found.look, station, poses_of(station)[-1], 0)
+    numbered = [spot for spot in spots if spot.labelled]
+    assert sorted(spot.leg for spot in numbered) == [1, 2, 3, 4, 5, 6]
+
+
+def test_colours_are_those_of_the_style_sheet():
+    style = Path(pkmcal.report.__file__).with_name("templates") / "style.css"
+    blue, green, red = leg_colours()[0]
+    assert f"--leg1: #{red:02x}{green:02x}{blue:02x}" in style.read_text()
+
+
+def test_a_page_with_pictures(found):
+    part = with_pictures(found.look)
+    assert part.html.count('<svg class="shot"') == 2 * 9
+    assert part.html.count('plain">pose by hand') == part.html.count('plain">pose found') == 9
+    assert "predicted edges" in part.html
+    lost = found.look.stations[0]
+    look = replace(found.look, stations=(replace(lost, quality=None, by_hand=None),))
+    html = with_pictures(look).html
+    assert html.count('<svg class="shot"') == 3
+    assert "best pose found, not recognised" in html
+
+
+def test_the_command_writes_page_and_pictures(alone, tmp_path):
+    done = run("check", alone, "-o", tmp_path / "out", "--pictures", tmp_path / "drawn", "--json")
+    assert done.json["exit_code"] == done.code
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "check.html",
+        "check.json",
+    ]
+    assert len(list((tmp_path / "drawn").iterdir())) == 3
+    assert all(Path(path).exists() for path in done.json["files"].values())
+    page = (tmp_path / "out" / "check.html").read_text()
+    assert "The drawing over the photographs" in page
+    assert "What a full capture would give" in page
+    # again, over the same; but not beside what is somebody's
+    assert run("check", alone, "--pictures", tmp_path / "drawn").code == done.code
+    (tmp_path / "drawn" / "mine.txt").write_text("mine")
+    refused = run("check", alone, "--pictures", tmp_path / "drawn")
+    assert refused.code == 2
+    assert "something other than pictures of a check" in refused.err
+
+
+def test_without_these_options_nothing_is_drawn(alone, monkeypatch):
+    def never(*_):
+        raise AssertionError
+
+    monkeypatch.setattr("pkmcal.report.check.overlay", never)
+    before = sorted(alone.rglob("*"))
+    assert run("check", alone).code < 2
+    assert sorted(alone.rglob("*")) == before
+
+
+def test_pictures_whole_or_not_at_all(found, tmp_path, monkeypatch):
+    monkeypatch.setattr("pkmcal.report.check.BAR", -1)  # fails in the first picture
+    with pytest.raises(ValueError, match="negative"):
+        write_pictures(found.look, tmp_path / "pictures")
+    assert list(tmp_path.iterdir()) == []
