@@ -34,9 +34,9 @@ LEGEND = (
 )
 ONE_LEGEND = (
     "Seen: of its edges, what nothing hides. Found: of these, measured, agreeing",
-    "with the others. Sigma: of an edge, across. Tells: of what all edges tell about",
-    "the machine. Variance: of the platform's position, what comes from its edges:",
-    "where it is large, a better view of that leg gains most.",
+    "with the others. Sigma: of an edge, across. Tells: of what all edges tell",
+    "about the machine. Variance: of the platform's position, what comes from its",
+    "edges: where it is large, a better view of that leg gains most.",
 )
 
 
