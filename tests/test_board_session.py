@@ -32,7 +32,8 @@ from pkmcal.simulation.scene import discs_of
 def rendered(tmp_path_factory):
     """Two stations of four configurations each, by the command; nobody writes into it."""
     folder = tmp_path_factory.mktemp("board") / "session"
-    done = run("simulate", folder, "--board", "--stations", "2", "--configurations", "4")
+    words = ("--board", "--stations", "2", "--configurations", "4", "--size", "800x600")
+    done = run("simulate", folder, *words)
     assert done.code == 0
     return folder
 

@@ -343,10 +343,10 @@ def test_repeats_without_an_edge_in_common_are_no_accuracy():
 # whole sessions
 
 
-def simulated(folder, repeats, shake=(0.0, 0.0), stations=2):
-    settings = Settings(stations=stations, configurations=4, repeats=repeats, shake=shake)
+def simulated(folder, repeats, *, size=(480, 360), **more):
+    settings = Settings(**{"stations": 2, "configurations": 4, "repeats": repeats, **more})
     drawing = load_mechanism("gough-stewart")
-    return rendered(folder, drawing, camera_of_size((480, 360)), settings, seed=5)
+    return rendered(folder, drawing, camera_of_size(size), settings, seed=5)
 
 
 @pytest.fixture(scope="module")
@@ -354,8 +354,8 @@ def repeats(tmp_path_factory):
     return simulated(tmp_path_factory.mktemp("repeats") / "session", 4)
 
 
-def test_the_first_repeat_is_the_photograph_of_a_session_without(repeats, tmp_path):
-    single = simulated(tmp_path / "session", 1)
+def test_the_first_repeat_is_the_photograph_of_a_session_without(tmp_path):
+    single, repeats = (simulated(tmp_path / str(n), n, size=(120, 90)) for n in (1, 4))
     for path in sorted((single / "images" / "station1").iterdir()):
         first = repeats / "images" / "station1" / f"{path.stem}_1.png"
         second = repeats / "images" / "station1" / f"{path.stem}_2.png"
@@ -415,7 +415,8 @@ def test_check_repeat_as_json(repeats):
 
 
 def test_a_shaken_camera_is_told(tmp_path):
-    folder = simulated(tmp_path / "session", 3, (3e-5, 5e-4), stations=1)
+    shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3}
+    folder = simulated(tmp_path / "session", 3, **shaken)
     told = run("check", folder, "--repeat", "--json")
     assert told.code == 1
     (station,) = told.json["repeats"]["stations"]
