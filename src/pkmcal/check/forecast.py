@@ -161,7 +161,7 @@ class _First(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """A capture: pairs (M, 2) of station and configuration, and where all stand."""
+    """A capture: pairs (M, 2) of station and configuration, and where all stand; shading : px."""
 
     machine: Machine
     cameras: tuple[Camera, ...]
@@ -171,6 +171,7 @@ class _Plan(NamedTuple):
     T_base_platform: Array
     joints: Array
     pairs: Integers
+    shading: float
 
 
 class _Told(NamedTuple):
@@ -338,6 +339,7 @@ def _planned(look: Look, first: _First, photographs: int) -> _Plan:
         poses[:wanted],
         readings[:wanted],
         np.array(pairs),
+        first.estimate.statistics.shading,
     )
 
 
@@ -381,7 +383,7 @@ def _told(plan: _Plan, pools: tuple[tuple[_Pool, ...], ...]) -> _Told:
         edges, plan.joints, plan.joint_noise, n_stations, plan.camera_of_station, shaded=True
     )
     gauge = default_gauge(machine)
-    assembled = assemble(machine, measurements, gauge)
+    assembled = assemble(machine, measurements, gauge, shading=plan.shading)
     shift = np.zeros(measurements.n_cameras)
     state = State(machine.values, plan.T_camera_base, plan.T_base_platform, shift)
     problem = assembled.problem

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar, cast
 
 import numpy as np
@@ -14,14 +14,9 @@ from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import EdgeBlocks, EdgeData, Kinds, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.measurements import Measurements
+from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 
-SHADING_SIGMA = 0.03
-"""Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
-before any data. Path-traced photographs of a known machine show 0.02 (and are best fitted without
-it), our own renderer's 0.05; with 0.03 the deviations are right for both, at 3 to 5 % of their
-size."""
 SHIFT_SIGMA = 0.3
 """Standard deviation (px) of a camera's constant edge shift before any data: errata, B."""
 
@@ -81,8 +76,12 @@ def assemble(
     *,
     use_drawing: bool = True,
     radius_prior: bool = True,
+    shading: float = SHADING_SIGMA,
 ) -> Assembled:
-    """The joint problem of one session (B = 1), every edge a block of its own."""
+    """The joint problem of one session (B = 1), every edge a block of its own.
+
+    shading : px, standard deviation of the lines' shading, where an estimate has told it.
+    """
     _check(machine, measurements)
     seen, line = seen_configurations(measurements), _lines(measurements)
     edges = _places(measurements.edges.configuration, seen)
@@ -108,6 +107,7 @@ def assemble(
         camera = np.array([kind == "camera" for kind in kinds])
         target[camera] = np.pad(-measurements.intrinsics_at, ((0, 0), (1, 0))).ravel()
     blocks, data = _edges(machine, measurements, edges, line, seen)
+    data = replace(data, shading=np.full(1, shading))
     pose_blocks, pose_data = _poses(measurements, poses)
     problem = Problem(
         layout=machine.layout,
@@ -243,8 +243,8 @@ def prior_rows(
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
     Without the drawing the frames are free, so the gauge's constraints stand in as rows: they
-    can be met exactly, hence fix the frames and pull on nothing else. Intrinsics stand in units of
-    their prior. on_platform : (M,) mounts.
+    can be met exactly, hence fix the frames and pull on nothing else. Intrinsics and shading stand
+    in units of their prior. on_platform : (M,) mounts.
 
     What is on a platform is as near its start as the machine is large. Where a platform turns about
     one axis, nothing tells along it how high the board sits; its tilt by a tenth of a degree then
@@ -255,7 +255,7 @@ def prior_rows(
     radius = np.array([table.kinds[k] == "radius" for k in first], dtype=bool)
     held = np.flatnonzero((radius & radius_prior) | (~radius & use_drawing))
     optics = np.tile([SHIFT_SIGMA] + [1.0] * (u.n_optics - 1), u.n_cameras)
-    lines = np.full(u.n_lines, SHADING_SIGMA)
+    lines = np.ones(u.n_lines)
     moving = np.flatnonzero(np.zeros(0, dtype=bool) if on_platform is None else on_platform)
     places = (u.mounts.start + 6 * moving[:, None] + [3, 4, 5]).ravel()
     known = (

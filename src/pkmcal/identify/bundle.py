@@ -13,7 +13,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import ResultError
-from pkmcal.identify.assembly import Assembled, assemble, batch_of, state_of
+from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
     Identifiability,
     Information,
@@ -44,7 +44,9 @@ LEAST_SCALE = 1.0
 """The stated noise is never believed to be too large. What moves several edges alike (shading,
 lens) is partly taken up by the parameters, so residuals come out smaller than errors are: scaling
 down by them would promise too much."""
-ROUNDS = 12
+ROUNDS = 30
+SHADING_CHANGE = 0.02
+"""Relative change of the shading's deviation below which it counts as found."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,12 @@ def solve_batch(
     ones: Kinds[Array] = Kinds(np.ones(n_runs), np.ones(n_runs))
     present = (kind.present.astype(float) for kind in problem.kinds)
     every = Kinds(*(np.broadcast_to(p, (n_runs, *p.shape)) for p in present))
+    # Begun with as much as a whole camera's shift may be: a prior that is too narrow would make
+    # outliers of the edges that speak against it.
+    estimates_shading = scale_noise and problem.unknowns.n_lines > 0
+    least = np.broadcast_to(problem.data.shading, (n_runs,))
+    if estimates_shading:
+        problem = problem.shaded(np.full(n_runs, SHIFT_SIGMA))
     fit = _Fit(problem, start, every, ones, np.zeros(n_runs, dtype=int), ())
     if robust:
         found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
@@ -94,12 +102,21 @@ def solve_batch(
         if scale.poses.min() > hopeless:
             fit = fit._replace(scale=scale)
             break
-        weight = fit.weight
+        weight, shading = fit.weight, problem.data.shading
         if robust:
             weight = settled_weights(problem, fit.state, scale)
-        if _settled(scale, fit.scale, weight, fit.weight):
+        if estimates_shading:
+            shading = np.maximum(_shading_sigma(fit), least)
+        found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
+        if found_shading and _settled(scale, fit.scale, weight, fit.weight):
             break
-        fit = _solved(problem, fit._replace(weight=weight, scale=scale), RESTART_DAMPING)
+        state = fit.state
+        if estimates_shading:  # the same shifts in other units
+            units = (problem.data.shading / shading)[:, None]
+            state = replace(state, shading=state.shading * units)
+            problem = problem.shaded(shading)
+        new = fit._replace(state=state, weight=weight, scale=scale)
+        fit = _solved(problem, new, RESTART_DAMPING)
     info = information(fit.problem, fit.state)
     solution = Solution(fit.state, info.cost(), fit.steps, fit.stop)
     return BatchResult(fit.problem, solution, fit.weight, fit.scale, fit.steps, info)
@@ -153,6 +170,20 @@ def _noise_scale(fit: _Fit) -> Kinds[Array]:
         new = scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
         out.append(np.where(freedom > 5, np.maximum(new, LEAST_SCALE), scale))
     return Kinds(*out)
+
+
+def _shading_sigma(fit: _Fit) -> Array:
+    """Standard deviation (B,) px of the lines' shading, by restricted maximum likelihood.
+
+    The fixed point of s^2 = sum of squares of the shifts over the number of them that the data
+    tell: a line counts by what its variance has become less than the prior's (MacKay 1992).
+    """
+    u, problem = fit.problem.unknowns, fit.problem
+    info = information(problem, fit.state)
+    variance = np.diagonal(info.covariance, axis1=-2, axis2=-1)[:, u.shading]
+    told = np.sum(1 - np.minimum(variance, 1.0), axis=1)
+    squares = np.sum(fit.state.shading**2, axis=1)
+    return problem.data.shading * np.sqrt(squares / np.maximum(told, 1e-9))
 
 
 def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:
@@ -209,7 +240,8 @@ def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiab
     unidentified, and of what the drawing knows better than the data.
     """
     machine = estimate.machine
-    assembled = assemble(machine, measurements, default_gauge(machine))
+    shading = estimate.statistics.shading
+    assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
     problem = assembled.trusting(
         Kinds(
             estimate.edge_weights / estimate.statistics.noise_scale**2,
@@ -314,4 +346,5 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
         dof_edges=freedom[0],
         dof_joints=freedom[1],
         dof_poses=freedom[2],
+        shading=float(result.problem.data.shading[0]),
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
+from pkmcal.measurements import SHADING_SIGMA
 from pkmcal.mechanisms import Machine
 
 
@@ -41,7 +42,8 @@ class Statistics:
     stated standard deviations had to be enlarged (or shrunk) to agree with the residuals;
     1 when they were taken as they are. chi2_poses, n_poses : of poses, six numbers of a full one;
     pose_scale : the same factor of theirs. dof_edges, dof_joints, dof_poses : degrees of freedom
-    that each kind of residual has left; their sum and the drawing's is ``dof``.
+    that each kind of residual has left; their sum and the drawing's is ``dof``. shading : px,
+    standard deviation of what the edges of one side of a tube at one station have in common.
     """
 
     chi2: float
@@ -61,6 +63,7 @@ class Statistics:
     dof_edges: float = 0.0
     dof_joints: float = 0.0
     dof_poses: float = 0.0
+    shading: float = SHADING_SIGMA
 
 
 @dataclass(frozen=True)

@@ -98,6 +98,10 @@ class Problem:
             pose_data=replace(self.pose_data, weight=weight.poses),
         )
 
+    def shaded(self, sigma: Array) -> Problem:
+        """The same problem with other standard deviations (B,) px of the lines' shading."""
+        return replace(self, data=replace(self.data, shading=sigma))
+
     def opened(self, state: BatchState) -> tuple[Problem, BatchState]:
         """The same problem and state with every parameter of the machine an unknown of its own.
 
@@ -140,7 +144,7 @@ class Problem:
         edges, poses = self._edges(state, c), self._poses(state)
         value = self._values(state, c, edges, poses)
         blocks, boards = self.blocks, self.pose_blocks
-        lines = [(u.shading, blocks.line, edges.by_optics[..., :1])] if u.n_lines else []
+        lines = [(u.shading, blocks.line, edges.by_line)] if u.n_lines else []
         closures = self._to_free([(c.index[None], c.by_theta[..., None, :])])[..., 0, :]
         by_shared = (
             self._columns(

@@ -28,6 +28,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import EdgeNormals, edge_normal_jacobians
 from pkmcal.geometry.rigid import dot, pose_difference, skew
+from pkmcal.measurements import SHADING_SIGMA
 from pkmcal.mechanisms.closure import LimbEnds, LimbLayout
 
 PERFECT = 1e-6
@@ -99,6 +100,7 @@ class EdgeData:
     the measured normals, less the predicted ones', by the w unknowns of their camera: the edge
     shift (px), then its intrinsics where they are refined (in units of their prior).
     joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale squared.
+    shading : (B,) px by which one unit of a line's shading moves its edges, its standard deviation.
     """
 
     basis: Array
@@ -106,6 +108,7 @@ class EdgeData:
     optics: Array
     joints: Array
     weight: Array
+    shading: Array = field(default_factory=lambda: np.full(1, SHADING_SIGMA))
 
 
 @dataclass(frozen=True)
@@ -132,14 +135,19 @@ class EdgeRows:
         """
         rows = self._whitened(self.normals.n[..., None])
         rows = (rows + self.by_optics @ optics[:, self.blocks.camera, :, None])[..., 0]
-        if shading.shape[-1]:  # a line's shading moves its edges as the camera's shift moves all
-            rows = rows + self.by_optics[..., 0] * shading[:, self.blocks.line, None]
+        if shading.shape[-1]:
+            rows = rows + self.by_line[..., 0] * shading[:, self.blocks.line, None]
         return np.where((self.data.weight == 0)[..., None], 0.0, rows)
 
     @cached_property
     def by_optics(self) -> Array:
-        """By their camera's unknowns, (B or 1, K, G, 2g, w); by their line's shading the first."""
+        """By their camera's unknowns, (B or 1, K, G, 2g, w)."""
         return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ self.data.optics)
+
+    @property
+    def by_line(self) -> Array:
+        """By their line's shading, which moves them as the camera's shift moves all, (..., 1)."""
+        return self.by_optics[..., :1] * self.data.shading[:, None, None, None, None]
 
     @property
     def by_machine(self) -> list[tuple[Integers, Array]]:

@@ -28,7 +28,7 @@ from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState, Name
-from pkmcal.measurements import Measurements
+from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import RANK_TOLERANCE, RESTART_DAMPING, Stop, minimise
 
@@ -39,8 +39,8 @@ UNSCALED = Kinds(1.0, 1.0)
 
 @dataclass(frozen=True)
 class Trust:
-    """How far new data are believed: robust weights (N,) 0..1 of each kind, and factors on its
-    stated noise.
+    """How far new data are believed: robust weights (N,) 0..1 of each kind, factors on its stated
+    noise, and the standard deviation (px) of shading.
 
     Weights come from an estimate whose machine could move: with the machine held, a leg that has
     changed would be taken for an error of its edges, and be let go.
@@ -48,6 +48,7 @@ class Trust:
 
     robust: Kinds[Array]
     scale: Kinds[float] = UNSCALED
+    shading: float = SHADING_SIGMA
 
     @property
     def weights(self) -> Kinds[Array]:
@@ -66,6 +67,7 @@ class Trust:
         return cls(
             Kinds(estimate.edge_weights, estimate.pose_weights),
             Kinds(*(max(pair) for pair in zip(own, scale, strict=True))),
+            estimate.statistics.shading,
         )
 
 
@@ -133,7 +135,8 @@ def hold(
     from a change of the machine. Raises ResultError where the poses are not found.
     """
     still = held_machine(machine, radii=trust is None)
-    assembled = assemble(still, measurements, default_gauge(still))
+    shading = SHADING_SIGMA if trust is None else trust.shading
+    assembled = assemble(still, measurements, default_gauge(still), shading=shading)
     begin = batch_of(still, assembled, replace(start, theta=still.values))
     if trust is None:
         _check_enough(assembled.problem, begin)
@@ -151,7 +154,8 @@ def hold(
     still = still.with_values(problem.theta(state)[0])
     if trust is None or magnified is None:
         return Held(still, assembled.seen, problem, state, ("machine",))
-    problem = assemble(still, magnified, default_gauge(still)).trusting(trust.weights)
+    opened = assemble(still, magnified, default_gauge(still), shading=trust.shading)
+    problem = opened.trusting(trust.weights)
     state = replace(state, optics=np.pad(state.optics, ((0, 0), (0, 0), (0, 1))))
     return Held(still, assembled.seen, problem, state, ("machine", "intrinsics"))
 
