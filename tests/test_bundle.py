@@ -132,6 +132,28 @@ def test_noise_scale_is_found():
         assert np.mean(error / variance) == pytest.approx(1, abs=0.15)
 
 
+def shaded(scene, sigma, rng):
+    """The scene with a shift (px) of its own for each side of a tube at each station."""
+    lines = np.unique(scene.index[[0, 2, 3, 4]], axis=1, return_inverse=True)[1].ravel()
+    shift = sigma * rng.normal(size=(len(scene.theta), lines.max() + 1))
+    return replace(scene, shading=shift[:, lines])
+
+
+@pytest.mark.parametrize("sigma", [0.03, 0.3])
+def test_shading_is_as_large_as_the_edges_say(sigma):
+    """As little as is believed of it, or ten times that, as in hard light on polished metal: it is
+    found, and the deviations are right with either."""
+    rng = np.random.default_rng(8)
+    scene = shaded(make_scene(rng, runs=20, configurations=6, n_stations=2), sigma, rng)
+    assembled, truth = scene.batch(rng)
+    result = solve_batch(assembled.problem, truth)
+    found = result.problem.data.shading
+    assert np.median(found) == pytest.approx(sigma, rel=0.1)
+    error = (result.solution.state.z - truth.z) ** 2
+    variance = np.einsum("bii->bi", result.info.covariance)[:, : error.shape[1]]
+    assert np.mean(error / variance) == pytest.approx(1, abs=0.15)
+
+
 def test_stated_noise_is_kept_when_asked():
     rng = np.random.default_rng(3)
     scene = make_scene(rng)

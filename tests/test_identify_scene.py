@@ -29,7 +29,7 @@ JOINT_NOISE = 3e-6
 class Scene:
     """machine : the drawing. theta (B, P), T_camera_base (S, 4, 4), poses (B, K, 4, 4), joints
     (B, K, 6), edge_shift (B,). index : station, configuration, leg, tube, side, (5, N).
-    normal (B, N, 3), basis (B, N, 3, 2), covariance (N, 2, 2), shift (N, 2)."""
+    normal (B, N, 3), basis (B, N, 3, 2), covariance (N, 2, 2), shift (N, 2). shading (B, N) px."""
 
     machine: Machine
     theta: np.ndarray
@@ -42,6 +42,7 @@ class Scene:
     covariance: np.ndarray
     shift: np.ndarray
     middle: np.ndarray
+    shading: np.ndarray | None = None
 
     def state(self, run: int = 0) -> State:
         return State(
@@ -63,12 +64,14 @@ class Scene:
         )
         joints = self.joints[run] + noise * JOINT_NOISE * rng.normal(size=self.joints[run].shape)
         n = len(self.T_camera_base)
-        return Measurements(edges, joints, JOINT_NOISE, n, np.zeros(n, dtype=int))
+        shaded = self.shading is not None
+        return Measurements(edges, joints, JOINT_NOISE, n, np.zeros(n, dtype=int), shaded=shaded)
 
     def noisy(self, rng, noise: float = 1.0) -> np.ndarray:
         """Normals (B, N, 3) with the edge shift and noise drawn from the covariances."""
         basis = tangent_basis(self.normal, self.middle)
-        move = self.shift * self.edge_shift[:, None, None]
+        pixels = self.edge_shift[:, None] + (0.0 if self.shading is None else self.shading)
+        move = self.shift * pixels[..., None]
         chol = np.linalg.cholesky(self.covariance)
         draw = rng.normal(size=(*self.normal.shape[:2], 2, 1))
         move = move + noise * (chol @ draw)[..., 0]
@@ -99,6 +102,7 @@ class Scene:
         z = (self.theta - self.machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
         stations = np.broadcast_to(self.T_camera_base, (len(z), *self.T_camera_base.shape))
         truth = BatchState(z, stations, self.poses, self.edge_shift[:, None, None])
+        truth = replace(truth, shading=np.zeros((len(z), assembled.problem.unknowns.n_lines)))
         return replace(assembled, problem=problem), truth
 
 

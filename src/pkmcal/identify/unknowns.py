@@ -6,7 +6,8 @@ Shared by all configurations, in this order of columns:
 - **stations** : left perturbation (omega, tau) of each T_camera_base.
 - **optics** : of each camera its edge shift (px), then its intrinsics where they are refined (in
   units of their prior).
-- **shading** : shift (px) of each tube's side at each station, where light gives it one.
+- **shading** : shift of each tube's side at each station, where light gives it one (in units of its
+  standard deviation).
 - **mounts** : left perturbation of each T_mount, of boards and targets.
 
 Each configuration has unknowns of its own besides: the platform's motion (left perturbation of
@@ -97,7 +98,8 @@ def own_blocks(matrix: Array, part: slice, width: int) -> Array:
 class BatchState:
     """Values of the unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
     T_base_platform (B, K, 4, 4), optics (B, C, w), T_mount (B, M, 4, 4) of boards,
-    internal (B, K, n) of articulated platforms, shading (B, n) px, outward, of the lines.
+    internal (B, K, n) of articulated platforms, shading (B, n) of the lines, outward, in units of
+    its standard deviation.
     """
 
     z: Array
