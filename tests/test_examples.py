@@ -29,9 +29,10 @@ def test_a_folder_of_photographs_becomes_a_table(demo):
     assert [row[0] for row in rows] == photographs
     speeds = [[float(v) for v in row[1:7]] for row in rows]
     assert any(any(speed) for speed in speeds)
-    # at the goal itself, hardly anything is left to do
-    largest = [max(map(abs, speed)) for speed in speeds]
-    assert largest[-1] < 0.2 * max(largest)
+    # at the goal itself, hardly anything is left: of what is seen, not of what legs that are hidden
+    # leave to a speed
+    errors = [float(row[7]) for row in rows if row[7] != "nan"]
+    assert errors[-1] < 0.05 * max(errors)
 
 
 def test_what_is_not_in_the_session_is_named(demo):
