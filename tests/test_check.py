@@ -111,13 +111,24 @@ def test_a_station_whose_photographs_are_all_broken(session):
     assert not any(station.recognised for station in found.stations)
 
 
-def test_what_cannot_be_observed_is_told(session):
+def test_a_station_without_a_pose_is_found_anywhere(session):
     text = (session / "session.yaml").read_text()
     start, end = text.index("    pose:"), text.index("  station2:")
     (session / "session.yaml").write_text(text[:start] + text[end:])
     found = check_session(session)
+    assert found.exit_code == 0
+    assert found.stations[0].recognised
+    assert np.isnan(found.stations[0].moved)
+    assert found.stations[0].by_chance < 1e-3
+
+
+def test_what_cannot_be_observed_is_told(session):
+    text = (session / "mechanism.yaml").read_text()
+    lines = [line for line in text.splitlines() if "tubes:" not in line and "radius:" not in line]
+    (session / "mechanism.yaml").write_text("\n".join(lines) + "\n")
+    found = check_session(session)
     assert found.exit_code == 2
-    assert "station1: the station has no rough pose" in texts(found, Level.WRONG)[0]
+    assert "no leg of the drawing has visible cylinders" in texts(found, Level.WRONG)[0]
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,11 @@ from pkmcal.boards.views import Boards, find_boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.observe import legs
-from pkmcal.observe.diagnose import unrecognised
+from pkmcal.observe.diagnose import Seen, mistake
 from pkmcal.observe.images import decode, decode_all
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import FoundStation, StationView, find_station
+from pkmcal.observe.tables import distance_tables
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import label_of
@@ -32,30 +33,10 @@ NEARLY = 2.0
 MOST = 0.5
 """Share of the configurations that the drawing has to reach for the rest to be believed."""
 ALMOST_ALL = 0.9
-NOWHERE = FoundStation(np.eye(4), score=1.0, chance=1.0)
-"""Of a station for whose search there was no start."""
 
 
 def check_observable(session: Session) -> None:
     """What the session's form allows but this observation cannot use."""
-    on_base = session.board_body == "base"
-    joining = [
-        station.name
-        for station in session.stations
-        if "board" in station.observe and station.T_camera_base is not None
-    ]
-    for station in session.stations:
-        # A board on the platform tells where the camera stands; one on the base, from another's.
-        told = "board" in station.observe and (joining or not on_base)
-        if station.T_camera_base is None and not told:
-            raise InputError(
-                "the station has no rough pose",
-                where=f"session.yaml, stations.{station.name}",
-                expected="pose: {position: [x, y, z], look_at: [x, y, z], up: [0, 0, 1]}",
-                next_step="Measure by hand where the camera stands; 10 cm and 10 degrees will do."
-                " Of stations that see one board fixed to the base, one pose is enough; those that"
-                " see one on the platform need none",
-            )
     seen = [station.name for station in session.stations if "legs" in station.observe]
     if seen and not any(leg.tubes for leg in session.machine.document.legs):
         raise InputError(
@@ -75,7 +56,7 @@ def read_photographs(session: Session) -> list[legs.Photographs]:
         labels = [label_of(session.folder, path) for path in paths]
         images = decode_all(paths, station.camera.image_size, labels)
         rows = np.array([p.configuration for p in station.photographs])
-        return legs.photographs_of(number, station.camera, rows, session.joints, images)
+        return legs.Photographs(number, station.camera, rows, session.joints[rows], images)
 
     with ThreadPoolExecutor(WORKERS) as pool:
         return list(pool.map(read, legs_stations(session)))
@@ -167,13 +148,9 @@ def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
 
 @dataclass(frozen=True)
 class Recognition:
-    """Where the search for each station's pose ended.
-
-    rough : the poses it began from, by hand, or through the board from a station that was found.
-    """
+    """Where the search for each station's pose ended."""
 
     views: tuple[StationView, ...]
-    rough: tuple[Array, ...]
     found: tuple[FoundStation, ...]
 
     @property
@@ -195,71 +172,99 @@ def recognise(
     poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``photographs``.
     boards : on the base, give stations without a pose by hand a start, from the stations that were
     found. starts : (S, 4, 4) of all stations where more is known than by hand, NaN where nothing.
+    A station that is not found from there is looked for anywhere.
     """
     boards = boards or Boards()
     machine, tubes = session.machine, tubes_of(session.machine)
-    views = tuple(
-        StationView(machine, p.camera, tubes, p.joints, poses[p.configuration], p.tables)
-        for p in photographs
-    )
+
+    def view(p: legs.Photographs) -> StationView:
+        tables = distance_tables(p.images)
+        return StationView(machine, p.camera, tubes, p.configuration, session.joints, poses, tables)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        views = tuple(pool.map(view, photographs))
     at = [p.station for p in photographs]
-    by_hand = [station.T_camera_base for station in session.stations]
+    known = [station.T_camera_base for station in session.stations]
     if starts is not None:
-        known = zip(by_hand, starts[: len(by_hand)], strict=True)
-        by_hand = [T if T is not None or np.isnan(start).any() else start for T, start in known]
-    found = _searched(views, [by_hand[s] for s in at], rngs)
+        told = zip(known, starts[: len(known)], strict=True)
+        known = [T if T is not None or np.isnan(start).any() else start for T, start in told]
+    found = _searched(views, [known[s] for s in at], [None] * len(at), rngs)
     # Through the board a pose by hand would be off by its angle times the stations' distance, so
     # the rest are searched from where the search has ended with those that were found.
-    good: list[Array | None] = [None] * len(by_hand)
+    good: list[Array | None] = [None] * len(known)
     for s, pose in zip(at, found, strict=True):
         good[s] = pose.T_camera_base if pose and pose.good else None
     ahead = boards.joined(good)
-    retried = [ahead[s] if good[s] is None else None for s in at]
-    again = _searched(views, retried, rngs)
-    # Of a station that is not found, a start is told all the same.
-    through = boards.joined(by_hand)
-    rough = [
-        second if pose and pose.good else through[s]
-        for s, second, pose in zip(at, retried, again, strict=True)
-    ]
-    return Recognition(
-        views,
-        tuple(np.eye(4) if T is None else T for T in rough),
-        tuple(
-            min((end for end in ends if end), key=lambda pose: pose.score, default=NOWHERE)
-            for ends in zip(found, again, strict=True)
-        ),
-    )
+    found = _searched(views, [ahead[s] for s in at], found, rngs)
+    return Recognition(views, tuple(_anywhere(views, found, rngs)))
+
+
+Search = FoundStation | None
 
 
 def _searched(
-    views: tuple[StationView, ...], starts: list[Array | None], rngs: list[np.random.Generator]
-) -> list[FoundStation | None]:
-    """The search from each start that there is."""
+    views: tuple[StationView, ...],
+    starts: list[Array | None],
+    before: Sequence[Search],
+    rngs: list[np.random.Generator],
+) -> list[Search]:
+    """What is found already, and else the search from each start that there is."""
 
     def search(
-        view: StationView, start: Array | None, rng: np.random.Generator
-    ) -> FoundStation | None:
-        return None if start is None else find_station(view, start, rng)
+        view: StationView, start: Array | None, before: Search, rng: np.random.Generator
+    ) -> Search:
+        if start is None or (before and before.good):
+            return before
+        return _better(find_station(view, start, rng), before)
 
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(search, views, starts, rngs))
+        return list(pool.map(search, views, starts, before, rngs))
 
 
-def why_unrecognised(
+def _anywhere(
+    views: tuple[StationView, ...], before: Sequence[Search], rngs: list[np.random.Generator]
+) -> list[FoundStation]:
+    """What is found already, and else the search all round the machine."""
+
+    def search(view: StationView, before: Search, rng: np.random.Generator) -> FoundStation:
+        if before and before.good:
+            return before
+        return _better(find_station(view, None, rng), before)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return list(pool.map(search, views, before, rngs))
+
+
+def _better(one: FoundStation, other: Search) -> FoundStation:
+    if other is None:
+        return one
+    return max(one, other, key=lambda found: (found.good, found.evidence))
+
+
+def mistake_in(
     session: Session,
     photographs: list[legs.Photographs],
     recognition: Recognition,
     rng: np.random.Generator,
-) -> InputError:
-    """The error about the stations that were not recognised; the usual mix-ups are tried."""
-    return unrecognised(
-        [session.stations[p.station].name for p in photographs],
-        list(recognition.views),
-        list(recognition.rough),
-        list(recognition.found),
-        session.joints,
-        [p.configuration for p in photographs],
+) -> InputError | None:
+    """The error about stations that were not recognised, or show something else than the session
+    says: the usual mix-ups are tried.
+    """
+    stations = [session.stations[p.station] for p in photographs]
+    return mistake(
+        [
+            Seen(
+                station.name,
+                [label_of(session.folder, p.path) for p in station.photographs],
+                session.configurations,
+                view,
+                station.T_camera_base,
+                found,
+            )
+            for station, view, found in zip(
+                stations, recognition.views, recognition.found, strict=True
+            )
+        ],
         rng,
     )
 
@@ -279,9 +284,13 @@ def station_poses(
     if photographs:
         rngs = rng.spawn(len(photographs) + 1)
         found = recognise(session, photographs, platform_poses(session), rngs[1:], boards, known)
-        if not found.complete:
-            raise why_unrecognised(session, photographs, found, rngs[0])
+        error = mistake_in(session, photographs, found, rngs[0])
+        if error is not None:
+            raise error
         known[[p.station for p in photographs]] = [pose.T_camera_base for pose in found.found]
+        seen = [None if np.isnan(T).any() else T for T in known[: len(session.stations)]]
+        for k, T in enumerate(boards.joined(seen)):
+            known[k] = known[k] if T is None else T
     return _by_poses(session, boards, known)
 
 
@@ -292,8 +301,9 @@ def known_stations(session: Session, boards: Boards) -> Array:
     given = [station.T_camera_base for station in session.stations]
     given = boards.joined(given) + _tracker_starts(session)
     known = np.stack([np.full((4, 4), np.nan) if T is None else T for T in given])
-    first = known[: len(session.stations)]
-    if boards.body == "base" or not boards.stations or np.isfinite(first).all():
+    lost = np.isnan(known[: len(session.stations), 0, 0])
+    legs_tell = any(lost[k] and k not in boards.stations for k in legs_stations(session))
+    if boards.body == "base" or not boards.stations or legs_tell or not lost.any():
         return known
     return _by_poses(session, boards, known)
 

@@ -28,10 +28,10 @@ from pkmcal.calibration.recognise import (
     check_observable,
     known_stations,
     legs_stations,
+    mistake_in,
     platform_poses,
     recognise,
     station_poses,
-    why_unrecognised,
 )
 from pkmcal.calibration.turns import identify_poses
 from pkmcal.check.advice import advice, forecast_figure, forecast_part
@@ -83,7 +83,8 @@ END = 0.15
 FEW_CONFIGURATIONS = 8
 """Configurations below which standard deviations are large and mistakes go unnoticed."""
 STATION_LEGEND = (
-    "Mismatch: of drawing and pictures, 0 perfect, below 0.34 recognised.",
+    "By chance: the probability that readings other than its own fit a station's photographs as"
+    " well; below 0.001 the machine is recognised. Mismatch: of drawing and pictures, 0 perfect.",
     "Moved: from the pose by hand to the one found. Legs: found in a photograph.",
     "White, black: of the legs' pixels. Blur: of the sharpest edges.",
 )
@@ -131,7 +132,8 @@ class JointCheck:
 
 @dataclass(frozen=True)
 class StationCheck:
-    """One station. mismatch : 0 perfect, 1 nothing fits; NaN where not looked for.
+    """One station. mismatch : 0 perfect, 1 nothing fits; by_chance : probability that wrong
+    readings fit as well; NaN where not looked for.
 
     moved, turned : from the pose by hand to the one found, m and rad. legs : mean number found in
     a photograph. saturated, black : mean shares of the legs' pixels. blur : median, px. board :
@@ -149,6 +151,7 @@ class StationCheck:
     black: float = math.nan
     blur: float = math.nan
     board: BoardCheck | None = None
+    by_chance: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -259,9 +262,12 @@ def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Find
                 rows.append(photo.configuration)
             except InputError as error:
                 findings.append(wrong(error, station.name))
-        whole = legs.photographs_of(
-            number, station.camera, np.array(rows, dtype=int), session.joints, images
-        ) if images else None  # fmt: skip
+        at = np.array(rows, dtype=int)
+        whole = (
+            legs.Photographs(number, station.camera, at, session.joints[at], images)
+            if images
+            else None
+        )
         out.append(whole)
     return out, findings
 
@@ -361,10 +367,8 @@ def _observed(
         looks.append(look)
     stations = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
     look = Look(session, poses, tuple(looks)) if looks else None
-    if found.complete:
-        return _Observed(stations, told, look)
-    why = why_unrecognised(session, whole, found, rngs[0])
-    return _Observed(stations, (wrong(why), *told), look)
+    mistake = mistake_in(session, whole, found, rngs[0])
+    return _Observed(stations, (*([wrong(mistake)] if mistake else []), *told), look)
 
 
 def _station(
@@ -378,9 +382,11 @@ def _station(
     look = StationLook(station.name, photographs, by_hand, pose.T_camera_base, None)
     if not pose.good:
         what = unrecognised_quality(photographs.images, machine.n_legs)
-        return replace(_summary(station, what, recognised=False), mismatch=pose.score), look
+        summary = _summary(station, what, recognised=False)
+        return replace(summary, mismatch=pose.score, by_chance=pose.by_chance), look
     what = quality(photographs, machine, pose.T_camera_base, poses[photographs.configuration])
-    summary = replace(_summary(station, what, recognised=True), mismatch=pose.score)
+    summary = _summary(station, what, recognised=True)
+    summary = replace(summary, mismatch=pose.score, by_chance=pose.by_chance)
     look = replace(look, quality=what)
     if by_hand is None:
         return summary, look
@@ -651,6 +657,7 @@ def _stations_table(found: SessionCheck) -> Table:
         seen = station.recognised and math.isfinite(station.legs)
         cells = (
             str(station.photographs),
+            _number(station.by_chance, "{:.0e}"),
             _number(station.mismatch, "{:.2f}"),
             moved if math.isfinite(station.moved) else "–",
             f"{station.legs:.1f}/{found.n_legs}" if seen else "–",
@@ -659,7 +666,17 @@ def _stations_table(found: SessionCheck) -> Table:
             _number(station.blur, "{:.1f} px"),
         )
         rows.append(Row(station.name, cells, mark=mark))
-    columns = ("Station", "Photos", "Mismatch", "Moved", "Legs", "White", "Black", "Blur")
+    columns = (
+        "Station",
+        "Photos",
+        "By chance",
+        "Mismatch",
+        "Moved",
+        "Legs",
+        "White",
+        "Black",
+        "Blur",
+    )
     return Table("", columns, tuple(rows), " ".join(STATION_LEGEND), legend=STATION_LEGEND)
 
 

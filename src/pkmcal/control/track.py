@@ -22,7 +22,6 @@ from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import Closure, closure
 from pkmcal.observe import profiles
 from pkmcal.observe.legs import Photographs, StationEdges, measure, search
-from pkmcal.observe.stations import DistanceTables
 
 FITS = float(np.deg2rad(5.0))
 """Angle between a leg as seen and as predicted, median over the legs, up to which it is the
@@ -322,9 +321,8 @@ def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> 
         lost = replace(state, found=lines.found)
         return TrackedLegs(lines, lines.found, reasons, state.T_base_platform, False, 0.0, lost)
     closed, first, blur = forward.T_base_platform, np.isnan(state.blur), state.blur
-    no_tables = DistanceTables(np.zeros((1, 1, 1, 1)), 1.0)
     station = np.zeros(1, dtype=int)
-    photograph = Photographs(0, sight.camera, station, readings[None], [image], no_tables)
+    photograph = Photographs(0, sight.camera, station, readings[None], [image])
     predicted = perturb(closed, state.correction)
     searched = not first and _poor(state.found) and not state.searched
     if searched:

@@ -1,110 +1,223 @@
-"""Why no machine was recognised in a station's photographs: the usual mix-ups, tried one by one."""
+"""What is not as the session says: the usual mix-ups, as hypotheses beside the one that was found.
+
+A hypothesis is the same photographs with other readings, other names, or mirrored. It is looked at
+where the machine was found, and where that is not where the user says, there too; only the
+likeliest are searched in full, and named where they explain the photographs better, one by one. A
+machine that was recognised is asked too: with two columns exchanged, four legs in six still fit.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.observe.stations import GOOD_SCORE, FoundStation, StationView, find_station
+from pkmcal.geometry.rigid import pose_difference
+from pkmcal.observe.stations import (
+    FoundStation,
+    StationView,
+    evidence_nearby,
+    evidence_of,
+    find_station,
+    no_better,
+)
 from pkmcal.wording import listed
 
-CLEARLY_BETTER = 0.75
-"""A hypothesis must lower the score to this share of the best other one's to be named."""
-WELL = 0.26
-"""Score below which a station is recognised beyond doubt: two legs mixed up still give 0.29."""
+SURE = 0.01
+"""Probability of its being no better below which a hypothesis replaces the session's word."""
+ELSEWHERE = np.radians(45.0)
+"""Turn from the pose by hand beyond which the machine was found where the user does not see it: a
+machine of three or six equal parts looks the same from there."""
+SEARCHED = 3
+"""Hypotheses, likeliest first, that are searched in full."""
 
 
-def unrecognised(
-    names: list[str],
-    views: list[StationView],
-    rough: list[Array],
-    found: list[FoundStation],
-    all_joints: Array,
-    configurations: list[Integers],
-    rng: np.random.Generator,
-) -> InputError:
-    """The error about stations in whose photographs no leg was recognised.
-
-    names, views, rough, found : by station. all_joints : (K, m) the session's readings.
-    configurations : rows of the readings, by station.
+class Seen(NamedTuple):
+    """A station: its name, the files of its photographs and the names of the session's
+    configurations, its view, pose by hand (4, 4) if there is one, and what was found.
     """
-    bad = [i for i, pose in enumerate(found) if not pose.good]
-    error = _swapped_stations(names, views, rough, bad, rng)
-    worst = max(bad, key=lambda i: found[i].score)
-    # One well recognised station shows that the readings are in order.
-    if error is None and min(pose.score for pose in found) > WELL:
-        rows = configurations[worst]
-        error = _mixed_columns(views[worst], rough[worst], found[worst], all_joints[rows], rng)
-    if error is not None:
+
+    name: str
+    files: list[str]
+    configurations: tuple[str, ...]
+    view: StationView
+    by_hand: Array | None
+    found: FoundStation
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether the machine was found far from where the user says, or not at all."""
+        if not self.found.good or self.by_hand is None:
+            return not self.found.good
+        turn = pose_difference(self.found.T_camera_base, self.by_hand)[:3]
+        return bool(np.linalg.norm(turn) > ELSEWHERE)
+
+
+class Hypothesis(NamedTuple):
+    """What the photographs may show instead, and the error that names it. share : of the
+    photographs that it is about.
+    """
+
+    view: StationView
+    error: InputError
+    share: float = 1.0
+
+
+def mistake(stations: list[Seen], rng: np.random.Generator) -> InputError | None:
+    """The error about stations whose photographs show something else than the session says."""
+    error = _swapped_stations([s for s in stations if s.elsewhere], rng)
+    if error is not None or not stations:
         return error
-    others = [names[i] for i in bad if i != worst]
+    bad = [station for station in stations if not station.found.good]
+    worst = max(stations, key=lambda s: (not s.found.good, s.elsewhere, s.found.by_chance))
+    # one station that is where the user says shows that its readings are in order
+    in_order = any(s.by_hand is not None and not s.elsewhere for s in stations)
+    error = _mixed_up(worst, in_order, rng)
+    if error is not None or not bad:
+        return error
+    others = [station.name for station in bad if station is not worst]
     return InputError(
-        f"the machine is not recognised in the photographs of {names[worst]}"
+        f"the machine is not recognised in the photographs of {worst.name}"
         + (f", nor in those of {listed(others)}" if others else ""),
-        where=f"session.yaml, stations.{names[worst]}",
-        found=f"a mismatch of {found[worst].score:.2f} between the drawing's legs and the picture",
-        expected=f"less than {GOOD_SCORE:g} (0 is perfect, a good session has 0.2)",
-        next_step=(
-            "Check that these photographs show this machine's legs, that the station's pose is"
-            " right to 10 cm and 10 degrees, that each photograph bears the name of its"
-            " configuration, and that the drawing is this machine's"
-        ),
+        where=f"session.yaml, stations.{worst.name}",
+        found=_little(worst.found),
+        expected="one place where its legs lie on edges of the picture far oftener than any"
+        " machine's would",
+        next_step="Check that these photographs show this machine's legs, that each bears the name"
+        " of its configuration, and that the drawing is this machine's"
+        + ("" if worst.by_hand is not None else "; a pose by hand, right to 10 cm, may help"),
     )
 
 
-def _swapped_stations(
-    names: list[str],
-    views: list[StationView],
-    rough: list[Array],
-    bad: list[int],
-    rng: np.random.Generator,
-) -> InputError | None:
-    """Two stations each recognised from the other's pose."""
-    for i, j in combinations(bad, 2):
-        exchanged = (find_station(views[a], rough[b], rng) for a, b in ((i, j), (j, i)))
-        if all(pose.good for pose in exchanged):
+def _little(found: FoundStation) -> str:
+    """What of the evidence is too little."""
+    if found.by_chance < found.limit:
+        return "legs that fit nearly as well at another place"
+    often = f"once in {1 / found.by_chance:.0f} times" if found.by_chance < 0.5 else "as a rule"
+    return f"legs that readings of other configurations fit as well {often}"
+
+
+def _swapped_stations(stations: list[Seen], rng: np.random.Generator) -> InputError | None:
+    """Two stations each recognised near the other's pose."""
+    for one, other in combinations(stations, 2):
+        if one.by_hand is None or other.by_hand is None:
+            continue
+        exchanged = (one._replace(by_hand=other.by_hand), other._replace(by_hand=one.by_hand))
+        exchanged = (s._replace(found=find_station(s.view, s.by_hand, rng)) for s in exchanged)
+        if not any(station.elsewhere for station in exchanged):
             return InputError(
-                f"stations {names[i]} and {names[j]} are mixed up",
+                f"stations {one.name} and {other.name} are mixed up",
                 where="session.yaml, stations",
                 found="the photographs of each fit the pose of the other",
-                next_step=f"Exchange the poses of {names[i]} and {names[j]} in session.yaml,"
+                next_step=f"Exchange the poses of {one.name} and {other.name} in session.yaml,"
                 " or their image folders",
             )
     return None
 
 
-def _mixed_columns(
-    view: StationView, rough: Array, found: FoundStation, joints: Array, rng: np.random.Generator
-) -> InputError | None:
-    """Readings whose columns stand in another order: turned round, or two of them swapped.
-
-    joints : (K, m) the readings of the view's photographs.
-    """
-    count = joints.shape[1]
-    orders = [np.roll(np.arange(count), -r) for r in range(1, count)]
-    orders += [_exchanged(count, a, b) for a, b in combinations(range(count), 2)]
-    scores = [find_station(_with_joints(view, joints[:, o]), rough, rng) for o in orders]
-    best = int(np.argmin([s.score for s in scores]))
-    if not scores[best].good or scores[best].score > CLEARLY_BETTER * found.score:
+def _mixed_up(station: Seen, in_order: bool, rng: np.random.Generator) -> InputError | None:
+    """The hypothesis that explains a station's photographs better than the session, if any."""
+    view, found = station.view, station.found
+    starts = [found.T_camera_base] if found.good or station.by_hand is not None else []
+    if station.elsewhere and station.by_hand is not None:
+        starts.append(station.by_hand)
+    begin = np.array(starts).reshape(-1, 4, 4)
+    own = evidence_nearby(view, begin, station.elsewhere, rng)
+    likely: list[tuple[float, Hypothesis]] = [(np.inf, h) for h in _other_photographs(station)]
+    for other in _hypotheses(station):
+        evidence = evidence_nearby(other.view, begin, station.elsewhere, rng)
+        # where the machine is as the user says, another word has to be better there at once
+        if evidence > own or station.elsewhere:
+            likely.append((evidence, other))
+    best = sorted(likely, key=lambda item: -item[0])[:SEARCHED]
+    searched = [(find_station(h.view, station.by_hand, rng), h) for _, h in best]
+    better = [(f, h) for f, h in searched if _replaces(h, f, station, in_order)]
+    if not better:
         return None
-    return _other_order(orders[best], turned=best < count - 1)
+    better.sort(key=lambda item: -item[0].evidence)
+    first, error = better[0][0], better[0][1].error
+    for other, hypothesis in better[1:]:
+        if no_better(first.evidence - other.evidence, first.spread) > SURE:
+            found_both = f"{error.found}; they fit as well if {hypothesis.error.what}"
+            return InputError(error.what, where=error.where, found=found_both,
+                              next_step=error.next_step)  # fmt: skip
+    return error
 
 
-def _other_order(order: Array, turned: bool) -> InputError:
-    """The error about readings that belong to other legs; order : column of each leg, from 0."""
-    if turned:
-        return InputError(
-            "the legs are numbered differently in the readings and in the drawing",
-            where="joints.csv",
-            found=f"the photographs fit when leg 1 takes the readings of column {order[0] + 1},"
-            f" leg 2 those of column {order[1] + 1}, and so on round",
-            next_step="Give the columns of joints.csv the order of the legs in the drawing",
-        )
-    a, b = np.flatnonzero(order != np.arange(len(order))) + 1
+def _replaces(other: Hypothesis, found: FoundStation, station: Seen, in_order: bool) -> bool:
+    """Whether a hypothesis explains a station better than its own readings. Where these put the
+    camera elsewhere than the user, and no other station shows that they are in order, as well is
+    enough.
+    """
+    if not found.good or station._replace(found=found).elsewhere:
+        return False
+    gain = evidence_of(other.view, found.T_camera_base) - evidence_of(
+        station.view, station.found.T_camera_base
+    )
+    spread = station.found.spread * math.sqrt(other.share)
+    if station.elsewhere and station.found.good and not in_order:
+        return no_better(-float(gain.sum()), spread) > SURE
+    return no_better(float(gain.sum()), spread) < SURE
+
+
+def _hypotheses(station: Seen) -> Iterator[Hypothesis]:
+    """What is tried: columns turned, turned round and exchanged, names shifted; of a station that
+    was not recognised, diameters taken for radii.
+    """
+    view = station.view
+    count = view.all_joints.shape[1]
+    own = np.arange(count)
+    tried = {tuple(own.tolist())}
+    for a, b in combinations(range(count), 2):
+        order = own.copy()
+        order[[a, b]] = b, a
+        tried.add(tuple(order.tolist()))
+        yield Hypothesis(view.with_joints(view.all_joints[:, order]), _two_legs(a + 1, b + 1))
+    turned = [np.roll(own, -r) for r in range(1, count)]
+    for order in turned + [np.roll(own[::-1], r) for r in range(count)]:
+        if tuple(order.tolist()) not in tried:
+            tried.add(tuple(order.tolist()))
+            yield Hypothesis(view.with_joints(view.all_joints[:, order]), _numbering(order))
+    names = view.configuration
+    if 2 < len(names) == len(np.unique(names)):
+        for step in (1, -1):
+            yield Hypothesis(replace(view, configuration=np.roll(names, step)), _shifted(step))
+    if not station.found.good:
+        values = view.machine.values.copy()
+        values[np.unique(view.tubes.radius)] /= 2
+        yield Hypothesis(replace(view, machine=view.machine.with_values(values)), _diameters())
+
+
+def _other_photographs(station: Seen) -> Iterator[Hypothesis]:
+    """Photographs that are mirrored, where the machine was not recognised; where it was, under the
+    names that fit each of them best.
+    """
+    view, T = station.view, station.found.T_camera_base
+    names = view.configuration
+    if not station.found.good:
+        yield Hypothesis(replace(view, tables=view.tables.mirrored()), _mirrored(station.name))
+        return
+    if not 2 < len(names) == len(np.unique(names)):
+        return
+    fits = np.stack(
+        [evidence_of(replace(view, configuration=np.full(len(names), j)), T) for j in names], axis=1
+    )
+    rows, columns = linear_sum_assignment(-fits)
+    moved = rows[rows != columns]
+    if 0 < len(moved) <= len(names) // 2:
+        right = replace(view, configuration=names[columns])
+        error = _misnamed(station, moved, names[columns[moved]])
+        yield Hypothesis(right, error, len(moved) / len(names))
+
+
+def _two_legs(a: int, b: int) -> InputError:
     return InputError(
         f"the readings of legs {a} and {b} are mixed up",
         where="joints.csv",
@@ -114,12 +227,55 @@ def _other_order(order: Array, turned: bool) -> InputError:
     )
 
 
-def _exchanged(count: int, a: int, b: int) -> Integers:
-    order = np.arange(count)
-    order[[a, b]] = order[[b, a]]
-    return order
+def _numbering(order: Integers) -> InputError:
+    """The error about legs numbered otherwise; order : column of each leg, from 0."""
+    rising = bool((order[1] - order[0]) % len(order) == 1)
+    return InputError(
+        "the legs are numbered differently in the readings and in the drawing",
+        where="joints.csv",
+        found=f"the photographs fit when leg 1 takes the readings of column {order[0] + 1},"
+        f" leg 2 those of column {order[1] + 1}, and so on {'round' if rising else 'backwards'}",
+        next_step="Give the columns of joints.csv the order of the legs in the drawing",
+    )
 
 
-def _with_joints(view: StationView, joints: Array) -> StationView:
-    poses = view.machine.forward_result(joints).T_base_platform
-    return replace(view, joints=joints, poses=poses)
+def _shifted(step: int) -> InputError:
+    return InputError(
+        "the photographs are shifted against the readings",
+        where="joints.csv",
+        found="each photograph fits the readings of the configuration"
+        f" {'before' if step > 0 else 'after'} its own",
+        next_step="Look for a row or a photograph that is missing or was taken twice, and name the"
+        " photographs by the readings at which they were taken",
+    )
+
+
+def _misnamed(station: Seen, photographs: Integers, fitting: Integers) -> InputError:
+    """The error about photographs, by number, that fit other rows of the readings."""
+    files = [station.files[k] for k in photographs]
+    fit = [station.configurations[k] for k in fitting]
+    return InputError(
+        f"photographs of {station.name} bear each other's names",
+        where=files[0],
+        found="; ".join(f"{f} fits configuration {c}" for f, c in zip(files, fit, strict=True)),
+        next_step="Give these photographs, or the rows of joints.csv, the right names",
+    )
+
+
+def _mirrored(name: str) -> InputError:
+    return InputError(
+        f"the photographs of {name} are mirrored",
+        where=f"session.yaml, stations.{name}",
+        found="the machine is recognised with left and right exchanged",
+        next_step="Switch mirroring off in the camera or in the program that saved them, or flip"
+        " the photographs and the camera's calibration alike",
+    )
+
+
+def _diameters() -> InputError:
+    return InputError(
+        "the tubes' radii look like diameters",
+        where="mechanism.yaml, tubes",
+        found="the photographs fit with radii half as large",
+        next_step="Divide the radii by 2",
+    )

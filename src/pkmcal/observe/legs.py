@@ -30,7 +30,6 @@ from pkmcal.observe.predict import (
     unobstructed,
 )
 from pkmcal.observe.profiles import EdgeFits, edge_set, fit_edges
-from pkmcal.observe.stations import DistanceTables, distance_tables
 
 REACH = 10.0
 """Pixels to each side that a leg is looked for: 2 mm of drawing error at 0.9 px/mm, several
@@ -178,7 +177,7 @@ class Photographs:
     """One station's decoded photographs.
 
     station : its number. configuration : (K,) rows of the session's joints. joints : (K, m).
-    images : K grey-level arrays (height, width). tables : for the coarse search.
+    images : K grey-level arrays (height, width).
     """
 
     station: int
@@ -186,7 +185,6 @@ class Photographs:
     configuration: Integers
     joints: Array
     images: list[Integers]
-    tables: DistanceTables
 
 
 @dataclass(frozen=True)
@@ -204,14 +202,6 @@ class StationEdges:
     point_edge: Integers
     blur: float
     moved: float
-
-
-def photographs_of(
-    station: int, camera: Camera, configuration: Integers, joints: Array, images: list[Integers]
-) -> Photographs:
-    """Decoded photographs with their distance tables."""
-    tables = distance_tables(images)
-    return Photographs(station, camera, configuration, joints[configuration], images, tables)
 
 
 def search(

@@ -1,19 +1,22 @@
 """Where a station's camera stands: a coarse search for the machine in its photographs.
 
-Photographs are reduced, picture edges found, and for each of a few directions the distance to
-the nearest edge of about that direction is tabulated. A predicted silhouette then scores by the
-distances under its points, smooth enough to be descended from a hundred pixels away. Where a
-station took several photographs, edges that never move are left out: the floor and the wall do
-not say where the machine is.
+From a rough pose many near it are tried at random; of a station without one, places all round the
+machine (:mod:`pkmcal.observe.places`). The best descend by damped steps on the distances of
+predicted silhouettes from picture edges (:mod:`pkmcal.observe.tables`), on more and more
+photographs, with distances cut off ever nearer.
 
-About the rough pose many are tried at random, on a few photographs; the best descend by damped
-steps on the distances, on more and more photographs, with distances cut off ever nearer.
+What was found is weighed. A place on a predicted silhouette has either a picture edge of the
+machine near by, or what chance has put there: a mixture, whose two numbers each hypothesis may
+choose for itself. Its likelihood against chance alone is the evidence, counted by the length of
+the silhouettes. How much evidence photographs yield to any machine, the same search tells with
+readings that are not theirs: those that other photographs of the session bear.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +24,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import cross, dot, inverse, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
+from pkmcal.observe.places import anywhere
 from pkmcal.observe.predict import (
     TubeList,
     edge_points,
@@ -28,170 +32,181 @@ from pkmcal.observe.predict import (
     plane_normals,
     visible_stretch,
 )
+from pkmcal.observe.tables import BIN, DistanceTables, direction_of
 
-DIRECTIONS = 8
-"""Edge directions told apart; each table takes the neighbouring directions in as well."""
-WORKING_WIDTH = 256
-"""Width in pixels that photographs are reduced to: fine enough for a leg's two edges to stay
-apart, coarse enough to search quickly."""
-STILL = 10.0
-"""Grey levels from the station's median photograph within which a place counts as still."""
-ENOUGH_TO_COMPARE = 4
-"""Photographs from which a median is a picture of the background."""
 SEARCH_ANGLE = np.radians(6.0)
 SEARCH_DISTANCE = 0.06
 """Spread (per axis, rad and m) of the poses tried around the user's: its norm over three axes
 is 10 degrees and 10 cm."""
 TRIES = 800
-RETRIES = 400
-GOOD_SCORE = 0.34
-"""Mean truncated distance above which no leg was recognised. Photographs of the machine give 0.2;
-another configuration, station or order of legs 0.36 to 0.6."""
-BY_CHANCE = 0.5
-"""Share of the score by chance that recognised legs stay below. Photographs that are all texture
-score 0.3 anywhere; photographs of a machine score 0.2 where chance has 0.9."""
+FEWER_TRIES = 160
+"""Poses tried where one of thirty hypotheses is looked at."""
+ANYWHERE = 600
+"""Poses from all round the machine that are looked at more closely."""
 FIRST_DAMPING = 1e-3
 """Of a step, relative to the normal equations' diagonal."""
+SHAKEN = 48
+"""Poses beside the best ones that are tried before the last descent."""
 LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
-
-
-@dataclass(frozen=True)
-class DistanceTables:
-    """Distances in reduced pixels, (K, DIRECTIONS, h, w), and the reduction factor."""
-
-    tables: Array
-    scale: float
-
-    def look(
-        self, direction: Integers, pixel: Array, photograph: Integers
-    ) -> tuple[Array, Booleans]:
-        """Distances (reduced px) at full-size pixels (..., 2), and which lie in the photograph.
-
-        direction, photograph : (...) table numbers. Nearest table entry; callers that need a
-        slope look on both sides.
-        """
-        height, width = self.tables.shape[-2:]
-        with np.errstate(invalid="ignore"):
-            place = (pixel + 0.5) / self.scale - 0.5
-            inside = (place[..., 0] >= 0) & (place[..., 0] <= width - 1)
-            inside &= (place[..., 1] >= 0) & (place[..., 1] <= height - 1)
-        x, y = (np.where(inside, np.rint(place[..., i]), 0).astype(np.intp) for i in (0, 1))
-        return self.tables[photograph, direction, y, x], inside
-
-    def look_smooth(
-        self, direction: Integers, pixel: Array, photograph: Integers
-    ) -> tuple[Array, Booleans]:
-        """As :meth:`look`, bilinear between table entries."""
-        height, width = self.tables.shape[-2:]
-        with np.errstate(invalid="ignore"):
-            place = (pixel + 0.5) / self.scale - 0.5
-            inside = (place[..., 0] >= 0) & (place[..., 0] < width - 1)
-            inside &= (place[..., 1] >= 0) & (place[..., 1] < height - 1)
-        place = np.where(inside[..., None], place, 0.0)
-        corner = np.floor(place).astype(np.intp)
-        fx, fy = (place[..., i] - corner[..., i] for i in (0, 1))
-        x, y = corner[..., 0], corner[..., 1]
-        at = self.tables
-        upper = (1 - fx) * at[photograph, direction, y, x]
-        upper = upper + fx * at[photograph, direction, y, x + 1]
-        lower = (1 - fx) * at[photograph, direction, y + 1, x]
-        lower = lower + fx * at[photograph, direction, y + 1, x + 1]
-        return (1 - fy) * upper + fy * lower, inside
-
-
-def direction_of(normal: Array) -> Integers:
-    """Direction number of edges whose image normals are (..., 2); the sign does not matter."""
-    angle = np.arctan2(normal[..., 1], normal[..., 0]) % np.pi
-    number = np.floor(np.nan_to_num(angle) * (DIRECTIONS / np.pi))
-    return number.astype(np.intp) % DIRECTIONS
-
-
-def distance_tables(images: list[Integers]) -> DistanceTables:
-    """Tables of one station's photographs, K arrays (height, width) uint8 of one size."""
-    import cv2
-
-    scale = max(images[0].shape[1] / WORKING_WIDTH, 1.0)
-    size = (round(images[0].shape[1] / scale), round(images[0].shape[0] / scale))
-    small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]
-    still = np.median(np.stack(small), axis=0) if len(small) >= ENOUGH_TO_COMPARE else None
-    return DistanceTables(np.stack([_tables_of(image, still) for image in small]), scale)
-
-
-def _tables_of(image: Any, still: Array | None) -> Array:
-    """Distance tables (DIRECTIONS, h, w) of one reduced photograph."""
-    import cv2
-
-    dx = cv2.Sobel(image, cv2.CV_16S, 1, 0)
-    dy = cv2.Sobel(image, cv2.CV_16S, 0, 1)
-    # weak edges count too: a dark rod before a dark wall differs by a few grey levels
-    edges = cv2.Canny(dx, dy, 40, 80) > 0
-    if still is not None:
-        moving = (np.abs(image - still) > STILL).astype(np.uint8)
-        edges &= cv2.dilate(moving, np.ones((3, 3), np.uint8)) > 0
-    y, x = np.nonzero(edges)
-    number = direction_of(np.stack([dx[y, x], dy[y, x]], axis=-1).astype(np.float32))
-    tables = np.empty((DIRECTIONS, *image.shape), dtype=np.float32)
-    for k in range(DIRECTIONS):
-        near = np.isin(number, [(k - 1) % DIRECTIONS, k, (k + 1) % DIRECTIONS])
-        mask = np.ones(image.shape, dtype=np.uint8)
-        mask[y[near], x[near]] = 0
-        tables[k] = cv2.distanceTransform(mask, cv2.DIST_L2, 3) if near.any() else 1e3
-    return tables
+CHANCES = (6, 12, 24)
+"""Searches with wrong readings, which tell what evidence chance gives: so many, and more where
+these leave it open."""
+DECIDED = 50.0
+"""Times the probability asked for, or part of it, at which it is open no more."""
+FEW_READINGS = 4
+"""Configurations of a session below which its readings are too few to be taken for each other."""
+AWAY = np.repeat([0.2, 0.1], 3)
+"""Turn (rad) and shift (in distances of base and platform) of a platform that is elsewhere."""
+BY_CHANCE, BY_CHANCE_TOLD = 1e-3, 1e-2
+"""Probability of as much evidence by chance, below which the machine is recognised: anywhere, and
+where it was looked for about a pose by hand, which says much the same already."""
+APART = 8.0
+"""Reduced pixels between two hypotheses' silhouettes from which they are not the same place."""
+DOUBT = 0.05
+"""Probability of a second place being as good above which neither is believed."""
 
 
 @dataclass(frozen=True)
 class StationView:
     """What the search looks at: one station's photographs and what should be in them.
 
-    joints : (K, m) and poses : T_base_platform (K, 4, 4) of its photographs.
+    configuration : (K,) rows of the session's readings. all_joints : (M, m) these readings.
+    all_poses : T_base_platform (M, 4, 4) by the drawing.
     """
 
     machine: Machine
     camera: Camera
     tubes: TubeList
-    joints: Array
-    poses: Array
+    configuration: Integers
+    all_joints: Array
+    all_poses: Array
     tables: DistanceTables
+
+    @property
+    def joints(self) -> Array:
+        """Readings (K, m) of the photographs."""
+        return self.all_joints[self.configuration]
+
+    @property
+    def poses(self) -> Array:
+        """Poses (K, 4, 4) of the platform in the photographs."""
+        return self.all_poses[self.configuration]
 
     def few(self, count: int) -> Integers:
         """Numbers of up to ``count`` photographs, spread over all."""
-        n = len(self.joints)
+        n = len(self.configuration)
         return np.unique(np.linspace(0, n - 1, min(count, n)).astype(int))
+
+    def with_joints(self, joints: Array) -> StationView:
+        """The same photographs with other readings (M, m)."""
+        found = self.machine.forward_result(joints).T_base_platform
+        return replace(self, all_joints=joints, all_poses=found)
+
+    def mistaken(self, rng: np.random.Generator) -> StationView:
+        """The same photographs, each with readings that are not its own."""
+        count = len(self.all_joints)
+        if count >= FEW_READINGS:
+            other = rng.integers(1, count, len(self.configuration))
+            return replace(self, configuration=(self.configuration + other) % count)
+        away = rng.normal(size=(len(self.configuration), 6)) * AWAY
+        away[:, 3:] *= np.linalg.norm(self.poses[:, :3, 3], axis=-1, keepdims=True)
+        return replace(
+            self,
+            configuration=np.arange(len(away)),
+            all_joints=self.joints,
+            all_poses=perturb(self.poses, away),
+        )
 
 
 @dataclass(frozen=True)
 class FoundStation:
     """A found pose T_camera_base (4, 4) and its score: 0 perfect, 1 nothing fits.
 
-    chance : the score of legs laid anywhere, low where the photographs are full of edges.
+    evidence : log likelihood against chance, by reduced pixels of silhouette. by_chance :
+    probability of as much without the machine. second : probability that another place is as good.
+    spread : standard deviation of evidence by chance. told : whether it was looked for about a
+    pose that is known.
     """
 
     T_camera_base: Array
     score: float
-    chance: float
+    evidence: float
+    by_chance: float
+    second: float = 0.0
+    spread: float = 1.0
+    told: bool = False
+
+    @property
+    def limit(self) -> float:
+        """What ``by_chance`` must stay below."""
+        return BY_CHANCE_TOLD if self.told else BY_CHANCE
 
     @property
     def good(self) -> bool:
-        """Whether the machine was recognised at all."""
-        return self.score < min(GOOD_SCORE, BY_CHANCE * self.chance)
+        """Whether the machine was recognised, and at one place only."""
+        return self.by_chance < self.limit and self.second < DOUBT
 
 
-def find_station(view: StationView, T_camera_base: Array, rng: np.random.Generator) -> FoundStation:
-    """Refine a rough pose; every photograph of the station takes part."""
-    candidates = _random_search(view, T_camera_base, rng)
-    few, more, every = view.few(4), view.few(8), view.few(len(view.joints))
+def find_station(
+    view: StationView, T_camera_base: Array | None, rng: np.random.Generator
+) -> FoundStation:
+    """The pose near a rough one, or anywhere; every photograph of the station takes part."""
+    few, more, every = view.few(4), view.few(8), view.few(len(view.configuration))
+    if T_camera_base is None:
+        candidates = _anywhere(view, few, ANYWHERE)
+        candidates = _best(view, candidates, few, reach=12, keep=96)
+        candidates = _descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
+        candidates = _best(view, candidates, few, reach=8, keep=24)
+    else:
+        candidates = _random_search(view, T_camera_base, rng)
     candidates = _descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
-    candidates = _best(view, candidates, more, reach=5, keep=4)
-    candidates = _descend(view, candidates, more, 6, (5, 4, 4, 3))
-    candidates = _best(view, candidates, more, reach=3, keep=1)
-    candidates = _descend(view, candidates, every, 8, (3, 2, 2, 1.5, 1.5))
-    chance = np.minimum(view.tables.tables, LAST_REACH).mean() / LAST_REACH
-    last = score(view, candidates, every, reach=LAST_REACH)
-    return FoundStation(candidates[0], float(last[0]), float(chance))
+    candidates = _best(view, candidates, more, reach=5, keep=12)
+    candidates = _descend(view, candidates, more, 5, (5, 4, 4, 3))
+    # the picture is rugged: what lies beside a good place may be better
+    beside = candidates[rng.integers(0, len(candidates), SHAKEN)]
+    spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
+    steps = rng.normal(size=(SHAKEN, 6)) * spread
+    turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
+    candidates = _settled(view, np.concatenate([candidates, turned]), more, 5, 6)
+    evidence = _evidence(view, candidates, more, 5).sum(axis=-1)
+    candidates = candidates[np.argsort(-evidence)]
+    candidates = candidates[_apart(view, candidates, every)[:3]]
+    candidates = _settled(view, candidates, every, 8, 8)
+    evidence = _evidence(view, candidates, every, 8)
+    order = np.argsort(-evidence.sum(axis=-1))
+    order = order[_apart(view, candidates[order], every)]
+    candidates, evidence = candidates[order], evidence[order]
+    # the most evidence leaves no edge out; where hidden ones were taken in, those that lie near
+    # tell the place better
+    best = candidates[:1]
+    nearer = _descend(view, best, every, 8, (5, 4, 3, 2, 2, 1.5, 1.5))
+    ends = np.concatenate([nearer, best])
+    scores = score(view, ends, every, LAST_REACH)
+    by_chance, spread = _chance(view, candidates[:2], more, rng)
+    gain = evidence[0].sum() - evidence[1:].sum(axis=-1).max(initial=-np.inf)
+    second = no_better(float(gain), spread)
+    return FoundStation(
+        T_camera_base=ends[scores.argmin()],
+        score=float(scores.min()),
+        evidence=float(evidence[0].sum()),
+        by_chance=by_chance,
+        second=second,
+        spread=spread,
+        told=T_camera_base is not None,
+    )
 
 
-def _random_search(view: StationView, T_camera_base: Array, rng: np.random.Generator) -> Array:
+def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
+    """Candidates (keep, 4, 4) from all round the machine."""
+    legs = legs_in_camera(view.machine, np.eye(4), view.poses, view.joints)
+    radius = view.machine.values[view.tubes.radius]
+    return anywhere(view.camera, view.tubes, radius, legs, view.tables, few, keep)
+
+
+def _random_search(
+    view: StationView, T_camera_base: Array, rng: np.random.Generator, tries: int = TRIES
+) -> Array:
     """Candidates (16, 4, 4): a wide random draw, then a narrower one around its best."""
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3)
     T_base_camera = inverse(T_camera_base)
@@ -200,10 +215,10 @@ def _random_search(view: StationView, T_camera_base: Array, rng: np.random.Gener
         return inverse(T_base_camera @ pose(rotation(steps[:, :3]), steps[:, 3:]))
 
     few = view.few(4)
-    steps = rng.normal(size=(TRIES, 6)) * spread
+    steps = rng.normal(size=(tries, 6)) * spread
     steps[0] = 0.0
     best = steps[np.argsort(score(view, moved(steps), few, reach=12))[:60]]
-    again = best[rng.integers(0, len(best), RETRIES)]
+    again = best[rng.integers(0, len(best), tries // 2)]
     steps = np.concatenate([best, again + rng.normal(size=again.shape) * (0.45 * spread)])
     order = np.argsort(score(view, moved(steps), few, reach=10))[:16]
     return moved(steps[order])
@@ -214,6 +229,28 @@ def _best(
 ) -> Array:
     order = np.argsort(score(view, candidates, photographs, reach))
     return candidates[order[:keep]]
+
+
+def _apart(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
+    """Of candidates (H, 4, 4), best first, those that are not the same place as a better one."""
+    pixel = np.stack(
+        [
+            edge_points(
+                view.machine,
+                view.camera,
+                legs_in_camera(view.machine, T, view.poses[photographs], view.joints[photographs]),
+                view.tubes,
+                2,
+            ).pixel
+            for T in candidates
+        ]
+    )
+    kept: list[int] = []
+    for h in range(len(candidates)):
+        off = np.sqrt(np.nansum((pixel[kept] - pixel[h]) ** 2, axis=-1)) / view.tables.scale
+        if all(np.nanmedian(other) > APART for other in off):
+            kept.append(h)
+    return kept
 
 
 def score(
@@ -241,21 +278,39 @@ def score(
     direction = direction_of(np.stack([-chord[..., 1], chord[..., 0]], axis=-1))
     fraction = (np.arange(samples) + 0.5) / samples
     points = pixel[..., :1, :] + fraction[:, None] * chord[..., None, :]
-    number = np.arange(len(view.joints))[photographs][:, None, None]
+    number = np.arange(len(view.configuration))[photographs][:, None, None]
     found, inside = view.tables.look(direction[..., None], points, number)
     cost = np.where(inside & ok[..., None], np.minimum(found, reach) / reach, 1.0)
     weight = np.nan_to_num(np.sqrt(dot(chord, chord)))
-    return np.sum(cost.mean(axis=-1) * weight, axis=(1, 2)) / np.sum(weight, axis=(1, 2))
+    total = np.maximum(np.sum(weight, axis=(1, 2)), 1e-9)
+    return np.sum(cost.mean(axis=-1) * weight, axis=(1, 2)) / total
+
+
+class _Mixture(NamedTuple):
+    """What a hypothesis says of the distances found, (H,): the share that chance has put there, and
+    the standard deviation (reduced px) of the rest.
+    """
+
+    share: Array
+    sigma: Array
+
+    def ratio(self, found: Array, chance: Array) -> Array:
+        """Density of distances (H, n) on the machine's edges, of those that chance gives."""
+        sigma = self.sigma[:, None]
+        return np.sqrt(2 / np.pi) / sigma * np.exp(-0.5 * (found / sigma) ** 2) / chance
 
 
 class _Look(NamedTuple):
     """The picture under predicted edges, (H, n): distance found and whether in the image; the
-    distance's derivatives by the camera frame's motion (H, n, 6).
+    distance's derivatives by the camera frame's motion (H, n, 6); density of such distances by
+    chance; reduced pixels of silhouette for which each place stands.
     """
 
     found: Array
     inside: Booleans
     jac: Array
+    chance: Array
+    length: Array
 
     def weight(self, reach: float) -> Array:
         """Geman-McClure: what is further than the reach is another edge."""
@@ -266,13 +321,35 @@ class _Look(NamedTuple):
         part = (self.found / reach) ** 2
         return np.where(self.inside, part / (1 + part), 1.0).mean(axis=-1)
 
+    def mixture(self, mixture: _Mixture, rounds: int = 3) -> _Mixture:
+        """The likeliest mixture, from another on (expectation and maximisation)."""
+        for _ in range(rounds):
+            own = self.length * self.own(mixture)
+            total = np.maximum(np.sum(self.length * self.inside, axis=-1), 1e-9)
+            share = np.clip(1 - own.sum(axis=-1) / total, 0.01, 0.99)
+            square = np.sum(own * self.found**2, axis=-1) / np.maximum(own.sum(axis=-1), 1e-9)
+            mixture = _Mixture(share, np.clip(np.sqrt(square), BIN, LAST_REACH))
+        return mixture
+
+    def own(self, mixture: _Mixture) -> Array:
+        """Probability (H, n) of each place's edge being the machine's."""
+        own = (1 - mixture.share[:, None]) * mixture.ratio(self.found, self.chance)
+        return np.where(self.inside, own / (own + mixture.share[:, None]), 0.0)
+
+    def evidence(self, mixture: _Mixture) -> Array:
+        """Log likelihood (H, n) of each place against chance."""
+        share = mixture.share[:, None]
+        gain = np.log((1 - share) * mixture.ratio(self.found, self.chance) + share)
+        return np.where(self.inside, self.length * gain, 0.0)
+
     def where(self, better: Booleans, other: _Look) -> _Look:
         """Take some of the hypotheses from here, the rest from the other look."""
         keep = better[:, None]
         return _Look(
-            np.where(keep, self.found, other.found),
-            np.where(keep, self.inside, other.inside),
-            np.where(keep[..., None], self.jac, other.jac),
+            *(
+                np.where(keep[..., None] if mine.ndim == 3 else keep, mine, its)
+                for mine, its in zip(self, other, strict=True)
+            )
         )
 
 
@@ -290,7 +367,7 @@ def _descend(
     look = _look(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
     for reach in reaches:
-        trial = _step(candidates, look, reach, damping)
+        trial = _step(candidates, look, look.weight(reach), damping)
         seen = _look(view, trial, photographs, samples)
         better = seen.cost(reach) < look.cost(reach)
         candidates = np.where(better[:, None, None], trial, candidates)
@@ -299,9 +376,92 @@ def _descend(
     return candidates
 
 
+def _settled(
+    view: StationView, candidates: Array, photographs: Integers, samples: int, steps: int
+) -> Array:
+    """The same to the most evidence: how far edges scatter is learnt on the way."""
+    look = _look(view, candidates, photographs, samples)
+    damping = np.full(len(candidates), FIRST_DAMPING)
+    mixture = _first_mixture(len(candidates))
+    for _ in range(steps):
+        mixture = look.mixture(mixture)
+        trial = _step(candidates, look, look.length * look.own(mixture), damping)
+        seen = _look(view, trial, photographs, samples)
+        better = seen.evidence(mixture).sum(axis=-1) > look.evidence(mixture).sum(axis=-1)
+        candidates = np.where(better[:, None, None], trial, candidates)
+        look = seen.where(better, look)
+        damping = np.where(better, 0.3, 10.0) * damping
+    return candidates
+
+
+def _first_mixture(count: int) -> _Mixture:
+    return _Mixture(np.full(count, 0.5), np.full(count, LAST_REACH / 2))
+
+
+def _evidence(view: StationView, candidates: Array, photographs: Integers, samples: int) -> Array:
+    """Evidence (H, K) of candidates (H, 4, 4) in each photograph."""
+    look = _look(view, candidates, photographs, samples)
+    mixture = look.mixture(_first_mixture(len(candidates)), rounds=10)
+    return look.evidence(mixture).reshape(len(candidates), len(photographs), -1).sum(axis=-1)
+
+
+def evidence_of(view: StationView, T_camera_base: Array) -> Array:
+    """Evidence (K,) of a pose (4, 4) in each photograph."""
+    return _evidence(view, T_camera_base[None], view.few(len(view.configuration)), 8)[0]
+
+
+def evidence_nearby(
+    view: StationView, starts: Array, wide: bool, rng: np.random.Generator
+) -> float:
+    """What a short search from poses (H, 4, 4) finds in a few photographs; from none, anywhere.
+
+    wide : look about the starts first, as about a pose by hand.
+    """
+    few = view.few(4)
+    if not len(starts):
+        starts = _best(view, _anywhere(view, few, FEWER_TRIES), few, reach=12, keep=16)
+    elif wide:
+        tried = [_random_search(view, T, rng, FEWER_TRIES)[:8] for T in starts]
+        starts = np.concatenate(tried)
+    starts = _descend(view, starts, few, 4, (12, 10, 8, 6, 5))
+    starts = _settled(view, _best(view, starts, few, reach=5, keep=8), few, 4, 3)
+    return float(_evidence(view, starts, few, 5).sum(axis=-1).max())
+
+
+def no_better(gain: float, spread: float) -> float:
+    """Probability that evidence gained is chance, which scatters by ``spread``."""
+    return 0.5 * math.erfc(gain / spread / math.sqrt(2))
+
+
+def _chance(
+    view: StationView, candidates: Array, photographs: Integers, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Probability of as much evidence as the first candidate's without the machine, and the spread
+    of such evidence: by Student's distribution of what the same photographs give to wrong readings,
+    from the same candidates on.
+    """
+    from scipy.special import stdtr
+
+    found = _evidence(view, candidates[:1], photographs, 5).sum()
+    chance: list[float] = []
+    probability, spread = 1.0, 1.0
+    while len(chance) < CHANCES[-1]:
+        wrong = view.mistaken(rng)
+        moved = _descend(wrong, candidates, photographs, 4, (10, 8, 6, 5))
+        moved = _settled(wrong, moved, photographs, 4, 3)
+        chance.append(_evidence(wrong, moved, photographs, 5).sum(axis=-1).max())
+        if len(chance) in CHANCES:
+            spread = max(float(np.std(chance, ddof=1)), 1.0)
+            away = (np.mean(chance) - found) / (spread * np.sqrt(1 + 1 / len(chance)))
+            probability = float(stdtr(len(chance) - 1, away))
+            if not BY_CHANCE / DECIDED < probability < BY_CHANCE * DECIDED:
+                break
+    return probability, spread
+
+
 def _look(view: StationView, candidates: Array, photographs: Integers, samples: int) -> _Look:
     """Distances under the edges predicted from poses (H, 4, 4)."""
-    number = np.arange(len(view.joints))[photographs][:, None, None]
+    number = np.arange(len(view.configuration))[photographs][:, None, None]
     legs = legs_in_camera(
         view.machine, candidates[:, None], view.poses[photographs], view.joints[photographs]
     )
@@ -316,15 +476,26 @@ def _look(view: StationView, candidates: Array, photographs: Integers, samples: 
     # the pixel moves outward by across . (omega x P + tau) for a motion of the camera frame
     motion = np.concatenate([cross(points.point, points.across), points.across], axis=-1)
     jac = np.where(inside[..., None], slope[..., None] * motion / view.tables.scale, 0.0)
+    found = np.where(inside, found, 0.0)
+    chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
+    length = np.nan_to_num(np.sqrt(dot(chord, chord)) / (view.tables.scale * (samples - 1)))
+    length = np.broadcast_to(length[..., None], found.shape)
     flat = (len(candidates), -1)
     return _Look(
-        np.where(inside, found, 0.0).reshape(flat), inside.reshape(flat), jac.reshape(*flat, 6)
+        found.reshape(flat),
+        inside.reshape(flat),
+        jac.reshape(*flat, 6),
+        view.tables.by_chance(direction, found).reshape(flat),
+        length.reshape(flat),
     )
 
 
-def _step(candidates: Array, look: _Look, reach: float, damping: Array) -> Array:
-    """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4); damping (H,)."""
-    weighted = (look.jac * look.weight(reach)[..., None]).mT
+def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Array:
+    """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4).
+
+    weight : (H, n) of the places. damping : (H,).
+    """
+    weighted = (look.jac * weight[..., None]).mT
     normal = weighted @ look.jac
     diagonal = np.einsum("hii->hi", normal) + 1e-12
     normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)

@@ -192,8 +192,10 @@ def parts_of(
         held = own @ np.linalg.lstsq(own[mask], flat[mask], rcond=LOOSE)[0]
         rate = np.linalg.norm((flat - held).reshape(len(items), -1), axis=1)
         stay.append(rate < 0.05 * rate.max())
-    first = next(s for s in stay if not s.all())
-    other = next(s for s, frame in zip(stay, seen, strict=True) if (frame & ~first).any())
+    first = next((s for s in stay if not s.all()), np.zeros(len(items), dtype=bool))
+    # where one frame holds nearly all, no other may look beyond it
+    beyond = (s for s, frame in zip(stay, seen, strict=True) if (frame & ~first).any())
+    other = next(beyond, ~first)
     return first & ~other, other & ~first
 
 

@@ -1,0 +1,235 @@
+"""Where a camera could stand of which nothing is said: places all round the machine, all turns.
+
+A central camera sees rays. From a place, the parts of the machine that its joints move spread over
+a part of the sphere about the camera: its middle tells where the camera must look, its width how
+far away it stands. Both are seen in photographs of several configurations without knowing what
+moves there. So of six unknowns four are tried, place by place on a sphere about the machine and
+turn by turn about the line of sight, and two nearly follow. A camera in the midst of the legs is
+the same case: there the sphere is small.
+
+All that is compared on a chart: angles from the middle of what moves, in units of its width. Turns
+are turns of the chart and a wrong line of sight a shift of it, whatever the lens or mirror, so a
+million hypotheses are looked up in a table of some ten thousand cells.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.cameras import Camera
+from pkmcal.geometry.rigid import dot, pose, rotation
+from pkmcal.observe.predict import LegsInCamera, TubeList, visible_stretch
+from pkmcal.observe.tables import DIRECTIONS, DistanceTables, direction_of, distances
+
+PLACES = 642
+"""Directions from the machine to the camera: 8 degrees apart."""
+TURNS = 24
+"""Turns about the line of sight: 15 degrees apart."""
+NEAREST, FURTHEST = 0.05, 30.0
+"""Distances from the machine's middle that are tried, in its own sizes."""
+DISTANCES = 28
+POINTS = 160
+"""Points of the legs, in all configurations, whose spread is looked at."""
+WIDER = (0.9, 1.2, 1.6)
+"""How much wider what moves may look than the legs do: shadows and cables move too."""
+HALF = 40
+"""Cells of the chart from its middle to its border."""
+COVER = 3.0
+"""Widths of what moves from the chart's middle to its border."""
+REACH = 10
+"""Cells at which distances on the chart are cut off."""
+SHIFTS = np.stack(np.meshgrid(*[np.arange(-8, 9, 4)] * 2), axis=-1).reshape(-1, 2)
+"""Cells by which the line of sight may be off."""
+ALONG = np.array([0.05, 0.35, 0.65, 0.95])
+"""Places along a leg's visible part between which its chords lie."""
+LONGEST = COVER * HALF
+"""Cells that a chord counts for at most: from near by, a leg fills the sphere."""
+
+
+class Spread(NamedTuple):
+    """What moves, on the sphere about the camera: unit middle (..., 3) and width (...), rad."""
+
+    middle: Array
+    width: Array
+
+
+def anywhere(
+    camera: Camera,
+    tubes: TubeList,
+    radius: Array,
+    legs: LegsInCamera,
+    tables: DistanceTables,
+    photographs: Integers,
+    keep: int,
+) -> Array:
+    """The likeliest poses T_camera_base (keep, 4, 4), best first, with nothing known of any.
+
+    legs : of all configurations in the base frame, (K, L). radius : (E,) m of the tubes. tables :
+    of the same K photographs, of which ``photographs`` are looked at.
+    """
+    seen = _seen_spread(camera, tables)
+    frame = _frame(seen.middle)
+    places, spread = _places(tubes, radius, legs, float(seen.width))
+    chart = _chart_tables(camera, tables, photographs, frame, float(seen.width))
+    scores = _scores(chart, places, spread, tubes, legs, photographs, float(seen.width))
+    best = np.argpartition(scores.ravel(), keep)[:keep]
+    best = best[np.argsort(scores.ravel()[best])]
+    place, turn, shift = np.unravel_index(best, scores.shape)
+    # the camera looks `off` away from the middle of what it sees, and is turned about that line
+    off = SHIFTS[shift] * (COVER / HALF * float(seen.width))
+    zero = np.zeros(len(best))
+    tilt = rotation(np.stack([-off[:, 1], off[:, 0], zero], axis=-1))
+    roll = rotation(np.stack([zero, zero, 2 * np.pi / TURNS * turn], axis=-1))
+    rot = frame.T @ tilt @ roll @ _frame(spread.middle[place])
+    return pose(rot, -(rot @ places[place][..., None])[..., 0])
+
+
+def _seen_spread(camera: Camera, tables: DistanceTables) -> Spread:
+    """What moves in the photographs."""
+    y, x = np.nonzero(tables.moving)
+    corner = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
+    pixel = (np.stack([x, y], axis=-1)[:, None] + corner + 0.5) * tables.scale - 0.5
+    rays = camera.ray(pixel)
+    ok = np.isfinite(rays).all(axis=(1, 2))
+    rays, share = rays[ok], tables.moving[y[ok], x[ok]]
+    area = np.cross(rays[:, 1] - rays[:, 0], rays[:, 2] - rays[:, 0])
+    return _spread(rays[:, 0], share * np.sqrt(dot(area, area)))
+
+
+def _spread(rays: Array, weight: Array) -> Spread:
+    """Of rays (..., n, 3), not all of unit weight (..., n)."""
+    mean = np.sum(weight[..., None] * rays, axis=-2)
+    mean /= np.maximum(weight.sum(axis=-1), 1e-300)[..., None]
+    length = np.sqrt(dot(mean, mean))
+    middle = np.where(length[..., None] > 0, mean, [0.0, 0.0, 1.0])  # nothing moves: anywhere
+    middle = middle / np.sqrt(dot(middle, middle))[..., None]
+    return Spread(middle, np.arccos(np.clip(length, 0.0, 1 - 1e-9)))
+
+
+def _places(
+    tubes: TubeList, radius: Array, legs: LegsInCamera, width: float
+) -> tuple[Array, Spread]:
+    """Places (P, 3) in the base frame from which what moves looks about as wide as it is seen, and
+    how it looks from there.
+    """
+    one = np.flatnonzero(tubes.side == 0)
+    a, b, u = (v[:, tubes.leg] for v in (legs.a, legs.b, legs.u))
+    first, last = visible_stretch(a, b, tubes)
+    a, u, first, last = a[:, one], u[:, one], first[one], last[:, one]
+    length = np.maximum(last - first, 0.0)
+    quarter = (np.arange(4) + 0.5) / 4
+    point = (
+        a[:, :, None] + (first[:, None] + length[..., None] * quarter)[..., None] * u[:, :, None]
+    )
+    # a place is seen to move as far as it leaves where it was covered before
+    away = point - np.median(point, axis=0)
+    wide = 2 * radius[one][:, None]
+    moves = np.minimum(np.sqrt(dot(away, away)) / wide, 1.0)
+    if not moves.any():
+        moves = np.ones_like(moves)  # one configuration: what has edges stands for what moves
+    weight = (moves * wide * length[..., None]).ravel()
+    point = point.reshape(-1, 3)
+    centre = weight @ point / weight.sum()
+    size = np.sqrt(weight @ dot(point - centre, point - centre) / weight.sum())
+    few = np.linspace(0, len(point) - 1, min(len(point), POINTS)).astype(int)
+    point, weight = point[few], weight[few]
+    k = np.arange(PLACES) + 0.5  # Fibonacci's lattice
+    z, angle = 1 - 2 * k / PLACES, np.pi * (1 + np.sqrt(5)) * k
+    flat = np.sqrt(1 - z * z)
+    direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=-1)
+    distance = size * np.geomspace(NEAREST, FURTHEST, DISTANCES)
+    place = centre + direction[:, None] * distance[:, None]
+    ray = point - place[:, :, None]
+    square = dot(ray, ray)
+    spread = _spread(ray / np.sqrt(square)[..., None], weight / square)
+    nearest = [
+        np.abs(np.log(spread.width) - np.log(width / wider)).argmin(axis=1) for wider in WIDER
+    ]
+    at = np.concatenate([np.arange(PLACES)] * len(WIDER)), np.concatenate(nearest)
+    return place[at], Spread(spread.middle[at], spread.width[at])
+
+
+def _frame(middle: Array) -> Array:
+    """Rotations (..., 3, 3) from the frame of unit vectors (..., 3) to one whose z they are."""
+    other = np.where(np.abs(middle[..., 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    x = np.cross(other, middle)
+    x /= np.sqrt(dot(x, x))[..., None]
+    return np.stack([x, np.cross(middle, x), middle], axis=-2)
+
+
+def _on_chart(rays: Array, width: float) -> Array:
+    """Cells (..., 2) of unit rays (..., 3) in the chart's frame, from its middle."""
+    away = np.sqrt(rays[..., 0] ** 2 + rays[..., 1] ** 2)
+    angle = np.arctan2(away, rays[..., 2])
+    return rays[..., :2] * (angle / np.maximum(away, 1e-12) * (HALF / COVER / width))[..., None]
+
+
+def _chart_tables(
+    camera: Camera, tables: DistanceTables, photographs: Integers, frame: Array, width: float
+) -> Integers:
+    """Distance tables (K, DIRECTIONS, n, n) uint8 on the chart, of some photographs."""
+    n = 2 * HALF + 1
+    out = []
+    for k in photographs:
+        edges = tables.edges[k]
+        along = np.stack([-edges.normal[:, 1], edges.normal[:, 0]], axis=-1) / 2
+        ends = edges.pixel[:, None] + np.stack([-along, along], axis=1)
+        rays = camera.ray((ends + 0.5) * tables.scale - 0.5)
+        cell = _on_chart(rays[np.isfinite(rays).all(axis=(1, 2))] @ frame.T, width)
+        chord = cell[:, 1] - cell[:, 0]
+        number = direction_of(np.stack([-chord[:, 1], chord[:, 0]], axis=-1))
+        middle = np.rint(cell.mean(axis=1)).astype(int) + HALF
+        inside = ((middle >= 0) & (middle < n)).all(axis=1)
+        out.append(distances(middle[inside], number[inside], (n, n)))
+    return np.rint(np.minimum(np.stack(out), REACH)).astype(np.uint8)
+
+
+def _scores(
+    chart: Integers,
+    places: Array,
+    spread: Spread,
+    tubes: TubeList,
+    legs: LegsInCamera,
+    photographs: Integers,
+    width: float,
+) -> Array:
+    """Mean distance (P, TURNS, SHIFTS), in cells, of all legs' chords from edges so directed."""
+    leg = np.unique(tubes.leg)
+    a, b, u = (v[photographs][:, leg] for v in (legs.a, legs.b, legs.u))
+    low = np.array([tubes.start[tubes.leg == j].min() for j in leg])
+    high = np.array([tubes.stop[tubes.leg == j].max() for j in leg])
+    high = np.minimum(high, np.sqrt(dot(b - a, b - a)))
+    along = low[:, None] + (high - low)[..., None] * ALONG
+    point = (a[:, :, None] + along[..., None] * u[:, :, None]).reshape(-1, 3)
+    ray = point - places[:, None]
+    ray /= np.sqrt(dot(ray, ray))[..., None]
+    cell = _on_chart(ray @ _frame(spread.middle).mT, width)
+    cell = cell.reshape(len(places), -1, len(ALONG), 2)
+    chord = np.diff(cell, axis=-2).reshape(len(places), -1, 2)
+    middle = ((cell[..., 1:, :] + cell[..., :-1, :]) / 2).reshape(len(places), -1, 2)
+    normal = np.arctan2(chord[..., 1], chord[..., 0]) + np.pi / 2
+    weight = np.minimum(np.sqrt(dot(chord, chord)), LONGEST)
+    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    photograph = np.repeat(np.arange(len(chart)), chord.shape[1] // len(chart))
+    # beyond the chart nothing is near; what lies further still is taken to its border
+    border = REACH
+    limit = HALF + border - np.abs(SHIFTS).max() - 1
+    padded = np.pad(chart, ((0, 0), (0, 0), (border, border), (border, border)), "constant",
+                    constant_values=REACH)  # fmt: skip
+    n = padded.shape[-1]
+    flat, shift = padded.ravel(), SHIFTS[:, 1] * n + SHIFTS[:, 0]
+    out = np.empty((len(places), TURNS, len(SHIFTS)), dtype=np.float32)
+    for turn in range(TURNS):
+        angle = 2 * np.pi * turn / TURNS
+        turned = middle @ np.array(
+            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        )
+        at = np.clip(np.rint(turned), -limit, limit).astype(np.intp) + HALF + border
+        number = np.floor(((normal + angle) % np.pi) * (DIRECTIONS / np.pi)).astype(np.intp)
+        cells = ((photograph * DIRECTIONS + number % DIRECTIONS) * n + at[..., 1]) * n + at[..., 0]
+        for s, step in enumerate(shift):
+            out[:, turn, s] = np.einsum("pn,pn->p", flat[cells + step], weight)
+    return out

@@ -1,0 +1,201 @@
+"""Picture edges of one station's photographs, ready to be looked up: how far is the nearest?
+
+Photographs are reduced, picture edges found, and for each of a few directions the distance to
+the nearest edge of about that direction is tabulated. A predicted silhouette then scores by the
+distances under its points, smooth enough to be descended from a hundred pixels away. Where a
+station took several photographs, edges that never move are left out: the floor and the wall do
+not say where the machine is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+
+DIRECTIONS = 8
+"""Edge directions told apart; each table takes the neighbouring directions in as well."""
+WORKING_WIDTH = 256
+"""Width in pixels that photographs are reduced to: fine enough for a leg's two edges to stay
+apart, coarse enough to search quickly."""
+STILL = 5.0
+"""Levels from the station's median photograph within which a place counts as still."""
+ENOUGH_TO_COMPARE = 4
+"""Photographs from which a median is a picture of the background."""
+CANNY = (20, 40)
+"""Sobel slopes from which an edge goes on and begins: five times what the noise of a level, that a
+reduced photograph has at most, makes of it; from half of that to the double, little changes."""
+FURTHEST = 32.0
+"""Reduced pixels beyond which distances are not told apart."""
+BIN = 0.5
+"""Reduced pixels of a bin of the distances that chance gives."""
+
+
+class PictureEdges(NamedTuple):
+    """Edge points of one reduced photograph: pixel (n, 2), reduced px, and unit normal (n, 2)."""
+
+    pixel: Array
+    normal: Array
+
+
+@dataclass(frozen=True)
+class DistanceTables:
+    """Distances in reduced pixels, (K, DIRECTIONS, h, w), and the reduction factor.
+
+    edges : of each photograph. moving : (h, w) share of the photographs in which each place differs
+    from the others; where a single one cannot tell, where it has edges. chance : (DIRECTIONS,
+    bins) of BIN: how often a place taken anywhere has that distance.
+    """
+
+    tables: Array
+    scale: float
+    edges: tuple[PictureEdges, ...]
+    moving: Array
+    chance: Array
+
+    def look(
+        self, direction: Integers, pixel: Array, photograph: Integers
+    ) -> tuple[Array, Booleans]:
+        """Distances (reduced px) at full-size pixels (..., 2), and which lie in the photograph.
+
+        direction, photograph : (...) table numbers. Nearest table entry; callers that need a
+        slope look on both sides.
+        """
+        height, width = self.tables.shape[-2:]
+        with np.errstate(invalid="ignore"):
+            place = (pixel + 0.5) / self.scale - 0.5
+            inside = (place[..., 0] >= 0) & (place[..., 0] <= width - 1)
+            inside &= (place[..., 1] >= 0) & (place[..., 1] <= height - 1)
+        x, y = (np.where(inside, np.rint(place[..., i]), 0).astype(np.intp) for i in (0, 1))
+        return self.tables[photograph, direction, y, x], inside
+
+    def look_smooth(
+        self, direction: Integers, pixel: Array, photograph: Integers
+    ) -> tuple[Array, Booleans]:
+        """As :meth:`look`, bilinear between table entries."""
+        height, width = self.tables.shape[-2:]
+        with np.errstate(invalid="ignore"):
+            place = (pixel + 0.5) / self.scale - 0.5
+            inside = (place[..., 0] >= 0) & (place[..., 0] < width - 1)
+            inside &= (place[..., 1] >= 0) & (place[..., 1] < height - 1)
+        place = np.where(inside[..., None], place, 0.0)
+        corner = np.floor(place).astype(np.intp)
+        fx, fy = (place[..., i] - corner[..., i] for i in (0, 1))
+        x, y = corner[..., 0], corner[..., 1]
+        at = self.tables
+        upper = (1 - fx) * at[photograph, direction, y, x]
+        upper = upper + fx * at[photograph, direction, y, x + 1]
+        lower = (1 - fx) * at[photograph, direction, y + 1, x]
+        lower = lower + fx * at[photograph, direction, y + 1, x + 1]
+        return (1 - fy) * upper + fy * lower, inside
+
+    def by_chance(self, direction: Integers, found: Array) -> Array:
+        """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
+        last = self.chance.shape[1] - 1
+        return self.chance[direction, np.minimum(found / BIN, last).astype(np.intp)]
+
+    def mirrored(self) -> DistanceTables:
+        """Of the photographs with left and right exchanged."""
+        width = self.tables.shape[-1]
+        # the direction a becomes pi - a
+        edges = (
+            PictureEdges(e.pixel * (-1, 1) + (width - 1, 0), e.normal * (-1, 1)) for e in self.edges
+        )
+        return DistanceTables(
+            self.tables[:, ::-1, :, ::-1],
+            self.scale,
+            tuple(edges),
+            self.moving[:, ::-1],
+            self.chance[::-1],
+        )
+
+
+def direction_of(normal: Array) -> Integers:
+    """Direction number of edges whose image normals are (..., 2); the sign does not matter."""
+    angle = np.arctan2(normal[..., 1], normal[..., 0]) % np.pi
+    number = np.floor(np.nan_to_num(angle) * (DIRECTIONS / np.pi))
+    return number.astype(np.intp) % DIRECTIONS
+
+
+def distances(pixel: Integers, number: Integers, shape: tuple[int, int]) -> Array:
+    """Distance tables (DIRECTIONS, h, w) of edge points at whole pixels (n, 2), x first.
+
+    number : (n,) their directions. shape : (h, w).
+    """
+    import cv2
+
+    tables = np.empty((DIRECTIONS, *shape), dtype=np.float32)
+    for k in range(DIRECTIONS):
+        near = np.isin(number, [(k - 1) % DIRECTIONS, k, (k + 1) % DIRECTIONS])
+        mask = np.ones(shape, dtype=np.uint8)
+        mask[pixel[near, 1], pixel[near, 0]] = 0
+        tables[k] = cv2.distanceTransform(mask, cv2.DIST_L2, 3) if near.any() else 1e3
+    return tables
+
+
+def distance_tables(images: list[Integers]) -> DistanceTables:
+    """Tables of one station's photographs, K arrays (height, width) uint8 of one size."""
+    import cv2
+
+    scale = max(images[0].shape[1] / WORKING_WIDTH, 1.0)
+    size = (round(images[0].shape[1] / scale), round(images[0].shape[0] / scale))
+    small = [_levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)) for image in images]
+    still = np.median(np.stack(small), axis=0) if len(small) >= ENOUGH_TO_COMPARE else None
+    edges = tuple(_edges_of(image, still) for image in small)
+    tables = np.stack(
+        [distances(e.pixel.astype(int), direction_of(e.normal), small[0].shape) for e in edges]
+    )
+    return DistanceTables(tables, scale, edges, _moving(small, still, edges), _chance(tables))
+
+
+def _levels(image: Any) -> Integers:
+    """Grey levels (h, w) whose noise is even: a sensor's grows with the root of the light. So a
+    dark machine before a dark wall stands out as a bright one does in the sun.
+    """
+    return np.rint(np.sqrt(255.0 * image.astype(np.float32))).astype(np.uint8)
+
+
+def _edges_of(image: Any, still: Array | None) -> PictureEdges:
+    """Edge points of one reduced photograph."""
+    import cv2
+
+    dx = cv2.Sobel(image, cv2.CV_16S, 1, 0)
+    dy = cv2.Sobel(image, cv2.CV_16S, 0, 1)
+    edges = cv2.Canny(dx, dy, *CANNY) > 0
+    if still is not None:
+        moving = (np.abs(image - still) > STILL).astype(np.uint8)
+        edges &= cv2.dilate(moving, np.ones((3, 3), np.uint8)) > 0
+    y, x = np.nonzero(edges)
+    normal = np.stack([dx[y, x], dy[y, x]], axis=-1).astype(float)
+    return PictureEdges(
+        np.stack([x, y], axis=-1).astype(float),
+        normal / np.hypot(normal[:, 0], normal[:, 1])[:, None],
+    )
+
+
+def _moving(small: list[Integers], still: Array | None, edges: tuple[PictureEdges, ...]) -> Array:
+    """Share (h, w) of the photographs in which each place differs from the others."""
+    if still is not None:
+        return np.mean([np.abs(image - still) > STILL for image in small], axis=0)
+    if len(small) > 1:
+        return (np.ptp(np.stack(small).astype(float), axis=0) > STILL).astype(float)
+    out = np.zeros(small[0].shape)
+    x, y = edges[0].pixel.astype(int).T
+    out[y, x] = 1.0
+    return out
+
+
+def _chance(tables: Array) -> Array:
+    """How often each distance occurs, (DIRECTIONS, bins), a share a reduced pixel."""
+    bins = np.arange(0.0, FURTHEST + BIN, BIN)
+    count = np.stack(
+        [
+            np.histogram(np.minimum(tables[:, k], FURTHEST - BIN / 2), bins)[0]
+            for k in range(DIRECTIONS)
+        ]
+    )
+    count = count + 1.0  # a distance that no place has is not impossible
+    return count / count.sum(axis=1, keepdims=True) / BIN

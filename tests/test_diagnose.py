@@ -1,0 +1,141 @@
+"""What photographs show when the session says something else: named where it is one of the usual
+mix-ups, refused where it is not, and nothing said of a session that is right.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pkmcal.observe.diagnose import Seen, mistake
+from pkmcal.observe.predict import tubes_of
+from pkmcal.observe.stations import StationView, find_station
+from pkmcal.observe.tables import distance_tables
+from test_observe_drawing import camera_of, machine, photographs, poses, redrawn
+from test_observe_search import clouds, rough_pose
+
+NAMES = tuple("abcdef")
+
+
+def pictures():
+    return photographs()[0]
+
+
+def said(pictures, readings=None, configuration=None, mechanism=None, by_hand=None, seed=0):
+    """What is said of one station; the drawing is 1 mm wrong, as drawings are."""
+    mechanism = mechanism or redrawn(3, 0.001)
+    readings = machine().inverse(poses()) if readings is None else readings
+    view = StationView(
+        mechanism,
+        camera_of(),
+        tubes_of(mechanism),
+        np.arange(6) if configuration is None else np.asarray(configuration),
+        readings,
+        mechanism.forward_result(readings).T_base_platform,
+        distance_tables(pictures),
+    )
+    rng = np.random.default_rng(seed)
+    found = find_station(view, by_hand, rng)
+    if by_hand is not None and not found.good:
+        found = max(found, find_station(view, None, rng), key=lambda f: (f.good, f.evidence))
+    files = [f"images/front/{name}.png" for name in NAMES]
+    return mistake([Seen("front", files, NAMES, view, by_hand, found)], rng)
+
+
+def readings_with(order):
+    return machine().inverse(poses())[:, order]
+
+
+def given(by_hand):
+    return rough_pose(4) if by_hand else None
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+@pytest.mark.parametrize("spread", [0.0, 0.002])
+def test_nothing_is_said_of_what_is_right(by_hand, spread):
+    assert said(pictures(), by_hand=given(by_hand), mechanism=redrawn(1, spread)) is None
+
+
+@pytest.mark.parametrize(
+    ("pair", "by_hand"), [((0, 3), True), ((2, 4), True), ((1, 5), True), ((0, 3), False)]
+)
+def test_two_columns_exchanged(pair, by_hand):
+    order = np.arange(6)
+    order[list(pair)] = order[list(pair)[::-1]]
+    error = said(pictures(), readings_with(order), by_hand=given(by_hand))
+    assert error is not None
+    a, b = pair
+    assert f"the readings of legs {a + 1} and {b + 1} are mixed up" in str(error)
+
+
+@pytest.mark.parametrize("turn", [1, 2, 5])
+def test_columns_turned_round(turn):
+    """By the pose by hand: a hexapod turned by a third looks the same, and only it can tell."""
+    error = said(pictures(), readings_with(np.roll(np.arange(6), turn)), by_hand=given(True))
+    assert "numbered differently" in str(error)
+    assert f"leg 1 takes the readings of column {turn + 1}," in str(error)
+    assert "round" in str(error)
+
+
+def test_columns_in_reverse():
+    error = said(pictures(), readings_with(np.arange(6)[::-1]), by_hand=given(True))
+    assert "leg 1 takes the readings of column 6, leg 2 those of column 5" in str(error)
+    assert "backwards" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("step", "words", "by_hand"), [(1, "after", True), (-1, "before", True), (1, "after", False)]
+)
+def test_photographs_shifted_by_one(step, words, by_hand):
+    error = said(pictures(), configuration=np.roll(np.arange(6), step), by_hand=given(by_hand))
+    assert "the photographs are shifted against the readings" in str(error)
+    assert f"the configuration {words} its own" in str(error)
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_two_photographs_exchanged(by_hand):
+    error = said(pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(by_hand))
+    assert "photographs of front bear each other's names" in str(error)
+    assert "images/front/b.png fits configuration b" in str(error)
+    assert "images/front/e.png fits configuration e" in str(error)
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_mirrored_photographs(by_hand):
+    """A hexapod with its legs numbered backwards is its own mirror image: both are said."""
+    mirrored = [np.ascontiguousarray(picture[:, ::-1]) for picture in pictures()]
+    assert "the photographs of front are mirrored" in str(said(mirrored, by_hand=given(by_hand)))
+
+
+def test_tables_of_mirrored_photographs_are_mirrored_tables():
+    mirrored = distance_tables([np.ascontiguousarray(p[:, ::-1]) for p in pictures()])
+    tables = distance_tables(pictures()).mirrored()
+    np.testing.assert_allclose(tables.moving, mirrored.moving)
+    assert np.mean(np.abs(tables.tables - mirrored.tables) < 1.5) > 0.97
+    np.testing.assert_allclose(tables.chance, mirrored.chance, atol=0.02)
+
+
+def test_diameters_for_radii():
+    mechanism = redrawn(3, 0.001)
+    radii = np.unique(tubes_of(mechanism).radius)
+    values = mechanism.values.copy()
+    values[radii] *= 2
+    error = said(pictures(), mechanism=mechanism.with_values(values), by_hand=given(True))
+    assert error is None or "radii look like diameters" in str(error)
+
+
+def test_photographs_of_nothing_are_refused():
+    rng = np.random.default_rng(0)
+    error = said([clouds(rng) for _ in range(6)], by_hand=given(True))
+    assert "not recognised in the photographs of front" in str(error)
+
+
+def test_another_machine_is_refused_or_at_least_not_renamed():
+    """Half as large a base: no mix-up of the session explains it."""
+    mechanism = machine()
+    values = mechanism.values.copy()
+    rows = [k for k, name in enumerate(mechanism.parameters.names) if ".base." in name]
+    values[rows] *= 0.5
+    other = mechanism.with_values(values)
+    error = said(pictures(), mechanism=other, readings=other.inverse(poses()), by_hand=given(True))
+    assert error is None or "not recognised" in str(error)
