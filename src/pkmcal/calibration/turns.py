@@ -75,14 +75,19 @@ def take_turns(
     machine = session.machine
     # the nearest poses, where the drawing does not quite close: recognition has seen to it
     poses = machine.forward_result(session.joints).T_base_platform
-    looks = _each(
-        photographs,
-        lambda p: legs.search(p, machine, T_camera_base[p.station], poses[p.configuration]),
-    )
-    measurements = measurements_of(session, boards, _edges(looks))
-    lap("observe")
-    estimate = bundle(machine, measurements, start_state(machine, measurements, T_camera_base))
-    lap("identify")
+    estimate: Estimate | None = None
+    for reach in (legs.REACH, legs.AGAIN):
+        seen = machine, T_camera_base, poses
+        if estimate is not None:
+            state = estimate.state
+            seen = estimate.machine, state.T_camera_base, state.T_base_platform
+        looks = _each(photographs, partial(_search, seen=seen, reach=reach))
+        measurements = measurements_of(session, boards, _edges(looks))
+        lap("observe")
+        start = estimate.state if estimate else start_state(machine, measurements, T_camera_base)
+        estimate = bundle(machine, measurements, start)
+        lap("identify")
+    assert estimate is not None
     blur: dict[int, float | None] = {p.station: None for p in photographs}
     for turn in range(ROUNDS):
         told("Measuring edges and identifying", 0.45 + 0.5 * turn / ROUNDS)
@@ -168,6 +173,15 @@ def _reached(session: Session, measurements: Measurements, start: State) -> Stat
             next_step="Check these readings, or leave these configurations out",
         )
     return replace(estimate.state, T_base_platform=found.T_base_platform, internal=found.internal)
+
+
+def _search(
+    photographs: legs.Photographs, seen: tuple[Machine, Array, Array], reach: float
+) -> legs.StationEdges:
+    """Whole legs within ``reach`` px; seen : machine, stations and platforms as they are known."""
+    machine, T_camera_base, poses = seen
+    at = T_camera_base[photographs.station]
+    return legs.search(photographs, machine, at, poses[photographs.configuration], reach)
 
 
 def _measure(

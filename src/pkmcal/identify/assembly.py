@@ -76,11 +76,12 @@ def assemble(
     *,
     use_drawing: bool = True,
     radius_prior: bool = True,
-    shading: float = SHADING_SIGMA,
+    shading: float | Array = SHADING_SIGMA,
 ) -> Assembled:
     """The joint problem of one session (B = 1), every edge a block of its own.
 
-    shading : px, standard deviation of the lines' shading, where an estimate has told it.
+    shading : px, standard deviation of the lines' shading, of all or of each (n,), where an
+    estimate has told it.
     """
     _check(machine, measurements)
     seen, line = seen_configurations(measurements), _lines(measurements)
@@ -107,7 +108,7 @@ def assemble(
         camera = np.array([kind == "camera" for kind in kinds])
         target[camera] = np.pad(-measurements.intrinsics_at, ((0, 0), (1, 0))).ravel()
     blocks, data = _edges(machine, measurements, edges, line, seen)
-    data = replace(data, shading=np.full(1, shading))
+    data = replace(data, shading=np.atleast_2d(shading).astype(float))
     pose_blocks, pose_data = _poses(measurements, poses)
     problem = Problem(
         layout=machine.layout,

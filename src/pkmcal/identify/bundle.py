@@ -29,7 +29,7 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, settled_weights
 from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState, own_blocks
-from pkmcal.measurements import Measurements
+from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import (
     FIRST_DAMPING,
@@ -47,6 +47,11 @@ down by them would promise too much."""
 ROUNDS = 30
 SHADING_CHANGE = 0.02
 """Relative change of the shading's deviation below which it counts as found."""
+FREEDOM = 4.0
+"""Degrees of freedom of Student's distribution of the lines' shading: four lets a line go that is
+some five deviations off, and costs clean ones little."""
+WEIGHINGS = 5
+"""Rounds of weights and their common deviation, before the next solution."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +93,9 @@ def solve_batch(
     # Begun with as much as a whole camera's shift may be: a prior that is too narrow would make
     # outliers of the edges that speak against it.
     estimates_shading = scale_noise and problem.unknowns.n_lines > 0
-    least = np.broadcast_to(problem.data.shading, (n_runs,))
+    least = problem.data.shading[:, :1]
     if estimates_shading:
-        problem = problem.shaded(np.full(n_runs, SHIFT_SIGMA))
+        problem = problem.shaded(np.full((n_runs, problem.unknowns.n_lines), SHIFT_SIGMA))
     fit = _Fit(problem, start, every, ones, np.zeros(n_runs, dtype=int), ())
     if robust:
         found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
@@ -106,13 +111,13 @@ def solve_batch(
         if robust:
             weight = settled_weights(problem, fit.state, scale)
         if estimates_shading:
-            shading = np.maximum(_shading_sigma(fit), least)
+            shading = _shading_sigma(fit, least)
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
         if found_shading and _settled(scale, fit.scale, weight, fit.weight):
             break
         state = fit.state
-        if estimates_shading:  # the same shifts in other units
-            units = (problem.data.shading / shading)[:, None]
+        if estimates_shading:
+            units = problem.data.shading / shading  # the same shifts in other units
             state = replace(state, shading=state.shading * units)
             problem = problem.shaded(shading)
         new = fit._replace(state=state, weight=weight, scale=scale)
@@ -172,18 +177,29 @@ def _noise_scale(fit: _Fit) -> Kinds[Array]:
     return Kinds(*out)
 
 
-def _shading_sigma(fit: _Fit) -> Array:
-    """Standard deviation (B,) px of the lines' shading, by restricted maximum likelihood.
+def _shading_sigma(fit: _Fit, least: Array) -> Array:
+    """Standard deviation (B, n) px of each line's shading, by restricted maximum likelihood.
 
-    The fixed point of s^2 = sum of squares of the shifts over the number of them that the data
-    tell: a line counts by what its variance has become less than the prior's (MacKay 1992).
+    least : (B or 1, 1) what all have at least. Shifts have Student's distribution with FREEDOM
+    degrees: most lines are shaded alike, and some show a highlight's border for their own, pixels
+    off. Each line's variance is s^2 / w with its weight w = (FREEDOM + 1) / (FREEDOM + x^2 / s^2)
+    (Lange, Little, Taylor 1989), x^2 the square expected of its shift. The common s^2 is the fixed
+    point of the weighted sum of squares over the number of shifts that the data tell: a line counts
+    by what its variance has become less than the prior's (MacKay 1992).
     """
     u, problem = fit.problem.unknowns, fit.problem
     info = information(problem, fit.state)
     variance = np.diagonal(info.covariance, axis1=-2, axis2=-1)[:, u.shading]
-    told = np.sum(1 - np.minimum(variance, 1.0), axis=1)
-    squares = np.sum(fit.state.shading**2, axis=1)
-    return problem.data.shading * np.sqrt(squares / np.maximum(told, 1e-9))
+    unit = problem.data.shading
+    told = np.sum(1 - np.minimum(variance, 1.0), axis=1, keepdims=True)
+    square = (unit * fit.state.shading) ** 2
+    expected = square + unit**2 * np.minimum(variance, 1.0)
+    common = np.median(unit, axis=1, keepdims=True) ** 2
+    for _ in range(WEIGHINGS):
+        weight = (FREEDOM + 1) / (FREEDOM + expected / common)
+        total = np.sum(weight * square, axis=1, keepdims=True)
+        common = np.maximum(total / np.maximum(told, 1e-9), least**2)
+    return np.maximum(np.sqrt(common / weight), least)
 
 
 def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:
@@ -240,7 +256,7 @@ def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiab
     unidentified, and of what the drawing knows better than the data.
     """
     machine = estimate.machine
-    shading = estimate.statistics.shading
+    shading = estimate.line_shading if len(estimate.line_shading) else SHADING_SIGMA
     assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
     problem = assembled.trusting(
         Kinds(
@@ -296,6 +312,7 @@ def _estimate(
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
         mount_covariance=own_blocks(full, told.mounts, 6),
+        line_shading=result.problem.data.shading[0],
     )
 
 
@@ -346,5 +363,5 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
         dof_edges=freedom[0],
         dof_joints=freedom[1],
         dof_poses=freedom[2],
-        shading=float(result.problem.data.shading[0]),
+        shading=float(np.median(result.problem.data.shading[0])),
     )

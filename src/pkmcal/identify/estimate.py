@@ -81,6 +81,7 @@ class Estimate:
         data decide; near 0, the value is the drawing's.
     pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
     mount_covariance : (M, 6, 6) of (omega, tau), left perturbation of T_mount.
+    line_shading : (n,) px, standard deviation of each tube's side's shading at each station.
     configurations : (K,) True where the configuration was seen and its pose estimated.
     gauge : its name for people.
     """
@@ -101,3 +102,4 @@ class Estimate:
     pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
     pose_weights: Array = field(default_factory=lambda: np.zeros(0))
     mount_covariance: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
+    line_shading: Array = field(default_factory=lambda: np.zeros(0))

@@ -99,7 +99,7 @@ class Problem:
         )
 
     def shaded(self, sigma: Array) -> Problem:
-        """The same problem with other standard deviations (B,) px of the lines' shading."""
+        """The same problem with other standard deviations (B, n) px of the lines' shading."""
         return replace(self, data=replace(self.data, shading=sigma))
 
     def opened(self, state: BatchState) -> tuple[Problem, BatchState]:

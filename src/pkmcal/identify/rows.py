@@ -100,7 +100,8 @@ class EdgeData:
     the measured normals, less the predicted ones', by the w unknowns of their camera: the edge
     shift (px), then its intrinsics where they are refined (in units of their prior).
     joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale squared.
-    shading : (B,) px by which one unit of a line's shading moves its edges, its standard deviation.
+    shading : (B, n) px by which one unit of each line's shading moves its edges, its standard
+    deviation; n = 1 where all have the same.
     """
 
     basis: Array
@@ -108,7 +109,7 @@ class EdgeData:
     optics: Array
     joints: Array
     weight: Array
-    shading: Array = field(default_factory=lambda: np.full(1, SHADING_SIGMA))
+    shading: Array = field(default_factory=lambda: np.full((1, 1), SHADING_SIGMA))
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,9 @@ class EdgeRows:
     @property
     def by_line(self) -> Array:
         """By their line's shading, which moves them as the camera's shift moves all, (..., 1)."""
-        return self.by_optics[..., :1] * self.data.shading[:, None, None, None, None]
+        sigma = self.data.shading
+        own = sigma[:, self.blocks.line] if sigma.shape[1] > 1 else sigma[:, :, None]
+        return self.by_optics[..., :1] * own[..., None, None]
 
     @property
     def by_machine(self) -> list[tuple[Integers, Array]]:

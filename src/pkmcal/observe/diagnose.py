@@ -8,7 +8,6 @@ machine that was recognised is asked too: with two columns exchanged, four legs 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
@@ -26,12 +25,11 @@ from pkmcal.observe.stations import (
     evidence_nearby,
     evidence_of,
     find_station,
-    no_better,
 )
 from pkmcal.wording import listed
 
-SURE = 0.01
-"""Probability of its being no better below which a hypothesis replaces the session's word."""
+SURE = 0.05
+"""Times that a hypothesis has to be less probable by chance to replace the session's word."""
 ELSEWHERE = np.radians(45.0)
 """Turn from the pose by hand beyond which the machine was found where the user does not see it: a
 machine of three or six equal parts looks the same from there."""
@@ -61,13 +59,10 @@ class Seen(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """What the photographs may show instead, and the error that names it. share : of the
-    photographs that it is about.
-    """
+    """What the photographs may show instead, and the error that names it."""
 
     view: StationView
     error: InputError
-    share: float = 1.0
 
 
 def mistake(stations: list[Seen], rng: np.random.Generator) -> InputError | None:
@@ -87,7 +82,7 @@ def mistake(stations: list[Seen], rng: np.random.Generator) -> InputError | None
         f"the machine is not recognised in the photographs of {worst.name}"
         + (f", nor in those of {listed(others)}" if others else ""),
         where=f"session.yaml, stations.{worst.name}",
-        found=_little(worst.found),
+        found=_little(worst),
         expected="one place where its legs lie on edges of the picture far oftener than any"
         " machine's would",
         next_step="Check that these photographs show this machine's legs, that each bears the name"
@@ -96,10 +91,13 @@ def mistake(stations: list[Seen], rng: np.random.Generator) -> InputError | None
     )
 
 
-def _little(found: FoundStation) -> str:
+def _little(station: Seen) -> str:
     """What of the evidence is too little."""
+    found = station.found
     if found.by_chance < found.limit:
         return "legs that fit nearly as well at another place"
+    if len(station.view.configuration) < 2:
+        return "one photograph alone, and none to confirm what it seems to show"
     often = f"once in {1 / found.by_chance:.0f} times" if found.by_chance < 0.5 else "as a rule"
     return f"legs that readings of other configurations fit as well {often}"
 
@@ -138,33 +136,30 @@ def _mixed_up(station: Seen, in_order: bool, rng: np.random.Generator) -> InputE
             likely.append((evidence, other))
     best = sorted(likely, key=lambda item: -item[0])[:SEARCHED]
     searched = [(find_station(h.view, station.by_hand, rng), h) for _, h in best]
-    better = [(f, h) for f, h in searched if _replaces(h, f, station, in_order)]
+    better = [(f, h) for f, h in searched if _replaces(f, station, in_order)]
     if not better:
         return None
-    better.sort(key=lambda item: -item[0].evidence)
+    better.sort(key=lambda item: item[0].by_chance)
     first, error = better[0][0], better[0][1].error
     for other, hypothesis in better[1:]:
-        if no_better(first.evidence - other.evidence, first.spread) > SURE:
+        if other.by_chance * SURE < first.by_chance:
             found_both = f"{error.found}; they fit as well if {hypothesis.error.what}"
             return InputError(error.what, where=error.where, found=found_both,
                               next_step=error.next_step)  # fmt: skip
     return error
 
 
-def _replaces(other: Hypothesis, found: FoundStation, station: Seen, in_order: bool) -> bool:
+def _replaces(found: FoundStation, station: Seen, in_order: bool) -> bool:
     """Whether a hypothesis explains a station better than its own readings. Where these put the
     camera elsewhere than the user, and no other station shows that they are in order, as well is
     enough.
     """
     if not found.good or station._replace(found=found).elsewhere:
         return False
-    gain = evidence_of(other.view, found.T_camera_base) - evidence_of(
-        station.view, station.found.T_camera_base
-    )
-    spread = station.found.spread * math.sqrt(other.share)
+    before, now = station.found.by_chance, found.by_chance
     if station.elsewhere and station.found.good and not in_order:
-        return no_better(-float(gain.sum()), spread) > SURE
-    return no_better(float(gain.sum()), spread) < SURE
+        return now * SURE < before
+    return now < before * SURE
 
 
 def _hypotheses(station: Seen) -> Iterator[Hypothesis]:
@@ -196,14 +191,13 @@ def _hypotheses(station: Seen) -> Iterator[Hypothesis]:
 
 
 def _other_photographs(station: Seen) -> Iterator[Hypothesis]:
-    """Photographs that are mirrored, where the machine was not recognised; where it was, under the
-    names that fit each of them best.
+    """Photographs under the names that fit each of them best; where the machine was not recognised,
+    mirrored ones.
     """
     view, T = station.view, station.found.T_camera_base
     names = view.configuration
     if not station.found.good:
         yield Hypothesis(replace(view, tables=view.tables.mirrored()), _mirrored(station.name))
-        return
     if not 2 < len(names) == len(np.unique(names)):
         return
     fits = np.stack(
@@ -213,8 +207,7 @@ def _other_photographs(station: Seen) -> Iterator[Hypothesis]:
     moved = rows[rows != columns]
     if 0 < len(moved) <= len(names) // 2:
         right = replace(view, configuration=names[columns])
-        error = _misnamed(station, moved, names[columns[moved]])
-        yield Hypothesis(right, error, len(moved) / len(names))
+        yield Hypothesis(right, _misnamed(station, moved, names[columns[moved]]))
 
 
 def _two_legs(a: int, b: int) -> InputError:

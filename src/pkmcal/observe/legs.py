@@ -34,12 +34,19 @@ from pkmcal.observe.profiles import EdgeFits, edge_set, fit_edges
 REACH = 10.0
 """Pixels to each side that a leg is looked for: 2 mm of drawing error at 0.9 px/mm, several
 times over, and what the station's pose leaves."""
+AGAIN = 4.0
+"""The same once the other legs have told where it is: beyond lies a highlight, or a neighbour."""
 TILTS = np.arange(-4.0, 4.5, 1.0)
 """Shifts of a leg's ends against its middle that are tried, px."""
-GRADIENT_HALF = 12.0
-"""Grey levels per pixel at which an edge counts half of a strong one: strong highlights must not
-outvote three weak edges."""
-RIVAL = 0.93
+SMOOTH = 1.0
+"""Pixels of blur (standard deviation) against the noise of dark photographs."""
+PEAK = 2
+"""Pixels to each side within which the steepest place counts most."""
+GRADIENT_HALF = 1.5
+"""Levels per pixel at which an edge counts half of a strong one: strong highlights must not outvote
+three weak edges. Levels are roots of grey levels (255 stays), whose noise is even: 0.3 a pixel once
+smoothed, so this is five times that."""
+RIVAL = 0.95
 """A second place with this share of the best one's score makes a leg ambiguous."""
 RIVAL_AWAY = 4.0
 """Pixels from the best place at which another one is a rival, not its flank."""
@@ -48,6 +55,8 @@ FEWEST_POINTS = 8
 SEARCH_SIGMA = 1.0
 """Standard deviation (px) given to edges found this way: one step of the search."""
 SEARCH_SAMPLES = 12
+LEG_TILTS = np.arange(-1.0, 1.25, 0.25)
+"""Shifts of a leg's ends against its middle that are tried once it is known to a pixel, px."""
 SEGMENTS = 8
 """Places along an edge at which a position is fitted, each to the mean of its samples' profiles."""
 PLACES = 5 * SEGMENTS
@@ -104,16 +113,20 @@ def sample(images: list[Integers], pixel: Array, cubic: bool = True) -> Array:
 
 
 def search_legs(
-    images: list[Integers], tubes: TubeList, points: EdgePoints, clear: Booleans
+    images: list[Integers],
+    tubes: TubeList,
+    points: EdgePoints,
+    clear: Booleans,
+    reach: float = REACH,
 ) -> LegPlaces:
     """Shift and tilt of every leg in the photographs of one station.
 
     images : K arrays (height, width), float32 or uint8. points, clear : predictions (K, E, n).
     """
-    strength, offsets = gradient_strength(images, points, REACH + TILTS[-1])
+    strength, offsets = gradient_strength(images, points, reach + TILTS[-1])
     weight = clear.astype(np.float32)
     sign = SIDE_SIGNS[tubes.side]
-    steps = np.arange(-REACH, REACH + 0.5)
+    steps = np.arange(-reach, reach + 0.5)
     legs = range(tubes.leg.max() + 1)
     place = place_on_leg(points.along, clear, tubes)
     scores = np.zeros((len(images), tubes.leg.max() + 1, len(TILTS), len(steps)), np.float32)
@@ -142,9 +155,15 @@ def gradient_strength(
     offsets = np.arange(-np.ceil(reach), np.ceil(reach) + 1)
     wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]])
     pixel = points.pixel[..., None, :] + wide[:, None] * points.outward[..., None, :]
-    grey = sample(images, pixel, cubic=False)
-    slope = np.abs(grey[..., 2:] - grey[..., :-2]) / 2
-    return slope / (slope + GRADIENT_HALF), offsets
+    import cv2
+    from scipy.ndimage import maximum_filter1d
+
+    smooth = [cv2.GaussianBlur(image, (0, 0), SMOOTH) if SMOOTH else image for image in images]
+    level = np.sqrt(255.0 * sample(smooth, pixel, cubic=False))
+    slope = np.abs(level[..., 2:] - level[..., :-2]) / 2
+    peak = maximum_filter1d(slope, 2 * PEAK + 1, axis=-1)
+    sharp = slope / np.maximum(peak, 1e-6)
+    return (1 + sharp) / 2 * slope**2 / (slope**2 + GRADIENT_HALF**2), offsets
 
 
 def place_on_leg(along: Array, clear: Booleans, tubes: TubeList) -> Array:
@@ -167,7 +186,7 @@ def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlace
     best = flat.max(axis=-1)
     away = np.abs(steps - steps[step][..., None]) >= RIVAL_AWAY
     rival = np.where(away, scores.max(axis=2), 0.0).max(axis=-1)
-    inside = np.abs(steps[step]) < REACH
+    inside = np.abs(steps[step]) < steps[-1]
     clear = (total >= FEWEST_POINTS) & (rival < RIVAL * best) & inside
     return LegPlaces(steps[step], TILTS[tilt], best, share, clear)
 
@@ -205,14 +224,18 @@ class StationEdges:
 
 
 def search(
-    photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
+    photographs: Photographs,
+    machine: Machine,
+    T_camera_base: Array,
+    poses: Array,
+    reach: float = REACH,
 ) -> StationEdges:
     """Every leg to about a pixel, each moved as a whole; edges have sigmas of a pixel.
 
     poses : T_base_platform (K, 4, 4) of the photographs.
     """
     tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
-    places = search_legs(photographs.images, tubes, points, clear)
+    places = search_legs(photographs.images, tubes, points, clear, reach)
     found = clear & places.clear[:, tubes.leg][..., None]
     position = places.outward(points, clear, tubes)
     fits = fit_edges(points, position, np.full(position.shape, SEARCH_SIGMA), found)
@@ -225,7 +248,7 @@ def search(
         if leg in tubes.leg
     ]
     nowhere = np.zeros((0, 2)), np.zeros(0, dtype=int)
-    return StationEdges(edges, tuple(rejected), *nowhere, float("nan"), REACH)
+    return StationEdges(edges, tuple(rejected), *nowhere, float("nan"), reach)
 
 
 def measure(
@@ -250,7 +273,9 @@ def measure(
     full, across = _segment_profiles(grey, np.repeat(clear, BETWEEN, axis=-1), half_width)
     if blur is None:
         blur = profiles.estimate_blur(across) if full.any() else BLUR
-    at = profiles.locate(across, blur)
+    curves = profiles.residual_curves(across, blur)
+    about = _leg_lines(profiles.likelihood(across, curves), places.along, full, tubes)
+    at = profiles.locate(across, curves, about)
     position, sigma, found = np.zeros(full.shape), np.ones(full.shape), full.copy()
     position[full], sigma[full], found[full] = at.position, at.sigma, at.found
     fits = fit_edges(places, position, sigma, found)
@@ -307,6 +332,30 @@ def _segment_profiles(
     saturated = np.any((kept >= profiles.SATURATED) & weight, axis=-2)
     cut = profiles.cut_of(saturated, half_width[full])
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
+
+
+def _leg_lines(likelihood: Array, along: Array, full: Booleans, tubes: TubeList) -> Array:
+    """Where the edges of each profile's leg are by all profiles of the leg, px outward (N,).
+
+    likelihood : (N, shifts) of the profiles at ``full`` (K, E, n). A leg is shifted and tilted as a
+    whole: a highlight beside one edge is likelier there than the edge, but not for all of them.
+    """
+    k, e, n = np.ogrid[: full.shape[0], : full.shape[1], : full.shape[2]]
+    every = np.zeros((*full.shape, likelihood.shape[-1]))
+    every[full] = likelihood
+    sign, place = SIDE_SIGNS[tubes.side], place_on_leg(along, full, tubes)
+    steps, count = profiles.SHIFTS, len(profiles.SHIFTS)
+    pitch = steps[1] - steps[0]
+    score = np.zeros((len(full), tubes.leg.max() + 1, len(LEG_TILTS), count))
+    for i, tilt in enumerate(LEG_TILTS):
+        at = sign[:, None, None] * (steps + tilt * place[..., None])
+        column = np.clip(np.rint((at - steps[0]) / pitch), 0, count - 1).astype(np.intp)
+        by_edge = every[k[..., None], e[..., None], n[..., None], column].sum(axis=2)
+        np.add.at(score[:, :, i], (slice(None), tubes.leg), by_edge)
+    best = score.reshape(*score.shape[:2], -1).argmax(axis=-1)
+    tilt, shift = np.unravel_index(best, score.shape[2:])
+    shift, tilt = (v[:, tubes.leg][..., None] for v in (steps[shift], LEG_TILTS[tilt]))
+    return (sign[:, None] * (shift + tilt * place))[full]
 
 
 def _rejections(

@@ -58,8 +58,11 @@ SATURATED = 250
 """Grey level from which a sample is taken as clipped."""
 MOST_CUT = -0.25
 """Place (px) beyond which a profile must be free of saturation: its edge itself."""
-FAINT = 0.25
-"""Standard deviation (px) of a position above which a profile shows no edge."""
+WINDOW = 0.5
+"""Pixels about the place of its leg as a whole within which a profile's own edge is looked for:
+further off lie highlights, which all places of an edge may show alike."""
+FAINT = 0.5
+"""Standard deviation (px) of a position above which a profile shows no edge: the window's half."""
 FLOOR = 0.02
 """Pixels below which no position is believed, however crisp the profile."""
 HALVES = 2.0
@@ -175,26 +178,53 @@ def residual_curves(profiles: Profiles, blur: float) -> Array:
     return np.maximum(out, 0.0)
 
 
-def locate(profiles: Profiles, blur: float) -> ProfileEdges:
-    """Edge positions of profiles, with the blur in px."""
-    curves = residual_curves(profiles, blur)
-    lowest = np.argmin(curves, axis=-1)
-    best = np.clip(lowest, 1, len(SHIFTS) - 2)
+def likelihood(profiles: Profiles, curves: Array) -> Array:
+    """Log likelihood (N, shifts) of every trial position, the noise's size unknown, less its
+    largest value; 0 of profiles that are clipped up to their edge.
+
+    curves : of :func:`residual_curves`.
+    """
+    samples = np.maximum(profiles.grey.shape[-1] - profiles.cut, 1)
+    floor = samples * (_noise(profiles) ** 2 + MODEL_ERROR**2)
+    freedom = np.maximum(samples * STEP - BRIGHTNESSES, 1.0)
+    out = -freedom[:, None] / 2 * np.log(curves + floor[:, None])
+    out -= out.max(axis=-1, keepdims=True)
+    return np.where(_shows_its_edge(profiles)[:, None], out, 0.0)
+
+
+def locate(profiles: Profiles, curves: Array, about: Array) -> ProfileEdges:
+    """Edge positions of profiles, each within WINDOW of where its leg is, ``about`` (N,) px.
+
+    curves : of :func:`residual_curves`.
+    """
+    step, half = SHIFTS[1] - SHIFTS[0], round(WINDOW / (SHIFTS[1] - SHIFTS[0]))
+    middle = np.rint((about - SHIFTS[0]) / step).astype(int)
+    middle = np.clip(middle, half, len(SHIFTS) - 1 - half)
+    near = middle[:, None] + np.arange(-half, half + 1)
+    lowest = np.argmin(np.take_along_axis(curves, near, axis=-1), axis=-1)
+    best = middle - half + np.clip(lowest, 1, 2 * half - 1)
     left, here, right = (
         np.take_along_axis(curves, (best + d)[..., None], -1)[..., 0] for d in (-1, 0, 1)
     )
     bend = np.maximum(left - 2 * here + right, 1e-12)
-    step = SHIFTS[1] - SHIFTS[0]
     position = SHIFTS[best] + step * np.clip((left - right) / (2 * bend), -1, 1)
     # neighbouring samples of a profile at half a pixel share their noise: two count as one
-    freedom = (curves.shape[-1] * 0 + profiles.grey.shape[-1] - profiles.cut) * STEP - BRIGHTNESSES
-    noise = GREY_NOISE / profiles.contrast() / np.sqrt(np.maximum(profiles.count, 1))
-    variance = here * STEP / np.maximum(freedom, 1.0) + noise**2
+    freedom = (profiles.grey.shape[-1] - profiles.cut) * STEP - BRIGHTNESSES
+    variance = here * STEP / np.maximum(freedom, 1.0) + _noise(profiles) ** 2
     # cost(x) = residual / (variance / STEP): its second derivative is 2 / sigma^2
     sigma = np.sqrt(2 * (variance / STEP) / (bend / step**2))
-    inside = (lowest > 0) & (lowest < len(SHIFTS) - 1)
-    enough = profiles.cut < np.searchsorted(profile_offsets(), MOST_CUT)
-    return ProfileEdges(position, sigma, inside & enough & (sigma < FAINT))
+    inside = (lowest > 0) & (lowest < 2 * half)
+    return ProfileEdges(position, sigma, inside & _shows_its_edge(profiles) & (sigma < FAINT))
+
+
+def _noise(profiles: Profiles) -> Array:
+    """Least noise (N,) believed of a sample, in contrasts."""
+    return GREY_NOISE / profiles.contrast() / np.sqrt(np.maximum(profiles.count, 1))
+
+
+def _shows_its_edge(profiles: Profiles) -> Booleans:
+    """Profiles (N,) that are not clipped up to their edge."""
+    return profiles.cut < np.searchsorted(profile_offsets(), MOST_CUT)
 
 
 def estimate_blur(profiles: Profiles) -> float:

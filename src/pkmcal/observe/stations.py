@@ -49,13 +49,11 @@ SHAKEN = 48
 """Poses beside the best ones that are tried before the last descent."""
 LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
-CHANCES = (6, 12, 24)
-"""Searches with wrong readings, which tell what evidence chance gives: so many, and more where
-these leave it open."""
-DECIDED = 50.0
-"""Times the probability asked for, or part of it, at which it is open no more."""
-FEW_READINGS = 4
-"""Configurations of a session below which its readings are too few to be taken for each other."""
+FEWEST_RIVALS, MOST_RIVALS = 8, 24
+"""Other readings for each photograph, which tell what evidence chance gives."""
+DECIDED = 10.0
+"""Times less than the probability asked for, by one half of the photographs, at which the other
+half need not be asked."""
 AWAY = np.repeat([0.2, 0.1], 3)
 """Turn (rad) and shift (in distances of base and platform) of a platform that is elsewhere."""
 BY_CHANCE, BY_CHANCE_TOLD = 1e-3, 1e-2
@@ -63,6 +61,9 @@ BY_CHANCE, BY_CHANCE_TOLD = 1e-3, 1e-2
 where it was looked for about a pose by hand, which says much the same already."""
 APART = 8.0
 """Reduced pixels between two hypotheses' silhouettes from which they are not the same place."""
+FEWEST_PAIRED = 3
+"""Photographs from which their scatter says whether one place is better than another; fewer have
+to agree."""
 DOUBT = 0.05
 """Probability of a second place being as good above which neither is believed."""
 
@@ -103,20 +104,33 @@ class StationView:
         found = self.machine.forward_result(joints).T_base_platform
         return replace(self, all_joints=joints, all_poses=found)
 
-    def mistaken(self, rng: np.random.Generator) -> StationView:
-        """The same photographs, each with readings that are not its own."""
-        count = len(self.all_joints)
-        if count >= FEW_READINGS:
-            other = rng.integers(1, count, len(self.configuration))
-            return replace(self, configuration=(self.configuration + other) % count)
-        away = rng.normal(size=(len(self.configuration), 6)) * AWAY
-        away[:, 3:] *= np.linalg.norm(self.poses[:, :3, 3], axis=-1, keepdims=True)
+    def select(self, photographs: Integers) -> StationView:
+        """Some of the photographs alone."""
         return replace(
             self,
-            configuration=np.arange(len(away)),
-            all_joints=self.joints,
-            all_poses=perturb(self.poses, away),
+            configuration=self.configuration[photographs],
+            tables=self.tables.select(photographs),
         )
+
+    def rivals(self, rng: np.random.Generator) -> list[StationView]:
+        """The same photographs with readings that are not their own: each time those of the
+        configurations that follow by so many; where the session has few, platforms elsewhere too.
+        """
+        count, own = len(self.all_joints), self.configuration
+        steps = np.unique(np.linspace(1, count - 1, MOST_RIVALS).astype(int)) if count > 1 else []
+        views = [replace(self, configuration=(own + step) % count) for step in steps]
+        for _ in range(len(views), FEWEST_RIVALS):
+            away = rng.normal(size=(len(own), 6)) * AWAY
+            away[:, 3:] *= np.linalg.norm(self.poses[:, :3, 3], axis=-1, keepdims=True)
+            views.append(
+                replace(
+                    self,
+                    configuration=np.arange(len(own)),
+                    all_joints=self.joints,
+                    all_poses=perturb(self.poses, away),
+                )
+            )
+        return views
 
 
 @dataclass(frozen=True)
@@ -125,7 +139,7 @@ class FoundStation:
 
     evidence : log likelihood against chance, by reduced pixels of silhouette. by_chance :
     probability of as much without the machine. second : probability that another place is as good.
-    spread : standard deviation of evidence by chance. told : whether it was looked for about a
+    told : whether it was looked for about a
     pose that is known.
     """
 
@@ -134,7 +148,6 @@ class FoundStation:
     evidence: float
     by_chance: float
     second: float = 0.0
-    spread: float = 1.0
     told: bool = False
 
     @property
@@ -151,27 +164,21 @@ class FoundStation:
 def find_station(
     view: StationView, T_camera_base: Array | None, rng: np.random.Generator
 ) -> FoundStation:
-    """The pose near a rough one, or anywhere; every photograph of the station takes part."""
-    few, more, every = view.few(4), view.few(8), view.few(len(view.configuration))
-    if T_camera_base is None:
-        candidates = _anywhere(view, few, ANYWHERE)
-        candidates = _best(view, candidates, few, reach=12, keep=96)
-        candidates = _descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
-        candidates = _best(view, candidates, few, reach=8, keep=24)
-    else:
-        candidates = _random_search(view, T_camera_base, rng)
-    candidates = _descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
-    candidates = _best(view, candidates, more, reach=5, keep=12)
-    candidates = _descend(view, candidates, more, 5, (5, 4, 4, 3))
-    # the picture is rugged: what lies beside a good place may be better
-    beside = candidates[rng.integers(0, len(candidates), SHAKEN)]
-    spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
-    steps = rng.normal(size=(SHAKEN, 6)) * spread
-    turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
-    candidates = _settled(view, np.concatenate([candidates, turned]), more, 5, 6)
-    evidence = _evidence(view, candidates, more, 5).sum(axis=-1)
-    candidates = candidates[np.argsort(-evidence)]
-    candidates = candidates[_apart(view, candidates, every)[:3]]
+    """The pose near a rough one, or anywhere, from half of the photographs; what the other half
+    says of it decides. Then every photograph takes part.
+    """
+    count = len(view.configuration)
+    halves = [np.arange(first, count, 2) for first in (0, 1)]
+    kept: list[Array] = []
+    surely = np.zeros(0)
+    for half, other in (halves, halves[::-1]) if count > 1 else ():
+        found = _search(view.select(half), T_camera_base, rng)
+        kept.append(found)
+        surely = np.concatenate([surely, _surely(view, found[0], half, other, rng)])
+        if _by_chance(surely) < BY_CHANCE / DECIDED:
+            break
+    candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng)
+    every = view.few(count)
     candidates = _settled(view, candidates, every, 8, 8)
     evidence = _evidence(view, candidates, every, 8)
     order = np.argsort(-evidence.sum(axis=-1))
@@ -183,18 +190,41 @@ def find_station(
     nearer = _descend(view, best, every, 8, (5, 4, 3, 2, 2, 1.5, 1.5))
     ends = np.concatenate([nearer, best])
     scores = score(view, ends, every, LAST_REACH)
-    by_chance, spread = _chance(view, candidates[:2], more, rng)
-    gain = evidence[0].sum() - evidence[1:].sum(axis=-1).max(initial=-np.inf)
-    second = no_better(float(gain), spread)
     return FoundStation(
         T_camera_base=ends[scores.argmin()],
         score=float(scores.min()),
         evidence=float(evidence[0].sum()),
-        by_chance=by_chance,
-        second=second,
-        spread=spread,
+        by_chance=_by_chance(surely),
+        second=_second(evidence),
         told=T_camera_base is not None,
     )
+
+
+def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Generator) -> Array:
+    """Up to three places (H, 4, 4), the one with the most evidence first."""
+    few, more = view.few(4), view.few(8)
+    if T_camera_base is None:
+        each = 4 // len(few)  # fewer photographs tell less, and cost less
+        candidates = _anywhere(view, few, each * ANYWHERE)
+        candidates = _best(view, candidates, few, reach=12, keep=each * 96)
+        candidates = _descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
+        candidates = _best(view, candidates, few, reach=8, keep=each * 24)
+    else:
+        candidates = _random_search(view, T_camera_base, rng)
+    candidates = _descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
+    candidates = _best(view, candidates, more, reach=5, keep=12)
+    candidates = _descend(view, candidates, more, 5, (5, 4, 4, 3))
+    candidates = _best(view, candidates, more, reach=3, keep=12)
+    candidates = candidates[_apart(view, candidates, more)[:4]]
+    # the picture is rugged: what lies beside a good place may be better
+    beside = candidates[rng.integers(0, len(candidates), SHAKEN)]
+    spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
+    steps = rng.normal(size=(SHAKEN, 6)) * spread
+    turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
+    candidates = _settled(view, np.concatenate([candidates, turned]), more, 5, 6)
+    evidence = _evidence(view, candidates, more, 5).sum(axis=-1)
+    candidates = candidates[np.argsort(-evidence)]
+    return candidates[_apart(view, candidates, more)[:3]]
 
 
 def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
@@ -428,35 +458,54 @@ def evidence_nearby(
     return float(_evidence(view, starts, few, 5).sum(axis=-1).max())
 
 
-def no_better(gain: float, spread: float) -> float:
-    """Probability that evidence gained is chance, which scatters by ``spread``."""
-    return 0.5 * math.erfc(gain / spread / math.sqrt(2))
+def _surely(
+    view: StationView,
+    T_camera_base: Array,
+    half: Integers,
+    other: Integers,
+    rng: np.random.Generator,
+) -> Array:
+    """How surely each photograph of one half shows the machine at a pose (4, 4) that was found from
+    the other: standard normal (K,) where it does not.
+
+    Without the machine, a photograph's own readings fit it no better than others do; by how much
+    they do, in units of the others' scatter, has Student's distribution.
+    """
+    from scipy.special import ndtri, stdtr
+
+    def evidence(view: StationView) -> Array:
+        look = _look(view, T_camera_base[None], other, 8)
+        return look.evidence(mixture).reshape(len(other), -1).sum(axis=-1)
+
+    mixture = _look(view, T_camera_base[None], half, 8).mixture(_first_mixture(1), rounds=10)
+    fits = np.stack([evidence(rival) for rival in view.rivals(rng)], axis=1)
+    count = fits.shape[1]
+    scatter = np.maximum(fits.std(axis=1, ddof=1), 1e-9) * np.sqrt(1 + 1 / count)
+    away = (evidence(view) - fits.mean(axis=1)) / scatter
+    return -ndtri(np.maximum(stdtr(count - 1, -away), 1e-300))
 
 
-def _chance(
-    view: StationView, candidates: Array, photographs: Integers, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Probability of as much evidence as the first candidate's without the machine, and the spread
-    of such evidence: by Student's distribution of what the same photographs give to wrong readings,
-    from the same candidates on.
+def _second(evidence: Array) -> float:
+    """Probability that the second of places is as good as the first, by what the photographs say
+    one by one, evidence (H, K): Student's.
     """
     from scipy.special import stdtr
 
-    found = _evidence(view, candidates[:1], photographs, 5).sum()
-    chance: list[float] = []
-    probability, spread = 1.0, 1.0
-    while len(chance) < CHANCES[-1]:
-        wrong = view.mistaken(rng)
-        moved = _descend(wrong, candidates, photographs, 4, (10, 8, 6, 5))
-        moved = _settled(wrong, moved, photographs, 4, 3)
-        chance.append(_evidence(wrong, moved, photographs, 5).sum(axis=-1).max())
-        if len(chance) in CHANCES:
-            spread = max(float(np.std(chance, ddof=1)), 1.0)
-            away = (np.mean(chance) - found) / (spread * np.sqrt(1 + 1 / len(chance)))
-            probability = float(stdtr(len(chance) - 1, away))
-            if not BY_CHANCE / DECIDED < probability < BY_CHANCE * DECIDED:
-                break
-    return probability, spread
+    count = evidence.shape[1]
+    if len(evidence) < 2:
+        return 0.0
+    gain = evidence[0] - evidence[1:]
+    if count < FEWEST_PAIRED:
+        return 0.0 if np.all(gain > 0) else 1.0
+    spread = np.maximum(gain.std(axis=1, ddof=1) / np.sqrt(count), 1e-9)
+    return float(stdtr(count - 1, -gain.mean(axis=1) / spread).max())
+
+
+def _by_chance(surely: Array) -> float:
+    """Probability of so sure photographs (K,), taken together, by chance."""
+    if not len(surely):
+        return 1.0
+    return 0.5 * math.erfc(float(surely.sum()) / math.sqrt(2 * len(surely)))
 
 
 def _look(view: StationView, candidates: Array, photographs: Integers, samples: int) -> _Look:

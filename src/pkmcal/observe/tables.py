@@ -9,7 +9,7 @@ not say where the machine is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,6 +96,11 @@ class DistanceTables:
         """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
         last = self.chance.shape[1] - 1
         return self.chance[direction, np.minimum(found / BIN, last).astype(np.intp)]
+
+    def select(self, photographs: Integers) -> DistanceTables:
+        """Of some of the photographs; what moves and what chance gives, as all show it."""
+        edges = tuple(self.edges[k] for k in photographs)
+        return replace(self, tables=self.tables[photographs], edges=edges)
 
     def mirrored(self) -> DistanceTables:
         """Of the photographs with left and right exchanged."""
