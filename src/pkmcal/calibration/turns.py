@@ -75,19 +75,11 @@ def take_turns(
     machine = session.machine
     # the nearest poses, where the drawing does not quite close: recognition has seen to it
     poses = machine.forward_result(session.joints).T_base_platform
-    estimate: Estimate | None = None
-    for reach in (legs.REACH, legs.AGAIN):
-        seen = machine, T_camera_base, poses
-        if estimate is not None:
-            state = estimate.state
-            seen = estimate.machine, state.T_camera_base, state.T_base_platform
-        looks = _each(photographs, partial(_search, seen=seen, reach=reach))
-        measurements = measurements_of(session, boards, _edges(looks))
-        lap("observe")
-        start = estimate.state if estimate else start_state(machine, measurements, T_camera_base)
-        estimate = bundle(machine, measurements, start)
-        lap("identify")
-    assert estimate is not None
+    seen = machine, T_camera_base, poses
+    estimate = _whole_legs(session, photographs, boards, seen, legs.REACH, lap)
+    start = estimate.state
+    seen = estimate.machine, start.T_camera_base, start.T_base_platform
+    estimate = _whole_legs(session, photographs, boards, seen, legs.AGAIN, lap, start)
     blur: dict[int, float | None] = {p.station: None for p in photographs}
     for turn in range(ROUNDS):
         told("Measuring edges and identifying", 0.45 + 0.5 * turn / ROUNDS)
@@ -175,13 +167,30 @@ def _reached(session: Session, measurements: Measurements, start: State) -> Stat
     return replace(estimate.state, T_base_platform=found.T_base_platform, internal=found.internal)
 
 
-def _search(
-    photographs: legs.Photographs, seen: tuple[Machine, Array, Array], reach: float
-) -> legs.StationEdges:
-    """Whole legs within ``reach`` px; seen : machine, stations and platforms as they are known."""
-    machine, T_camera_base, poses = seen
-    at = T_camera_base[photographs.station]
-    return legs.search(photographs, machine, at, poses[photographs.configuration], reach)
+def _whole_legs(
+    session: Session,
+    photographs: list[legs.Photographs],
+    boards: Boards,
+    seen: tuple[Machine, Array, Array],
+    reach: float,
+    lap: Callable[[str], None],
+    start: State | None = None,
+) -> Estimate:
+    """The estimate from legs that are looked for within ``reach`` px of where they should be.
+
+    seen : machine, stations (S, 4, 4) and platforms (K, 4, 4) as they are known.
+    """
+    machine, stations, poses = seen
+
+    def search(p: legs.Photographs) -> legs.StationEdges:
+        return legs.search(p, machine, stations[p.station], poses[p.configuration], reach)
+
+    measurements = measurements_of(session, boards, _edges(_each(photographs, search)))
+    lap("observe")
+    start = start or start_state(session.machine, measurements, stations)
+    estimate = bundle(session.machine, measurements, start)
+    lap("identify")
+    return estimate
 
 
 def _measure(

@@ -25,6 +25,7 @@ from pkmcal.observe.stations import (
     evidence_nearby,
     evidence_of,
     find_station,
+    settled,
 )
 from pkmcal.wording import listed
 
@@ -33,6 +34,8 @@ SURE = 0.05
 ELSEWHERE = np.radians(45.0)
 """Turn from the pose by hand beyond which the machine was found where the user does not see it: a
 machine of three or six equal parts looks the same from there."""
+ASSIGNED = 3
+"""Rounds of names for photographs, and of the pose that these tell."""
 SEARCHED = 3
 """Hypotheses, likeliest first, that are searched in full."""
 
@@ -200,11 +203,17 @@ def _other_photographs(station: Seen) -> Iterator[Hypothesis]:
         yield Hypothesis(replace(view, tables=view.tables.mirrored()), _mirrored(station.name))
     if not 2 < len(names) == len(np.unique(names)):
         return
-    fits = np.stack(
-        [evidence_of(replace(view, configuration=np.full(len(names), j)), T) for j in names], axis=1
-    )
-    rows, columns = linear_sum_assignment(-fits)
-    moved = rows[rows != columns]
+    columns = np.arange(len(names))
+    for _ in range(ASSIGNED):  # the wrong names have moved the pose, and it the names
+        fits = np.stack(
+            [evidence_of(replace(view, configuration=np.full(len(names), j)), T) for j in names],
+            axis=1,
+        )
+        before, columns = columns, linear_sum_assignment(-fits)[1]
+        if np.array_equal(before, columns):
+            break
+        T = settled(replace(view, configuration=names[columns]), T)
+    moved = np.flatnonzero(columns != np.arange(len(names)))
     if 0 < len(moved) <= len(names) // 2:
         right = replace(view, configuration=names[columns])
         yield Hypothesis(right, _misnamed(station, moved, names[columns[moved]]))

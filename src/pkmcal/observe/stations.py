@@ -440,6 +440,11 @@ def evidence_of(view: StationView, T_camera_base: Array) -> Array:
     return _evidence(view, T_camera_base[None], view.few(len(view.configuration)), 8)[0]
 
 
+def settled(view: StationView, T_camera_base: Array) -> Array:
+    """The pose (4, 4) with the most evidence near another."""
+    return _settled(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0]
+
+
 def evidence_nearby(
     view: StationView, starts: Array, wide: bool, rng: np.random.Generator
 ) -> float:
