@@ -22,8 +22,8 @@ from pkmcal.geometry.rigid import pose_difference
 from pkmcal.observe.stations import (
     FoundStation,
     StationView,
+    evidence_by_name,
     evidence_nearby,
-    evidence_of,
     find_station,
     settled,
 )
@@ -205,10 +205,7 @@ def _other_photographs(station: Seen) -> Iterator[Hypothesis]:
         return
     columns = np.arange(len(names))
     for _ in range(ASSIGNED):  # the wrong names have moved the pose, and it the names
-        fits = np.stack(
-            [evidence_of(replace(view, configuration=np.full(len(names), j)), T) for j in names],
-            axis=1,
-        )
+        fits = evidence_by_name(replace(view, configuration=names[columns]), T, names)
         before, columns = columns, linear_sum_assignment(-fits)[1]
         if np.array_equal(before, columns):
             break

@@ -435,9 +435,19 @@ def _evidence(view: StationView, candidates: Array, photographs: Integers, sampl
     return look.evidence(mixture).reshape(len(candidates), len(photographs), -1).sum(axis=-1)
 
 
-def evidence_of(view: StationView, T_camera_base: Array) -> Array:
-    """Evidence (K,) of a pose (4, 4) in each photograph."""
-    return _evidence(view, T_camera_base[None], view.few(len(view.configuration)), 8)[0]
+def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -> Array:
+    """Evidence (K, n) of a pose (4, 4) in each photograph under each of the names (n,), rows of the
+    readings; edges scatter as they do under the names that the view has.
+    """
+    every = view.few(len(view.configuration))
+    look = _look(view, T_camera_base[None], every, 8)
+    mixture = look.mixture(_first_mixture(1), rounds=10)
+    fits: list[Array] = []
+    for name in names:
+        other = replace(view, configuration=np.full(len(every), name))
+        look = _look(other, T_camera_base[None], every, 8)
+        fits.append(look.evidence(mixture).reshape(len(every), -1).sum(axis=-1))
+    return np.stack(fits, axis=1)
 
 
 def settled(view: StationView, T_camera_base: Array) -> Array:
