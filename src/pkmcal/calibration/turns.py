@@ -81,6 +81,8 @@ def take_turns(
     seen = estimate.machine, start.T_camera_base, start.T_base_platform
     estimate = _whole_legs(session, photographs, boards, seen, legs.AGAIN, lap, start)
     blur: dict[int, float | None] = {p.station: None for p in photographs}
+    looks: list[legs.StationEdges] = []
+    measurements = measurements_of(session, boards)
     for turn in range(ROUNDS):
         told("Measuring edges and identifying", 0.45 + 0.5 * turn / ROUNDS)
         cameras = cameras.moved(estimate)

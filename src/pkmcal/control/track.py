@@ -303,7 +303,8 @@ def warm_up(blur: float) -> None:
     width = np.repeat(profiles.HALF_WIDTHS, samples)
     cut = np.tile(np.arange(samples), len(profiles.HALF_WIDTHS))
     grey = np.zeros((len(width), samples))
-    profiles.locate(profiles.Profiles(grey, np.ones(len(width)), width, cut), blur)
+    some = profiles.Profiles(grey, np.ones(len(width)), width, cut)
+    profiles.locate(some, profiles.residual_curves(some, blur), np.zeros(len(width)))
 
 
 def track(sight: Sight, state: TrackState, image: Integers, readings: Array) -> TrackedLegs:

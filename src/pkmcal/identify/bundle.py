@@ -195,6 +195,7 @@ def _shading_sigma(fit: _Fit, least: Array) -> Array:
     square = (unit * fit.state.shading) ** 2
     expected = square + unit**2 * np.minimum(variance, 1.0)
     common = np.median(unit, axis=1, keepdims=True) ** 2
+    weight = np.ones_like(square)
     for _ in range(WEIGHINGS):
         weight = (FREEDOM + 1) / (FREEDOM + expected / common)
         total = np.sum(weight * square, axis=1, keepdims=True)

@@ -144,25 +144,29 @@ def _mixed_up(station: Seen, in_order: bool, rng: np.random.Generator) -> InputE
         return None
     better.sort(key=lambda item: item[0].by_chance)
     first, error = better[0][0], better[0][1].error
-    for other, hypothesis in better[1:]:
-        if other.by_chance * SURE < first.by_chance:
-            found_both = f"{error.found}; they fit as well if {hypothesis.error.what}"
-            return InputError(error.what, where=error.where, found=found_both,
-                              next_step=error.next_step)  # fmt: skip
-    return error
+    also = [
+        hypothesis.error.what
+        for other, hypothesis in better[1:]
+        if other.by_chance * SURE < first.by_chance
+    ]
+    if station.elsewhere and found.good:
+        also.append("the pose by hand is of another side of the machine")
+    if not also:
+        return error
+    said = f"{error.found}; they fit as well if {' or '.join(also)}"
+    return InputError(error.what, where=error.where, found=said, next_step=error.next_step)
 
 
 def _replaces(found: FoundStation, station: Seen, in_order: bool) -> bool:
     """Whether a hypothesis explains a station better than its own readings. Where these put the
-    camera elsewhere than the user, and no other station shows that they are in order, as well is
-    enough.
+    camera elsewhere than the user, and no other station shows that they are in order, to be
+    recognised where the user says is enough.
     """
     if not found.good or station._replace(found=found).elsewhere:
         return False
-    before, now = station.found.by_chance, found.by_chance
     if station.elsewhere and station.found.good and not in_order:
-        return now * SURE < before
-    return now < before * SURE
+        return True
+    return found.by_chance < station.found.by_chance * SURE
 
 
 def _hypotheses(station: Seen) -> Iterator[Hypothesis]:
@@ -197,7 +201,7 @@ def _other_photographs(station: Seen) -> Iterator[Hypothesis]:
     """Photographs under the names that fit each of them best; where the machine was not recognised,
     mirrored ones.
     """
-    view, T = station.view, station.found.T_camera_base
+    view, T_camera_base = station.view, station.found.T_camera_base
     names = view.configuration
     if not station.found.good:
         yield Hypothesis(replace(view, tables=view.tables.mirrored()), _mirrored(station.name))
@@ -205,11 +209,11 @@ def _other_photographs(station: Seen) -> Iterator[Hypothesis]:
         return
     columns = np.arange(len(names))
     for _ in range(ASSIGNED):  # the wrong names have moved the pose, and it the names
-        fits = evidence_by_name(replace(view, configuration=names[columns]), T, names)
+        fits = evidence_by_name(replace(view, configuration=names[columns]), T_camera_base, names)
         before, columns = columns, linear_sum_assignment(-fits)[1]
         if np.array_equal(before, columns):
             break
-        T = settled(replace(view, configuration=names[columns]), T)
+        T_camera_base = settled(replace(view, configuration=names[columns]), T_camera_base)
     moved = np.flatnonzero(columns != np.arange(len(names)))
     if 0 < len(moved) <= len(names) // 2:
         right = replace(view, configuration=names[columns])

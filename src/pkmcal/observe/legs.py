@@ -11,7 +11,9 @@ across it (:mod:`pkmcal.observe.profiles`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -96,7 +98,7 @@ class LegPlaces:
         return SIDE_SIGNS[tubes.side][:, None] * (shift + tilt * along)
 
 
-def sample(images: list[Integers], pixel: Array, cubic: bool = True) -> Array:
+def sample(images: Sequence[Any], pixel: Array, cubic: bool = True) -> Array:
     """Grey levels of K images at pixels (K, E, ..., 2): (K, E, ...), interpolated."""
     import cv2
 
@@ -158,7 +160,7 @@ def gradient_strength(
     import cv2
     from scipy.ndimage import maximum_filter1d
 
-    smooth = [cv2.GaussianBlur(image, (0, 0), SMOOTH) if SMOOTH else image for image in images]
+    smooth = [cv2.GaussianBlur(im.astype(np.float32), (0, 0), SMOOTH) for im in images]
     level = np.sqrt(255.0 * sample(smooth, pixel, cubic=False))
     slope = np.abs(level[..., 2:] - level[..., :-2]) / 2
     peak = maximum_filter1d(slope, 2 * PEAK + 1, axis=-1)
@@ -351,7 +353,8 @@ def _leg_lines(likelihood: Array, along: Array, full: Booleans, tubes: TubeList)
         at = sign[:, None, None] * (steps + tilt * place[..., None])
         column = np.clip(np.rint((at - steps[0]) / pitch), 0, count - 1).astype(np.intp)
         by_edge = every[k[..., None], e[..., None], n[..., None], column].sum(axis=2)
-        np.add.at(score[:, :, i], (slice(None), tubes.leg), by_edge)
+        for leg in range(score.shape[1]):
+            score[:, leg, i] = by_edge[:, tubes.leg == leg].sum(axis=1)
     best = score.reshape(*score.shape[:2], -1).argmax(axis=-1)
     tilt, shift = np.unravel_index(best, score.shape[2:])
     shift, tilt = (v[:, tubes.leg][..., None] for v in (steps[shift], LEG_TILTS[tilt]))

@@ -61,9 +61,6 @@ BY_CHANCE, BY_CHANCE_TOLD = 1e-3, 1e-2
 where it was looked for about a pose by hand, which says much the same already."""
 APART = 8.0
 """Reduced pixels between two hypotheses' silhouettes from which they are not the same place."""
-FEWEST_PAIRED = 3
-"""Photographs from which their scatter says whether one place is better than another; fewer have
-to agree."""
 DOUBT = 0.05
 """Probability of a second place being as good above which neither is believed."""
 
@@ -118,7 +115,9 @@ class StationView:
         """
         count, own = len(self.all_joints), self.configuration
         steps = np.unique(np.linspace(1, count - 1, MOST_RIVALS).astype(int)) if count > 1 else []
-        views = [replace(self, configuration=(own + step) % count) for step in steps]
+        views: list[StationView] = [
+            replace(self, configuration=(own + step) % count) for step in steps
+        ]
         for _ in range(len(views), FEWEST_RIVALS):
             away = rng.normal(size=(len(own), 6)) * AWAY
             away[:, 3:] *= np.linalg.norm(self.poses[:, :3, 3], axis=-1, keepdims=True)
@@ -180,8 +179,8 @@ def find_station(
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng)
     every = view.few(count)
     candidates = _settled(view, candidates, every, 8, 8)
-    evidence = _evidence(view, candidates, every, 8)
-    order = np.argsort(-evidence.sum(axis=-1))
+    evidence = _evidence(view, candidates, every, 8).sum(axis=-1)
+    order = np.argsort(-evidence)
     order = order[_apart(view, candidates[order], every)]
     candidates, evidence = candidates[order], evidence[order]
     # the most evidence leaves no edge out; where hidden ones were taken in, those that lie near
@@ -193,9 +192,9 @@ def find_station(
     return FoundStation(
         T_camera_base=ends[scores.argmin()],
         score=float(scores.min()),
-        evidence=float(evidence[0].sum()),
+        evidence=float(evidence[0]),
         by_chance=_by_chance(surely),
-        second=_second(evidence),
+        second=_second(view, candidates, evidence),
         told=T_camera_base is not None,
     )
 
@@ -500,20 +499,16 @@ def _surely(
     return -ndtri(np.maximum(stdtr(count - 1, -away), 1e-300))
 
 
-def _second(evidence: Array) -> float:
-    """Probability that the second of places is as good as the first, by what the photographs say
-    one by one, evidence (H, K): Student's.
+def _second(view: StationView, candidates: Array, evidence: Array) -> float:
+    """Probability that the second of places (H, 4, 4) is the machine's and not the first, by their
+    evidence (H,), of which each half of an edge counts as one measurement.
     """
-    from scipy.special import stdtr
-
-    count = evidence.shape[1]
     if len(evidence) < 2:
         return 0.0
-    gain = evidence[0] - evidence[1:]
-    if count < FEWEST_PAIRED:
-        return 0.0 if np.all(gain > 0) else 1.0
-    spread = np.maximum(gain.std(axis=1, ddof=1) / np.sqrt(count), 1e-9)
-    return float(stdtr(count - 1, -gain.mean(axis=1) / spread).max())
+    every = view.few(len(view.configuration))
+    length = _look(view, candidates[:1], every, 2).length[0]
+    half = float(length[length > 0].mean()) / 2  # two samples stand for an edge's length each
+    return 1 / (1 + math.exp(min(float(evidence[0] - evidence[1:].max()) / half, 500.0)))
 
 
 def _by_chance(surely: Array) -> float:
