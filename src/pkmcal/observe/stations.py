@@ -51,9 +51,11 @@ LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
 FEWEST_RIVALS, MOST_RIVALS = 8, 24
 """Other readings for each photograph, which tell what evidence chance gives."""
+ENOUGH_FOR_HALVES = 7
+"""Photographs from which half of them are enough to search in."""
 DECIDED = 10.0
-"""Times less than the probability asked for, by one half of the photographs, at which the other
-half need not be asked."""
+"""Times less than the probability asked for, by some of the photographs, at which the others need
+not be asked."""
 AWAY = np.repeat([0.2, 0.1], 3)
 """Turn (rad) and shift (in distances of base and platform) of a platform that is elsewhere."""
 BY_CHANCE, BY_CHANCE_TOLD = 1e-3, 1e-2
@@ -163,17 +165,20 @@ class FoundStation:
 def find_station(
     view: StationView, T_camera_base: Array | None, rng: np.random.Generator
 ) -> FoundStation:
-    """The pose near a rough one, or anywhere, from half of the photographs; what the other half
-    says of it decides. Then every photograph takes part.
+    """The pose near a rough one, or anywhere, from half of the photographs, or two thirds of few;
+    what the others say of it decides, each in its turn. Then every photograph takes part.
     """
     count = len(view.configuration)
-    halves = [np.arange(first, count, 2) for first in (0, 1)]
+    number = np.arange(count)
+    folds = 3 if 2 < count < ENOUGH_FOR_HALVES else min(count, 2)
     kept: list[Array] = []
     surely = np.zeros(0)
-    for half, other in (halves, halves[::-1]) if count > 1 else ():
-        found = _search(view.select(half), T_camera_base, rng)
+    for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
+        asked = number % folds == fold
+        searched, other = np.flatnonzero(~asked), np.flatnonzero(asked)
+        found = _search(view.select(searched), T_camera_base, rng)
         kept.append(found)
-        surely = np.concatenate([surely, _surely(view, found[0], half, other, rng)])
+        surely = np.concatenate([surely, _surely(view, found[0], searched, other, rng)])
         if _by_chance(surely) < BY_CHANCE / DECIDED:
             break
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng)
@@ -475,12 +480,12 @@ def evidence_nearby(
 def _surely(
     view: StationView,
     T_camera_base: Array,
-    half: Integers,
+    searched: Integers,
     other: Integers,
     rng: np.random.Generator,
 ) -> Array:
-    """How surely each photograph of one half shows the machine at a pose (4, 4) that was found from
-    the other: standard normal (K,) where it does not.
+    """How surely each of some photographs shows the machine at a pose (4, 4) that was found from
+    others, ``searched``: standard normal (K,) where it does not.
 
     Without the machine, a photograph's own readings fit it no better than others do; by how much
     they do, in units of the others' scatter, has Student's distribution.
@@ -491,7 +496,7 @@ def _surely(
         look = _look(view, T_camera_base[None], other, 8)
         return look.evidence(mixture).reshape(len(other), -1).sum(axis=-1)
 
-    mixture = _look(view, T_camera_base[None], half, 8).mixture(_first_mixture(1), rounds=10)
+    mixture = _look(view, T_camera_base[None], searched, 8).mixture(_first_mixture(1), rounds=10)
     fits = np.stack([evidence(rival) for rival in view.rivals(rng)], axis=1)
     count = fits.shape[1]
     scatter = np.maximum(fits.std(axis=1, ddof=1), 1e-9) * np.sqrt(1 + 1 / count)
