@@ -83,8 +83,8 @@ END = 0.15
 FEW_CONFIGURATIONS = 8
 """Configurations below which standard deviations are large and mistakes go unnoticed."""
 STATION_LEGEND = (
-    "By chance: the probability that readings other than its own fit a station's photographs as"
-    " well; below 0.001 the machine is recognised. Mismatch: of drawing and pictures, 0 perfect.",
+    "By chance: probability of other readings fitting as well; good below 0.001,",
+    "or 0.01 near a pose by hand.",
     "Moved: from the pose by hand to the one found. Legs: found in a photograph.",
     "White, black: of the legs' pixels. Blur: of the sharpest edges.",
 )
@@ -658,7 +658,6 @@ def _stations_table(found: SessionCheck) -> Table:
         cells = (
             str(station.photographs),
             _number(station.by_chance, "{:.0e}"),
-            _number(station.mismatch, "{:.2f}"),
             moved if math.isfinite(station.moved) else "–",
             f"{station.legs:.1f}/{found.n_legs}" if seen else "–",
             _number(station.saturated, "{:.0%}"),
@@ -666,17 +665,7 @@ def _stations_table(found: SessionCheck) -> Table:
             _number(station.blur, "{:.1f} px"),
         )
         rows.append(Row(station.name, cells, mark=mark))
-    columns = (
-        "Station",
-        "Photos",
-        "By chance",
-        "Mismatch",
-        "Moved",
-        "Legs",
-        "White",
-        "Black",
-        "Blur",
-    )
+    columns = ("Station", "Photos", "By chance", "Moved", "Legs", "White", "Black", "Blur")
     return Table("", columns, tuple(rows), " ".join(STATION_LEGEND), legend=STATION_LEGEND)
 
 
