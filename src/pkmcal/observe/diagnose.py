@@ -166,7 +166,8 @@ def _replaces(found: FoundStation, station: Seen, in_order: bool) -> bool:
         return False
     if station.elsewhere and station.found.good and not in_order:
         return True
-    return found.by_chance < station.found.by_chance * SURE
+    before = station.found
+    return found.evidence > before.evidence and found.by_chance < before.by_chance * SURE
 
 
 def _hypotheses(station: Seen) -> Iterator[Hypothesis]:
@@ -183,7 +184,10 @@ def _hypotheses(station: Seen) -> Iterator[Hypothesis]:
         tried.add(tuple(order.tolist()))
         yield Hypothesis(view.with_joints(view.all_joints[:, order]), _two_legs(a + 1, b + 1))
     turned = [np.roll(own, -r) for r in range(1, count)]
-    for order in turned + [np.roll(own[::-1], r) for r in range(count)]:
+    turned += [np.roll(own[::-1], r) for r in range(count)]
+    if station.found.good and station.by_hand is None:
+        turned = []  # of a machine with equal thirds, any of its equal numberings would do as well
+    for order in turned:
         if tuple(order.tolist()) not in tried:
             tried.add(tuple(order.tolist()))
             yield Hypothesis(view.with_joints(view.all_joints[:, order]), _numbering(order))

@@ -165,12 +165,12 @@ class FoundStation:
 def find_station(
     view: StationView, T_camera_base: Array | None, rng: np.random.Generator
 ) -> FoundStation:
-    """The pose near a rough one, or anywhere, from half of the photographs, or two thirds of few;
-    what the others say of it decides, each in its turn. Then every photograph takes part.
+    """The pose near a rough one, or anywhere, from half of the photographs, or all but one or two
+    of few; what the others say of it decides, each in its turn. Then every photograph takes part.
     """
     count = len(view.configuration)
     number = np.arange(count)
-    folds = 3 if 2 < count < ENOUGH_FOR_HALVES else min(count, 2)
+    folds = min(count, 4 if count < ENOUGH_FOR_HALVES else 2)
     kept: list[Array] = []
     surely = np.zeros(0)
     for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
