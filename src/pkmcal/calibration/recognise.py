@@ -224,10 +224,10 @@ def _searched(
 def _anywhere(
     views: tuple[StationView, ...], before: Sequence[Search], rngs: list[np.random.Generator]
 ) -> list[FoundStation]:
-    """What is found already, and else the search all round the machine."""
+    """What is surely found already, and else the better of it and of the search all round."""
 
     def search(view: StationView, before: Search, rng: np.random.Generator) -> FoundStation:
-        if before and before.good:
+        if before and before.sure:
             return before
         return _better(find_station(view, None, rng), before)
 

@@ -161,6 +161,11 @@ class FoundStation:
         """Whether the machine was recognised, and at one place only."""
         return self.by_chance < self.limit and self.second < DOUBT
 
+    @property
+    def sure(self) -> bool:
+        """Whether it was recognised without what is said of the pose."""
+        return self.by_chance < BY_CHANCE and self.second < DOUBT
+
 
 def find_station(
     view: StationView, T_camera_base: Array | None, rng: np.random.Generator
