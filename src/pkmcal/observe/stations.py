@@ -175,7 +175,7 @@ def find_station(
     """
     count = len(view.configuration)
     number = np.arange(count)
-    folds = min(count, 4 if count < ENOUGH_FOR_HALVES else 2)
+    folds = 2 if count >= ENOUGH_FOR_HALVES else min(count, 4) if count < 5 else 3
     kept: list[Array] = []
     surely = np.zeros(0)
     for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
