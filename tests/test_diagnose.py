@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkmcal.observe.diagnose import Seen, mistake
+from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import StationView, find_station
 from pkmcal.observe.tables import distance_tables
@@ -39,7 +39,7 @@ def said(pictures, readings=None, configuration=None, mechanism=None, by_hand=No
     if by_hand is not None and not found.good:
         found = max(found, find_station(view, None, rng), key=lambda f: (f.good, f.evidence))
     files = [f"images/front/{name}.png" for name in NAMES]
-    return mistake([Seen("front", files, NAMES, view, by_hand, found)], rng)
+    return mistake([SeenStation("front", files, NAMES, view, by_hand, found)], rng)
 
 
 def readings_with(order):

@@ -67,3 +67,14 @@ def test_no_files_import_each_other_in_a_circle():
         for path in ends:
             del left[path]
     assert sorted(str(path.relative_to(SOURCE)) for path in left) == []
+
+
+def test_a_public_class_name_exists_once():
+    names = [
+        node.name
+        for path in SOURCE.rglob("*.py")
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    ]
+    assert len(names) > 100
+    assert {name for name in names if names.count(name) > 1} == set()

@@ -15,7 +15,7 @@ from pkmcal.boards.views import Boards, find_boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.observe import legs
-from pkmcal.observe.diagnose import Seen, mistake
+from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.images import decode, decode_all
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import FoundStation, StationView, find_station
@@ -253,7 +253,7 @@ def mistake_in(
     stations = [session.stations[p.station] for p in photographs]
     return mistake(
         [
-            Seen(
+            SeenStation(
                 station.name,
                 [label_of(session.folder, p.path) for p in station.photographs],
                 session.configurations,

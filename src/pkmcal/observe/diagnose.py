@@ -40,7 +40,7 @@ SEARCHED = 3
 """Hypotheses, likeliest first, that are searched in full."""
 
 
-class Seen(NamedTuple):
+class SeenStation(NamedTuple):
     """A station: its name, the files of its photographs and the names of the session's
     configurations, its view, pose by hand (4, 4) if there is one, and what was found.
     """
@@ -68,7 +68,7 @@ class Hypothesis(NamedTuple):
     error: InputError
 
 
-def mistake(stations: list[Seen], rng: np.random.Generator) -> InputError | None:
+def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError | None:
     """The error about stations whose photographs show something else than the session says."""
     error = _swapped_stations([s for s in stations if s.elsewhere], rng)
     if error is not None or not stations:
@@ -94,7 +94,7 @@ def mistake(stations: list[Seen], rng: np.random.Generator) -> InputError | None
     )
 
 
-def _little(station: Seen) -> str:
+def _little(station: SeenStation) -> str:
     """What of the evidence is too little."""
     found = station.found
     if found.by_chance < found.limit:
@@ -105,7 +105,7 @@ def _little(station: Seen) -> str:
     return f"legs that readings of other configurations fit as well {often}"
 
 
-def _swapped_stations(stations: list[Seen], rng: np.random.Generator) -> InputError | None:
+def _swapped_stations(stations: list[SeenStation], rng: np.random.Generator) -> InputError | None:
     """Two stations each recognised near the other's pose."""
     for one, other in combinations(stations, 2):
         if one.by_hand is None or other.by_hand is None:
@@ -123,7 +123,7 @@ def _swapped_stations(stations: list[Seen], rng: np.random.Generator) -> InputEr
     return None
 
 
-def _mixed_up(station: Seen, in_order: bool, rng: np.random.Generator) -> InputError | None:
+def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) -> InputError | None:
     """The hypothesis that explains a station's photographs better than the session, if any."""
     view, found = station.view, station.found
     starts = [found.T_camera_base] if found.good or station.by_hand is not None else []
@@ -157,7 +157,7 @@ def _mixed_up(station: Seen, in_order: bool, rng: np.random.Generator) -> InputE
     return InputError(error.what, where=error.where, found=said, next_step=error.next_step)
 
 
-def _replaces(found: FoundStation, station: Seen, in_order: bool) -> bool:
+def _replaces(found: FoundStation, station: SeenStation, in_order: bool) -> bool:
     """Whether a hypothesis explains a station better than its own readings. Where these put the
     camera elsewhere than the user, and no other station shows that they are in order, to be
     recognised where the user says is enough.
@@ -170,7 +170,7 @@ def _replaces(found: FoundStation, station: Seen, in_order: bool) -> bool:
     return found.evidence > before.evidence and found.by_chance < before.by_chance * SURE
 
 
-def _hypotheses(station: Seen) -> Iterator[Hypothesis]:
+def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
     """What is tried: columns turned, turned round and exchanged, names shifted; of a station that
     was not recognised, diameters taken for radii.
     """
@@ -201,7 +201,7 @@ def _hypotheses(station: Seen) -> Iterator[Hypothesis]:
         yield Hypothesis(replace(view, machine=view.machine.with_values(values)), _diameters())
 
 
-def _other_photographs(station: Seen) -> Iterator[Hypothesis]:
+def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
     """Photographs under the names that fit each of them best; where the machine was not recognised,
     mirrored ones.
     """
@@ -257,7 +257,7 @@ def _shifted(step: int) -> InputError:
     )
 
 
-def _misnamed(station: Seen, photographs: Integers, fitting: Integers) -> InputError:
+def _misnamed(station: SeenStation, photographs: Integers, fitting: Integers) -> InputError:
     """The error about photographs, by number, that fit other rows of the readings."""
     files = [station.files[k] for k in photographs]
     fit = [station.configurations[k] for k in fitting]

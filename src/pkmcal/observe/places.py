@@ -49,7 +49,7 @@ LONGEST = COVER * HALF
 """Cells that a chord counts for at most: from near by, a leg fills the sphere."""
 
 
-class Spread(NamedTuple):
+class Breadth(NamedTuple):
     """What moves, on the sphere about the camera: unit middle (..., 3) and width (...), rad."""
 
     middle: Array
@@ -87,7 +87,7 @@ def anywhere(
     return pose(rot, -(rot @ places[place][..., None])[..., 0])
 
 
-def _seen_spread(camera: Camera, tables: DistanceTables) -> Spread:
+def _seen_spread(camera: Camera, tables: DistanceTables) -> Breadth:
     """What moves in the photographs."""
     y, x = np.nonzero(tables.moving)
     corner = np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5]])
@@ -99,19 +99,19 @@ def _seen_spread(camera: Camera, tables: DistanceTables) -> Spread:
     return _spread(rays[:, 0], share * np.sqrt(dot(area, area)))
 
 
-def _spread(rays: Array, weight: Array) -> Spread:
+def _spread(rays: Array, weight: Array) -> Breadth:
     """Of rays (..., n, 3), not all of unit weight (..., n)."""
     mean = np.sum(weight[..., None] * rays, axis=-2)
     mean /= np.maximum(weight.sum(axis=-1), 1e-300)[..., None]
     length = np.sqrt(dot(mean, mean))
     middle = np.where(length[..., None] > 0, mean, [0.0, 0.0, 1.0])  # nothing moves: anywhere
     middle = middle / np.sqrt(dot(middle, middle))[..., None]
-    return Spread(middle, np.arccos(np.clip(length, 0.0, 1 - 1e-9)))
+    return Breadth(middle, np.arccos(np.clip(length, 0.0, 1 - 1e-9)))
 
 
 def _places(
     tubes: TubeList, radius: Array, legs: LegsInCamera, width: float
-) -> tuple[Array, Spread]:
+) -> tuple[Array, Breadth]:
     """Places (P, 3) in the base frame from which what moves looks about as wide as it is seen, and
     how it looks from there.
     """
@@ -149,7 +149,7 @@ def _places(
         np.abs(np.log(spread.width) - np.log(width / wider)).argmin(axis=1) for wider in WIDER
     ]
     at = np.concatenate([np.arange(PLACES)] * len(WIDER)), np.concatenate(nearest)
-    return place[at], Spread(spread.middle[at], spread.width[at])
+    return place[at], Breadth(spread.middle[at], spread.width[at])
 
 
 def _frame(middle: Array) -> Array:
@@ -190,7 +190,7 @@ def _chart_tables(
 def _scores(
     chart: Integers,
     places: Array,
-    spread: Spread,
+    spread: Breadth,
     tubes: TubeList,
     legs: LegsInCamera,
     photographs: Integers,

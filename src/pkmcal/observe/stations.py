@@ -8,8 +8,9 @@ photographs, with distances cut off ever nearer.
 What was found is weighed. A place on a predicted silhouette has either a picture edge of the
 machine near by, or what chance has put there: a mixture, whose two numbers each hypothesis may
 choose for itself. Its likelihood against chance alone is the evidence, counted by the length of
-the silhouettes. How much evidence photographs yield to any machine, the same search tells with
-readings that are not theirs: those that other photographs of the session bear.
+the silhouettes. The most evidence is found in any picture, machine or not. So the place is searched
+in some of the photographs, and the others are asked: at that place, do their own readings fit
+better than those that other photographs of the session bear? Without the machine they do not.
 """
 
 from __future__ import annotations
@@ -51,8 +52,9 @@ LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
 FEWEST_RIVALS, MOST_RIVALS = 8, 24
 """Other readings for each photograph, which tell what evidence chance gives."""
-ENOUGH_FOR_HALVES = 7
-"""Photographs from which half of them are enough to search in."""
+HALVES, THIRDS = 7, 5
+"""Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
+each in its turn."""
 DECIDED = 10.0
 """Times less than the probability asked for, by some of the photographs, at which the others need
 not be asked."""
@@ -140,8 +142,7 @@ class FoundStation:
 
     evidence : log likelihood against chance, by reduced pixels of silhouette. by_chance :
     probability of as much without the machine. second : probability that another place is as good.
-    told : whether it was looked for about a
-    pose that is known.
+    told : whether it was looked for about a pose that is known.
     """
 
     T_camera_base: Array
@@ -175,7 +176,7 @@ def find_station(
     """
     count = len(view.configuration)
     number = np.arange(count)
-    folds = 2 if count >= ENOUGH_FOR_HALVES else min(count, 4) if count < 5 else 3
+    folds = 2 if count >= HALVES else 3 if count >= THIRDS else count
     kept: list[Array] = []
     surely = np.zeros(0)
     for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
@@ -213,7 +214,7 @@ def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Gener
     """Up to three places (H, 4, 4), the one with the most evidence first."""
     few, more = view.few(4), view.few(8)
     if T_camera_base is None:
-        each = 4 // len(few)  # fewer photographs tell less, and cost less
+        each = 4 // len(few)  # more candidates of fewer photographs: these tell less, and cost less
         candidates = _anywhere(view, few, each * ANYWHERE)
         candidates = _best(view, candidates, few, reach=12, keep=each * 96)
         candidates = _descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))

@@ -33,7 +33,7 @@ from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, kinematics
 from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense
 from pkmcal.papers.hand_eye import start_from_poses
-from pkmcal.papers.measured_platform import Seen, Taken, seen_platform, taken
+from pkmcal.papers.measured_platform import SeenPlatform, Taken, seen_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames
 from pkmcal.solver import (
     RESTART_DAMPING,
@@ -83,7 +83,7 @@ class _Rows(NamedTuple):
     """
 
     value: Array
-    seen: Seen
+    seen: SeenPlatform
     taken: Taken
     closure: Closure
     scale: Array

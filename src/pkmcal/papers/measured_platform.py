@@ -17,7 +17,7 @@ from pkmcal.geometry.rigid import pose, rotation, rotation_vector, skew
 from pkmcal.identify.rows import turn_jacobian
 
 
-class Seen(NamedTuple):
+class SeenPlatform(NamedTuple):
     """Platform poses (..., 4, 4) and their change (..., 6, 6) by T_base_camera, by the mount's pose
     and by the measured one.
     """
@@ -39,7 +39,9 @@ class Taken(NamedTuple):
     off_by: Array
 
 
-def seen_platform(T_camera_base: Array, T_camera_board: Array, T_platform_board: Array) -> Seen:
+def seen_platform(
+    T_camera_base: Array, T_camera_board: Array, T_platform_board: Array
+) -> SeenPlatform:
     """[C] eq. 6 and its derivatives; (..., 4, 4) each, leading axes broadcast."""
     back = T_camera_base[..., :3, :3].mT
     rot = back @ T_camera_board[..., :3, :3] @ T_platform_board[..., :3, :3].mT
@@ -54,7 +56,9 @@ def seen_platform(T_camera_base: Array, T_camera_board: Array, T_platform_board:
         out[..., 3:, :3] = skew(lever) @ turn
         return out
 
-    return Seen(pose(rot, place), by(np.eye(3), camera - place), by(-rot, arm), by(back, arm))
+    return SeenPlatform(
+        pose(rot, place), by(np.eye(3), camera - place), by(-rot, arm), by(back, arm)
+    )
 
 
 def taken(motion: Array, whole: Array) -> Taken:

@@ -134,7 +134,7 @@ def lamp_seen(
     return seen
 
 
-class Sight(NamedTuple):
+class RayHits(NamedTuple):
     """What rays meet, (bundles, rays) each: light, labels that change at every visible border, and
     the part of the lamp that the place sees. A label counts the shape, its face, and whether it
     lies in shadow.
@@ -147,7 +147,7 @@ class Sight(NamedTuple):
 
 def look(
     scene: Scene, bounds: Bounds, origin: Array, rays: Array, seen: Array | None = None
-) -> Sight:
+) -> RayHits:
     """What rays (3, bundles, rays) meet; seen : (bundles, rays) of the lamp, where it is known."""
     shapes = [part.shape for part in scene.parts]
     distance, owner = first_hits(shapes, bounds, origin, rays)
@@ -172,7 +172,7 @@ def look(
                 part.shape, part.material, flat[:, at], toward[:, at], lit[at], scene.lighting
             )
     label = 6 * owner + 2 * face.reshape(owner.shape) + (seen < 0.5)
-    return Sight(light.reshape(distance.shape), np.where(lost, -1, label).astype(np.int16), seen)
+    return RayHits(light.reshape(distance.shape), np.where(lost, -1, label).astype(np.int16), seen)
 
 
 def _flat(rays: Array, rows: Integers) -> Array:
@@ -251,7 +251,7 @@ def _rays(camera: Camera, x: Array, y: Array) -> Array:
 
 def _through_centres(
     scene: Scene, bounds: Bounds, origin: Array, rot: Array, view: PixelRays, blind: Booleans
-) -> Sight:
+) -> RayHits:
     """One ray a pixel, (H, W); meaningless in blind pixels."""
     shape = blind.shape
     light, label = np.zeros(blind.size), np.full(blind.size, -2, dtype=np.int16)
@@ -263,7 +263,7 @@ def _through_centres(
         d = _seeing(rays[:, rows])
         light[rows], label[rows], seen[rows] = look(scene, bounds, origin, turned(rot, d))
     label[blind.ravel()] = -2
-    return Sight(light.reshape(shape), label.reshape(shape), seen.reshape(shape))
+    return RayHits(light.reshape(shape), label.reshape(shape), seen.reshape(shape))
 
 
 def _over_area(

@@ -1,0 +1,305 @@
+"""Recognition: stations of all machines without a pose, and sessions with a usual mistake in them.
+
+    python benchmarks/recognition.py [--stations 100]         right, refused, wrong; seconds
+    python benchmarks/recognition.py --mistakes [--no-pose]   named, refused otherwise, not noticed
+    python benchmarks/recognition.py --keep FOLDER ...        draws photographs once and keeps them
+
+Each session is simulated with a machine of its own, and what calibration begins with is asked where
+the cameras stand. Right is a place within a tenth of its distance and six degrees of the true one:
+what follows finds the rest from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+NEAR, TURNED = 0.1, np.radians(6.0)
+"""Share of the camera's distance, and rad, within which a place is right."""
+SIZE = (640, 480)
+PHOTOGRAPHS = 10
+"""Of each station of the catalogue's machines."""
+MISTAKEN = (2, 8)
+"""Stations, and photographs of each, of a session with a mistake."""
+HINGED = ("h4-rods",)
+"""Machines that cannot be simulated: how far their side bars turn is not known."""
+
+
+class Outcome(NamedTuple):
+    """What became of a session: right, refused or wrong; what was said; processor's seconds."""
+
+    what: str
+    said: str
+    seconds: float
+
+
+class Mistake(NamedTuple):
+    """A usual mistake: how a session's folder gets it, and words by which it is named; none where
+    the session is as good as before.
+    """
+
+    make: Callable[[Path, np.random.Generator], None]
+    named: tuple[str, ...]
+
+
+def simulated(machine: str, seed: int, stations: int, count: int, keep: Path) -> Path:
+    """The folder of a session, drawn where it is not there yet."""
+    from pkmcal.mechanisms import load_mechanism
+    from pkmcal.simulation import Settings, simulate_session, with_forearms
+    from pkmcal.simulation.demo import camera_of_size
+
+    folder = keep / f"{machine}-{stations}x{count}-{seed}"
+    if not folder.exists():
+        settings = Settings(stations=stations, configurations=count)
+        drawing = with_forearms(load_mechanism(machine))
+        simulate_session(folder, drawing, camera_of_size(SIZE), settings, seed=seed)
+    return folder
+
+
+def recognised(folder: Path, seed: int) -> Outcome:
+    """Where the cameras stand by a session's photographs, against its truth."""
+    from pkmcal.calibration.recognise import (
+        boards_of,
+        check_observable,
+        read_photographs,
+        station_poses,
+    )
+    from pkmcal.errors import PkmcalError
+    from pkmcal.geometry.rigid import inverse, pose_difference
+    from pkmcal.session.load import load_session
+    from pkmcal.simulation import load_truth
+
+    begin = time.process_time()
+    try:
+        session = load_session(folder)
+        check_observable(session)
+        photographs = read_photographs(session)
+        boards = boards_of(session, photographs)
+        begin = time.process_time()  # of the search alone, where it comes to that
+        found = station_poses(session, photographs, boards, np.random.default_rng(seed))
+    except PkmcalError as error:
+        return Outcome("refused", str(error), time.process_time() - begin)
+    seconds = time.process_time() - begin
+    true = load_truth(folder, session.machine).T_camera_base
+    off = pose_difference(inverse(found), inverse(true))
+    distance = np.linalg.norm(inverse(true)[:, :3, 3], axis=1)
+    place = np.linalg.norm(inverse(found)[:, :3, 3] - inverse(true)[:, :3, 3], axis=1) / distance
+    turn = np.linalg.norm(off[:, :3], axis=1)
+    right = bool((place < NEAR).all() and (turn < TURNED).all())
+    said = f"{100 * place.max():.1f} % of the distance, {np.degrees(turn.max()):.1f} degrees off"
+    return Outcome("right" if right else "wrong", said, seconds / len(session.stations))
+
+
+# ------------------------------------------------------------------ mistakes
+
+
+def edited(path: Path, change: Callable[[Any], None]) -> None:
+    """A YAML file with a change."""
+    document = yaml.safe_load(path.read_text())
+    change(document)
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+
+
+def readings(folder: Path, order: Callable[[list[str]], list[str]]) -> None:
+    """The readings' columns in another order, under their names as before."""
+    path = folder / "joints.csv"
+    head, *rows = list(csv.reader(path.read_text().splitlines()))
+    lines = [head, *([row[0], *order(row[1:])] for row in rows)]
+    path.write_text("\n".join(",".join(line) for line in lines) + "\n")
+
+
+def pictures(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    """All photographs changed."""
+    import cv2
+
+    for path in sorted(folder.glob("images/*/*.png")):
+        cv2.imwrite(str(path), change(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+
+
+def renamed(folder: Path, order: Callable[[list[Path]], list[Path]]) -> None:
+    """Each station's photographs under each other's names."""
+    for station in sorted((folder / "images").iterdir()):
+        paths = sorted(station.iterdir())
+        data = [path.read_bytes() for path in order(paths)]
+        for path, bytes_ in zip(paths, data, strict=True):
+            path.write_bytes(bytes_)
+
+
+def without_poses(folder: Path) -> None:
+    """The stations' poses dropped."""
+    edited(
+        folder / "session.yaml",
+        lambda d: [station.pop("pose", None) for station in d["stations"].values()],
+    )
+
+
+def _two(count: int, rng: np.random.Generator) -> tuple[int, int]:
+    a, b = rng.choice(count, 2, replace=False)
+    return int(a), int(b)
+
+
+def _exchanged(items: list[Any], rng: np.random.Generator) -> list[Any]:
+    a, b = _two(len(items), rng)
+    out = list(items)
+    out[a], out[b] = out[b], out[a]
+    return out
+
+
+def _columns(folder: Path, rng: np.random.Generator) -> None:
+    a, b = _two(6, rng)
+    order = [b if k == a else a if k == b else k for k in range(6)]
+    readings(folder, lambda row: [row[k] for k in order])
+
+
+def _radii(folder: Path, _: np.random.Generator) -> None:
+    def double(document: dict[str, Any]) -> None:
+        for leg in document["legs"]:
+            for tube in leg["tubes"]:
+                tube["radius"] *= 2
+
+    edited(folder / "mechanism.yaml", double)
+
+
+def _millimetres(folder: Path, _: np.random.Generator) -> None:
+    def larger(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: larger(part) for key, part in value.items()}
+        if isinstance(value, list):
+            return [larger(part) for part in value]
+        return 1e3 * value if isinstance(value, float) else value
+
+    edited(folder / "mechanism.yaml", lambda d: d.update(legs=larger(d["legs"])))
+
+
+def _another(folder: Path, _: np.random.Generator) -> None:
+    """A machine of the same kind, a third wider, whose base's joints stand elsewhere."""
+
+    def other(document: dict[str, Any]) -> None:
+        turn = np.radians(25.0)
+        for number, leg in enumerate(document["legs"]):
+            x, y, z = leg["base"]["center"]
+            s = np.sin(turn if number % 2 else -turn)
+            c = np.cos(turn)
+            leg["base"]["center"] = [float(1.3 * (c * x - s * y)), float(1.3 * (s * x + c * y)), z]
+
+    edited(folder / "mechanism.yaml", other)
+
+
+def _stations(folder: Path, _: np.random.Generator) -> None:
+    def exchange(document: dict[str, Any]) -> None:
+        one, two = document["stations"].values()
+        one["pose"], two["pose"] = two["pose"], one["pose"]
+
+    edited(folder / "session.yaml", exchange)
+
+
+MISTAKES: dict[str, Mistake] = {
+    "columns exchanged": Mistake(_columns, ("are mixed up",)),
+    "numbering turned": Mistake(
+        lambda f, _: readings(f, lambda row: row[1:] + row[:1]), ("numbered differently", "round")
+    ),
+    "numbering backwards": Mistake(
+        lambda f, _: readings(f, lambda row: row[::-1]), ("numbered differently", "backwards")
+    ),
+    "photographs exchanged": Mistake(
+        lambda f, rng: renamed(f, lambda paths: _exchanged(paths, rng)), ("each other's names",)
+    ),
+    "photographs shifted": Mistake(
+        lambda f, _: renamed(f, lambda paths: paths[1:] + paths[:1]), ("are shifted",)
+    ),
+    "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), ("are mirrored",)),
+    "upside down": Mistake(lambda f, _: pictures(f, lambda p: p[::-1, ::-1]), ()),
+    "diameters": Mistake(_radii, ("look like diameters",)),
+    "millimetres": Mistake(_millimetres, ("millimetre",)),
+    "another machine": Mistake(_another, ("not recognised",)),
+    "stations exchanged": Mistake(_stations, ("are mixed up",)),
+}
+
+
+def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
+    """A session with a mistake: named, refused otherwise, or not noticed."""
+    mistake = MISTAKES[name]
+    with tempfile.TemporaryDirectory() as temporary:
+        copy = Path(temporary) / folder.name
+        shutil.copytree(folder, copy)
+        if no_pose:
+            without_poses(copy)
+        mistake.make(copy, np.random.default_rng(seed))
+        found = recognised(copy, seed)
+    if not mistake.named:
+        return found._replace(what="named" if found.what == "right" else found.what)
+    if found.what != "refused":
+        return found._replace(what="not noticed")
+    named = all(word in found.said for word in mistake.named)
+    return found._replace(what="named" if named else "refused")
+
+
+# ------------------------------------------------------------------ told
+
+
+def of_catalogue(count: int, keep: Path) -> Iterator[tuple[str, Outcome]]:
+    """Stations of all machines in turn, each without a pose."""
+    from pkmcal.mechanisms import catalogue
+
+    names = sorted(set(catalogue()) - set(HINGED))
+    for k in range(count):
+        name, seed = names[k % len(names)], k // len(names)
+        folder = simulated(name, seed, 1, PHOTOGRAPHS, keep)
+        with tempfile.TemporaryDirectory() as temporary:
+            copy = Path(temporary) / folder.name
+            shutil.copytree(folder, copy)
+            without_poses(copy)
+            yield name, recognised(copy, seed)
+
+
+def of_mistakes(count: int, keep: Path, no_pose: bool) -> Iterator[tuple[str, Outcome]]:
+    """Each mistake in sessions of a hexapod."""
+    for name in MISTAKES:
+        if name == "stations exchanged" and no_pose:
+            continue
+        for seed in range(count):
+            folder = simulated("gough-stewart", 100 + seed, *MISTAKEN, keep)
+            yield name, mistaken(name, folder, seed, no_pose)
+
+
+def main() -> None:
+    """One line a session as it is done, then the counts."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--stations", type=int, default=100)
+    parser.add_argument("--mistakes", action="store_true")
+    parser.add_argument("--sessions", type=int, default=5, help="of each mistake")
+    parser.add_argument("--no-pose", action="store_true", help="mistakes: drop the rough poses")
+    parser.add_argument("--keep", type=Path, help="folder for the photographs")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        keep = options.keep or Path(temporary)
+        if options.mistakes:
+            outcomes = of_mistakes(options.sessions, keep, options.no_pose)
+        else:
+            outcomes = of_catalogue(options.stations, keep)
+        counts: dict[str, Counter[str]] = {}
+        seconds: dict[str, list[float]] = {}
+        for name, outcome in outcomes:
+            counts.setdefault(name, Counter())[outcome.what] += 1
+            seconds.setdefault(name, []).append(outcome.seconds)
+            print(f"{name}: {outcome.what} ({outcome.said.splitlines()[0]})", file=sys.stderr)
+    total: Counter[str] = sum(counts.values(), Counter())
+    for name, count in [*counts.items(), ("all", total)]:
+        words = ", ".join(f"{n} {what}" for what, n in count.most_common())
+        taken = np.concatenate(list(seconds.values())) if name == "all" else seconds[name]
+        print(f"{name:24} {words:40} {np.median(taken):6.1f} s")
+
+
+if __name__ == "__main__":
+    main()
