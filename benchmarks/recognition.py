@@ -124,7 +124,7 @@ def pictures(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     import cv2
 
     for path in sorted(folder.glob("images/*/*.png")):
-        cv2.imwrite(str(path), change(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+        cv2.imwrite(str(path), change(np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))))
 
 
 def renamed(folder: Path, order: Callable[[list[Path]], list[Path]]) -> None:
@@ -138,10 +138,12 @@ def renamed(folder: Path, order: Callable[[list[Path]], list[Path]]) -> None:
 
 def without_poses(folder: Path) -> None:
     """The stations' poses dropped."""
-    edited(
-        folder / "session.yaml",
-        lambda d: [station.pop("pose", None) for station in d["stations"].values()],
-    )
+
+    def drop(document: dict[str, Any]) -> None:
+        for station in document["stations"].values():
+            station.pop("pose", None)
+
+    edited(folder / "session.yaml", drop)
 
 
 def _two(count: int, rng: np.random.Generator) -> tuple[int, int]:

@@ -29,7 +29,7 @@ from pkmcal.simulation import (
 from pkmcal.simulation.demo import MECHANISM, SETTINGS, demo_camera
 from pkmcal.simulation.placement import draw_configurations, usable
 from pkmcal.simulation.render import PixelRays, Scene, ScenePart, photograph, render
-from pkmcal.simulation.scene import Finish, discs_of, machine_parts
+from pkmcal.simulation.scene import CABLE_PIECES, Finish, discs_of, machine_parts, room_of
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
 from pkmcal.simulation.surfaces import Lamp, Lighting, Material, SmoothNoise
 
@@ -139,7 +139,7 @@ def test_every_shape_is_entered_on_its_surface_facing_the_ray():
         Wall(np.array([0.0, 3.0, 0.0]), np.array([0.0, -1.0, 0.0])),
     ]
     for shape in shapes:
-        t = shape.enter(origin, d)
+        t = shape.enter(origin[:, None], d)
         hit = np.isfinite(t)
         assert hit.sum() > 50
         points = origin[:, None] + t[hit] * d[:, hit]
@@ -179,6 +179,65 @@ def test_turned_steel_shows_a_narrow_line_along_the_rod(view):
     peak = line.max(axis=1)
     assert peak.min() > 0.15
     assert np.all((line > peak[:, None] / 2).sum(axis=1) < 0.4 * (dull[150:330] > 0).sum(axis=1))
+
+
+def test_polished_metal_shows_at_its_limb_what_lies_behind(view):
+    """A wall in halves, light and dark: each limb of a polished rod has its own half's level, and
+    the middle what stands beside the camera; a dull rod has its own level throughout.
+    """
+    bright, dark = (Material(emission=level, albedo=0.0) for level in (0.8, 0.2))
+    halves = [
+        ScenePart(Box(np.array([x, 0.5, 0.0]), np.eye(3), np.array([0.5, 0.01, 0.5])), half)
+        for x, half in ((-0.5, bright), (0.5, dark))
+    ]
+    beside = ScenePart(
+        Wall(np.array([0.0, -1.5, 0.0]), np.array([0.0, 1.0, 0.0])),
+        Material(emission=0.5, albedo=0.0),
+    )
+    rod = between((0, 0, -0.2), (0, 0, 0.2), 0.04)
+
+    def row(material):
+        return picture([ScenePart(rod, material), *halves, beside], view, DARK)[240]
+
+    behind, mirror = row(Material(0.0)), row(Material(0.0, polish=1.0))
+    on_rod = np.flatnonzero(behind == 0.0)
+    first, last = on_rod[0], on_rod[-1]
+    assert mirror[first - 3] == pytest.approx(0.8)
+    assert mirror[last + 3] == pytest.approx(0.2)
+    assert mirror[first + 1] == pytest.approx(0.8, abs=0.01)
+    assert mirror[last - 1] == pytest.approx(0.2, abs=0.01)
+    assert mirror[(first + last) // 2] == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_style_changes_the_legs_alone_and_no_silhouette(machine):
+    truth = draw_truth(machine, (SMALL,), Settings(stations=1, configurations=2), 5)
+    view, station = PixelRays.of(SMALL), truth.T_camera_base[0]
+    noise = SmoothNoise.from_rng(np.random.default_rng(0))
+    room = room_of(discs_of(machine), 1.0, noise, np.random.default_rng(1))
+
+    def parts(style, as_built=False):
+        finish = Finish.from_noise(noise, style=style)
+        pose, readings = truth.T_base_platform[0], truth.joints[0]
+        return finish, machine_parts(machine, discs_of(machine), finish, pose, readings, as_built)
+
+    def seen(parts):
+        return picture([*parts, *room.parts], view, room.lighting, station)
+
+    finish, mixed = parts("mixed")
+    legs = [part for part in mixed if part.material in (finish.paint, finish.steel)]
+    on_legs = picture([glowing(part.shape) for part in legs], view, DARK, station) > 0
+    usual = seen(mixed)
+    for style in ("matte", "dark", "metal"):
+        differs = np.abs(seen(parts(style)[1]) - usual)
+        assert np.mean(differs[on_legs] > 0.02) > 0.2
+        # other borders are looked at through other points of their pixels
+        assert differs[~on_legs].max() < 0.1
+    assert seen(parts("dark")[1])[on_legs].mean() < 0.5 * usual[on_legs].mean()
+    _, built = parts("mixed", as_built=True)
+    # a motor, a ring and a cable for each leg, and nothing else moved
+    assert len(built) == len(mixed) + machine.n_legs * (2 + CABLE_PIECES)
+    # they hide a part of the legs, or shade it
+    assert 0.02 < np.mean(np.abs(seen(built) - usual)[on_legs] > 0.05) < 0.5
 
 
 def test_noise_of_a_photograph_is_as_stated():

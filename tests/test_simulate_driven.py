@@ -58,7 +58,7 @@ def seen_along(parts, origin, targets):
     """Distances to the first part, and its number, along rays to targets (n, 3)."""
     rays = (targets - origin).T
     rays = rays / np.linalg.norm(rays, axis=0)
-    hits = np.array([part.shape.enter(origin, rays) for part in parts])
+    hits = np.array([part.shape.enter(origin[:, None], rays) for part in parts])
     return hits.min(axis=0), hits.argmin(axis=0)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,23 @@ from pkmcal.errors import InputError
 
 SMALLEST, LARGEST = 64, 8192
 """Pixels along a side: below, no leg is wide enough to have edges; above, no memory is enough."""
+
+
+class LegStyle(StrEnum):
+    """Surfaces of the legs."""
+
+    mixed = "mixed"
+    matte = "matte"
+    dark = "dark"
+    metal = "metal"
+
+
+class RoomLight(StrEnum):
+    """Kinds of light."""
+
+    usual = "usual"
+    soft = "soft"
+    hard = "hard"
 
 
 def simulate(
@@ -56,6 +74,13 @@ def simulate(
     on_platform: Annotated[
         bool, typer.Option("--on-platform", help="The board on the platform instead.")
     ] = False,
+    finish: Annotated[
+        LegStyle, typer.Option(help="Surface of the legs; metal is polished.")
+    ] = LegStyle.mixed,
+    light: Annotated[RoomLight, typer.Option(help="From all sides, or hard.")] = RoomLight.usual,
+    as_built: Annotated[
+        bool, typer.Option("--as-built", help="Motors, rings and cables on the legs.")
+    ] = False,
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
@@ -84,6 +109,9 @@ def simulate(
         board=board_for(machine, place) if board or on_platform else None,
         board_on=place,
         repeats=repeats,
+        finish=finish.value,
+        light=light.value,
+        as_built=as_built,
     )
     with console.progress() as told:
         truth = simulate_session(

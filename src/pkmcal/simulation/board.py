@@ -365,6 +365,6 @@ def _share_seen(
     distance = np.linalg.norm(rays, axis=1)
     rays = (rays / distance[:, None]).T
     facing = np.clip(T_base_board[:3, 2] @ rays / SLANTED, 0, 1)
-    hit = np.min([part.shape.enter(eye, rays) for part in parts], axis=0)
+    hit = np.min([part.shape.enter(eye[:, None], rays) for part in parts], axis=0)
     seen = camera.in_image(pixels, margin=10.0) & (hit > distance - 1e-4)
     return float(np.mean(seen * facing))

@@ -101,7 +101,7 @@ def first_hits(
         rows = np.flatnonzero(reached[:, k])
         if not rows.size:
             continue
-        found = shape.enter(origin, _flat(rays, rows)).reshape(rows.size, -1)
+        found = shape.enter(origin[:, None], _flat(rays, rows)).reshape(rows.size, -1)
         before = distance[rows]
         closer = found < before
         distance[rows] = np.where(closer, found, before)
@@ -171,8 +171,30 @@ def look(
             light[at] = radiance(
                 part.shape, part.material, flat[:, at], toward[:, at], lit[at], scene.lighting
             )
+            if part.material.polish > 0:
+                light[at] += part.material.polish * _mirrored(scene, k, flat[:, at], toward[:, at])
     label = 6 * owner + 2 * face.reshape(owner.shape) + (seen < 0.5)
     return RayHits(light.reshape(distance.shape), np.where(lost, -1, label).astype(np.int16), seen)
+
+
+def _mirrored(scene: Scene, number: int, points: Array, to_camera: Array) -> Array:
+    """Light (n,) that a polished shape's points (3, n) mirror towards the camera: what their rays
+    meet first of all else, in full light, mirroring nothing itself.
+    """
+    n = scene.parts[number].shape.normal(points)
+    d = 2 * np.einsum("in,in->n", n, to_camera) * n - to_camera
+    nearest, owner = np.full(points.shape[1], np.inf), np.full(points.shape[1], -1)
+    for k, part in enumerate(scene.parts):
+        if k != number:  # it is convex
+            found = part.shape.enter(points, d)
+            owner = np.where(found < nearest, k, owner)
+            nearest = np.minimum(found, nearest)
+    light, lit = np.zeros(points.shape[1]), np.ones(points.shape[1])
+    for k in np.unique(owner[owner >= 0]):
+        at, part = np.flatnonzero(owner == k), scene.parts[k]
+        met = points[:, at] + nearest[at] * d[:, at]
+        light[at] = radiance(part.shape, part.material, met, -d[:, at], lit[at], scene.lighting)
+    return light
 
 
 def _flat(rays: Array, rows: Integers) -> Array:

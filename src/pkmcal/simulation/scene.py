@@ -6,7 +6,7 @@ in a laboratory; only the machine moves. Sizes follow the machine's own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -23,6 +23,7 @@ from pkmcal.simulation.surfaces import (
     Clouds,
     Finish,
     Lamp,
+    Light,
     Lighting,
     Material,
     Slats,
@@ -49,8 +50,18 @@ AROUND = {False: (0.26, 0.13), True: (0.42, 0.28)}
 DIRECT = 0.7
 """Light from above and below, and the share of the lamps' that is left where it is soft, round
 machines with thin rods: in hard light these end, for a camera, where their lit side does."""
+LIGHTS: dict[Light, tuple[float, float, float]] = {
+    "usual": (1.0, 1.0, 1.0),
+    "soft": (2.5, 0.5, 1.8),
+    "hard": (0.3, 1.3, 0.4),
+}
+"""How wide and how strong the lamps are, and how strong the light from everywhere, in kinds of
+light: under a white ceiling, and in the sun or under a spot."""
 ASIDE = 1.2
 """rad; how far a lamp that lights a board stands to either side of the cameras, at most."""
+MOTOR_SHARE, RING_AT, CABLE_PIECES = 0.5, 0.7, 8
+"""Length of a leg's motor and place of its ring, in the length of its first tube; straight pieces
+of the motor's cable."""
 FLANGE = 0.3
 """Radius of an articulated platform's tool flange, in that of a rigid one's plate."""
 
@@ -123,9 +134,16 @@ def _held(machine: Machine, drives: Drives, balls: Array) -> tuple[Array, float]
 
 
 def machine_parts(
-    machine: Machine, discs: Discs, finish: Finish, T_base_platform: Array, joints: Array
+    machine: Machine,
+    discs: Discs,
+    finish: Finish,
+    T_base_platform: Array,
+    joints: Array,
+    as_built: bool = False,
 ) -> list[ScenePart]:
-    """The machine at one pose (4, 4) and its readings (m,)."""
+    """The machine at one pose (4, 4) and its readings (m,); as built, with what hangs on its legs
+    and is on no drawing.
+    """
     ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
     balls = _ball_radii(machine)
     bars = side_bars(machine)
@@ -136,6 +154,8 @@ def machine_parts(
         driven = bool(discs.drives.arms[j] or discs.drives.guides[j])
         bare = finish.forearm if driven else finish.steel
         parts += _leg(machine, j, ends.a[j], ends.b[j], finish, bare)
+        if as_built:
+            parts += _hung_on(machine, j, ends.a[j], ends.b[j], discs, finish)
         parts += _base_end(discs, j, chains[j], balls[:, 0], finish)
     return parts
 
@@ -221,6 +241,36 @@ def _leg(
         neck = Cylinder(a, u, 0.8 * float(machine.radii()[j][0]), tubes[0].start)
         parts.append(ScenePart(neck, finish.joint))
     return parts
+
+
+def _hung_on(
+    machine: Machine, j: int, a: Array, b: Array, discs: Discs, finish: Finish
+) -> list[ScenePart]:
+    """A motor beside the leg's first tube, outside, a ring about it, and the motor's cable."""
+    tubes, radii = machine.document.legs[j].tubes, machine.radii()[j]
+    if not tubes:
+        return []
+    u = (b - a) / np.linalg.norm(b - a)
+    out = a - discs.base
+    out = out - (out @ u) * u
+    out = out / max(float(np.linalg.norm(out)), 1e-9)
+    radius, first = float(radii[0]), tubes[0]
+    wide, long = 1.1 * radius, MOTOR_SHARE * (first.stop - first.start)
+    foot = a + first.start * u + (radius + 1.2 * wide) * out
+    ring = a + (first.start + RING_AT * (first.stop - first.start)) * u
+    parts = [
+        ScenePart(Cylinder(foot, u, wide, long), finish.joint),
+        ScenePart(Cylinder(ring, u, 1.12 * radius, 0.5 * radius), finish.joint),
+    ]
+    # a cable from the motor's upper end, in a slack bow, to the base's rim
+    rim = discs.base + discs.base_radius * (foot - discs.base) / np.linalg.norm(foot - discs.base)
+    t = np.linspace(0.0, 1.0, CABLE_PIECES + 1)[:, None]
+    top = foot + long * u + wide * out
+    bow = 4 * t * (1 - t) * (0.4 * long * out)
+    cable = (1 - t) * top + t * rim + bow
+    return parts + [
+        _rod(start, stop, 0.18 * radius, finish.joint) for start, stop in pairwise(cable)
+    ]
 
 
 def _ball_radii(machine: Machine) -> Array:
@@ -417,6 +467,7 @@ def room_of(
     noise: SmoothNoise,
     rng: np.random.Generator,
     lit_from: float | None = None,
+    light: Light = "usual",
 ) -> Room:
     """A room around a machine; cameras stand within ``reach`` (m) of the base disc's centre.
 
@@ -432,12 +483,17 @@ def room_of(
     parts += _walls(middle, floor, reach, noise, rng)
     for azimuth in 2 * np.pi * (np.arange(11) + rng.uniform(-0.4, 0.4, 11)) / 11:
         parts.append(_furniture(middle, floor, size, reach, azimuth, noise, rng))
-    lamps = _lamps(middle, size, reach, rng, lit_from, discs.drives.any)
+    usual = _lamps(middle, size, reach, rng, lit_from, discs.drives.any)
+    wide, strong, around = LIGHTS[light]
+    lamps = tuple(
+        replace(lamp, radius=wide * lamp.radius, power=strong * lamp.power) for lamp in usual
+    )
     bulbs = [
         ScenePart(Ball(lamp.place, lamp.radius), Material(0.0, emission=3.0), False)
         for lamp in lamps
     ]
-    return Room((*parts, *bulbs), Lighting(lamps, *AROUND[discs.drives.any]))
+    sky, ground = AROUND[discs.drives.any]
+    return Room((*parts, *bulbs), Lighting(lamps, around * sky, around * ground))
 
 
 def _table(

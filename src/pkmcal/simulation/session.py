@@ -57,7 +57,9 @@ def simulate_session(
 
 @dataclass(frozen=True)
 class Studio:
-    """Everything that photographs of one session share; views : by station; fixed : to the base."""
+    """Everything that photographs of one session share; views : by station; fixed : to the base;
+    as_built : with motors, rings and cables on the legs.
+    """
 
     truth: Truth
     discs: Discs
@@ -67,6 +69,7 @@ class Studio:
     sensor: Sensor
     fixed: tuple[ScenePart, ...] = ()
     board: Board | None = None
+    as_built: bool = False
 
     @classmethod
     def of(cls, truth: Truth, cameras: Sequence[Camera], settings: Settings) -> Studio:
@@ -79,7 +82,8 @@ class Studio:
         way = (places - discs.base).mean(axis=0)
         read = truth.T_platform_board is not None and discs.drives.any
         lit_from = float(np.arctan2(way[1], way[0])) if read else None
-        room = room_of(discs, reach, noise, np.random.default_rng(seeds[1]), lit_from)
+        rng = np.random.default_rng(seeds[1])
+        room = room_of(discs, reach, noise, rng, lit_from, settings.light)
         known = {
             id(camera): PixelRays.of(camera) for camera in {id(c): c for c in cameras}.values()
         }
@@ -87,8 +91,10 @@ class Studio:
         fixed: tuple[ScenePart, ...] = ()
         if settings.board is not None and truth.T_base_board is not None:
             fixed = (board_part(settings.board, truth.T_base_board),)
-        finish = Finish.from_noise(noise, flat=truth.machine.document.motion == "planar")
-        return cls(truth, discs, finish, room, views, settings.sensor, fixed, settings.board)
+        flat = truth.machine.document.motion == "planar"
+        finish = Finish.from_noise(noise, flat, settings.finish)
+        board, built = settings.board, settings.as_built
+        return cls(truth, discs, finish, room, views, settings.sensor, fixed, board, built)
 
     def photographs(self, index: int, shake: tuple[float, float] = (0.0, 0.0)) -> list[Integers]:
         """The repeats (8 bits, (H, W)) of the session's photograph number ``index``.
@@ -111,7 +117,9 @@ class Studio:
         """Light (H, W) on a camera at a pose, of photograph number ``index``."""
         station, k = self.truth.photographs[index]
         poses, joints = self.truth.T_base_platform, self.truth.joints
-        parts = machine_parts(self.truth.machine, self.discs, self.finish, poses[k], joints[k])
+        parts = machine_parts(
+            self.truth.machine, self.discs, self.finish, poses[k], joints[k], self.as_built
+        )
         on_platform = self.truth.T_platform_board
         if on_platform is not None and self.board is not None:
             parts.append(board_part(self.board, poses[k] @ on_platform))

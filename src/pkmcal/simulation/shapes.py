@@ -2,7 +2,7 @@
 
 All coordinates are in one outer frame (base), m. Inside the renderer vectors have their
 components first, (3, n): that keeps NumPy's inner loops long. ``d`` are unit directions of rays
-from one common ``origin``, which lies outside every shape.
+from one common ``origin`` (3, 1), or one each (3, n), outside the shape.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ class Shape(ABC):
 
     @abstractmethod
     def enter(self, origin: Array, d: Array) -> Array:
-        """Distance (n,) to the first hit of rays from origin (3,) along d (3, n); inf at a miss."""
+        """Distance (n,) to the first hit of rays from origin (3, 1 or n) along d (3, n); inf at a
+        miss.
+        """
 
     @abstractmethod
     def normal(self, points: Array) -> Array:
@@ -49,11 +51,11 @@ class Shape(ABC):
         or nothing; round shapes give a soft border.
         """
         del spread
-        return (self.enter(light, d) < distance - 1e-9).astype(float)
+        return (self.enter(light[:, None], d) < distance - 1e-9).astype(float)
 
 
 def inner(d: Array, v: Array) -> Array:
-    """Inner products (n,) of vectors (3, n) with one vector (3,)."""
+    """Inner products (n,) of vectors (3, n) with one vector (3,), or one each (3, n)."""
     return d[0] * v[0] + d[1] * v[1] + d[2] * v[2]
 
 
@@ -86,15 +88,17 @@ class Cylinder(Shape):
         """Quadratic of the infinite cylinder, cut to its length, and the cap that faces."""
         o, along, du, b = self._along(origin, d)
         a = 1 - du * du
-        c = o @ o - along**2 - self.radius**2
+        c = inner(o, o) - along**2 - self.radius**2
         with np.errstate(invalid="ignore", divide="ignore"):
             t = (-b - np.sqrt(b * b - a * c)) / a
             s = along + t * du
             t = np.where((t > 0) & (s >= 0) & (s <= self.length), t, np.inf)
-            if 0 <= along <= self.length:
-                return t  # neither cap can be seen from between their planes
-            t_cap = ((0.0 if along < 0 else self.length) - along) / du
-            inside = (c + t_cap * (2 * b + a * t_cap) <= 0) & (t_cap > 0)
+            # neither cap can be seen from between their planes
+            beyond = (along < 0) | (along > self.length)
+            if not beyond.any():
+                return t
+            t_cap = (np.where(along < 0, 0.0, self.length) - along) / du
+            inside = (c + t_cap * (2 * b + a * t_cap) <= 0) & (t_cap > 0) & beyond
             return np.where(inside, np.minimum(t, t_cap), t)
 
     def normal(self, points: Array) -> Array:
@@ -122,9 +126,9 @@ class Cylinder(Shape):
 
     def veil(self, light: Array, d: Array, distance: Array, spread: float) -> Array:
         """By how far the ray misses: a tube at its nearest approach, a disc in its middle plane."""
-        o, along, du, b = self._along(light, d)
+        o, along, du, b = self._along(light[:, None], d)
         a = np.maximum(1 - du * du, 1e-9)
-        across2 = o @ o - along**2
+        across2 = inner(o, o) - along**2
         if self.length > self.radius:
             t = -b / a
             s = along + t * du
@@ -148,10 +152,10 @@ class Cylinder(Shape):
         """Whichever surface is nearer: points are known to 1e-12 m, so only rims are in doubt."""
         return np.minimum(s, self.length - s) < np.abs(self.radius - rho)
 
-    def _along(self, origin: Array, d: Array) -> tuple[Array, float, Array, Array]:
+    def _along(self, origin: Array, d: Array) -> tuple[Array, Array, Array, Array]:
         """Origin from the start, its place on the axis, and the rays' parts along and across."""
-        o = origin - self.start
-        along = float(o @ self.axis)
+        o = origin - self.start[:, None]
+        along = inner(o, self.axis)
         du = inner(d, self.axis)
         return o, along, du, inner(d, o) - along * du
 
@@ -166,10 +170,10 @@ class Ball(Shape):
 
     def enter(self, origin: Array, d: Array) -> Array:
         """Nearer root of the quadratic."""
-        o = origin - self.centre
+        o = origin - self.centre[:, None]
         b = inner(d, o)
         with np.errstate(invalid="ignore"):
-            t = -b - np.sqrt(b * b - (o @ o - self.radius**2))
+            t = -b - np.sqrt(b * b - (inner(o, o) - self.radius**2))
         return np.where(t > 0, t, np.inf)
 
     def normal(self, points: Array) -> Array:
@@ -204,11 +208,11 @@ class Box(Shape):
 
     def enter(self, origin: Array, d: Array) -> Array:
         """The last of the three slabs to be entered, before the first is left."""
-        o = self.rot @ (origin - self.centre)
+        o = self.local(origin)
         with np.errstate(divide="ignore", invalid="ignore"):
             inv = 1 / turned(self.rot, d)
-            near = -o[:, None] * inv - self.half[:, None] * np.abs(inv)
-            far = -o[:, None] * inv + self.half[:, None] * np.abs(inv)
+            near = -o * inv - self.half[:, None] * np.abs(inv)
+            far = -o * inv + self.half[:, None] * np.abs(inv)
         first, last = near.max(axis=0), far.min(axis=0)
         return np.where((first < last) & (first > 0), first, np.inf)
 
@@ -246,7 +250,7 @@ class Wall(Shape):
 
     def enter(self, origin: Array, d: Array) -> Array:
         """Where the ray falls onto the plane from inside."""
-        height = float((origin - self.point) @ self.inward)
+        height = inner(origin - self.point[:, None], self.inward)
         with np.errstate(divide="ignore"):
             t = -height / inner(d, self.inward)
         return np.where(t > 0, t, np.inf)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import final
+from typing import Literal, final
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.simulation.shapes import Cylinder, Shape, inner
 
+Style = Literal["mixed", "matte", "dark", "metal"]
+Light = Literal["usual", "soft", "hard"]
 NOISE_SIZE = 256
 BRUSH_ACROSS, BRUSH_ALONG = 0.13, 0.75
 """Ward roughness of turned steel across and along the axis."""
@@ -123,8 +125,10 @@ class Material:
 
     albedo : diffuse reflectance. pattern : factor on it. gloss, sharpness : strength and
     exponent of a Blinn-Phong highlight. brushed : the highlight is drawn out along a cylinder's
-    axis, narrow across (turned steel; Ward's model). mirror : share of the surroundings
-    reflected. emission : light of its own.
+    axis, narrow across (turned steel; Ward's model). mirror : share of the surroundings that a
+    rough surface reflects, all blurred. polish : share that a polished one does, each thing in its
+    place: at the limb it shows what lies behind, and its contrast vanishes. emission : light of its
+    own.
     """
 
     albedo: float = 0.5
@@ -133,6 +137,7 @@ class Material:
     sharpness: float = 30.0
     brushed: bool = False
     mirror: float = 0.0
+    polish: float = 0.0
     emission: float = 0.0
 
 
@@ -151,17 +156,39 @@ class Finish:
     platform: Material
 
     @classmethod
-    def from_noise(cls, noise: SmoothNoise, flat: bool = False) -> Finish:
-        """White paint, turned steel, blackened joints, a stained base, a milled platform.
+    def from_noise(cls, noise: SmoothNoise, flat: bool = False, style: Style = "mixed") -> Finish:
+        """Tubes, rods and forearms of a style, blackened joints, a stained base, a milled platform.
 
-        flat : the legs lie open to the lamps above, and white ones would be overexposed.
+        flat : the legs lie open to the lamps above, and white ones would be overexposed. style :
+        ``mixed`` is white paint and turned steel, ``matte`` and ``dark`` are paint throughout,
+        ``metal`` is polished aluminium and chrome.
         """
-        return cls(
-            paint=Material(
-                0.42 if flat else 0.8, Clouds(noise, 0.012, 0.03), gloss=0.3, sharpness=40.0
+        coarse, fine = Clouds(noise, 0.012, 0.03), Clouds(noise, 0.004, 0.05)
+        dull = Material(0.5, Clouds(noise, 0.008, 0.04), gloss=0.08, sharpness=15.0)
+        white = 0.42 if flat else 0.8
+        styles: dict[Style, tuple[Material, Material, Material]] = {
+            "mixed": (
+                Material(white, coarse, gloss=0.3, sharpness=40.0),
+                Material(0.38, fine, gloss=0.45, brushed=True, mirror=0.3),
+                dull,
             ),
-            steel=Material(0.38, Clouds(noise, 0.004, 0.05), gloss=0.45, brushed=True, mirror=0.3),
-            forearm=Material(0.5, Clouds(noise, 0.008, 0.04), gloss=0.08, sharpness=15.0),
+            "matte": (Material(white, coarse, gloss=0.03, sharpness=8.0), dull, dull),
+            "dark": (
+                Material(0.05, coarse, gloss=0.12, sharpness=25.0),
+                Material(0.08, fine, gloss=0.15, sharpness=40.0),
+                Material(0.06, coarse, gloss=0.08, sharpness=15.0),
+            ),
+            "metal": (
+                Material(0.08, coarse, polish=0.6),
+                Material(0.02, fine, polish=0.75),
+                Material(0.08, coarse, polish=0.6),
+            ),
+        }
+        paint, steel, forearm = styles[style]
+        return cls(
+            paint=paint,
+            steel=steel,
+            forearm=forearm,
             joint=Material(0.035, gloss=0.45, sharpness=60.0, mirror=0.06),
             base=Material(0.16, Clouds(noise, 0.015, 0.25), gloss=0.05, sharpness=12.0),
             platform=Material(0.27, Clouds(noise, 0.02, 0.08), gloss=0.12, sharpness=10.0),

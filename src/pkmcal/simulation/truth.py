@@ -31,6 +31,7 @@ from pkmcal.simulation.placement import (
     unfolded,
 )
 from pkmcal.simulation.render import Sensor
+from pkmcal.simulation.surfaces import Light, Style
 
 FILE = "truth.json"
 STREAMS = ("machine", "stations", "configurations", "readings", "room", "photographs", "board")
@@ -48,7 +49,8 @@ class Settings:
     near the ends of their ranges. board : seen by every station, fixed to ``board_on``. observe :
     what the session says of the stations that see one. repeats :
     photographs of each configuration from each station, with sensor noise of their own. shake :
-    standard deviations (m, rad) by which the camera moves between them.
+    standard deviations (m, rad) by which the camera moves between them. finish, light : of the
+    legs and of the room. as_built : motors, rings and cables, which no drawing shows, on the legs.
     """
 
     stations: int | tuple[StationPlace, ...] = 3
@@ -65,6 +67,9 @@ class Settings:
     observe: tuple[str, ...] = ("legs", "board")
     repeats: int = 1
     shake: tuple[float, float] = (0.0, 0.0)
+    finish: Style = "mixed"
+    light: Light = "usual"
+    as_built: bool = False
 
     @property
     def n_stations(self) -> int:
