@@ -111,7 +111,7 @@ def solve_batch(
         if robust:
             weight = settled_weights(problem, fit.state, scale)
         if estimates_shading:
-            shading = _shading_sigma(fit, least)
+            shading = _shading_of(fit, least)
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
         if found_shading and _settled(scale, fit.scale, weight, fit.weight):
             break
@@ -177,30 +177,37 @@ def _noise_scale(fit: _Fit) -> Kinds[Array]:
     return Kinds(*out)
 
 
-def _shading_sigma(fit: _Fit, least: Array) -> Array:
+def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float) -> Array:
     """Standard deviation (B, n) px of each line's shading, by restricted maximum likelihood.
 
-    least : (B or 1, 1) what all have at least. Shifts have Student's distribution with FREEDOM
-    degrees: most lines are shaded alike, and some show a highlight's border for their own, pixels
-    off. Each line's variance is s^2 / w with its weight w = (FREEDOM + 1) / (FREEDOM + x^2 / s^2)
-    (Lange, Little, Taylor 1989), x^2 the square expected of its shift. The common s^2 is the fixed
-    point of the weighted sum of squares over the number of shifts that the data tell: a line counts
-    by what its variance has become less than the prior's (MacKay 1992).
+    shift : (B, n) px, as estimated with the deviations sigma (B, n) px. told : (B, n) what the data
+    left of its variance, 1 where they say nothing of it. least : (B or 1, 1) what all have at
+    least. Shifts have Student's distribution with FREEDOM degrees: most lines are shaded alike, and
+    some show a highlight's border for their own, pixels off. Each line's variance is s^2 / w with
+    its weight w = (FREEDOM + 1) / (FREEDOM + x^2 / s^2) (Lange, Little, Taylor 1989), x^2 the
+    square expected of its shift. The common s^2 is the fixed point of the weighted sum of squares
+    over the number of shifts that the data tell: a line counts by what its variance has become less
+    than the prior's (MacKay 1992).
     """
-    u, problem = fit.problem.unknowns, fit.problem
-    info = information(problem, fit.state)
-    variance = np.diagonal(info.covariance, axis1=-2, axis2=-1)[:, u.shading]
-    unit = problem.data.shading
-    told = np.sum(1 - np.minimum(variance, 1.0), axis=1, keepdims=True)
-    square = (unit * fit.state.shading) ** 2
-    expected = square + unit**2 * np.minimum(variance, 1.0)
-    common = np.median(unit, axis=1, keepdims=True) ** 2
+    left = np.minimum(told, 1.0)
+    count = np.sum(1 - left, axis=1, keepdims=True)
+    square = shift**2
+    expected = square + sigma**2 * left
+    common = np.median(sigma, axis=1, keepdims=True) ** 2
     weight = np.ones_like(square)
     for _ in range(WEIGHINGS):
         weight = (FREEDOM + 1) / (FREEDOM + expected / common)
         total = np.sum(weight * square, axis=1, keepdims=True)
-        common = np.maximum(total / np.maximum(told, 1e-9), least**2)
+        common = np.maximum(total / np.maximum(count, 1e-9), np.square(least))
     return np.maximum(np.sqrt(common / weight), least)
+
+
+def _shading_of(fit: _Fit, least: Array) -> Array:
+    """The fit's :func:`common_shading`."""
+    problem, unit = fit.problem, fit.problem.data.shading
+    info = information(problem, fit.state)
+    variance = np.diagonal(info.covariance, axis1=-2, axis2=-1)[:, problem.unknowns.shading]
+    return common_shading(unit * fit.state.shading, variance, unit, least)
 
 
 def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:

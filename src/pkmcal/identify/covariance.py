@@ -131,6 +131,18 @@ def machine_covariance(
     spread[told.machine, solved.machine] = problem.free
     spread[told.stations, solved.stations] = np.eye(6 * solved.n_stations)
     spread[told.mounts, solved.mounts] = np.eye(6 * solved.n_mounts)
+    return told_in_gauge(machine, before, spread, shared, gauge)
+
+
+def told_in_gauge(
+    machine: Machine, before: State, spread: Array, shared: Array, gauge: Gauge
+) -> Array:
+    """The covariance ``spread shared spread^T`` (n, n) of parameters, stations and mounts in the
+    frames of ``before``, told in the gauge.
+
+    spread : (n, m) how they change with what has the covariance shared (m, m).
+    """
+    told = told_unknowns(before)
     e, f = alignment(machine, before, gauge)
     after = changed_frames(machine.layout, before, e, f)
     spread = carried_errors(machine.layout, before, e, f) @ spread

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +38,8 @@ LARGE = 0.3
 """Share of what is undecided from which on a single cause of it is worth a reason."""
 
 
+EXACT_SHARE = 1e-9
+"""Part of a variance below which it is rounding."""
 POOR = 1.3
 """Factor on the poses' noise beyond which the model is too poor for them, if that is no chance."""
 
@@ -153,6 +155,8 @@ def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]
             " steps, so these are not the best: check that the drawing's tolerances fit the"
             " machine, or measure more configurations."
         )
+    if method == "linear":
+        out.append(_base_alone(estimate))
     out.extend(undecided)
     out.extend(_singular(estimate))
     bad = np.abs(estimate.joint_residuals) > 6.0
@@ -163,6 +167,38 @@ def _reasons(estimate: Estimate, method: str, undecided: list[str]) -> list[str]
             f" ({int(bad.sum())} of {bad.size} by more than 6 standard deviations)."
         )
     return out
+
+
+def _base_alone(estimate: Estimate) -> str:
+    """How far [B]'s linear method goes: the base, by the edges and by the drawing, and no further.
+
+    By the edges alone is what the drawing was to them taken out: in units of the drawing's
+    deviations, what is known together has the variance v = e / (1 + e) where the edges' is e.
+    """
+    machine, table = estimate.machine, estimate.machine.parameters
+    drawing = machine.with_values(table.drawing)
+    root = table.free_matrix() * table.tolerances_free()
+    drawn = free_of_gauge(replace(estimate, covariance=root @ root.T))
+    together, before = (
+        joint_centres(drawing, machine, covariance)[0].covariance
+        for covariance in (free_of_gauge(estimate), drawn)
+    )
+    values, vectors = np.linalg.eigh(before)
+    known = values > EXACT_SHARE * values[-1]
+    unit = vectors[:, known] * np.sqrt(values[known])
+    inverse = vectors[:, known] / np.sqrt(values[known])
+    v, axes = np.linalg.eigh(inverse.T @ together @ inverse)
+    by_edges = v / np.maximum(1 - v, EXACT_SHARE)
+    alone = np.sum((unit @ axes) ** 2 * by_edges)
+    edges, drawing_, both = (
+        f"{np.sqrt(x / len(before)) * 1e3:.2g} mm"
+        for x in (alone, np.trace(before), np.trace(together))
+    )
+    return (
+        f"The linear method tells of the base alone: its joints are known to {both}, to {edges} by"
+        f" the edges and to {drawing_} by the drawing. The platform's joints and the legs' lengths"
+        " stay as drawn. Use the joint method, bundle, which is the default."
+    )
 
 
 def _poses_against(estimate: Estimate, richer: tuple[RicherModel, ...]) -> list[str]:

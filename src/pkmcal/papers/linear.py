@@ -26,6 +26,9 @@ TRIPLES = 500
 """Random triples: with 35 % wrong edges a clean one is among them but for 1 case in 10^69."""
 HUBER, TUKEY = 1.345, 4.685
 """95 % efficiency for normal residuals."""
+KEPT = 0.05
+"""Tukey's weight from which an edge counts fully afterwards: a clean one may lose most of its own.
+"""
 POORLY_FIXED = 1e-7
 """Ratio of the normal matrix's eigenvalues below which A is not fixed: one leg direction."""
 
@@ -113,9 +116,20 @@ def reweighted(
 
 
 def least_median(
-    n: Array, radius: Array, present: Array, rng: np.random.Generator, triples: int = TRIPLES
+    n: Array,
+    radius: Array,
+    present: Array,
+    rng: np.random.Generator,
+    triples: int = TRIPLES,
+    noise: Array | None = None,
 ) -> Array:
-    """Least median of squares: the best of random triples' exact solutions, A (..., 3)."""
+    """Least median of squares: the best of random triples' exact solutions, A (..., 3).
+
+    noise : (..., n, 3, 3) covariances of the normals; residuals are then told in their own standard
+    deviations at each solution. Edges of a rod, far from A, say thirty times less of it than those
+    of its tube: in metres half of all edges are outliers to the other half. And A = 0, where wrong
+    edges drive a solution, has residuals without bound.
+    """
     shape = (*present.shape[:-1], triples, 3)
     count = np.sum(present > 0, axis=-1)[..., None, None]
     order = np.argsort(present <= 0, axis=-1, kind="stable")
@@ -128,6 +142,11 @@ def least_median(
     rows = np.where(good[..., None, None], rows, np.eye(3))
     a = np.linalg.solve(rows, -right[..., None])[..., 0]
     r = np.abs(a @ n.mT + np.broadcast_to(radius, present.shape)[..., None, :])
+    if noise is not None:
+        flat = (*noise.shape[:-2], 9)
+        square = (a[..., :, None] * a[..., None, :]).reshape(*a.shape[:-1], 9)
+        spread = square @ noise.reshape(flat).mT
+        r /= np.sqrt(np.maximum(spread, np.finfo(float).tiny))
     r = np.where((present > 0)[..., None, :], r, np.inf)
     # the quantile that LMedS needs counts present edges only, so sort rather than take a median
     half = np.broadcast_to((count[..., 0] + 3) // 2, r.shape[:-1])
@@ -214,15 +233,21 @@ def solve(
     a, inverse = weighted(n, radius, present)
     w = present
     if method in ("least-median", "robust"):
-        a = least_median(n, radius, present, rng)
+        told = noise if method == "robust" else None
+        a = least_median(n, radius, present, rng, noise=told)
         if method == "least-median":
             return a, w, np.full((*a.shape, 3), np.nan)
-    if method in ("huber", "tukey", "robust"):
-        kind = "huber" if method == "huber" else "tukey"
-        a, w, inverse = reweighted(n, radius, present, a, kind)
+    if method == "robust":
+        # in standard deviations, as they are at the start
+        spread = dot(a[..., None, :], (noise @ a[..., None, :, None])[..., 0])
+        sigma = np.sqrt(np.maximum(np.nan_to_num(spread), np.finfo(float).tiny))
+        one = np.where(present > 0, 1 / sigma, 0.0)
+        a, w, _ = reweighted(n * one[..., None], radius * one, present, a, "tukey")
+    if method in ("huber", "tukey"):
+        a, w, inverse = reweighted(n, radius, present, a, method)
     if method in ("errors-in-variables", "robust"):
         # a clean edge may lose most of its Tukey weight; count it fully, a wrong one not at all
-        w = np.where(w > 0.05, 1.0, 0.0) * present
+        w = np.where(w > KEPT, 1.0, 0.0) * present
         a, covariance = errors_in_variables(n, radius, noise, w, a)
         return a, w, covariance
     sigma = scale_of(residuals(n, radius, a), present)

@@ -1,8 +1,9 @@
 """[A]'s four steps, [B]'s linear solution and [C]'s inverse-kinematic method as results of their
 own, to compare with.
 
-They come without uncertainties in the papers; here, standard deviations are the spread of the
-method over repetitions with the edges' and readings' stated noise added once more.
+They come without uncertainties in the papers. Here the linear solution's standard deviations are
+those of its equations; the others' are the spread of the method over repetitions with the edges'
+and readings' stated noise added once more.
 """
 
 from __future__ import annotations
@@ -12,24 +13,25 @@ from typing import Literal
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array
 from pkmcal.errors import ResultError
-from pkmcal.geometry.rigid import apply as move
-from pkmcal.geometry.rigid import inverse, perturb, pose_difference, register
+from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
-from pkmcal.identify.covariance import data_share
+from pkmcal.identify.covariance import data_share, told_in_gauge
 from pkmcal.identify.estimate import Estimate, State, Statistics
-from pkmcal.identify.gauge import apply, centre_index, default_gauge
+from pkmcal.identify.gauge import apply, default_gauge, told_unknowns
+from pkmcal.identify.unknowns import own_blocks
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.papers import linear
 from pkmcal.papers.four_step import four_step
 from pkmcal.papers.four_step_base import with_boards
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.inverse_kinematic import inverse_kinematic
+from pkmcal.papers.linear_together import base_together
 from pkmcal.solver import NONE
 
 Method = Literal["four-step", "linear", "inverse-kinematic"]
+Repeated = Literal["four-step", "inverse-kinematic"]
 REPETITIONS = 60
 """Repetitions for the standard deviations: they are then known to 9 %."""
 
@@ -42,6 +44,8 @@ def by_paper(
     joint : the joint estimate, for the stations' poses where a station sees too few legs.
     Raises ResultError where the method cannot be applied.
     """
+    if method == "linear":
+        return linear_estimate(machine, measurements)
     guess = joint.state.T_camera_base
     state = _solve(method, machine, measurements, guess)
     rng = np.random.default_rng(seed)
@@ -60,10 +64,8 @@ def by_paper(
     return _estimate(machine.with_values(state.theta), measurements, state, theta, stations)
 
 
-def _solve(method: Method, machine: Machine, measurements: Measurements, guess: Array) -> State:
-    if method == "linear":
-        state = linear_state(machine, measurements)
-    elif method == "inverse-kinematic":
+def _solve(method: Repeated, machine: Machine, measurements: Measurements, guess: Array) -> State:
+    if method == "inverse-kinematic":
         start = start_from_poses(machine, measurements, guess)
         state = inverse_kinematic(machine, measurements, start)
     else:
@@ -72,41 +74,34 @@ def _solve(method: Method, machine: Machine, measurements: Measurements, guess: 
     return replace(state, theta=machine.parameters.unit_axes(state.theta))
 
 
-def linear_state(machine: Machine, measurements: Measurements) -> State:
-    """[B] 14 robustly for the base centres, 16 for their scale, 15 for the stations; rest drawn.
+def linear_estimate(machine: Machine, measurements: Measurements) -> Estimate:
+    """[B] 14 for base, radii, edge shift and stations; the platform and all lengths as drawn.
 
-    An edge shift or a wrong radius scales what a station sees (16 tells why), so each station's
-    centres are brought to the drawing's size, by Procrustes: as printed, the mean ratio of
-    distances, close pairs and their noise decide.
-    Base centres of several stations are averaged after registration, weighted by how well each
-    station knows them.
+    Its covariance is that of the equations, with the drawing's tolerances where nothing else is
+    known: platform joints that were not measured are no better known for being left alone.
     """
-    found = linear.centres(machine, measurements, "robust")
-    drawing = machine.base_centers()
-    known: Booleans = np.all(np.isfinite(found.centres), axis=-1)
-    if (known.sum(axis=1) < 3).any():
-        raise ResultError(
-            "[B]'s linear method needs three legs, each in two directions, at every station",
-            found=f"{known.sum(axis=1).min()} legs at one of them",
-            next_step="Use the joint method (bundle), which is the default",
-        )
-    centres, stations = np.zeros(found.centres.shape), np.zeros((len(known), 4, 4))
-    for s, (a, k) in enumerate(zip(found.centres, known, strict=True)):
-        centres[s, k] = a[k] / linear.procrustes_scale(a[k], drawing[k])
-        stations[s] = register(drawing[k], centres[s, k])
-    variance = np.trace(found.covariance, axis1=-2, axis2=-1)
-    weight = np.where(known, 1 / np.where(known, variance, 1.0), 0.0)
-    in_base = move(inverse(stations)[:, None], centres)
-    total = weight.sum(axis=0)
-    mean = np.einsum("sl,slc->lc", weight, in_base) / np.where(total > 0, total, 1.0)[:, None]
-    theta = machine.values.copy()
-    base_index, platform_index = centre_index(machine.layout)
-    theta[base_index] = np.where(total[:, None] > 0, mean, drawing)
-    if machine.document.motion == "planar":  # both ends of a leg have one height
-        rise = theta[base_index[:, 2]] - drawing[:, 2]
-        theta[platform_index[:, 2]] = machine.platform_centers()[:, 2] + rise
-    poses = machine.with_values(theta).forward_result(measurements.joints, machine.home())
-    return with_boards(measurements, theta, stations, poses.T_base_platform)
+    base = base_together(machine, measurements)
+    poses = machine.with_values(base.theta).forward_result(measurements.joints, machine.home())
+    state = with_boards(measurements, base.theta, base.T_camera_base, poses.T_base_platform)
+    state = replace(state, edge_shift=base.edge_shift)
+    gauge, told = default_gauge(machine), told_unknowns(state)
+    spread = np.zeros((told.count, base.spread.shape[1]))
+    spread[: len(base.spread)] = base.spread
+    full = told_in_gauge(machine, state, spread, np.eye(spread.shape[1]), gauge)
+    state = apply(machine, state, gauge)
+    state = replace(state, theta=machine.parameters.unit_axes(state.theta))
+    return replace(
+        _estimate(
+            machine.with_values(state.theta),
+            measurements,
+            state,
+            full[told.machine, told.machine],
+            own_blocks(full, told.stations, 6),
+            (base.weights, base.scale),
+        ),
+        edge_shift_sigma=base.edge_shift_sigma,
+        line_shading=base.shading,
+    )
 
 
 def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements:
@@ -128,11 +123,17 @@ def _noisy(measurements: Measurements, rng: np.random.Generator) -> Measurements
 
 
 def _estimate(
-    machine: Machine, measurements: Measurements, state: State, theta: Array, stations: Array
+    machine: Machine,
+    measurements: Measurements,
+    state: State,
+    theta: Array,
+    stations: Array,
+    trust: tuple[Array, float] | None = None,
 ) -> Estimate:
-    """The method's result with its residuals; edges far off the rest have weight 0.
+    """The method's result with its residuals.
 
-    theta : (P, P) and stations (S, 6, 6) covariances.
+    theta : (P, P) and stations (S, 6, 6) covariances. trust : weights (N,) of the edges and the
+    factor on their noise, where the method has its own; else edges far off the rest have weight 0.
     """
     gauge = default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=False)
@@ -143,6 +144,8 @@ def _estimate(
     middle = float(np.median(distance)) if distance.size else 0.0
     scale = max(middle / np.sqrt(2 * np.log(2)), 1.0)
     weight = (distance < NONE * scale).astype(float)
+    if trust is not None:
+        weight, scale = trust
     poses = assembled.places.poses.taken(unweighted.poses[0])
     n_poses, n_edges = float(measurements.poses.rows.sum()), float(2 * weight.sum())
     pose_scale = max(float(np.sqrt(np.sum(poses**2) / n_poses)) if n_poses else 1.0, 1.0)

@@ -1,0 +1,310 @@
+"""[B] 14 for all legs and stations at once, with what is known beforehand of base, radii and edges.
+
+Leg by leg, a base centre's distance comes from nothing but the apparent width of its tube: a shift
+of both its edges by a thousandth of that width puts it a thousandth nearer or farther. Edges have
+such shifts, by blur and shading, and no edge of the same leg tells them from distance. The other
+legs do: a shift that all edges share scales the whole base, and the drawing knows the base to a few
+thousandths. So this is the paper's first way, "solving simultaneously (14) together with
+constraints linking the attachment points", the constraints being the drawing's values with their
+tolerances. It contains 15, the stations' poses, and 16, the scale, whose cause (shift or radii) is
+left to the data. It is no longer linear; leg by leg, which needs no start and lets go of wrong
+edges, is where it begins. No reading is used and nothing that moves: platform and offsets stay the
+drawing's, and so do their deviations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import ResultError
+from pkmcal.geometry.rigid import apply as move
+from pkmcal.geometry.rigid import cross, dot, perturb, register
+from pkmcal.identify.assembly import SHIFT_SIGMA
+from pkmcal.identify.bundle import LEAST_SCALE, SHADING_CHANGE, common_shading
+from pkmcal.identify.gauge import centre_index
+from pkmcal.identify.robust import TAIL, clean_norm
+from pkmcal.identify.unknowns import Unknowns
+from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements
+from pkmcal.mechanisms import Machine
+from pkmcal.papers import linear
+from pkmcal.solver import FULL, NONE, final_weights
+
+STEPS, ROUNDS = 30, 30
+"""Most Gauss-Newton steps with given variances, and most rounds of variances."""
+SETTLED = 1e-6
+"""The last step moves what the rows predict by no more than this part of what they miss."""
+FEW = 5.0
+"""Degrees of freedom, without more of which nothing is said of the noise."""
+BUNDLE = "Use the joint method (bundle), which is the default"
+ONE = FULL / float(clean_norm(TAIL, np.ones((), dtype=int)))
+"""Factor on one residual's size, so that as many clean ones lie beyond FULL as of pairs."""
+
+
+@dataclass(frozen=True)
+class BaseSolution:
+    """What the edges tell of the base, with the drawing.
+
+    theta : (P,) all parameters; those that no edge tells of are the drawing's.
+    T_camera_base : (S, 4, 4). spread : (P + 6 S, m) square root of the covariance of parameters
+    and stations (omega, tau), in theta's frames. edge_shift, edge_shift_sigma : (C,) px.
+    shading : (n,) px, standard deviation of each line's own shift.
+    weights : (N,) of the edges. scale : factor on the edges' stated noise.
+    """
+
+    theta: Array
+    T_camera_base: Array
+    spread: Array
+    edge_shift: Array
+    edge_shift_sigma: Array
+    shading: Array
+    weights: Array
+    scale: float
+
+
+def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
+    """Base centres, radii, stations and edge shifts by [B] 14 on all edges, maximum likelihood.
+
+    One equation an edge, ``n.A + R = 0`` with A = T_camera_base P, its normal n as it is without
+    the camera's edge shift and the line's shading, divided by the deviation of n.A. Beside them
+    the drawing, 0.3 px for a camera's shift, and for the lines' what they have in common, which is
+    estimated as the joint estimate's is.
+    Raises ResultError where a station sees fewer than three legs in two directions each, or the
+    legs' joints on the base move.
+    """
+    system = _system(machine, measurements)
+    now = system.start
+    weight, scale = final_weights(_distance(system, now) * ONE) * system.used, LEAST_SCALE
+    shading = np.full(system.unknowns.n_lines, SHIFT_SIGMA)
+    for _ in range(ROUNDS):
+        now, half = _solved(system, now, weight, scale, shading)
+        residual, jac = _rows(system, now)
+        # the noise scale makes chi2 equal its degrees of freedom, as in the joint estimate
+        freedom = np.sum(weight) - np.sum(weight[:, None] * (jac @ half) ** 2) / scale**2
+        before = weight, scale, shading
+        if freedom > FEW:
+            scale = float(np.sqrt(np.sum(weight * residual**2) / freedom))
+            scale = max(scale, LEAST_SCALE)
+        if shading.size:
+            lines = system.unknowns.shading
+            told = np.sum(half[lines] ** 2, axis=1) / shading**2
+            shift = now.shifts[system.unknowns.n_cameras :]
+            shading = common_shading(*(x[None] for x in (shift, told, shading)), SHADING_SIGMA)[0]
+        weight = final_weights(np.abs(residual) / scale * ONE) * system.used
+        change = np.abs(shading / before[2] - 1).max(initial=0.0) / SHADING_CHANGE
+        change = max(change, np.abs(weight - before[0]).max() / 1e-2)
+        if max(change, abs(scale / before[1] - 1) / 1e-3) < 1:
+            break
+    now, half = _solved(system, now, weight, scale, shading)
+    u = system.unknowns
+    return BaseSolution(
+        theta=system.theta(now),
+        T_camera_base=now.T_camera_base,
+        spread=np.concatenate(
+            [machine.parameters.free_matrix() @ half[u.machine], half[u.stations]]
+        ),
+        edge_shift=now.shifts[: u.n_cameras],
+        edge_shift_sigma=np.sqrt(np.sum(half[u.optics] ** 2, axis=1)),
+        shading=shading,
+        weights=weight,
+        scale=scale,
+    )
+
+
+class _State(NamedTuple):
+    """z : (nz,) free parameters off the drawing. T_camera_base : (S, 4, 4). shifts : (C + n,) px
+    outward, of cameras and then of lines.
+    """
+
+    z: Array
+    T_camera_base: Array
+    shifts: Array
+
+    def moved(self, step: Array, u: Unknowns) -> _State:
+        """The state after a step (na,) of all unknowns."""
+        turns = step[u.stations].reshape(-1, 6)
+        shifts = self.shifts + step[u.optics.start : u.shading.stop]
+        return _State(self.z + step[u.machine], perturb(self.T_camera_base, turns), shifts)
+
+
+@dataclass(frozen=True)
+class _System:
+    """Everything of [B] 14 that stays: N edges, their places among the parameters and unknowns.
+
+    tolerance : (nz,) of the free parameters. shifts : (N, 1 or 2) which of the shifts each edge
+    has. noise : (N, 3, 3) covariances of the normals. by_shift : (N, 3) their change by a pixel
+    outward. used : (N,) of legs that their station knows. first : (N,) weights to begin with.
+    """
+
+    machine: Machine
+    unknowns: Unknowns
+    edges: EdgeSet
+    centre: Integers
+    radius: Integers
+    shifts: Integers
+    noise: Array
+    by_shift: Array
+    used: Booleans
+    start: _State
+
+    def theta(self, state: _State) -> Array:
+        """All parameters, (P,)."""
+        table = self.machine.parameters
+        return table.drawing + table.free_matrix() @ state.z
+
+    @property
+    def believed(self) -> Integers:
+        """Columns (c,) of the unknowns of which something is known beforehand."""
+        return np.r_[self.unknowns.machine, self.unknowns.optics, self.unknowns.shading]
+
+    def prior(self, shading: Array) -> Array:
+        """Their standard deviations, (c,); shading : (n,) px of the lines."""
+        shift = np.full(self.unknowns.n_cameras, SHIFT_SIGMA)
+        return np.concatenate([self.machine.parameters.tolerances_free(), shift, shading])
+
+
+def _system(machine: Machine, measurements: Measurements) -> _System:
+    """The system with its start: drawing, stations registered on the legs' own solutions (15)."""
+    if any(group.carrier.driven for group in machine.layout.base):
+        raise ResultError(
+            "[B]'s linear method is for legs that turn about points of the base",
+            found=f"mechanism {machine.name!r} with joints on cranks or slides",
+            next_step=BUNDLE,
+        )
+    edges = measurements.edges
+    alone = linear.centres(machine, measurements, "robust")
+    known: Booleans = np.all(np.isfinite(alone.centres), axis=-1)
+    if (known.sum(axis=1) < 3).any():
+        raise ResultError(
+            "[B]'s linear method needs three legs, each in two directions, at every station",
+            found=f"{known.sum(axis=1).min()} legs at one of them",
+            next_step=BUNDLE,
+        )
+    n_cameras = measurements.n_cameras
+    camera = np.asarray(measurements.camera_of_station)[edges.station]
+    shifts = camera[:, None]
+    if measurements.shaded:
+        keys = np.stack([edges.station, edges.leg, edges.tube, edges.side], axis=1)
+        line = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+        shifts = np.stack([camera, n_cameras + line], axis=1)
+    n_shifts = int(shifts.max()) + 1
+    table = machine.parameters
+    n_free = table.free_matrix().shape[1]
+    tubes = zip(edges.leg, edges.tube, strict=True)
+    system = _System(
+        machine=machine,
+        unknowns=Unknowns(
+            n_free, measurements.n_stations, n_cameras, n_lines=max(n_shifts - n_cameras, 0)
+        ),
+        edges=edges,
+        centre=centre_index(machine.layout)[0][edges.leg],
+        radius=np.array([machine.layout.radius[j][t] for j, t in tubes], dtype=int),
+        shifts=shifts,
+        noise=edges.basis @ edges.covariance @ edges.basis.mT,
+        by_shift=(edges.basis @ edges.shift[..., None])[..., 0],
+        used=known[edges.station, edges.leg],
+        start=_State(
+            table.to_free(machine.values),
+            np.tile(np.eye(4), (measurements.n_stations, 1, 1)),
+            np.zeros(n_shifts),
+        ),
+    )
+    return _registered(system, alone.centres, known)
+
+
+def _registered(system: _System, centres: Array, known: Booleans) -> _System:
+    """The system with its stations where the drawing, laid on three legs' centres (15), explains
+    the most edges: among few configurations a leg may be lost to wrong edges, and would take a
+    station that is laid on all legs along.
+
+    centres : (S, L, 3) leg by leg; known : (S, L).
+    """
+    edges, start = system.edges, system.start
+    drawing = system.theta(start)[centre_index(system.machine.layout)[0]]
+    best, least = start.T_camera_base.copy(), np.full(len(known), np.inf)
+    for legs in ((), *combinations(range(len(drawing)), 3)):
+        three = np.isin(np.arange(len(drawing)), legs) if legs else np.ones(len(drawing), bool)
+        for s, (a, there) in enumerate(zip(centres, known & three, strict=True)):
+            if there.sum() < 3 or (legs and not known[s][list(legs)].all()):
+                continue
+            trial = start.T_camera_base.copy()
+            trial[s] = register(drawing[there], a[there])
+            far = _distance(system, start._replace(T_camera_base=trial))
+            cost = np.sum(np.minimum(far, NONE)[system.used & (edges.station == s)] ** 2)
+            if cost < least[s]:
+                best[s], least[s] = trial[s], cost
+    start = start._replace(T_camera_base=best)
+    return replace(system, start=start)
+
+
+def _distance(system: _System, state: _State) -> Array:
+    """|n.A + R| (N,) in standard deviations of all that is known at the start: the edge's noise,
+    the drawing's tolerances and the shifts that edges may have.
+    """
+    residual, jac = _rows(system, state)
+    prior = np.square(system.prior(np.full(system.unknowns.n_lines, SHIFT_SIGMA)))
+    return np.abs(residual) / np.sqrt(1 + jac[:, system.believed] ** 2 @ prior)
+
+
+def _rows(system: _System, state: _State) -> tuple[Array, Array]:
+    """(n.A + R) by its standard deviation, (N,), and its derivatives, (N, na).
+
+    The deviation is that of n.A by the normal's noise and grows with A: leaving its derivative out
+    would shrink A towards the camera, as in :func:`pkmcal.papers.linear.errors_in_variables`.
+    """
+    edges, u, theta = system.edges, system.unknowns, system.theta(state)
+    station = state.T_camera_base[edges.station]
+    point = theta[system.centre]
+    a = move(station, point)
+    outward = np.sum(state.shifts[system.shifts], axis=1)
+    n = edges.normal - outward[:, None] * system.by_shift
+    spread = (system.noise @ a[..., None])[..., 0]
+    sigma = np.sqrt(np.maximum(dot(a, spread), np.finfo(float).tiny))
+    value = (dot(n, a) + theta[system.radius]) / sigma
+    by_a = (n - (value / sigma)[:, None] * spread) / sigma[:, None]
+    free = system.machine.parameters.free_matrix()
+    turn = station[:, :3, :3]
+    by = np.zeros((len(value), u.count))
+    by[:, u.machine] = free[system.radius] / sigma[:, None]
+    by[:, u.machine] += np.einsum("na,nab,nbz->nz", by_a, turn, free[system.centre])
+    at = np.arange(len(value))
+    arm = (turn @ point[..., None])[..., 0]
+    columns = u.stations.start + 6 * edges.station[:, None] + np.arange(6)
+    # A moves by omega x arm + tau
+    by[at[:, None], columns] = np.concatenate([cross(arm, by_a), by_a], axis=1)
+    by[at[:, None], u.optics.start + system.shifts] = (-dot(system.by_shift, a) / sigma)[:, None]
+    return value, by
+
+
+def _solved(
+    system: _System, state: _State, weight: Array, scale: float, shading: Array
+) -> tuple[_State, Array]:
+    """The best state with given variances, and a square root (na, na) of its covariance.
+
+    weight : (N,) of the edges. scale : of their noise. shading : (n,) px of the lines.
+    Raises ResultError where the steps do not end.
+    """
+    u, prior = system.unknowns, system.prior(shading)
+    beliefs = np.zeros((len(prior), u.count))
+    beliefs[np.arange(len(prior)), system.believed] = 1 / prior
+    root = np.sqrt(weight)[:, None] / scale
+    for _ in range(STEPS):
+        value, by = _rows(system, state)
+        rows = np.concatenate([by * root, beliefs])
+        right = np.concatenate([value * root[:, 0], np.append(state.z, state.shifts) / prior])
+        size = np.linalg.norm(rows, axis=0)
+        q, r = np.linalg.qr(rows / size)
+        half = np.linalg.inv(r) / size[:, None]
+        step = -half @ (q.T @ right)
+        state = state.moved(step, u)
+        if np.linalg.norm(q.T @ right) < SETTLED * max(1.0, np.linalg.norm(right)):
+            return state, half
+    raise ResultError(
+        "[B]'s equations of all legs together found no solution",
+        found=f"steps that had not settled after {STEPS}",
+        next_step=BUNDLE,
+    )

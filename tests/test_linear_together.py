@@ -1,0 +1,223 @@
+"""[B] 14 for all legs at once: exact on exact edges, true deviations, and no leg lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pkmcal
+from pkmcal.cameras import camera_models
+from pkmcal.errors import ResultError
+from pkmcal.geometry.rigid import apply, look_at, perturb, register
+from pkmcal.identify.gauge import BestFit, centre_index, generators, transformation
+from pkmcal.identify.verdict import judge
+from pkmcal.measurements import Measurements, Observation
+from pkmcal.papers import linear
+from pkmcal.papers.linear_together import base_together
+from pkmcal.papers.methods import linear_estimate
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+
+DRAWING = pkmcal.load_mechanism("gough-stewart")
+STATION = look_at(
+    np.array([0.01, -0.02, 0.06]), np.array([0.01, -0.02, 0.4]), np.array([0, -1.0, 0])
+)
+MIRROR = camera_models()["unified"](
+    (640, 480), np.array([149.0, 149.2, 319.8, 240.2, 0.9, 0, 0, 0, 0])
+)
+"""Hyperbolic: it sees down to 17 degrees below its horizon."""
+
+
+def true_machine(rng, share=1.0):
+    """A machine off its drawing by the tolerances."""
+    table = DRAWING.parameters
+    off = share * table.tolerances_free() * rng.normal(size=table.free_matrix().shape[1])
+    return DRAWING.with_values(table.drawing + table.free_matrix() @ off)
+
+
+def seen(machine, rng, noise, configurations=12, shading=0.0):
+    """What the mirror sees of a machine; shading (px) of each side of a tube by Student's t."""
+    spread = np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.04])
+    poses = perturb(machine.home(), rng.uniform(-1, 1, (configurations, 6)) * spread)
+    edges, joints = simulate_edges(machine, STATION[None], MIRROR, poses, noise, rng)
+    line = (edges.leg * 2 + edges.tube) * 2 + edges.side
+    pixels = shading * rng.standard_t(4, size=line.max() + 1)[line, None]
+    moved = edges.normal + (edges.basis @ (edges.shift * pixels)[..., None])[..., 0]
+    edges = replace(edges, normal=moved / np.linalg.norm(moved, axis=-1, keepdims=True))
+    return Measurements(edges, joints, 3e-6, 1, np.zeros(1, dtype=int), shaded=True)
+
+
+def missed(found, truth):
+    """Root mean square (m) of what base centres (L, 3) miss, laid on the truth."""
+    return float(np.sqrt(np.mean((found - apply(register(truth, found), truth)) ** 2)))
+
+
+def leg_by_leg(measurements):
+    """The paper's own: each leg alone, then the scale (16)."""
+    found = linear.centres(DRAWING, measurements, "robust").centres[0]
+    return found / linear.procrustes_scale(found, DRAWING.base_centers())
+
+
+def together(measurements):
+    return DRAWING.with_values(base_together(DRAWING, measurements).theta).base_centers()
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """Machines, cameras and tubes off by what is stated of them, each once."""
+    made = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        machine = true_machine(rng)
+        noise = EdgeNoise(outward=0.3 * rng.normal(), wrong=0.03)
+        made.append((machine, seen(machine, rng, noise, shading=0.05)))
+    return made
+
+
+def test_exact_edges_give_the_base_and_the_edge_shift():
+    """Where the drawing is no more than a hint, and radii are exact, data alone decide."""
+    rng = np.random.default_rng(1)
+    truth = true_machine(rng)
+    radii = truth.parameters.of_kind("radius")
+    tolerance = np.ones(len(truth.values))
+    tolerance[radii] = 1e-9
+    drawing = DRAWING.values.copy()
+    drawing[radii] = truth.values[radii]
+    table = replace(DRAWING.parameters, drawing=drawing, tolerance=tolerance)
+    machine = replace(DRAWING, parameters=table, values=drawing)
+    sharp = EdgeNoise(shift=1e-6, tilt=1e-6, outward=0.2)
+    measurements = seen(truth, rng, sharp)
+    stated = replace(measurements.edges, covariance=1e6 * measurements.edges.covariance)
+    measurements = replace(measurements, edges=stated, shaded=False)
+    found = base_together(machine, measurements)
+    base = machine.with_values(found.theta).base_centers()
+    # the shift counts to first order, and what is known of it beforehand draws a little
+    assert missed(base, truth.base_centers()) < 1e-6
+    assert found.edge_shift[0] == pytest.approx(0.2, abs=1e-4)
+    alone = linear.centres(machine, measurements, "robust").centres[0]
+    assert missed(alone, truth.base_centers()) > 1e-3
+
+
+def test_better_than_leg_by_leg(scenes):
+    """Radii and shading of single legs, which no scale takes out, are weighed with the drawing."""
+    errors = np.array(
+        [
+            [missed(f(m), machine.base_centers()) for f in (together, leg_by_leg)]
+            for machine, m in scenes
+        ]
+    )
+    drawn = [missed(DRAWING.base_centers(), machine.base_centers()) for machine, _ in scenes]
+    rms = np.sqrt(np.mean(errors**2, axis=0))
+    assert rms[0] < 0.8 * rms[1]
+    assert rms[0] < 0.7 * np.sqrt(np.mean(np.square(drawn)))
+
+
+def test_a_leg_that_is_lost_alone_is_not_lost_together():
+    """A third of wrong edges in twelve photographs: legs fall into the mirror one by one."""
+    alone, both = [], []
+    for seed in range(4):
+        rng = np.random.default_rng(50 + seed)
+        machine = true_machine(rng)
+        measurements = seen(machine, rng, EdgeNoise(wrong=0.4), shading=0.05)
+        alone.append(missed(leg_by_leg(measurements), machine.base_centers()))
+        both.append(missed(together(measurements), machine.base_centers()))
+    assert max(alone) > 10e-3
+    assert max(both) < 2e-3
+
+
+def test_one_side_of_a_tube_two_pixels_off():
+    """A highlight's border along a whole tube: its leg alone is put a centimetre off."""
+    rng = np.random.default_rng(5)
+    machine = true_machine(rng)
+    measurements = seen(machine, rng, EdgeNoise())
+    edges = measurements.edges
+    off = (edges.leg == 2) & (edges.tube == 0) & (edges.side == 1)
+    moved = edges.normal - 2 * off[:, None] * (edges.basis @ edges.shift[..., None])[..., 0]
+    measurements = replace(measurements, edges=replace(edges, normal=moved))
+    assert missed(leg_by_leg(measurements), machine.base_centers()) > 3e-3
+    assert missed(together(measurements), machine.base_centers()) < 1.5e-3
+
+
+def chi2(values, found, covariance, machine):
+    """Sum of squares of an error by its covariance (P, P), frames taken out of both, and how many
+    numbers it holds.
+    """
+    layout = machine.layout
+    keep = np.concatenate([i.ravel() for i in centre_index(layout)] + [layout.rod[layout.rod >= 0]])
+    frames = np.linalg.qr(generators(layout, found)[keep])[0]
+    project = np.eye(len(keep)) - frames @ frames.T
+    error = project @ (found - values)[keep]
+    spread, axes = np.linalg.eigh(project @ covariance[np.ix_(keep, keep)] @ project)
+    known = spread > 1e-9 * spread[-1]
+    return np.sum((axes.T @ error)[known] ** 2 / spread[known]), int(known.sum())
+
+
+def test_deviations_are_true_for_base_platform_and_lengths(scenes):
+    """As large as errors are; what stays as drawn has the drawing's."""
+    squares, shifts, count = [], [], 0
+    for machine, measurements in scenes:
+        estimate = linear_estimate(DRAWING, measurements)
+        values = _laid_on(machine, estimate.machine)
+        square, numbers = chi2(values, estimate.state.theta, estimate.covariance, estimate.machine)
+        squares.append(square)
+        count += numbers
+        shifts.append(estimate.state.edge_shift[0] / 0.3)
+    assert count == 16 * 30
+    # within four deviations of a mean square of one
+    assert np.sum(squares) / count == pytest.approx(1, abs=4 * np.sqrt(2 / count))
+
+
+def _laid_on(machine, found):
+    """The machine's values (P,) told in the frames that lay its centres on those found."""
+    values = machine.values.copy()
+    for index, old, new in zip(
+        centre_index(machine.layout),
+        (machine.base_centers(), machine.platform_centers()),
+        (found.base_centers(), found.platform_centers()),
+        strict=True,
+    ):
+        values[index] = apply(register(old, new), old)
+    return values
+
+
+def test_verdict_says_how_far_the_method_goes(scenes):
+    """Base joints by edges, by the drawing and by both: figures, and the better method."""
+    machine, measurements = scenes[0]
+    estimate = linear_estimate(DRAWING, measurements)
+    observation = Observation(
+        measurements.edges,
+        (),
+        np.zeros((0, 2)),
+        np.zeros(0, dtype=int),
+        estimate.state.T_camera_base,
+    )
+    verdict = judge(observation, estimate, "linear")
+    assert not verdict.usable
+    told = verdict.reasons[0]
+    assert "tells of the base alone" in told
+    assert "bundle" in told
+    both, edges, drawing = (float(word) for word in told.split() if word.replace(".", "").isdigit())
+    assert both < min(edges, drawing)
+    # of 18 coordinates with 2 mm each, six are frames
+    assert drawing == pytest.approx(2 * np.sqrt(12 / 18), rel=0.05)
+    n = len(estimate.covariance)
+    keep = transformation(estimate.machine, estimate.state, BestFit())[:n, :n]
+    spread = np.diag(keep @ estimate.covariance @ keep.T)[centre_index(machine.layout)[0].ravel()]
+    assert both == pytest.approx(1e3 * np.sqrt(spread.mean()), rel=0.05)
+
+
+def test_few_legs_are_told():
+    machine = true_machine(np.random.default_rng(0))
+    measurements = seen(machine, np.random.default_rng(0), EdgeNoise())
+    edges = measurements.edges
+    few = replace(measurements, edges=edges.select(edges.leg < 2))
+    with pytest.raises(ResultError, match=r"needs three legs.*2 legs"):
+        base_together(DRAWING, few)
+
+
+def test_joints_that_move_are_told():
+    machine = pkmcal.load_mechanism("6-rus")
+    measurements = seen(DRAWING, np.random.default_rng(0), EdgeNoise())
+    with pytest.raises(ResultError, match="turn about points of the base"):
+        base_together(machine, measurements)
