@@ -4,7 +4,8 @@
   ``four_step_platform`` (3, 4), with ``legs`` (the machine as the steps see it),
   ``registration`` (rigid bodies), ``four_step_checks`` and ``conditions`` (what data they need);
   ``axis_measurements`` (its Table 1).
-- [B] ``linear``, base centres from edges; ``conics``, the planes that they are found from.
+- [B] ``linear``, base centres from edges, each leg alone; ``linear_together``, all of them with the
+  drawing; ``conics``, the planes that they are found from.
 - [C] ``hand_eye`` (camera and board), ``inverse_kinematic`` on the poses of ``measured_platform``,
   ``rotation_axis``.
 
