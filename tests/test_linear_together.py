@@ -43,9 +43,16 @@ def seen(machine, rng, noise, configurations=12, shading=0.0):
     edges, joints = simulate_edges(machine, STATION[None], MIRROR, poses, noise, rng)
     line = (edges.leg * 2 + edges.tube) * 2 + edges.side
     pixels = shading * rng.standard_t(4, size=line.max() + 1)[line, None]
-    moved = edges.normal + (edges.basis @ (edges.shift * pixels)[..., None])[..., 0]
-    edges = replace(edges, normal=moved / np.linalg.norm(moved, axis=-1, keepdims=True))
+    edges = shifted(edges, pixels)
     return Measurements(edges, joints, 3e-6, 1, np.zeros(1, dtype=int), shaded=True)
+
+
+def shifted(edges, pixels):
+    """Edges that lie outwards by some pixels (N, 1)."""
+    moved = edges.normal + (edges.basis @ (edges.shift * pixels)[..., None])[..., 0]
+    moved /= np.linalg.norm(moved, axis=-1, keepdims=True)
+    basis = edges.basis - moved[..., None] * (moved[:, None] @ edges.basis)
+    return replace(edges, normal=moved, basis=basis)
 
 
 def missed(found, truth):
@@ -67,7 +74,7 @@ def together(measurements):
 def scenes():
     """Machines, cameras and tubes off by what is stated of them, each once."""
     made = []
-    for seed in range(16):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         machine = true_machine(rng)
         noise = EdgeNoise(outward=0.3 * rng.normal(), wrong=0.03)
@@ -133,8 +140,7 @@ def test_one_side_of_a_tube_two_pixels_off():
     measurements = seen(machine, rng, EdgeNoise())
     edges = measurements.edges
     off = (edges.leg == 2) & (edges.tube == 0) & (edges.side == 1)
-    moved = edges.normal - 2 * off[:, None] * (edges.basis @ edges.shift[..., None])[..., 0]
-    measurements = replace(measurements, edges=replace(edges, normal=moved))
+    measurements = replace(measurements, edges=shifted(edges, -2.0 * off[:, None]))
     assert missed(leg_by_leg(measurements), machine.base_centers()) > 3e-3
     assert missed(together(measurements), machine.base_centers()) < 1.5e-3
 
@@ -163,7 +169,7 @@ def test_deviations_are_true_for_base_platform_and_lengths(scenes):
         squares.append(square)
         count += numbers
         shifts.append(estimate.state.edge_shift[0] / 0.3)
-    assert count == 16 * 30
+    assert count == 12 * 30
     # within four deviations of a mean square of one
     assert np.sum(squares) / count == pytest.approx(1, abs=4 * np.sqrt(2 / count))
 
