@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -203,7 +204,7 @@ def test_verdict_says_how_far_the_method_goes(scenes):
     told = verdict.reasons[0]
     assert "tells of the base alone" in told
     assert "bundle" in told
-    both, edges, drawing = (float(word) for word in told.split() if word.replace(".", "").isdigit())
+    both, edges, drawing = (float(number) for number in re.findall(r"([\d.]+) mm", told))
     assert both < min(edges, drawing)
     # of 18 coordinates with 2 mm each, six are frames
     assert drawing == pytest.approx(2 * np.sqrt(12 / 18), rel=0.05)

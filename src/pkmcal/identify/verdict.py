@@ -195,9 +195,9 @@ def _base_alone(estimate: Estimate) -> str:
         for x in (alone, np.trace(before), np.trace(together))
     )
     return (
-        f"The linear method tells of the base alone: its joints are known to {both}, to {edges} by"
-        f" the edges and to {drawing_} by the drawing. The platform's joints and the legs' lengths"
-        " stay as drawn. Use the joint method, bundle, which is the default."
+        f"The linear method tells of the base alone: its joints are known to {both} (by the edges"
+        f" alone to {edges}, by the drawing alone to {drawing_}). The platform's joints and the"
+        " legs' lengths stay as drawn. Use the joint method, bundle, which is the default."
     )
 
 
