@@ -484,14 +484,17 @@ def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Ar
         trial_value, trial_by = _model(trial, shape)
         trial_cost = np.sum(weight * (grey - trial_value) ** 2, axis=1)
         better = trial_cost < cost
-        p = np.where(better[:, None], trial, p)
-        value = np.where(better[:, None], trial_value, value)
-        by = np.where(better[:, None, None], trial_by, by)
-        cost = np.where(better, trial_cost, cost)
-        damping = np.where(better, damping * 0.1, damping * 10)
+        p, value = _taken(better, trial, p), _taken(better, trial_value, value)
+        by, cost = _taken(better, trial_by, by), _taken(better, trial_cost, cost)
+        damping = _taken(better, damping * 0.1, damping * 10)
         if np.abs(step[:, :2]).max() < SETTLED:
             break
     return p, grey - value
+
+
+def _taken(better: Booleans, trial: Array, before: Array) -> Array:
+    """Rows of the trial (n, ...) where it is better (n,), else those before."""
+    return np.where(better.reshape(-1, *[1] * (trial.ndim - 1)), trial, before)
 
 
 def _levelled(grey: Array, weight: Array, shape: _Shape, p: Array) -> Array:
