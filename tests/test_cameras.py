@@ -290,6 +290,15 @@ def test_derivatives_of_project(case, place):
     agrees(by_parameters, found, place.tolerance)
 
 
+def test_the_projection_with_its_derivatives_by_the_point(case, place):
+    """To rounding: a model may have both from one pass through its lens."""
+    _, camera = case
+    points = np.concatenate([rays_at(camera, place), [[0.0, 0.0, 0.0]]])
+    pixels, by_point = camera.project_by_point(points)
+    np.testing.assert_array_equal(pixels, camera.project(points))
+    np.testing.assert_array_equal(by_point, camera.project_jacobians(points)[0])
+
+
 def test_derivatives_of_ray(case, place):
     _, camera = case
     pixels = camera.project(rays_at(camera, place))

@@ -80,6 +80,13 @@ class Camera(ABC):
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project`: by the point (..., 2, 3), by parameters (..., 2, n)."""
 
+    def project_by_point(self, points: Array) -> tuple[Array, Array]:
+        """:meth:`project` (..., 2) and its derivatives by the point alone (..., 2, 3).
+
+        What a search asks for thousands of times; a model may have it for less.
+        """
+        return self.project(points), self.project_jacobians(points)[0]
+
     @abstractmethod
     def ray(self, pixels: Array) -> Array:
         """Unit viewing rays (..., 3) of pixels (..., 2); NaN where no ray meets the pixel."""

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
+from pkmcal.geometry.rigid import dot
 
 _NEWTON_STEPS = 20
 _TABLE = 513
@@ -149,25 +150,23 @@ class Pinhole(Camera):
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold."""
         _, good, distorted, _ = self._imaged(points)
-        focal, center = self.parameters[:2], self.parameters[2:4]
-        return np.where(good[..., None], focal * distorted + center, np.nan)
+        return self._pixels(good, distorted)
+
+    def project_by_point(self, points: Array) -> tuple[Array, Array]:
+        """Both from one pass through the lens, and without the parameters' derivatives."""
+        xy, good, distorted, by_xy = self._imaged(points)
+        return self._pixels(good, distorted), self._by_point(points, xy, good, by_xy)
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
         xy, good, distorted, by_xy = self._imaged(points)
-        focal = self.parameters[:2, None]
-        z = np.where(good, points[..., 2], 1.0)
-        dxy = np.zeros((*points.shape[:-1], 2, 3))
-        dxy[..., 0, 0] = dxy[..., 1, 1] = 1 / z
-        dxy[..., :, 2] = -xy / z[..., None]
         by_parameters = np.zeros((*points.shape[:-1], 2, 9))
         by_parameters[..., 0, 0], by_parameters[..., 1, 1] = distorted[..., 0], distorted[..., 1]
         by_parameters[..., 0, 2] = by_parameters[..., 1, 3] = 1.0
-        by_parameters[..., 4:] = focal * distort_by_coefficients(xy)
-        bad = ~good[..., None, None]
+        by_parameters[..., 4:] = self.parameters[:2, None] * distort_by_coefficients(xy)
         return (
-            np.where(bad, np.nan, focal * (by_xy @ dxy)),
-            np.where(bad, np.nan, by_parameters),
+            self._by_point(points, xy, good, by_xy),
+            np.where(good[..., None, None], by_parameters, np.nan),
         )
 
     def ray(self, pixels: Array) -> Array:
@@ -179,6 +178,18 @@ class Pinhole(Camera):
     def in_field(self, points: Array) -> Booleans:
         """In front of the camera, and before the lens polynomial folds back; (...)."""
         return self._imaged(points)[1]
+
+    def _pixels(self, good: Booleans, distorted: Array) -> Array:
+        focal, center = self.parameters[:2], self.parameters[2:4]
+        return np.where(good[..., None], focal * distorted + center, np.nan)
+
+    def _by_point(self, points: Array, xy: Array, good: Booleans, by_xy: Array) -> Array:
+        """Derivatives (..., 2, 3): x/z and y/z have 1/z by x and by y, and -(x/z, y/z)/z by z."""
+        out = np.empty((*points.shape[:-1], 2, 3))
+        out[..., :2] = by_xy
+        out[..., 2] = -dot(by_xy, xy[..., None, :])
+        scale = self.parameters[:2] / np.where(good, points[..., 2], np.nan)[..., None]
+        return scale[..., None] * out
 
     def _imaged(self, points: Array) -> tuple[Array, Booleans, Array, Array]:
         """x/z and y/z (..., 2), where they have an image (...), and :func:`distort` of them."""

@@ -119,13 +119,12 @@ def edge_points(
     fraction = (np.arange(samples) + 0.5) / samples
     along = first[:, None] + np.maximum(last - first, 0.0)[..., None] * fraction
     point = (a + radius[:, None] * normal)[..., None, :] + along[..., None] * u[..., None, :]
-    pixel = camera.project(point)
-    by_point = camera.project_jacobians(point)[0]
-    tangent = (by_point @ u[..., None, :, None])[..., 0]
+    pixel, by_point = camera.project_by_point(point)
+    tangent = dot(by_point, u[..., None, None, :])
     outward = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         outward /= np.sqrt(dot(outward, outward))[..., None]
-    across = (outward[..., None, :] @ by_point)[..., 0, :]
+    across = outward[..., :1] * by_point[..., 0, :] + outward[..., 1:] * by_point[..., 1, :]
     gain = dot(across, normal[..., None, :])
     sign = np.sign(gain)[..., None]
     valid = (ok & (last > first))[..., None] & np.isfinite(gain)

@@ -273,18 +273,10 @@ def _best(
 
 def _apart(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
     """Of candidates (H, 4, 4), best first, those that are not the same place as a better one."""
-    pixel = np.stack(
-        [
-            edge_points(
-                view.machine,
-                view.camera,
-                legs_in_camera(view.machine, T, view.poses[photographs], view.joints[photographs]),
-                view.tubes,
-                2,
-            ).pixel
-            for T in candidates
-        ]
+    legs = legs_in_camera(
+        view.machine, candidates[:, None], view.poses[photographs], view.joints[photographs]
     )
+    pixel = edge_points(view.machine, view.camera, legs, view.tubes, 2).pixel
     kept: list[int] = []
     for h in range(len(candidates)):
         off = np.sqrt(np.nansum((pixel[kept] - pixel[h]) ** 2, axis=-1)) / view.tables.scale
