@@ -101,23 +101,27 @@ def machine(request):
 def workspace(machine, count, seed):
     """Poses about home whose readings are in range, spread over the motion's freedoms."""
     rng = np.random.default_rng(seed)
+    low, high = machine.joint_ranges.T
     size = np.sqrt(np.mean(np.sum(np.var(machine.base_centers(), axis=0))))
     spread = np.repeat([0.5, 0.3 * size], 3)
     tries = 100 * count + 1000
     if machine.layout.n_internal:
         # bars that only theta turns; from a tilt one comes to assemblies that home is not in
         spread[:2], spread[2:3], spread[3:], tries = 0.0, 0.35, 0.1, 4 * count
-    steps = rng.uniform(-1, 1, (tries, 6)) * spread
     freedoms = machine.layout.motion
-    poses = perturb(machine.home(), steps @ freedoms @ freedoms.T)
-    # only poses that the constant rods and the axes allow
-    found = kinematics.on_manifold(machine.layout, machine.values, poses)
-    poses = found.T_base_platform[found.converged]
-    readings = machine.inverse(poses)
-    low, high = machine.joint_ranges.T
-    allowed = ~((readings < low) | (readings > high)).any(axis=-1)
-    assert allowed.sum() >= count
-    return poses[allowed][:count]
+    kept = np.zeros((0, 4, 4))
+    while len(kept) < count:
+        assert tries > 0
+        steps = rng.uniform(-1, 1, (2 * count, 6)) * spread
+        tries -= len(steps)
+        poses = perturb(machine.home(), steps @ freedoms @ freedoms.T)
+        # only poses that the constant rods and the axes allow
+        found = kinematics.on_manifold(machine.layout, machine.values, poses)
+        poses = found.T_base_platform[found.converged]
+        readings = machine.inverse(poses)
+        allowed = ~((readings < low) | (readings > high)).any(axis=-1)
+        kept = np.concatenate([kept, poses[allowed]])
+    return kept[:count]
 
 
 @given(seeds)
@@ -168,14 +172,10 @@ STENCIL = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
 
 
 def differences(function, count, step):
-    """Sixth-order central differences of function(delta (count,)) at zero."""
-    return np.stack(
-        [
-            sum(w * (function(i * by) - function(-i * by)) for i, w in STENCIL) / step
-            for by in step * np.eye(count)
-        ],
-        axis=-1,
-    )
+    """Sixth-order central differences of function(delta (count, count)), row by row, at zero."""
+    by = step * np.eye(count)
+    rows = sum(w * (function(i * by) - function(-i * by)) for i, w in STENCIL) / step
+    return np.moveaxis(rows, 0, -1)
 
 
 def assert_exact_derivatives(machine, readings, T, step=1e-3):
