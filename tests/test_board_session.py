@@ -141,10 +141,15 @@ def test_a_board_is_made_in_proportion_to_the_machine():
 # stations through the board
 
 
-def test_a_station_without_a_pose_is_found_through_the_board(rendered, folder):
-    without_pose(folder, "station2")
+@pytest.mark.parametrize("without", [["station2"], ["station1", "station2"]])
+def test_stations_without_a_pose_are_found_through_the_board(rendered, folder, without):
+    """Where no station has a pose, legs tell where they stand; the board then joins them."""
+    for station in without:
+        without_pose(folder, station)
     session = load_session(folder)
-    assert session.stations[1].T_camera_base is None
+    assert [s.T_camera_base is None for s in session.stations] == [
+        name in without for name in ("station1", "station2")
+    ]
     check_observable(session)
     photographs = read_photographs(session)
     boards = boards_of(session, photographs)
@@ -152,21 +157,6 @@ def test_a_station_without_a_pose_is_found_through_the_board(rendered, folder):
     truth = load_truth(rendered, session.machine)
     error = pose_difference(inverse(T), inverse(truth.T_camera_base))
     # as near as the search comes from a pose by hand; the estimate's start need not be nearer
-    assert np.all(np.linalg.norm(error[:, 3:], axis=1) < 0.06)
-    assert np.all(np.linalg.norm(error[:, :3], axis=1) < np.deg2rad(3))
-
-
-def test_no_pose_at_all(rendered, folder):
-    """Legs tell where their stations stand; the board then joins them."""
-    without_pose(folder, "station1")
-    without_pose(folder, "station2")
-    session = load_session(folder)
-    check_observable(session)
-    photographs = read_photographs(session)
-    boards = boards_of(session, photographs)
-    T = station_poses(session, photographs, boards, np.random.default_rng(0))
-    truth = load_truth(rendered, session.machine)
-    error = pose_difference(inverse(T), inverse(truth.T_camera_base))
     assert np.all(np.linalg.norm(error[:, 3:], axis=1) < 0.06)
     assert np.all(np.linalg.norm(error[:, :3], axis=1) < np.deg2rad(3))
 
