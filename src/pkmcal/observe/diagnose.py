@@ -8,6 +8,7 @@ machine that was recognised is asked too: with two columns exchanged, four legs 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
@@ -29,8 +30,11 @@ from pkmcal.observe.stations import (
 )
 from pkmcal.wording import listed
 
-SURE = 0.05
-"""Times that a hypothesis has to be less probable by chance to replace the session's word."""
+DECIDED = math.log(30 / 0.05)
+"""Log odds from which one of some thirty hypotheses replaces the session's word, or excludes
+another."""
+BESIDE = np.radians(15.0)
+"""Turn from the pose by hand beyond which the search about it would not have come there."""
 ELSEWHERE = np.radians(45.0)
 """Turn from the pose by hand beyond which the machine was found where the user does not see it: a
 machine of three or six equal parts looks the same from there."""
@@ -55,10 +59,15 @@ class SeenStation(NamedTuple):
     @property
     def elsewhere(self) -> bool:
         """Whether the machine was found far from where the user says, or not at all."""
-        if not self.found.good or self.by_hand is None:
-            return not self.found.good
+        return not self.found.good or self.turned > ELSEWHERE
+
+    @property
+    def turned(self) -> float:
+        """Turn (rad) of the found pose from the one by hand; 0 without one."""
+        if self.by_hand is None:
+            return 0.0
         turn = pose_difference(self.found.T_camera_base, self.by_hand)[:3]
-        return bool(np.linalg.norm(turn) > ELSEWHERE)
+        return float(np.linalg.norm(turn))
 
 
 class Hypothesis(NamedTuple):
@@ -127,13 +136,14 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
     """The hypothesis that explains a station's photographs better than the session, if any."""
     view, found = station.view, station.found
     starts = [found.T_camera_base] if found.good or station.by_hand is not None else []
-    if station.elsewhere and station.by_hand is not None:
+    wide = station.elsewhere or station.turned > BESIDE
+    if wide and station.by_hand is not None:
         starts.append(station.by_hand)
     begin = np.array(starts).reshape(-1, 4, 4)
-    own = evidence_nearby(view, begin, station.elsewhere, rng)
+    own = evidence_nearby(view, begin, wide, rng)
     likely: list[tuple[float, Hypothesis]] = [(np.inf, h) for h in _other_photographs(station)]
     for other in _hypotheses(station):
-        evidence = evidence_nearby(other.view, begin, station.elsewhere, rng)
+        evidence = evidence_nearby(other.view, begin, wide, rng)
         # where the machine is as the user says, another word has to be better there at once
         if evidence > own or station.elsewhere:
             likely.append((evidence, other))
@@ -142,13 +152,9 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
     better = [(f, h) for f, h in searched if _replaces(f, station, in_order)]
     if not better:
         return None
-    better.sort(key=lambda item: item[0].by_chance)
+    better.sort(key=lambda item: -item[0].evidence)
     first, error = better[0][0], better[0][1].error
-    also = [
-        hypothesis.error.what
-        for other, hypothesis in better[1:]
-        if other.by_chance * SURE < first.by_chance
-    ]
+    also = [h.error.what for other, h in better[1:] if first.likelier(other) < DECIDED]
     if station.elsewhere and found.good:
         also.append("the pose by hand is of another side of the machine")
     if not also:
@@ -166,8 +172,7 @@ def _replaces(found: FoundStation, station: SeenStation, in_order: bool) -> bool
         return False
     if station.elsewhere and station.found.good and not in_order:
         return True
-    before = station.found
-    return found.evidence > before.evidence and found.by_chance < before.by_chance * SURE
+    return found.likelier(station.found) > DECIDED
 
 
 def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:

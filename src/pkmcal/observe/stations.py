@@ -142,7 +142,8 @@ class FoundStation:
 
     evidence : log likelihood against chance, by reduced pixels of silhouette. by_chance :
     probability of as much without the machine. second : probability that another place is as good.
-    told : whether it was looked for about a pose that is known.
+    told : whether it was looked for about a pose that is known. grain : reduced pixels of
+    silhouette that count as one measurement.
     """
 
     T_camera_base: Array
@@ -151,6 +152,11 @@ class FoundStation:
     by_chance: float
     second: float = 0.0
     told: bool = False
+    grain: float = 1.0
+
+    def likelier(self, other: FoundStation) -> float:
+        """Log odds of this explanation of the photographs against another one of the same."""
+        return (self.evidence - other.evidence) / self.grain
 
     @property
     def limit(self) -> float:
@@ -205,8 +211,9 @@ def find_station(
         score=float(scores.min()),
         evidence=float(evidence[0]),
         by_chance=_by_chance(surely),
-        second=_second(view, candidates, evidence),
+        second=_second(evidence, grain := _grain(view, candidates[0])),
         told=T_camera_base is not None,
+        grain=grain,
     )
 
 
@@ -502,16 +509,22 @@ def _surely(
     return -ndtri(np.maximum(stdtr(count - 1, -away), 1e-300))
 
 
-def _second(view: StationView, candidates: Array, evidence: Array) -> float:
-    """Probability that the second of places (H, 4, 4) is the machine's and not the first, by their
-    evidence (H,), of which each half of an edge counts as one measurement.
+def _grain(view: StationView, T_camera_base: Array) -> float:
+    """Reduced pixels of half a predicted edge: what moves an edge moves its places together, so
+    each half counts as one measurement.
+    """
+    every = view.few(len(view.configuration))
+    length = _look(view, T_camera_base[None], every, 2).length[0]
+    return float(length[length > 0].mean()) / 2  # two samples stand for an edge's length each
+
+
+def _second(evidence: Array, grain: float) -> float:
+    """Probability that the second of places is the machine's and not the first, by their evidence
+    (H,).
     """
     if len(evidence) < 2:
         return 0.0
-    every = view.few(len(view.configuration))
-    length = _look(view, candidates[:1], every, 2).length[0]
-    half = float(length[length > 0].mean()) / 2  # two samples stand for an edge's length each
-    return 1 / (1 + math.exp(min(float(evidence[0] - evidence[1:].max()) / half, 500.0)))
+    return 1 / (1 + math.exp(min(float(evidence[0] - evidence[1:].max()) / grain, 500.0)))
 
 
 def _by_chance(surely: Array) -> float:
