@@ -67,8 +67,10 @@ def simulated(machine: str, seed: int, stations: int, count: int, keep: Path) ->
     return folder
 
 
-def recognised(folder: Path, seed: int) -> Outcome:
-    """Where the cameras stand by a session's photographs, against its truth."""
+def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
+    """Where the cameras stand by a session's photographs, against its truth; upside down, they are
+    turned about their line of sight.
+    """
     from pkmcal.calibration.recognise import (
         boards_of,
         check_observable,
@@ -92,6 +94,8 @@ def recognised(folder: Path, seed: int) -> Outcome:
         return Outcome("refused", str(error), time.process_time() - begin)
     seconds = time.process_time() - begin
     true = load_truth(folder, session.machine).T_camera_base
+    if upside_down:
+        true = np.diag([-1.0, -1.0, 1.0, 1.0]) @ true
     off = pose_difference(inverse(found), inverse(true))
     distance = np.linalg.norm(inverse(true)[:, :3, 3], axis=1)
     place = np.linalg.norm(inverse(found)[:, :3, 3] - inverse(true)[:, :3, 3], axis=1) / distance
@@ -223,7 +227,7 @@ MISTAKES: dict[str, Mistake] = {
     "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), ("are mirrored",)),
     "upside down": Mistake(lambda f, _: pictures(f, lambda p: p[::-1, ::-1]), ()),
     "diameters": Mistake(_radii, ("look like diameters",)),
-    "millimetres": Mistake(_millimetres, ("millimetre",)),
+    "millimetres": Mistake(_millimetres, ("range",)),
     "another machine": Mistake(_another, ("not recognised",)),
     "stations exchanged": Mistake(_stations, ("are mixed up",)),
 }
@@ -238,7 +242,7 @@ def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
         if no_pose:
             without_poses(copy)
         mistake.make(copy, np.random.default_rng(seed))
-        found = recognised(copy, seed)
+        found = recognised(copy, seed, upside_down=name == "upside down")
     if not mistake.named:
         return found._replace(what="named" if found.what == "right" else found.what)
     if found.what != "refused":

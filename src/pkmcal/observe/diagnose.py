@@ -115,13 +115,19 @@ def _little(station: SeenStation) -> str:
 
 
 def _swapped_stations(stations: list[SeenStation], rng: np.random.Generator) -> InputError | None:
-    """Two stations each recognised near the other's pose."""
+    """Two stations each recognised near the other's pose, and better than mirrored at its own: a
+    symmetric machine's mirror image looks much as the machine does from the other side.
+    """
     for one, other in combinations(stations, 2):
         if one.by_hand is None or other.by_hand is None:
             continue
-        exchanged = (one._replace(by_hand=other.by_hand), other._replace(by_hand=one.by_hand))
-        exchanged = (s._replace(found=find_station(s.view, s.by_hand, rng)) for s in exchanged)
-        if not any(station.elsewhere for station in exchanged):
+        swapped = (one._replace(by_hand=other.by_hand), other._replace(by_hand=one.by_hand))
+        swapped = [s._replace(found=find_station(s.view, s.by_hand, rng)) for s in swapped]
+        if any(station.elsewhere for station in swapped):
+            continue
+        view = replace(one.view, tables=one.view.tables.mirrored())
+        mirrored = find_station(view, one.by_hand, rng)
+        if not (mirrored.good and mirrored.likelier(swapped[0].found) > DECIDED):
             return InputError(
                 f"stations {one.name} and {other.name} are mixed up",
                 where="session.yaml, stations",
@@ -200,6 +206,7 @@ def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
     if 2 < len(names) == len(np.unique(names)):
         for step in (1, -1):
             yield Hypothesis(replace(view, configuration=np.roll(names, step)), _shifted(step))
+    # thin legs of few pixels are as likely to be thinner still: only where nothing else explains
     if not station.found.good:
         values = view.machine.values.copy()
         values[np.unique(view.tubes.radius)] /= 2
