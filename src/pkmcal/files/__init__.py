@@ -14,6 +14,7 @@ from pkmcal.files.documents import (
     wanted_file,
     yaml_text,
 )
+from pkmcal.files.exif import Exif, read_exif, with_exif
 from pkmcal.files.schema import Schema, field_path, validate
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
@@ -27,6 +28,9 @@ from pkmcal.files.writing import (
 from pkmcal.wording import listed
 
 __all__ = [
+    "Exif",
+    "read_exif",
+    "with_exif",
     "CsvTable",
     "Document",
     "Keys",
