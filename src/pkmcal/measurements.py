@@ -16,9 +16,9 @@ SHADING_SIGMA = 0.03
 where light is even; hard light and polished metal show ten times as much, so data may enlarge it.
 Path-traced photographs of matt machines show 0.02, our own renderer's 0.05."""
 BREATHING_SIGMA = 1.5e-3
-"""Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens that
-is focused from f at a distance u forms its picture at f u / (u - f): a telephone's lens (5 mm) that
-goes from 3 m to 1 m, as one walks about a machine, changes by 0.3 %, so half of that to each side."""
+"""Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens of
+focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5
+mm) changes by 0.3 % from 3 m to 1 m, as one walks about a machine, so half of that to each side."""
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -78,6 +78,16 @@ class Boards:
     def rejected(self) -> tuple[Rejection, ...]:
         """All that is not used."""
         return tuple(r for station in self.stations.values() for r in station.rejected)
+
+    def of(self, stations: Integers) -> Boards:
+        """The board in some of the stations, numbered anew in their order."""
+        kept = {new: self.stations[k] for new, k in enumerate(stations) if k in self.stations}
+        return replace(
+            self,
+            stations={
+                new: replace(one, seen=replace(one.seen, station=new)) for new, one in kept.items()
+            },
+        )
 
     def joined(self, T_camera_base: Sequence[Array | None]) -> list[Array | None]:
         """Poses of the stations with those that are not known put in through a board on the base.

@@ -86,9 +86,7 @@ def take_turns(
     for turn in range(ROUNDS):
         told("Measuring edges and identifying", 0.45 + 0.5 * turn / ROUNDS)
         cameras = cameras.moved(estimate)
-        photographs = [
-            replace(p, camera=cameras.at_station(p.station)) for p in photographs
-        ]
+        photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
         look = partial(_measure, estimate=estimate, blur=blur, refine=cameras.active)
         looks = _each(photographs, look)
         blur = {p.station: look.blur for p, look in zip(photographs, looks, strict=True)}

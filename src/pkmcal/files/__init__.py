@@ -28,11 +28,9 @@ from pkmcal.files.writing import (
 from pkmcal.wording import listed
 
 __all__ = [
-    "Exif",
-    "read_exif",
-    "with_exif",
     "CsvTable",
     "Document",
+    "Exif",
     "Keys",
     "Schema",
     "check_own_folder",
@@ -45,6 +43,7 @@ __all__ = [
     "parse_yaml",
     "plain",
     "read_csv",
+    "read_exif",
     "read_json",
     "read_text",
     "read_yaml",
@@ -52,6 +51,7 @@ __all__ = [
     "staged_folder",
     "validate",
     "wanted_file",
+    "with_exif",
     "write_bytes",
     "write_folder",
     "write_text",

@@ -20,8 +20,8 @@ class State:
     ``Measurements.intrinsics_at``, in the same units; r = 0 where they are held.
     T_mount : (M, 4, 4) boards in the frame of what they are fixed to, T_base_board or
     T_platform_board by ``on_platform`` (M,). internal : (K, n) hinges of an articulated platform.
-    breathing : (S,) change of the stations' focal lengths from ``Measurements.breathing_at``, in the
-    same units; empty where none breathes.
+    breathing : (S,) change of the stations' focal lengths from ``Measurements.breathing_at``, in
+    the same units; empty where none breathes.
     """
 
     theta: Array

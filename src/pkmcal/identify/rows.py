@@ -154,8 +154,8 @@ class EdgeRows:
 
     @property
     def by_line(self) -> Array:
-        """By their line's shading, which moves them as the camera's shift moves all, (..., 1); edges
-        that are their station's only one of a line have theirs among their noise.
+        """By their line's shading, which moves them as the camera's shift moves all, (..., 1);
+        edges that are their station's only one of a line have theirs among their noise.
         """
         sigma = self.data.shading
         own = sigma[:, self.blocks.line] if sigma.shape[1] > 1 else sigma[:, :, None]
@@ -288,8 +288,8 @@ class PoseData:
     """Numbers measured in each run; leading axis B, or 1 where all runs share them.
 
     T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). optics :
-    (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'. breathing :
-    (B, K, G, 6, 1) by their station's focal breathing.
+    (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'.
+    breathing : (B, K, G, 6, 1) by their station's focal breathing.
     """
 
     T_station_target: Array

@@ -4,8 +4,13 @@ Places all round the machine, at distances from which it fills the picture or a 
 about the line of sight and places in the picture are tried, by the middles of the tubes on a chart
 of what could be tubes (:mod:`pkmcal.observe.tubes`). The best few thousand descend as those of a
 station do (:mod:`pkmcal.observe.stations`), on tables that tell three times as many directions
-apart; the best of these again on twice as fine a picture, where texture yields far less evidence
-and the machine more.
+apart; the best of these again on twice and four times as fine a picture, where texture yields far
+less evidence and the machine more.
+
+How surely the best is the machine, the second best tells: what is not the machine in a picture full
+of edges is rarely alone, and a machine of equal parts looks much the same from several sides. What
+the drawing has wrong moves all edges of a leg together, so each half of a leg counts as one
+measurement of that comparison.
 """
 
 from __future__ import annotations
@@ -18,7 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot, inverse, pose, rotation
 from pkmcal.observe.places import PLACES, TURNS, frame_of, sphere
-from pkmcal.observe.predict import legs_in_camera, visible_stretch
+from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
 from pkmcal.observe.stations import StationView, apart, descend, evidence_of, settle
 from pkmcal.observe.tables import WORKING_WIDTH, distance_tables
 from pkmcal.observe.tubes import CELL, DIRECTIONS, TubeChart, tube_chart
@@ -27,37 +32,52 @@ FILLS = (0.3, 1.5)
 """Share of the picture that the machine fills: from a third, to where its ends lie outside."""
 WIDEST = 1.2
 """Half the angle (rad) under which it is seen at most."""
-FURTHER = 1.13
+FURTHER = 1.18
 """Factor from one distance to the next: half of that moves a leg's end by half its width."""
-OFF = 0.3
+OFF = 0.2
 """Share of the chart's size by which the machine may lie off its middle, to each side."""
 STRIDE = 2
 """Cells of the chart from one place in the picture to the next."""
 EACH = 2
 """Places in the picture that are kept for each place and turn of the camera."""
-KEPT = 3000
+KEPT = 2000
 """Hypotheses that descend: in a cluttered laboratory the machine's is among the first thousand."""
-FEWER, FEW = 600, 200
+FEWER, FEW = 400, 120
 """How many go on after the first descents, and to the finer picture."""
 MANY_DIRECTIONS = 24
 """Directions of the tables: each takes its neighbours in, so edges within 11 degrees count."""
-BATCH = 107
+FEWEST = 40
+"""How many go on to the finest picture, and beside them the look-alikes of the first two."""
+ALIKE = np.radians(20.0)
+"""Turn within which two places are one: look-alikes are turned by 60 degrees at least."""
+FOLDS = (2, 3, 4, 6)
+"""Equal parts that a machine may have."""
+ONTO = 0.2
+"""Distance, in the base's radius, within which joints fall on joints: no two machines' parts are so
+equal that they could be exchanged, and yet from a photograph they could."""
+BATCH = 214
 """Places that are looked up together: some ten megabytes."""
 
 
 class Alone(NamedTuple):
     """Places that a photograph could show, the one with the most evidence first.
 
-    T_camera_base : (H, 4, 4). evidence : (H,) as :mod:`pkmcal.observe.stations` has it. view : the
-    photograph on the finer tables, on which it was found.
+    T_camera_base : (H, 4, 4), none near the first. evidence : (H,) as
+    :mod:`pkmcal.observe.stations` has it. unit : evidence that counts as one measurement.
     """
 
     T_camera_base: Array
     evidence: Array
-    view: StationView
+    unit: float
+
+    @property
+    def doubt(self) -> float:
+        """Probability that the second is the machine's place and not the first."""
+        second = float(self.evidence[1]) if len(self.evidence) > 1 else 0.0
+        return 1 / (1 + float(np.exp(min((self.evidence[0] - second) / self.unit, 500.0))))
 
 
-def find_alone(view: StationView, image: Integers, most: int = 60) -> Alone:
+def find_alone(view: StationView, image: Integers) -> Alone:
     """The likeliest places of the camera of one photograph; view : of it alone."""
     one = np.zeros(1, dtype=int)
     coarse = replace(view, tables=distance_tables([image], WORKING_WIDTH, MANY_DIRECTIONS))
@@ -67,17 +87,40 @@ def find_alone(view: StationView, image: Integers, most: int = 60) -> Alone:
     found = _most(coarse, found, 4, FEWER)
     found = descend(coarse, found, one, 4, (8, 7, 6, 5, 5))
     found = _most(coarse, found, 5, FEW)
-    return weighed(fine, found, most)
-
-
-def weighed(fine: StationView, found: Array, most: int = 60) -> Alone:
-    """Places (H, 4, 4) settled on the finer tables, those that are not the same place."""
-    one = np.zeros(1, dtype=int)
     found = settle(fine, found, one, 8, 6)
-    evidence = evidence_of(fine, found, one, 8).sum(axis=-1)
-    order = np.argsort(-evidence)[:most]
-    order = order[apart(fine, found[order], one)]
-    return Alone(found[order], evidence[order], fine)
+    found = _most(fine, found, 8, FEW)
+    found = found[apart(fine, found, one)][:FEWEST]
+    return weighed(view, image, np.concatenate([found, turned_about(view, found[:2])]))
+
+
+def weighed(view: StationView, image: Integers, found: Array) -> Alone:
+    """Places (H, 4, 4) settled on the finest tables, those that are not the same place."""
+    one = np.zeros(1, dtype=int)
+    view = replace(view, tables=distance_tables([image], 4 * WORKING_WIDTH, MANY_DIRECTIONS))
+    found = settle(view, found, one, 16, 6)
+    evidence = evidence_of(view, found, one, 16).sum(axis=-1)
+    order = np.argsort(-evidence)
+    order = order[evidence[order] > 0]
+    if not len(order):
+        order = np.array([int(np.argmax(evidence))])
+    order = order[apart(view, found[order], one)]
+    found, evidence = found[order], evidence[order]
+    turned = found[0, :3, :3] @ found[:, :3, :3].mT
+    angle = np.arccos(np.clip((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
+    # near the first lies the same place, less well settled
+    keep = (angle >= ALIKE) | (np.arange(len(found)) == 0)
+    return Alone(found[keep], evidence[keep], _unit(view, found[:1]))
+
+
+def _unit(view: StationView, found: Array) -> float:
+    """Reduced pixels of silhouette that count as one measurement: half a leg's."""
+    look = edge_points(
+        view.machine, view.camera, legs_in_camera(view.machine, found[0], view.poses, view.joints),
+        view.tubes, 2,
+    )  # fmt: skip
+    chord = look.pixel[0, :, 1] - look.pixel[0, :, 0]
+    length = np.nan_to_num(2 * np.hypot(chord[:, 0], chord[:, 1]) / view.tables.scale)
+    return float(length.sum()) / (2 * len(np.unique(view.tubes.leg)))
 
 
 def _most(view: StationView, found: Array, samples: int, count: int) -> Array:
@@ -111,15 +154,17 @@ def _hypotheses(view: StationView, chart: TubeChart) -> Array:
     # what is looked up: each place in the picture is a shift of the maps
     steps = [np.arange(-int(OFF * n / CELL), int(OFF * n / CELL) + 1, STRIDE) for n in chart.size]
     windows = _windows(chart.rarity, steps)
-    scores: list[Array] = []
+    values: list[Array] = []
+    shifts: list[Integers] = []
     for away in distance:
         point = tubes.ends - (tubes.centre + direction * away)[:, None, None]
         seen = np.einsum("pij,ptnj->ptni", look, point)
         for turn in range(TURNS):
-            scores.append(_scores(seen, tubes.radius, 2 * np.pi * turn / TURNS, chart, windows))
-    score = np.stack(scores)  # (distance * turn, place, shift)
-    best = np.argpartition(score, -EACH, axis=-1)[..., -EACH:]
-    value = np.take_along_axis(score, best, axis=-1)
+            score = _scores(seen, tubes.radius, 2 * np.pi * turn / TURNS, chart, windows)
+            best = np.argpartition(score, -EACH, axis=-1)[:, -EACH:]
+            shifts += [best]
+            values += [np.take_along_axis(score, best, axis=-1)]
+    value, best = np.stack(values), np.stack(shifts)  # (distance * turn, place, EACH)
     order = np.argsort(-value.ravel())[:KEPT]
     step, place, which = np.unravel_index(order, value.shape)
     shift = best[step, place, which]
@@ -147,7 +192,7 @@ def _tubes(view: StationView) -> _Tubes:
 
 
 def _windows(rarity: Integers, steps: list[Array]) -> Integers:
-    """The maps so that [width, direction, y, x] is a whole window of shifts, (Sy, Sx); y and x count
+    """The maps so that [width, direction, y, x] is a whole window of shifts, (Sy, Sx); y, x count
     from the chart's corner less what :func:`_border` says.
     """
     border = _border(rarity)
@@ -165,9 +210,7 @@ def _border(rarity: Integers) -> int:
     return max(rarity.shape[2:])
 
 
-def _scores(
-    seen: Array, radius: Array, turn: float, chart: TubeChart, windows: Integers
-) -> Array:
+def _scores(seen: Array, radius: Array, turn: float, chart: TubeChart, windows: Integers) -> Array:
     """Mean worth (P, shifts) of the tubes' middles; seen : (P, T, 3, 3) first, middle and last
     points from each place. Long tubes count more.
     """
@@ -195,14 +238,21 @@ def _scores(
     return out
 
 
-def turned_about(view: StationView, found: Array, count: int = 12) -> Array:
-    """Places (H, 4, 4) with the machine turned about its own axis in equal steps, (H count, 4, 4): a
-    machine of equal parts looks much the same from there.
+def turned_about(view: StationView, found: Array) -> Array:
+    """Places (H, 4, 4) with the machine turned about its own axis onto itself, all such turns of
+    each: a machine of equal parts looks much the same from there.
     """
     machine = view.machine
-    base, platform = machine.base_centers().mean(axis=0), view.poses[0][:3, 3]
-    axis = platform - base
-    axis = axis / np.sqrt(axis @ axis)
-    turn = rotation(axis * (2 * np.pi / count * np.arange(1, count))[:, None])
-    about = pose(turn, base - (turn @ base[:, None])[..., 0])
+    base = machine.base_centers()
+    middle = base.mean(axis=0)
+    axis = np.linalg.svd(base - middle)[2][2]  # across the plane in which they lie, nearly
+    near = ONTO * np.sqrt(dot(base - middle, base - middle).max())
+    turns: list[Array] = []
+    for angle in 2 * np.pi * np.unique([k / n for n in FOLDS for k in range(1, n)]):
+        turn = rotation(angle * axis)
+        moved = (base - middle) @ turn.T + middle
+        apart = np.sqrt(dot(moved[:, None] - base, moved[:, None] - base))
+        if apart.min(axis=1).max() < near:
+            turns.append(pose(turn, middle - turn @ middle))
+    about = np.array(turns).reshape(-1, 4, 4)
     return (found[:, None] @ inverse(about)).reshape(-1, 4, 4)

@@ -33,7 +33,7 @@ from pkmcal.observe.predict import (
     plane_normals,
     visible_stretch,
 )
-from pkmcal.observe.tables import BIN, DistanceTables, direction_of
+from pkmcal.observe.tables import BIN, DistanceTables
 
 SEARCH_ANGLE = np.radians(6.0)
 SEARCH_DISTANCE = 0.06

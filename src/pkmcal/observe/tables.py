@@ -124,8 +124,8 @@ class DistanceTables:
 
 
 def direction_of(normal: Array, count: int = DIRECTIONS, turn: float = np.pi) -> Integers:
-    """Direction number, of ``count``, of edges whose image normals are (..., 2); turn : pi where the
-    sign does not matter, 2 pi where it does.
+    """Direction number, of ``count``, of edges whose image normals are (..., 2); turn : pi where
+    the sign does not matter, 2 pi where it does.
     """
     angle = np.arctan2(normal[..., 1], normal[..., 0]) % turn
     number = np.floor(np.nan_to_num(angle) * (count / turn))

@@ -1,4 +1,4 @@
-"""Where tubes could lie in one photograph: two parallel edges at a tube's width, and how rare that is.
+"""Where tubes could lie in one photograph: two parallel edges at a tube's width, and how rare.
 
 Nothing moves in a single photograph, so nothing tells the machine from what stands about it but its
 looks: a leg shows two straight edges side by side, the one from dark to bright, the other back. For
@@ -24,6 +24,8 @@ CHART = 384
 picture wide, as where a machine fills it, has its edges eight cells apart."""
 CELL = 6
 """Fine cells that are one cell of the maps, which are looked up 15 degrees and 8 degrees apart."""
+COARSE = 2
+"""Fine cells between the places whose support is worked out."""
 DIRECTIONS = 24
 """Directions of a pair: 7.5 degrees apart."""
 WIDTHS = 3.2 * np.sqrt(2.0) ** np.arange(6)
@@ -68,8 +70,7 @@ class TubeChart(NamedTuple):
 def tube_chart(image: Integers, camera: Camera) -> TubeChart:
     """Of one photograph (height, width)."""
     grey, scale = _on_chart(image, camera)
-    support = np.stack([_support(grey, width) for width in WIDTHS])
-    return TubeChart(_rarity(support), scale, (grey.shape[1], grey.shape[0]))
+    return TubeChart(_rarity(_support(grey)), scale, (grey.shape[1], grey.shape[0]))
 
 
 def _on_chart(image: Integers, camera: Camera) -> tuple[Array, float]:
@@ -102,25 +103,29 @@ def _angle(rays: Array) -> Array:
     return np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
 
 
-def _support(grey: Array, width: float) -> Array:
-    """How clear a pair of a width lies about each place, (DIRECTIONS, h, w), 0 to 1."""
+def _support(grey: Array) -> Array:
+    """How clear a pair lies about each place, (WIDTHS, DIRECTIONS, h, w), 0 to 1; places lie COARSE
+    fine cells apart.
+    """
     import cv2
 
     dx, dy = (cv2.Sobel(grey.astype(np.float32), cv2.CV_32F, *way) / 8 for way in ((1, 0), (0, 1)))
-    length = max(SLENDER * width, SHORTEST)
-    out = np.empty((DIRECTIONS, *grey.shape), dtype=np.float32)
+    height, width = (n // COARSE for n in grey.shape)
+    out = np.empty((len(WIDTHS), DIRECTIONS, height, width), dtype=np.float32)
     for k in range(DIRECTIONS):
         angle = np.pi * k / DIRECTIONS
         n = np.array([np.cos(angle), np.sin(angle)])
         slope, other = dx * n[0] + dy * n[1], np.abs(dy * n[0] - dx * n[1])
         rising, falling = (_strength(sign * slope - ASIDE * other) for sign in (1, -1))
-        # at x + n width/2 and x - n width/2: a bright tube's edges rise inwards, a dark one's fall
-        out_rising, out_falling = (_shifted(s, -n * width / 2) for s in (rising, falling))
-        in_rising, in_falling = (_shifted(s, n * width / 2) for s in (rising, falling))
-        pair = np.maximum(
-            np.minimum(out_falling, in_rising), np.minimum(out_rising, in_falling)
-        )
-        out[k] = cv2.filter2D(pair, -1, _line(np.array([-n[1], n[0]]), length))
+        for w, wide in enumerate(WIDTHS):
+            # at x + n wide/2 and x - n wide/2: a bright tube rises inwards, a dark one falls
+            step = np.rint(n * wide / 2).astype(int)
+            bright = np.minimum(_shifted(falling, step), _shifted(rising, -step))
+            dark = np.minimum(_shifted(rising, step), _shifted(falling, -step))
+            pair = np.maximum(bright, dark)[: height * COARSE, : width * COARSE]
+            pair = pair.reshape(height, COARSE, width, COARSE).max(axis=(1, 3))
+            length = max(SLENDER * wide, SHORTEST) / COARSE
+            out[w, k] = cv2.filter2D(pair, -1, _line(np.array([-n[1], n[0]]), length))
     return out
 
 
@@ -132,12 +137,15 @@ def _strength(slope: Array) -> Array:
     return np.asarray(cv2.dilate(up / (up + SLOPE**2), np.ones((3, 3), np.uint8)))
 
 
-def _shifted(values: Array, step: Array) -> Array:
-    import cv2
-
-    moved = np.array([[1, 0, step[0]], [0, 1, step[1]]], dtype=np.float32)
-    size = values.shape[1], values.shape[0]
-    return np.asarray(cv2.warpAffine(values, moved, size, flags=cv2.INTER_LINEAR))
+def _shifted(values: Array, step: Integers) -> Array:
+    """Values (h, w) at x + step, zero beyond the border."""
+    x, y = (int(s) for s in step)
+    height, width = values.shape
+    out = np.zeros_like(values)
+    out[max(-y, 0) : height - max(y, 0), max(-x, 0) : width - max(x, 0)] = values[
+        max(y, 0) : height - max(-y, 0), max(x, 0) : width - max(-x, 0)
+    ]
+    return out
 
 
 def _line(along: Array, length: float) -> Array:
@@ -157,9 +165,10 @@ def _rarity(support: Array) -> Integers:
     """
     import cv2
 
-    height, width = (n // CELL for n in support.shape[-2:])
-    around = np.ones((CELL + 3, CELL + 3), np.uint8)
-    rows, columns = (slice(CELL // 2, n * CELL, CELL) for n in (height, width))
+    cell = CELL // COARSE
+    height, width = (n // cell for n in support.shape[-2:])
+    around = np.ones((cell + 2, cell + 2), np.uint8)
+    rows, columns = (slice(cell // 2, n * cell, cell) for n in (height, width))
     best = np.stack(
         [[np.asarray(cv2.dilate(m, around))[rows, columns] for m in maps] for maps in support]
     )

@@ -72,7 +72,7 @@ def _described(focal: float, size: tuple[int, int]) -> str:
 
 
 def _camera(focal: float, size: tuple[int, int]) -> Camera:
-    """focal : px."""
+    """With its focal length in px."""
     kind = camera_models()["pinhole"]
     middle = [(size[0] - 1) / 2, (size[1] - 1) / 2]
     camera = kind(size, np.array([focal, focal, *middle, 0.0, 0.0, 0.0, 0.0, 0.0]))

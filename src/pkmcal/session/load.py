@@ -6,6 +6,7 @@ any work is spent; each fault is an `InputError` with file, line and field.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
@@ -106,6 +107,13 @@ class Session:
     def station_names(self) -> tuple[str, ...]:
         """Names of all stations, trackers last, as measurements number them."""
         return tuple(station.name for station in (*self.stations, *self.trackers))
+
+    def of_stations(self, numbers: Sequence[int], warnings: tuple[str, ...] = ()) -> Session:
+        """The session with some of its stations that have a camera, and what is to be known of
+        the others.
+        """
+        stations = tuple(self.stations[k] for k in numbers)
+        return replace(self, stations=stations, warnings=self.warnings + warnings)
 
     def other_model(self, name: str | None) -> Machine:
         """Another model of the same machine."""

@@ -48,7 +48,7 @@ def _words(value: Any) -> tuple[str, ...]:
 
 
 class StationDocument(Schema):
-    """One entry of ``stations``: a camera in one place, or, held by hand, one place a photograph."""
+    """One entry of ``stations``: a camera in one place, or by hand, one place a photograph."""
 
     camera: str = Field(description="the camera's file, for example cameras/front.yaml, or exif")
     images: str = Field(description="a pattern such as images/front/{configuration}.png")

@@ -259,9 +259,7 @@ def places_by_hand(
         up = rotation(roll * forward) @ np.array([0.0, 0.0, 1.0])
         up = up - (up @ forward) * forward
         out.append(
-            StationPlace(
-                _rounded(position), _rounded(target), _rounded(up / np.linalg.norm(up))
-            )
+            StationPlace(_rounded(position), _rounded(target), _rounded(up / np.linalg.norm(up)))
         )
     return tuple(out)
 

@@ -77,9 +77,9 @@ def _breathed(camera: Camera, scale: float) -> Camera:
 
 @dataclass(frozen=True)
 class Studio:
-    """Everything that photographs of one session share; cameras : by station; views : of each camera
-    that has more than one photograph, by its id; fixed : to the base; as_built :
-    with motors, rings and cables on the legs.
+    """Everything that photographs of one session share; cameras : by station; views : of each
+    camera that has more than one photograph, by its id; fixed : to the base;
+    as_built : with motors, rings and cables on the legs.
     """
 
     truth: Truth
@@ -310,10 +310,8 @@ def _as_by_telephone(picture: Integers, camera: Camera, T_camera_base: Array) ->
         raise OSError("a photograph could not be encoded as JPEG")
     # where up is in the picture as stored: viewers turn it so that it is above
     right, down = T_camera_base[:2, 2]
-    if abs(down) >= abs(right):
-        orientation = 1 if down < 0 else 3
-    else:
-        orientation = 6 if right < 0 else 8
+    upright, lying = 1 if down < 0 else 3, 6 if right < 0 else 8
+    orientation = upright if abs(down) >= abs(right) else lying
     film = float(np.hypot(36.0, 24.0) / np.hypot(*camera.image_size))
     exif = Exif(orientation, float(camera.parameters[0]) * film)
     return with_exif(data.tobytes(), exif)
