@@ -420,18 +420,21 @@ def test_photographs_of_one_configuration_are_recognised(looked, monkeypatch):
 
 
 def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
-    """One whose edges the estimate gives up is left out, and the machine estimated without it."""
+    """One whose edges the estimate gives up, or that it moves away, is left out."""
     calibration, _ = breathed
-    weights = calibration.estimate.edge_weights.copy()
-    assert misplaced(calibration.session, calibration.measurements, calibration.estimate) == []
-    weights[calibration.measurements.edges.station == 1] *= 0.4
-    estimate = replace(calibration.estimate, edge_weights=weights)
-    wrong = misplaced(calibration.session, calibration.measurements, estimate)
+    session, measurements = calibration.session, calibration.measurements
+    estimate, T = calibration.estimate, calibration.estimate.state.T_camera_base
+    assert misplaced(session, measurements, estimate, T) == []
+    weights = estimate.edge_weights.copy()
+    weights[measurements.edges.station == 1] *= 0.4
+    given_up = replace(estimate, edge_weights=weights)
+    wrong = misplaced(session, measurements, given_up, T)
     assert wrong == [1]
-    T = calibration.estimate.state.T_camera_base
-    rest = without_misplaced(calibration.session, [], Boards(), T, wrong)
+    turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
+    assert misplaced(session, measurements, estimate, perturb(T, turn)) == [2]
+    rest = without_misplaced(session, [], Boards(), T, wrong)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
-    assert "most of its edges disagree" in rest.session.warnings[-1]
+    assert "too few of its edges agree" in rest.session.warnings[-1]
 
 
 def test_tubes_stand_out_of_a_chart():

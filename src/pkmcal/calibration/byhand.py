@@ -18,10 +18,11 @@ from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.recognise import WORKERS
 from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import dot, pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Measurements
 from pkmcal.observe import legs
-from pkmcal.observe.alone import Alone, find_alone
+from pkmcal.observe.alone import ALIKE, Alone, find_alone
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import StationView
 from pkmcal.observe.tables import distance_tables
@@ -32,6 +33,11 @@ from pkmcal.wording import listed
 SURE = 1e-2
 """Probability that a photograph shows the machine from another place, below which it is believed:
 of a hundred one may be wrong, and the joint estimate finds that one out."""
+
+
+FEWEST_EDGES = 4
+"""Edges of a photograph that tell its place: two numbers each, of which a pose and a focal length
+take seven."""
 
 
 class Placed(NamedTuple):
@@ -89,14 +95,19 @@ def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
     return np.stack([np.full((4, 4), np.nan) if T is None else T for T in joined])
 
 
-def misplaced(session: Session, measurements: Measurements, estimate: Estimate) -> list[int]:
-    """Photographs by hand of which the joint estimate has given up most edges."""
+def misplaced(
+    session: Session, measurements: Measurements, estimate: Estimate, T_camera_base: Array
+) -> list[int]:
+    """Photographs by hand of which the joint estimate has given up most edges, has too few to tell
+    their place, or finds the camera looking another way than where it was placed, T_camera_base.
+    """
+    turn = pose_difference(estimate.state.T_camera_base, T_camera_base)[:, :3]
+    astray = np.sqrt(dot(turn, turn)) > ALIKE / 2
     station = measurements.edges.station
     kept = np.bincount(station, estimate.edge_weights, len(session.stations))
     count = np.bincount(station, minlength=len(session.stations))
-    return [
-        k for k, s in enumerate(session.stations) if s.handheld and 2 * kept[k] < max(count[k], 1)
-    ]
+    lost = (2 * kept < count) | (kept < FEWEST_EDGES)
+    return [k for k, s in enumerate(session.stations) if s.handheld and (lost[k] or astray[k])]
 
 
 def without_misplaced(
@@ -107,7 +118,7 @@ def without_misplaced(
     wrong: list[int],
 ) -> Placed:
     """The session without these photographs, each told."""
-    why = dict.fromkeys(wrong, "most of its edges disagree with all other photographs")
+    why = dict.fromkeys(wrong, "too few of its edges agree with the other photographs")
     return _without(session, photographs, boards, T_camera_base[: len(session.stations)], why)
 
 

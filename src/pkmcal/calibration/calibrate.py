@@ -100,12 +100,15 @@ def calibrate(
         session, seen = _observe(session, seed, clock)
         cameras = refinement_of(session, refine_camera)  # of the stations that are left
         found = _identify(session, seen, cameras, method, seed, holdout, clock)
-        wrong = misplaced(session, found.turns.measurements, found.turns.estimate)
+        wrong = misplaced(
+            session, found.turns.measurements, found.turns.estimate, seen.T_camera_base
+        )
         if wrong:
             where = found.turns.estimate.state.T_camera_base
-            session, *rest = without_misplaced(session, *seen[:2], where, wrong)
+            rest = without_misplaced(session, seen.photographs, seen.boards, where, wrong)
+            session, seen = rest.session, _Seen(rest.photographs, rest.boards, rest.T_camera_base)
             cameras = refinement_of(session, refine_camera)
-            found = _identify(session, _Seen(*rest), cameras, method, seed, holdout, clock)
+            found = _identify(session, seen, cameras, method, seed, holdout, clock)
         return _judge(session, seen, found, method, seed, clock)
 
 

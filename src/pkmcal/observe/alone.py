@@ -15,6 +15,7 @@ measurement of that comparison.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -191,7 +192,7 @@ def _tubes(view: StationView) -> _Tubes:
     return _Tubes(ends, view.machine.values[tubes.radius[one]], centre, size)
 
 
-def _windows(rarity: Integers, steps: list[Array]) -> Integers:
+def _windows(rarity: Integers, steps: Sequence[Integers]) -> Integers:
     """The maps so that [width, direction, y, x] is a whole window of shifts, (Sy, Sx); y, x count
     from the chart's corner less what :func:`_border` says.
     """

@@ -134,7 +134,8 @@ def _strength(slope: Array) -> Array:
     import cv2
 
     up = np.square(np.maximum(slope, 0.0))
-    return np.asarray(cv2.dilate(up / (up + SLOPE**2), np.ones((3, 3), np.uint8)))
+    wide = cv2.dilate(up / (up + SLOPE**2), np.ones((3, 3), np.uint8))
+    return np.asarray(wide, dtype=np.float32)
 
 
 def _shifted(values: Array, step: Integers) -> Array:
