@@ -231,7 +231,7 @@ def simulated(tmp_path_factory):
     """Three photographs by hand of a machine as drawn, with focal lengths that breathe."""
     folder = tmp_path_factory.mktemp("byhand") / "session"
     machine = load_mechanism("gough-stewart")
-    rendered(folder, machine, camera_of_size((640, 480)), SETTINGS, seed=1)
+    rendered(folder, machine, camera_of_size((640, 480)), SETTINGS, seed=7)
     return folder
 
 
