@@ -15,6 +15,10 @@ SHADING_SIGMA = 0.03
 """Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
 where light is even; hard light and polished metal show ten times as much, so data may enlarge it.
 Path-traced photographs of matt machines show 0.02, our own renderer's 0.05."""
+BREATHING_SIGMA = 1.5e-3
+"""Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens of
+focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5
+mm) changes by 0.3 % from 3 m to 1 m, as one walks about a machine, so half of that to each side."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,8 @@ class PoseSet:
         whiten @ error has unit covariance. Rows of what is not measured (a point's turn) are zero.
     by_intrinsics : (N, 6, n) that perturbation by the camera's parameters, with the corners'
         pixels held; n = 0 where nobody asked.
+    by_focal : (N, 6) the same by the relative excess of the focal lengths, where these breathe from
+        photograph to photograph; else zero.
     """
 
     station: Integers
@@ -36,11 +42,14 @@ class PoseSet:
     T_station_target: Array
     whiten: Array
     by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 6, 0)))
+    by_focal: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     def __post_init__(self) -> None:
         """Poses without derivatives by intrinsics get empty ones, so that all select alike."""
         if len(self.by_intrinsics) != len(self.station):
             object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 6, 0)))
+        if len(self.by_focal) != len(self.station):
+            object.__setattr__(self, "by_focal", np.zeros((len(self.station), 6)))
 
     @classmethod
     def empty(cls) -> PoseSet:
@@ -86,6 +95,8 @@ class EdgeSet:
     span : (N, 2) first and last seen place along the leg, m from A.
     by_intrinsics : (N, 2, n) change of the normal, in that basis, by the camera's parameters with
         the edge's pixels held; n = 0 where nobody asked.
+    by_focal : (N, 2) the same by the relative excess of the focal lengths, where these breathe from
+        photograph to photograph; else zero.
     """
 
     station: Integers
@@ -99,11 +110,14 @@ class EdgeSet:
     shift: Array
     span: Array
     by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    by_focal: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
         """Edges without derivatives by intrinsics get empty ones, so that all select alike."""
         if len(self.by_intrinsics) != len(self.station):
             object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 2, 0)))
+        if len(self.by_focal) != len(self.station):
+            object.__setattr__(self, "by_focal", np.zeros((len(self.station), 2)))
 
     @classmethod
     def empty(cls) -> EdgeSet:
@@ -204,7 +218,8 @@ class Measurements:
     refined; r = 0 where they are held. intrinsics_at : (C, r) where the edges were measured, in
     those units from the calibration's values. poses : of boards or targets, each on one of the
     ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
-    gives edges in photographs.
+    gives edges in photographs. breathing_at : (S,) excess of the stations' focal lengths at which
+    they were measured, in BREATHING_SIGMA; empty where none breathes.
     """
 
     edges: EdgeSet
@@ -217,6 +232,7 @@ class Measurements:
     poses: PoseSet = field(default_factory=PoseSet.empty)
     mounts: tuple[Mount, ...] = ()
     shaded: bool = False
+    breathing_at: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def n_cameras(self) -> int:

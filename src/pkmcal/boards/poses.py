@@ -258,7 +258,9 @@ class Standing:
     def poses(self, seen: BoardViews, mount: int) -> PoseSet:
         """One measurement; the configuration of its row says nothing, for nothing moves."""
         row = seen.configuration[seen.shown[self.agreed]][:1]
-        return pose_set(seen.station, row, mount, self.T_camera_board[None], self.covariance[None])
+        found = pose_set(seen.station, row, mount, self.T_camera_board[None], self.covariance[None])
+        by = seen.poses.by_intrinsics[self.agreed].mean(axis=0)[None]
+        return replace(found, by_intrinsics=by)
 
 
 def standing(seen: BoardViews) -> Standing | None:

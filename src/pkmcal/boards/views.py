@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -79,6 +79,16 @@ class Boards:
         """All that is not used."""
         return tuple(r for station in self.stations.values() for r in station.rejected)
 
+    def of(self, stations: Integers) -> Boards:
+        """The board in some of the stations, numbered anew in their order."""
+        kept = {new: self.stations[k] for new, k in enumerate(stations) if k in self.stations}
+        return replace(
+            self,
+            stations={
+                new: replace(one, seen=replace(one.seen, station=new)) for new, one in kept.items()
+            },
+        )
+
     def joined(self, T_camera_base: Sequence[Array | None]) -> list[Array | None]:
         """Poses of the stations with those that are not known put in through a board on the base.
 
@@ -105,14 +115,22 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
     board = board_of(session)
     if board is None:
         return Boards()
-    return Boards(
-        {
-            number: station_board(session, board, number, images[number])
-            for number, station in enumerate(session.stations)
-            if "board" in station.observe
-        },
-        session.board_body,
-    )
+    found: dict[int, StationBoard] = {}
+    by_hand: dict[str, list[Detection]] = {}
+    for number, station in enumerate(session.stations):
+        if "board" not in station.observe:
+            continue
+        if not station.handheld:
+            found[number] = station_board(session, board, number, images[number])
+            continue
+        # walking round a machine one does not see its board from everywhere
+        one, seen = _board_by_hand(session, board, number, images[number])
+        by_hand.setdefault(station.entry, []).append(one)
+        if seen is not None:
+            found[number] = seen
+    for entry, detections in by_hand.items():
+        _check_shown(entry, board, detections)
+    return Boards(found, session.board_body)
 
 
 def board_of(session: Session) -> Board | None:
@@ -135,15 +153,7 @@ def station_board(
     # A board that moves says something new in every photograph; a still one is seen enough.
     most = len(images) if moves else ENOUGH if nowhere else 0
     detections = detect_again(images, board, detections, most)
-    if not any(detection.found for detection in detections):
-        raise InputError(
-            f"the board is in none of the photographs of station {station.name}",
-            where=detections[0].name,
-            found=detections[0].reason,
-            expected=f"{board.described}, sharp, and not hidden by the machine",
-            next_step="Check the board file, the light and the focus, or write observe: legs for"
-            " this station",
-        )
+    _check_shown(station.name, board, detections)
     rows = np.array([photo.configuration for photo in station.photographs])
     seen = board_views(number, station.camera, rows, board, detections)
     stood = None if moves else standing(seen)
@@ -155,6 +165,36 @@ def station_board(
             expected="one at least in which the board is large, sharp and little hidden",
         )
     return StationBoard(seen, stood)
+
+
+def _check_shown(name: str, board: Board, detections: Sequence[Detection]) -> None:
+    """Raise `InputError` where no photograph of a station shows the board."""
+    if not any(detection.found for detection in detections):
+        raise InputError(
+            f"the board is in none of the photographs of station {name}",
+            where=detections[0].name,
+            found=detections[0].reason,
+            expected=f"{board.described}, sharp, and not hidden by the machine",
+            next_step="Check the board file, the light and the focus, or write observe: legs for"
+            " this station",
+        )
+
+
+def _board_by_hand(
+    session: Session, board: Board, number: int, images: Sequence[Integers]
+) -> tuple[Detection, StationBoard | None]:
+    """The board in a photograph by hand, and what it tells if it is seen well enough."""
+    station = session.stations[number]
+    labels = [label_of(session.folder, photo.path) for photo in station.photographs]
+    detections = detect_again(images, board, detect_in(images, board, labels), len(images))
+    if not detections[0].found:
+        return detections[0], None
+    rows = np.array([photo.configuration for photo in station.photographs])
+    seen = board_views(number, station.camera, rows, board, detections)
+    if session.board_body == "platform":
+        return detections[0], StationBoard(seen, None)
+    stood = standing(seen)
+    return detections[0], None if stood is None else StationBoard(seen, stood)
 
 
 def _check_another(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -12,6 +12,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
+from pkmcal.calibration.byhand import misplaced, place_by_hand, without_misplaced
 from pkmcal.calibration.doubts import check_poses, richer_models, scale_doubt
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.recognise import (
@@ -95,9 +96,19 @@ def calibrate(
     # beside our own threads they slow it twentyfold.
     with threadpool_limits(1, "blas"):
         clock = _Clock(progress)
-        session, cameras = _load(session, refine_camera, clock)
-        seen = _observe(session, seed, clock)
+        session = _load(session, refine_camera, clock)
+        session, seen = _observe(session, seed, clock)
+        cameras = refinement_of(session, refine_camera)  # of the stations that are left
         found = _identify(session, seen, cameras, method, seed, holdout, clock)
+        wrong = misplaced(
+            session, found.turns.measurements, found.turns.estimate, seen.T_camera_base
+        )
+        if wrong:
+            where = found.turns.estimate.state.T_camera_base
+            rest = without_misplaced(session, seen.photographs, seen.boards, where, wrong)
+            session, seen = rest.session, _Seen(rest.photographs, rest.boards, rest.T_camera_base)
+            cameras = refinement_of(session, refine_camera)
+            found = _identify(session, seen, cameras, method, seed, holdout, clock)
         return _judge(session, seen, found, method, seed, clock)
 
 
@@ -120,30 +131,39 @@ class _Identified(NamedTuple):
     out: LeftOut | None
 
 
-def _load(
-    session: Session | Path | str, refine_camera: bool, clock: _Clock
-) -> tuple[Session, CameraRefinement]:
-    """The session, whole and possible, and its cameras."""
+def _load(session: Session | Path | str, refine_camera: bool, clock: _Clock) -> Session:
+    """The session, whole and possible."""
     if not isinstance(session, Session):
         session = load_session(session)
     check_observable(session)
     # a pose that the machine cannot take is told before any work
     platform_poses(session, most=not legs_stations(session))
-    cameras = refinement_of(session, refine_camera)
+    refinement_of(session, refine_camera)
     clock.lap("load")
-    return session, cameras
+    return session
 
 
-def _observe(session: Session, seed: int, clock: _Clock) -> _Seen:
-    """Where the stations stand, by what their photographs and tables show."""
+def _observe(session: Session, seed: int, clock: _Clock) -> tuple[Session, _Seen]:
+    """Where the stations stand, by what their photographs and tables show; and the session without
+    photographs by hand that could not be placed.
+    """
     clock.told("Reading photographs", 0.0)
     photographs = read_photographs(session)
     clock.lap("decode")
     clock.told("Recognising the machine", 0.2)
     boards = boards_of(session, photographs)
-    known = station_poses(session, photographs, boards, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    if any(station.handheld for station in session.stations):
+        fixed = [p for p in photographs if not session.stations[p.station].handheld]
+        known = station_poses(session, fixed, boards, rng, by_hand=True)
+        poses = platform_poses(session)
+        session, photographs, boards, known = place_by_hand(
+            session, photographs, poses, boards, known
+        )
+    else:
+        known = station_poses(session, photographs, boards, rng)
     clock.lap("observe")
-    return _Seen(photographs, boards, known)
+    return session, _Seen(photographs, boards, known)
 
 
 def _identify(
@@ -179,6 +199,13 @@ def _judge(
 ) -> Calibration:
     """What the data tell, what they leave open, and whether the result may be used."""
     clock.told("Judging", 0.95)
+    if found.turns.cameras.active:  # the edges are where these cameras see them
+        cameras = found.turns.cameras
+        refined = [
+            replace(station, camera=cameras.at_station(k))
+            for k, station in enumerate(session.stations)
+        ]
+        session = replace(session, stations=tuple(refined))
     findings = _findings(found.turns.measurements, found.estimate)
     verdict = judge(
         found.turns.observation,

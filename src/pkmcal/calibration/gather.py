@@ -1,21 +1,31 @@
 """What a session's photographs and tables measured, put together; cameras refined with it.
 
 A camera's intrinsics, where they are refined, are those of its calibration plus F u: F F^T is the
-calibration's covariance, and the u are unknowns of the estimate with unit variance.
+calibration's covariance, and the u are unknowns of the estimate with unit variance. The focal
+lengths of photographs by hand breathe besides: each photograph's are larger than its camera's by an
+unknown of its own.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.identify.estimate import Estimate
-from pkmcal.measurements import EdgeSet, Measurements, Mount, concatenate
+from pkmcal.measurements import (
+    BREATHING_SIGMA,
+    EdgeSet,
+    Measurements,
+    Mount,
+    PoseSet,
+    concatenate,
+)
 from pkmcal.session.load import Session
 
 
@@ -24,26 +34,51 @@ class CameraRefinement:
     """The cameras of a session and where their refinement stands.
 
     files, calibrated : names and cameras as calibrated, C of them. factor : (C, n, r) the F above,
-    r = 0 where cameras are held. at : (C, r).
+    r = 0 where cameras are held. at : (C, r). of_station : (S,) file of each station's camera.
+    breathes : (S,) whether the station is a photograph by hand. breath : (S,) excess of its focal
+    lengths, in BREATHING_SIGMA.
     """
 
     files: tuple[str, ...]
     calibrated: tuple[Camera, ...]
     factor: Array
     at: Array
+    of_station: tuple[str, ...]
+    breathes: Booleans
+    breath: Array
+
+    @property
+    def refined(self) -> bool:
+        """Whether any camera's intrinsics are refined."""
+        return self.factor.shape[-1] > 0
 
     @property
     def active(self) -> bool:
-        """Whether there is anything to refine."""
-        return self.factor.shape[-1] > 0
+        """Whether there is anything to refine, of a camera or of a photograph."""
+        return self.refined or bool(self.breathes.any())
 
     def camera(self, file: str) -> Camera:
         """A camera with its intrinsics at the present place."""
         camera = self.calibrated[self.files.index(file)]
-        if not self.active:
+        if not self.refined:
             return camera
         change = self.change(file)[: len(camera.parameters)]
         return replace(camera, parameters=camera.parameters + change)
+
+    def at_station(self, number: int) -> Camera:
+        """The camera of a station, with its own focal lengths where these breathe."""
+        camera = self.camera(self.of_station[number])
+        excess = BREATHING_SIGMA * self.breath[number] * focal_part(camera)
+        return replace(camera, parameters=camera.parameters + excess)
+
+    def of(self, stations: Integers) -> CameraRefinement:
+        """The same for some of the stations, by their numbers."""
+        return replace(
+            self,
+            of_station=tuple(self.of_station[k] for k in stations),
+            breathes=self.breathes[stations],
+            breath=self.breath[stations],
+        )
 
     def change(self, file: str) -> Array:
         """What the intrinsics have changed by so far, (n,), as wide as the widest camera's."""
@@ -52,37 +87,59 @@ class CameraRefinement:
 
     def moved(self, estimate: Estimate) -> CameraRefinement:
         """The refinement after an estimate."""
-        if estimate.state.intrinsics.shape != self.at.shape:
-            return self
-        return replace(self, at=self.at + estimate.state.intrinsics)
+        state, at, breath = estimate.state, self.at, self.breath
+        if state.intrinsics.shape == at.shape:
+            at = at + state.intrinsics
+        if len(state.breathing):
+            breath = breath + state.breathing[: len(breath)]
+        return replace(self, at=at, breath=breath)
 
     def result(self, estimate: Estimate, file: str) -> Camera:
         """A camera as the last estimate has it, with its covariance."""
         camera = self.moved(estimate).camera(file)
-        if not self.active:
+        if not self.refined:
             return camera
         covariance = estimate.intrinsics_covariance[self.files.index(file)]
         n = len(camera.parameters)
         return replace(camera, covariance=covariance[:n, :n])
 
 
+def focal_part(camera: Camera) -> Array:
+    """The camera's parameters (n,) with all but the focal lengths zero: their change when the
+    lengths grow by their own size.
+    """
+    focal = [name.startswith("focal.") for name in camera.parameter_names]
+    return np.where(focal, camera.parameters, 0.0)
+
+
 def refinement_of(session: Session, refine: bool) -> CameraRefinement:
-    """The session's cameras, held or to be refined; an InputError where one has no covariance."""
+    """The session's cameras, held or to be refined; an InputError where one has no covariance.
+
+    A camera of which EXIF alone tells is refined in any case.
+    """
     cameras = {s.camera_file: s.camera for s in session.stations}
+    rough = {s.camera_file for s in session.stations if s.from_exif}
     files, calibrated = tuple(cameras), tuple(cameras.values())
-    if not refine:
+    breathes = np.array([station.handheld for station in session.stations], dtype=bool)
+    stations = tuple(s.camera_file for s in session.stations), breathes, np.zeros(len(breathes))
+    if not refine and not rough:
         held = np.zeros((len(files), 0, 0))
-        return CameraRefinement(files, calibrated, held, np.zeros((len(files), 0)))
+        return CameraRefinement(files, calibrated, held, np.zeros((len(files), 0)), *stations)
     if not cameras:
         raise InputError(
             "no station has a camera whose intrinsics could be refined",
             where="session.yaml, stations",
             next_step="Leave --refine-camera out",
         )
-    roots = [covariance_root(file, camera) for file, camera in cameras.items()]
+    roots = [
+        covariance_root(file, camera)
+        if refine or file in rough
+        else np.zeros((len(camera.parameters), 0))
+        for file, camera in cameras.items()
+    ]
     n, r = (max(root.shape[k] for root in roots) for k in (0, 1))
     factor = np.stack([np.pad(f, ((0, n - len(f)), (0, r - f.shape[1]))) for f in roots])
-    return CameraRefinement(files, calibrated, factor, np.zeros((len(files), r)))
+    return CameraRefinement(files, calibrated, factor, np.zeros((len(files), r)), *stations)
 
 
 def covariance_root(file: str, camera: Camera) -> Array:
@@ -114,15 +171,24 @@ def measurements_of(
     number = [numbers[name] for name in files] + [0] * len(session.trackers)
     # What targets are fixed to: the board, then each tracker's own.
     mounts = [Mount("board", boards.body)] if boards.stations else []
-    poses = boards.poses
-    if cameras is not None and cameras.active:
-        poses = poses.moved(np.stack([cameras.change(s.camera_file) for s in session.stations]))
+    poses, edges = boards.poses, EdgeSet.empty() if edges is None else edges
+    breathing = np.zeros(0)
+    if cameras is not None and cameras.active and session.stations:
+        if cameras.breathes.any():
+            poses, edges = _breathing(poses, cameras), _breathing(edges, cameras)
+            breathing = np.pad(cameras.breath, (0, len(session.trackers)))
+        change = [
+            cameras.at_station(k).parameters - session.stations[k].camera.parameters
+            for k in range(len(session.stations))
+        ]
+        widest = max(len(part) for part in change)
+        poses = poses.moved(np.stack([np.pad(x, (0, widest - len(x))) for x in change]))
     sets = [poses]
     for k, table in enumerate(session.trackers, start=len(session.stations)):
         sets.append(table.poses(k, len(mounts)))
         mounts.append(Mount(table.name, "platform"))
     measurements = Measurements(
-        edges=EdgeSet.empty() if edges is None else edges,
+        edges=edges,
         joints=session.joints,
         joint_noise=session.joint_noise,
         n_stations=len(number),
@@ -137,4 +203,19 @@ def measurements_of(
         intrinsics_factor=cameras.factor,
         intrinsics_at=cameras.at,
         shaded=len(measurements.edges) > 0,
+        breathing_at=breathing,
     )
+
+
+Set = TypeVar("Set", PoseSet, EdgeSet)
+
+
+def _breathing(measured: Set, cameras: CameraRefinement) -> Set:
+    """What was measured, with what the excess of each photograph's focal lengths does to it."""
+    widest = measured.by_intrinsics.shape[-1]
+    focal = np.zeros((len(cameras.of_station), widest))
+    for k in np.flatnonzero(cameras.breathes):
+        part = focal_part(cameras.camera(cameras.of_station[k]))
+        focal[k, : len(part)] = part[:widest]
+    by_focal = (measured.by_intrinsics @ focal[measured.station][..., None])[..., 0]
+    return replace(measured, by_focal=by_focal)

@@ -274,11 +274,13 @@ def station_poses(
     photographs: list[legs.Photographs],
     boards: Boards,
     rng: np.random.Generator,
+    by_hand: bool = False,
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of all stations, each by the first that tells it: what is known
     before any leg is looked for, the search for the legs, and what measured poses tell.
 
-    Raises `InputError`, or `ResultError`, where nothing tells one of them.
+    by_hand : leave photographs by hand (NaN) where nothing tells them yet. Raises `InputError`, or
+    `ResultError`, where nothing tells one of the others.
     """
     known = known_stations(session, boards)
     if photographs:
@@ -291,6 +293,9 @@ def station_poses(
         seen = [None if np.isnan(T).any() else T for T in known[: len(session.stations)]]
         for k, T in enumerate(boards.joined(seen)):
             known[k] = known[k] if T is None else T
+    if by_hand and all(s.handheld for s, T in zip(session.stations, known, strict=False)
+                       if np.isnan(T).any()):  # fmt: skip
+        return known
     return _by_poses(session, boards, known)
 
 
@@ -301,7 +306,8 @@ def known_stations(session: Session, boards: Boards) -> Array:
     given = [station.T_camera_base for station in session.stations]
     given = boards.joined(given) + _tracker_starts(session)
     known = np.stack([np.full((4, 4), np.nan) if T is None else T for T in given])
-    lost = np.isnan(known[: len(session.stations), 0, 0])
+    by_hand = np.array([station.handheld for station in session.stations], dtype=bool)
+    lost = np.isnan(known[: len(session.stations), 0, 0]) & ~by_hand
     legs_tell = any(lost[k] and k not in boards.stations for k in legs_stations(session))
     if boards.body == "base" or not boards.stations or legs_tell or not lost.any():
         return known

@@ -30,6 +30,7 @@ from pkmcal.files import (
 )
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.decided import decided_by
+from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document, mechanism_text
 from pkmcal.outcome import Verdict
 from pkmcal.session.load import digests
@@ -107,7 +108,7 @@ def texts_of(
         EVERYTHING: json_text(document_of(calibration, not_identified, holdout)),
     }
     cameras = calibration.cameras
-    for file in cameras.files if cameras.active else ():
+    for file in cameras.files if cameras.refined else ():
         camera = cameras.result(calibration.estimate, file)
         texts[f"camera-{Path(file).stem}.yaml"] = camera_text(camera)
     return texts
@@ -238,9 +239,21 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
                 "sigma_rotation": sigma[:3],
                 "sigma_translation": sigma[3:],
                 "photographs": number,
+                **_focal_scale(calibration, s),
             }
         )
     return out
+
+
+def _focal_scale(calibration: Calibration, number: int) -> dict[str, Any]:
+    """By how much a hand-held photograph's focal lengths are its camera's, and how well known."""
+    cameras, estimate = calibration.cameras, calibration.estimate
+    if number >= len(cameras.breathes) or not cameras.breathes[number]:
+        return {}
+    return {
+        "focal_scale": 1 + BREATHING_SIGMA * cameras.moved(estimate).breath[number],
+        "sigma_focal_scale": BREATHING_SIGMA * estimate.breathing_sigma[number],
+    }
 
 
 def _targets(calibration: Calibration) -> list[dict[str, Any]]:
@@ -294,7 +307,7 @@ def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
 
 def _refined(calibration: Calibration, file: str) -> dict[str, Any]:
     """The intrinsics where they were refined with the machine, with their deviations."""
-    if not calibration.cameras.active:
+    if not calibration.cameras.refined:
         return {}
     camera = calibration.cameras.result(calibration.estimate, file)
     n = len(camera.parameters)

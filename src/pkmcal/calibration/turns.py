@@ -86,16 +86,13 @@ def take_turns(
     for turn in range(ROUNDS):
         told("Measuring edges and identifying", 0.45 + 0.5 * turn / ROUNDS)
         cameras = cameras.moved(estimate)
-        photographs = [
-            replace(p, camera=cameras.camera(session.stations[p.station].camera_file))
-            for p in photographs
-        ]
+        photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
         look = partial(_measure, estimate=estimate, blur=blur, refine=cameras.active)
         looks = _each(photographs, look)
         blur = {p.station: look.blur for p, look in zip(photographs, looks, strict=True)}
         measurements = measurements_of(session, boards, _edges(looks), cameras)
         lap("observe")
-        known = replace(estimate.state, intrinsics=np.zeros_like(cameras.at))
+        known = _at_cameras(estimate.state, cameras)
         start = better_start(machine, measurements, known) if turn == 0 else known
         estimate = bundle(machine, measurements, start)
         lap("identify")
@@ -103,6 +100,11 @@ def take_turns(
             break
     observation = observation_of(session, looks, boards, measurements, estimate)
     return Turns(observation, measurements, estimate, cameras)
+
+
+def _at_cameras(state: State, cameras: CameraRefinement) -> State:
+    """A state whose cameras are where the refinement is now."""
+    return replace(state, intrinsics=np.zeros_like(cameras.at), breathing=np.zeros(0))
 
 
 def better_start(machine: Machine, measurements: Measurements, known: State) -> State:
@@ -138,8 +140,7 @@ def identify_poses(
         told("Identifying with the cameras", 0.6 + 0.3 * turn / ROUNDS)
         cameras = cameras.moved(estimate)
         measurements = measurements_of(session, boards, None, cameras)
-        known = replace(estimate.state, intrinsics=np.zeros_like(cameras.at))
-        estimate = bundle(machine, measurements, known)
+        estimate = bundle(machine, measurements, _at_cameras(estimate.state, cameras))
     observation = observation_of(session, [], boards, measurements, estimate)
     return Turns(observation, measurements, estimate, cameras)
 

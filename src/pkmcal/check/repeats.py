@@ -203,7 +203,7 @@ class _Look:
         """Measure a station's photographs where the calibration says that the legs are."""
         state, machine = calibration.estimate.state, calibration.machine
         s, rows = photographs.station, photographs.configuration
-        camera = calibration.cameras.camera(calibration.session.stations[s].camera_file)
+        camera = calibration.cameras.at_station(int(s))
         numbered = replace(photographs, camera=camera, configuration=np.arange(len(rows)))
         poses, T_camera_base = state.T_base_platform[rows], state.T_camera_base[s]
         edges = legs.measure(numbered, machine, T_camera_base, poses).edges

@@ -81,6 +81,12 @@ def simulate(
     as_built: Annotated[
         bool, typer.Option("--as-built", help="Motors, rings and cables on the legs.")
     ] = False,
+    handheld: Annotated[
+        bool,
+        typer.Option(
+            "--handheld", help="Each photograph from its own place, --repeats of a configuration."
+        ),
+    ] = False,
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
@@ -112,6 +118,7 @@ def simulate(
         finish=finish.value,
         light=light.value,
         as_built=as_built,
+        handheld=handheld,
     )
     with console.progress() as told:
         truth = simulate_session(
@@ -124,7 +131,7 @@ def simulate(
         )
         return 0
     out = console.out()
-    places = "1 place" if stations == 1 else f"{stations} places"
+    places = "1 place" if len(truth.stations) == 1 else f"{len(truth.stations)} places"
     points = [
         (
             console.MARKS["good"],

@@ -14,6 +14,7 @@ from pkmcal.files.documents import (
     wanted_file,
     yaml_text,
 )
+from pkmcal.files.exif import Exif, read_exif, with_exif
 from pkmcal.files.schema import Schema, field_path, validate
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
@@ -29,6 +30,7 @@ from pkmcal.wording import listed
 __all__ = [
     "CsvTable",
     "Document",
+    "Exif",
     "Keys",
     "Schema",
     "check_own_folder",
@@ -41,6 +43,7 @@ __all__ = [
     "parse_yaml",
     "plain",
     "read_csv",
+    "read_exif",
     "read_json",
     "read_text",
     "read_yaml",
@@ -48,6 +51,7 @@ __all__ = [
     "staged_folder",
     "validate",
     "wanted_file",
+    "with_exif",
     "write_bytes",
     "write_folder",
     "write_text",

@@ -14,7 +14,7 @@ from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import EdgeBlocks, EdgeData, Kinds, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 
 SHIFT_SIGMA = 0.3
@@ -53,7 +53,8 @@ class Assembled:
 
     seen : (K,) configurations with at least one edge, or pose of a board on the platform; only
     they are in the problem. places : where each kind's measurements stand among the seen ones.
-    priors : names of the kinds of the prior rows, (c,): drawing, camera, shading, mount or gauge.
+    priors : names of the kinds of the prior rows, (c,): drawing, camera, shading, breathing, mount
+    or gauge.
     """
 
     problem: Problem
@@ -95,6 +96,7 @@ def assemble(
         n_optics=1 + measurements.intrinsics_factor.shape[-1],
         n_lines=int(line.max(initial=-1)) + 1,
         n_mounts=len(measurements.mounts),
+        n_breathing=len(measurements.breathing_at),
     )
     prior, target, kinds = prior_rows(
         machine,
@@ -107,6 +109,7 @@ def assemble(
     if measurements.intrinsics_at.size:
         camera = np.array([kind == "camera" for kind in kinds])
         target[camera] = np.pad(-measurements.intrinsics_at, ((0, 0), (1, 0))).ravel()
+    target[[kind == "breathing" for kind in kinds]] = -measurements.breathing_at
     blocks, data = _edges(machine, measurements, edges, line, seen)
     data = replace(data, shading=np.atleast_2d(shading).astype(float))
     pose_blocks, pose_data = _poses(measurements, poses)
@@ -170,12 +173,26 @@ def _places(configuration: Integers, seen: Booleans) -> Places:
 
 
 def _lines(measurements: Measurements) -> Integers:
-    """Number (N,) of each edge's line: station, leg, tube and side; none if nothing is shaded."""
-    if not measurements.shaded:
-        return np.zeros(0, dtype=int)
+    """Number (N,) of each edge's line: station, leg, tube and side; none if nothing is shaded, and
+    -1 at stations of one photograph, where each edge is a line of its own.
+    """
     e = measurements.edges
-    keys = np.stack([e.station, e.leg, e.tube, e.side], axis=1)
-    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+    if not measurements.shaded or not len(e):
+        return np.zeros(0, dtype=int)
+    number = np.full(len(e), -1)
+    many = ~_alone(measurements)
+    keys = np.stack([e.station, e.leg, e.tube, e.side], axis=1)[many]
+    number[many] = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+    return number
+
+
+def _alone(measurements: Measurements) -> Booleans:
+    """(N,) edges of stations that saw one configuration alone, as photographs by hand do."""
+    pair = np.unique(
+        np.stack([measurements.edges.station, measurements.edges.configuration], axis=1), axis=0
+    )
+    count = np.bincount(pair[:, 0], minlength=measurements.n_stations)
+    return count[measurements.edges.station] == 1
 
 
 def _edges(
@@ -191,6 +208,11 @@ def _edges(
     if factor.shape[-1] and len(edges):
         # the measured normals move with the intrinsics; residuals are predicted less measured
         optics[..., 1:] = -edges.by_intrinsics @ factor[camera]
+    covariance = edges.covariance
+    if len(line):
+        # what one edge alone is shaded by is noise of its own: no unknown could tell it from that
+        shift = np.where(line[:, None] < 0, SHADING_SIGMA * edges.shift, 0.0)
+        covariance = covariance + shift[:, :, None] * shift[:, None, :]
     blocks = EdgeBlocks(
         leg=at.filled(edges.leg),
         station=at.filled(edges.station),
@@ -203,10 +225,11 @@ def _edges(
     )
     data = EdgeData(
         basis=at.filled(edges.basis)[None, :, :, None],
-        whiten=at.filled(np.linalg.inv(np.linalg.cholesky(edges.covariance)))[None],
+        whiten=at.filled(np.linalg.inv(np.linalg.cholesky(covariance)))[None],
         optics=at.filled(optics)[None],
         joints=measurements.joints[None, seen],
         weight=at.present[None].astype(float),
+        breathing=at.filled(-BREATHING_SIGMA * edges.by_focal[..., None])[None],
     )
     return blocks, data
 
@@ -229,7 +252,10 @@ def _poses(measurements: Measurements, at: Places) -> tuple[PoseBlocks, PoseData
     target = at.filled(poses.T_station_target)
     target[~at.present] = np.eye(4)
     whiten, weight = at.filled(poses.whiten), at.present.astype(float)
-    return blocks, PoseData(target[None], whiten[None], weight[None], at.filled(optics)[None])
+    breathing = at.filled(-BREATHING_SIGMA * poses.by_focal[..., None])[None]
+    return blocks, PoseData(
+        target[None], whiten[None], weight[None], at.filled(optics)[None], breathing
+    )
 
 
 def prior_rows(
@@ -244,8 +270,8 @@ def prior_rows(
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
     Without the drawing the frames are free, so the gauge's constraints stand in as rows: they
-    can be met exactly, hence fix the frames and pull on nothing else. Intrinsics and shading stand
-    in units of their prior. on_platform : (M,) mounts.
+    can be met exactly, hence fix the frames and pull on nothing else. Intrinsics, shading
+    and breathing stand in units of their prior. on_platform : (M,) mounts.
 
     What is on a platform is as near its start as the machine is large. Where a platform turns about
     one axis, nothing tells along it how high the board sits; its tilt by a tenth of a degree then
@@ -263,6 +289,7 @@ def prior_rows(
         ("drawing", held, tolerance[held]),
         ("camera", u.columns("optics"), optics),
         ("shading", u.columns("shading"), lines),
+        ("breathing", u.columns("breathing"), np.ones(u.n_breathing)),
         ("mount", places, np.full(len(places), _size(machine) if len(places) else 1.0)),
     )
     rows: list[Array] = []
@@ -294,6 +321,7 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
     optics[:, 0] = state.edge_shift
     if state.intrinsics.shape[-1] == u.n_optics - 1:
         optics[: len(state.intrinsics), 1:] = state.intrinsics
+    breathing = state.breathing if len(state.breathing) else np.zeros(u.n_breathing)
     internal = np.zeros((len(state.T_base_platform), machine.layout.n_internal))
     if state.internal.shape == internal.shape:
         internal = state.internal
@@ -305,6 +333,7 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
         state.T_mount[None],
         internal[assembled.seen][None],
         np.zeros((1, u.n_lines)),
+        breathing[None],
     )
 
 
@@ -325,4 +354,5 @@ def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
         batch.T_mount[0],
         assembled.problem.pose_blocks.on_platform,
         internal,
+        batch.breathing[0],
     )

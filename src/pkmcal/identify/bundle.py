@@ -321,6 +321,7 @@ def _estimate(
         pose_weights=weights.poses,
         mount_covariance=own_blocks(full, told.mounts, 6),
         line_shading=result.problem.data.shading[0],
+        breathing_sigma=np.sqrt(np.diagonal(result.info.covariance[0])[u.breathing]),
     )
 
 

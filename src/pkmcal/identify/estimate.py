@@ -20,6 +20,8 @@ class State:
     ``Measurements.intrinsics_at``, in the same units; r = 0 where they are held.
     T_mount : (M, 4, 4) boards in the frame of what they are fixed to, T_base_board or
     T_platform_board by ``on_platform`` (M,). internal : (K, n) hinges of an articulated platform.
+    breathing : (S,) change of the stations' focal lengths from ``Measurements.breathing_at``, in
+    the same units; empty where none breathes.
     """
 
     theta: Array
@@ -30,6 +32,7 @@ class State:
     T_mount: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))
     on_platform: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
     internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    breathing: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ class Estimate:
     pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
     mount_covariance : (M, 6, 6) of (omega, tau), left perturbation of T_mount.
     line_shading : (n,) px, standard deviation of each tube's side's shading at each station.
+    breathing_sigma : (S,) standard deviations of ``state.breathing``, in the same units.
     configurations : (K,) True where the configuration was seen and its pose estimated.
     gauge : its name for people.
     """
@@ -103,3 +107,4 @@ class Estimate:
     pose_weights: Array = field(default_factory=lambda: np.zeros(0))
     mount_covariance: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
     line_shading: Array = field(default_factory=lambda: np.zeros(0))
+    breathing_sigma: Array = field(default_factory=lambda: np.zeros(0))

@@ -144,7 +144,10 @@ class Problem:
         edges, poses = self._edges(state, c), self._poses(state)
         value = self._values(state, c, edges, poses)
         blocks, boards = self.blocks, self.pose_blocks
-        lines = [(u.shading, blocks.line, edges.by_line)] if u.n_lines else []
+        lines = [(u.shading, np.maximum(blocks.line, 0), edges.by_line)] if u.n_lines else []
+        if u.n_breathing:
+            lines.append((u.breathing, blocks.station, edges.by_breathing))
+        breathing = [(u.breathing, boards.station, poses.by_breathing)] if u.n_breathing else []
         closures = self._to_free([(c.index[None], c.by_theta[..., None, :])])[..., 0, :]
         by_shared = (
             self._columns(
@@ -159,6 +162,7 @@ class Problem:
                 (u.stations, boards.station, poses.by_station),
                 (u.optics, boards.camera, poses.by_optics),
                 (u.mounts, boards.mount, poses.by_mount),
+                *breathing,
             ),
         )
         by_own = (
@@ -184,7 +188,7 @@ class Problem:
         """Whitened residuals of each kind of measurement without their weights, (B, K, G, n)."""
         plain = self.weighted(Kinds(*(kind.present[None].astype(float) for kind in self.kinds)))
         edges = plain._edges(state, plain.closure(state))
-        return Kinds(edges.value(state.optics, state.shading), plain._poses(state).value)
+        return Kinds(edges.value(state), plain._poses(state).value)
 
     def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
         """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""
@@ -197,6 +201,7 @@ class Problem:
         x[:, u.machine] = state.z
         x[:, u.optics] = state.optics.reshape(len(x), -1)
         x[:, u.shading] = state.shading
+        x[:, u.breathing] = state.breathing
         mounts = x[:, u.mounts].reshape(len(x), -1, 6)  # of which only places are known
         mounts[..., 3:] = state.T_mount[..., :3, 3]
         return x @ self.prior.T
@@ -213,6 +218,7 @@ class Problem:
             state.T_base_platform,
             state.T_mount,
             state.optics,
+            state.breathing,
         )
 
     def _by_noise(self, c: Closure, rows: Array) -> Array:
@@ -222,7 +228,7 @@ class Problem:
     def _values(self, state: BatchState, c: Closure, edges: EdgeRows, poses: PoseRows) -> Array:
         """All rows of the configurations, (B, K, r)."""
         parts = (
-            edges.value(state.optics, state.shading),
+            edges.value(state),
             self._by_noise(c, c.value[..., None]),
             poses.value,
         )
@@ -319,6 +325,7 @@ class Problem:
             ),
             state.internal + motion[..., 6:] + turned_back(layout, slides)[:, None],
             state.shading + shared[:, u.shading],
+            state.breathing + shared[:, u.breathing],
         )
         return self._closed(state, self._in_frames(inner, y[..., 0], slides), shared, own)
 

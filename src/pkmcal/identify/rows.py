@@ -28,6 +28,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import EdgeNormals, edge_normal_jacobians
 from pkmcal.geometry.rigid import dot, pose_difference, skew
+from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA
 from pkmcal.mechanisms.closure import LimbEnds, LimbLayout
 
@@ -80,7 +81,8 @@ class EdgeBlocks:
 
     leg, station, camera, radius : (K, G) leg, station, camera, position of the tube's radius.
     side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
-    its station, whose edges are shaded alike in all photographs; empty where nothing is.
+    its station, whose edges are shaded alike in all photographs, -1 where there is one edge alone;
+    empty where nothing is shaded.
     """
 
     leg: Integers
@@ -101,7 +103,8 @@ class EdgeData:
     shift (px), then its intrinsics where they are refined (in units of their prior).
     joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale squared.
     shading : (B, n) px by which one unit of each line's shading moves its edges, its standard
-    deviation; n = 1 where all have the same.
+    deviation; n = 1 where all have the same. breathing : (B, K, G, 2g, 1) the same change as optics
+    by a unit of their station's focal breathing; zero numbers where nothing breathes.
     """
 
     basis: Array
@@ -110,6 +113,7 @@ class EdgeData:
     joints: Array
     weight: Array
     shading: Array = field(default_factory=lambda: np.full((1, 1), SHADING_SIGMA))
+    breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 1)))
 
 
 @dataclass(frozen=True)
@@ -130,14 +134,17 @@ class EdgeRows:
     b: Array
     normals: EdgeNormals
 
-    def value(self, optics: Array, shading: Array) -> Array:
-        """Rows (B, K, G, 2g), zero where they do not count, with cameras (B, C, w) and lines (B, n)
-        as they are.
+    def value(self, state: BatchState) -> Array:
+        """Rows (B, K, G, 2g), zero where they do not count, with the state's cameras, lines and
+        focal lengths.
         """
+        optics, shading, breathing = state.optics, state.shading, state.breathing
         rows = self._whitened(self.normals.n[..., None])
         rows = (rows + self.by_optics @ optics[:, self.blocks.camera, :, None])[..., 0]
         if shading.shape[-1]:
             rows = rows + self.by_line[..., 0] * shading[:, self.blocks.line, None]
+        if breathing.shape[-1]:
+            rows = rows + self.by_breathing[..., 0] * breathing[:, self.blocks.station, None]
         return np.where((self.data.weight == 0)[..., None], 0.0, rows)
 
     @cached_property
@@ -147,10 +154,18 @@ class EdgeRows:
 
     @property
     def by_line(self) -> Array:
-        """By their line's shading, which moves them as the camera's shift moves all, (..., 1)."""
+        """By their line's shading, which moves them as the camera's shift moves all, (..., 1);
+        edges that are their station's only one of a line have theirs among their noise.
+        """
         sigma = self.data.shading
         own = sigma[:, self.blocks.line] if sigma.shape[1] > 1 else sigma[:, :, None]
+        own = np.where(self.blocks.line < 0, 0.0, own)
         return self.by_optics[..., :1] * own[..., None, None]
+
+    @property
+    def by_breathing(self) -> Array:
+        """By their station's focal breathing, (B or 1, K, G, 2g, 1)."""
+        return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ self.data.breathing)
 
     @property
     def by_machine(self) -> list[tuple[Integers, Array]]:
@@ -274,17 +289,20 @@ class PoseData:
 
     T_station_target : (B, K, G, 4, 4). whiten : (B, K, G, 6, 6). weight : (B, K, G). optics :
     (B, K, G, 6, w) change of the error by the w unknowns of their camera, as the edges'.
+    breathing : (B, K, G, 6, 1) by their station's focal breathing.
     """
 
     T_station_target: Array
     whiten: Array
     weight: Array
     optics: Array
+    breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 6, 0)))
 
 
 class PoseRows(NamedTuple):
     """Rows (B, K, G, 6) and their derivatives, (B, K, G, 6, 6) each: by their station, by the
-    platform's pose and by their mount; by their camera's unknowns (B, K, G, 6, w).
+    platform's pose and by their mount; by their camera's unknowns (B, K, G, 6, w), and by their
+    station's focal breathing (B, K, G, 6, 1).
     """
 
     value: Array
@@ -292,6 +310,7 @@ class PoseRows(NamedTuple):
     by_platform: Array
     by_mount: Array
     by_optics: Array
+    by_breathing: Array
 
 
 def pose_rows(
@@ -301,11 +320,12 @@ def pose_rows(
     poses: Array,
     T_mount: Array,
     optics: Array,
+    breathing: Array,
 ) -> PoseRows:
     """Whitened errors of the predicted poses.
 
     T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), optics
-    (B, C, w).
+    (B, C, w), breathing (B, S) or (B, 0).
     """
     moving = blocks.on_platform[blocks.mount][..., None, None]
     camera = T_camera_base[:, blocks.station]
@@ -326,13 +346,17 @@ def pose_rows(
         out[..., 3:, 3:] = by_shift
         return weigh @ out
 
-    eye, by_optics = np.eye(3), weigh @ data.optics
+    eye, by_optics, by_breathing = np.eye(3), weigh @ data.optics, weigh @ data.breathing
+    value = (weigh @ error[..., None] + by_optics @ optics[:, blocks.camera, :, None])[..., 0]
+    if breathing.shape[-1]:
+        value = value + by_breathing[..., 0] * breathing[:, blocks.station, None]
     return PoseRows(
-        (weigh @ error[..., None] + by_optics @ optics[:, blocks.camera, :, None])[..., 0],
+        value,
         rows(eye, -skew(place[..., 0]), eye),
         np.where(moving, rows(rot_c, -rot_c @ skew(arm[..., 0]), rot_c), 0.0),
         rows(rot_c @ rot_b, np.zeros((3, 3)), rot_c @ rot_b),
         by_optics,
+        by_breathing,
     )
 
 

@@ -8,6 +8,8 @@ Shared by all configurations, in this order of columns:
   units of their prior).
 - **shading** : shift of each tube's side at each station, where light gives it one (in units of its
   standard deviation).
+- **breathing** : of each station's photograph the excess of its focal lengths, where the camera is
+  held by hand (in units of its standard deviation).
 - **mounts** : left perturbation of each T_mount, of boards and targets.
 
 Each configuration has unknowns of its own besides: the platform's motion (left perturbation of
@@ -24,7 +26,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 
-Name = Literal["machine", "stations", "edge shifts", "intrinsics", "optics", "shading", "mounts"]
+Name = Literal[
+    "machine", "stations", "edge shifts", "intrinsics", "optics", "shading", "breathing", "mounts"
+]
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,8 @@ class Unknowns:
     """How many of each there are, and so in which columns each stands.
 
     n_free : of the machine. n_optics : of each camera, one and the refined intrinsics. n_lines :
-    tubes' sides at stations with a shading of their own.
+    tubes' sides at stations with a shading of their own. n_breathing : stations where focal lengths
+    breathe, all or none.
     """
 
     n_free: int
@@ -41,6 +46,7 @@ class Unknowns:
     n_optics: int = 1
     n_lines: int = 0
     n_mounts: int = 0
+    n_breathing: int = 0
 
     @property
     def machine(self) -> slice:
@@ -64,9 +70,14 @@ class Unknowns:
         return slice(self.optics.stop, self.optics.stop + self.n_lines)
 
     @property
+    def breathing(self) -> slice:
+        """The focal lengths' columns, one a station."""
+        return slice(self.shading.stop, self.shading.stop + self.n_breathing)
+
+    @property
     def mounts(self) -> slice:
         """The mounts' columns, six each."""
-        return slice(self.shading.stop, self.shading.stop + 6 * self.n_mounts)
+        return slice(self.breathing.stop, self.breathing.stop + 6 * self.n_mounts)
 
     @property
     def count(self) -> int:
@@ -80,7 +91,7 @@ class Unknowns:
             "edge shifts": optics[:, 0],
             "intrinsics": optics[:, 1:].ravel(),
         }
-        for name in ("machine", "stations", "optics", "shading", "mounts"):
+        for name in ("machine", "stations", "optics", "shading", "breathing", "mounts"):
             part: slice = getattr(self, name)
             where[name] = np.arange(part.start, part.stop)
         none = np.zeros(0, dtype=int)
@@ -99,7 +110,7 @@ class BatchState:
     """Values of the unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
     T_base_platform (B, K, 4, 4), optics (B, C, w), T_mount (B, M, 4, 4) of boards,
     internal (B, K, n) of articulated platforms, shading (B, n) of the lines, outward, in units of
-    its standard deviation.
+    its standard deviation, breathing (B, n) of the stations' focal lengths, in units of its own.
     """
 
     z: Array
@@ -109,6 +120,7 @@ class BatchState:
     T_mount: Array = field(default_factory=lambda: np.zeros((0, 0, 4, 4)))
     internal: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     shading: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    breathing: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         """Runs without boards or hinges get none each, so that all fields select alike."""
@@ -119,3 +131,5 @@ class BatchState:
             object.__setattr__(self, "internal", none)
         if len(self.shading) != len(self.z):
             object.__setattr__(self, "shading", np.zeros((len(self.z), 0)))
+        if len(self.breathing) != len(self.z):
+            object.__setattr__(self, "breathing", np.zeros((len(self.z), 0)))

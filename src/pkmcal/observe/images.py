@@ -10,6 +10,7 @@ import numpy as np
 
 from pkmcal.arrays import Integers
 from pkmcal.errors import InputError
+from pkmcal.files import read_exif
 
 PNG_END = b"IEND\xaeB`\x82"
 JPEG_END = b"\xff\xd9"
@@ -18,7 +19,10 @@ JPEG_END = b"\xff\xd9"
 def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
     """One photograph as grey levels (height, width), uint8.
 
-    image_size : (width, height) that the camera file states.
+    image_size : (width, height) that the camera file states. A photograph with the two exchanged
+    was turned by a quarter after it was taken, or its camera was calibrated from turned ones: it is
+    turned as EXIF asks viewers to, and where EXIF says nothing, as telephones that are held upright
+    are: landscape clockwise, portrait the other way.
     Raises InputError for a file that is absent, cut short, no image, or of another size.
     """
     import cv2
@@ -31,7 +35,8 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         raise _broken(label, "a PNG file that ends early")
     if data[:2] == b"\xff\xd8" and not _jpeg_reaches_its_end(data):
         raise _broken(label, "a JPEG file that ends early")
-    # a turned picture would no longer be its camera's: flags that ask for turning are ignored
+    # a turned picture would no longer be its camera's: flags that ask for turning are ignored where
+    # the size is the camera's
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
@@ -39,6 +44,12 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         image = None
     if image is None:
         raise _broken(label, "no readable image")
+    if image.shape == tuple(image_size) and image_size[0] != image_size[1]:
+        clockwise = {6: True, 8: False}.get(read_exif(data).orientation)
+        if clockwise is None:
+            clockwise = image.shape[1] > image.shape[0]
+        way = cv2.ROTATE_90_CLOCKWISE if clockwise else cv2.ROTATE_90_COUNTERCLOCKWISE
+        return np.ascontiguousarray(cv2.rotate(image, way))
     if (image.shape[1], image.shape[0]) != tuple(image_size):
         raise InputError(
             "the photograph has another size than its camera",

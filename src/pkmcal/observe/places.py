@@ -71,7 +71,7 @@ def anywhere(
     of the same K photographs, of which ``photographs`` are looked at.
     """
     seen = _seen_spread(camera, tables)
-    frame = _frame(seen.middle)
+    frame = frame_of(seen.middle)
     places, spread = _places(tubes, radius, legs, float(seen.width))
     chart = _chart_tables(camera, tables, photographs, frame, float(seen.width))
     scores = _scores(chart, places, spread, tubes, legs, photographs, float(seen.width))
@@ -83,7 +83,7 @@ def anywhere(
     zero = np.zeros(len(best))
     tilt = rotation(np.stack([-off[:, 1], off[:, 0], zero], axis=-1))
     roll = rotation(np.stack([zero, zero, 2 * np.pi / TURNS * turn], axis=-1))
-    rot = frame.T @ tilt @ roll @ _frame(spread.middle[place])
+    rot = frame.T @ tilt @ roll @ frame_of(spread.middle[place])
     return pose(rot, -(rot @ places[place][..., None])[..., 0])
 
 
@@ -136,10 +136,7 @@ def _places(
     size = np.sqrt(weight @ dot(point - centre, point - centre) / weight.sum())
     few = np.linspace(0, len(point) - 1, min(len(point), POINTS)).astype(int)
     point, weight = point[few], weight[few]
-    k = np.arange(PLACES) + 0.5  # Fibonacci's lattice
-    z, angle = 1 - 2 * k / PLACES, np.pi * (1 + np.sqrt(5)) * k
-    flat = np.sqrt(1 - z * z)
-    direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=-1)
+    direction = sphere(PLACES)
     distance = size * np.geomspace(NEAREST, FURTHEST, DISTANCES)
     place = centre + direction[:, None] * distance[:, None]
     ray = point - place[:, :, None]
@@ -152,7 +149,15 @@ def _places(
     return place[at], Breadth(spread.middle[at], spread.width[at])
 
 
-def _frame(middle: Array) -> Array:
+def sphere(count: int) -> Array:
+    """Unit directions (count, 3), evenly about the sphere: Fibonacci's lattice."""
+    k = np.arange(count) + 0.5
+    z, angle = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
+    flat = np.sqrt(1 - z * z)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=-1)
+
+
+def frame_of(middle: Array) -> Array:
     """Rotations (..., 3, 3) from the frame of unit vectors (..., 3) to one whose z they are."""
     other = np.where(np.abs(middle[..., 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     x = np.cross(other, middle)
@@ -206,7 +211,7 @@ def _scores(
     point = (a[:, :, None] + along[..., None] * u[:, :, None]).reshape(-1, 3)
     ray = point - places[:, None]
     ray /= np.sqrt(dot(ray, ray))[..., None]
-    cell = _on_chart(ray @ _frame(spread.middle).mT, width)
+    cell = _on_chart(ray @ frame_of(spread.middle).mT, width)
     cell = cell.reshape(len(places), -1, len(ALONG), 2)
     chord = np.diff(cell, axis=-2).reshape(len(places), -1, 2)
     middle = ((cell[..., 1:, :] + cell[..., :-1, :]) / 2).reshape(len(places), -1, 2)

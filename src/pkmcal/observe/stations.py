@@ -33,7 +33,7 @@ from pkmcal.observe.predict import (
     plane_normals,
     visible_stretch,
 )
-from pkmcal.observe.tables import BIN, DistanceTables, direction_of
+from pkmcal.observe.tables import BIN, DistanceTables
 
 SEARCH_ANGLE = np.radians(6.0)
 SEARCH_DISTANCE = 0.06
@@ -195,15 +195,15 @@ def find_station(
             break
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng)
     every = view.few(count)
-    candidates = _settled(view, candidates, every, 8, 8)
-    evidence = _evidence(view, candidates, every, 8).sum(axis=-1)
+    candidates = settle(view, candidates, every, 8, 8)
+    evidence = evidence_of(view, candidates, every, 8).sum(axis=-1)
     order = np.argsort(-evidence)
-    order = order[_apart(view, candidates[order], every)]
+    order = order[apart(view, candidates[order], every)]
     candidates, evidence = candidates[order], evidence[order]
     # the most evidence leaves no edge out; where hidden ones were taken in, those that lie near
     # tell the place better
     best = candidates[:1]
-    nearer = _descend(view, best, every, 8, (5, 4, 3, 2, 2, 1.5, 1.5))
+    nearer = descend(view, best, every, 8, (5, 4, 3, 2, 2, 1.5, 1.5))
     ends = np.concatenate([nearer, best])
     scores = score(view, ends, every, LAST_REACH)
     return FoundStation(
@@ -224,24 +224,24 @@ def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Gener
         each = 4 // len(few)  # more candidates of fewer photographs: these tell less, and cost less
         candidates = _anywhere(view, few, each * ANYWHERE)
         candidates = _best(view, candidates, few, reach=12, keep=each * 96)
-        candidates = _descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
+        candidates = descend(view, candidates, few, 3, (14, 12, 10, 10, 8, 8))
         candidates = _best(view, candidates, few, reach=8, keep=each * 24)
     else:
         candidates = _random_search(view, T_camera_base, rng)
-    candidates = _descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
+    candidates = descend(view, candidates, few, 5, (8, 8, 6, 6, 5, 5))
     candidates = _best(view, candidates, more, reach=5, keep=12)
-    candidates = _descend(view, candidates, more, 5, (5, 4, 4, 3))
+    candidates = descend(view, candidates, more, 5, (5, 4, 4, 3))
     candidates = _best(view, candidates, more, reach=3, keep=12)
-    candidates = candidates[_apart(view, candidates, more)[:4]]
+    candidates = candidates[apart(view, candidates, more)[:4]]
     # the picture is rugged: what lies beside a good place may be better
     beside = candidates[rng.integers(0, len(candidates), SHAKEN)]
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
     steps = rng.normal(size=(SHAKEN, 6)) * spread
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
-    candidates = _settled(view, np.concatenate([candidates, turned]), more, 5, 6)
-    evidence = _evidence(view, candidates, more, 5).sum(axis=-1)
+    candidates = settle(view, np.concatenate([candidates, turned]), more, 5, 6)
+    evidence = evidence_of(view, candidates, more, 5).sum(axis=-1)
     candidates = candidates[np.argsort(-evidence)]
-    return candidates[_apart(view, candidates, more)[:3]]
+    return candidates[apart(view, candidates, more)[:3]]
 
 
 def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
@@ -278,7 +278,7 @@ def _best(
     return candidates[order[:keep]]
 
 
-def _apart(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
+def apart(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
     """Of candidates (H, 4, 4), best first, those that are not the same place as a better one."""
     legs = legs_in_camera(
         view.machine, candidates[:, None], view.poses[photographs], view.joints[photographs]
@@ -314,7 +314,7 @@ def score(
     )  # (H, K, E, 2, 3)
     pixel = view.camera.project(ends)
     chord = pixel[..., 1, :] - pixel[..., 0, :]
-    direction = direction_of(np.stack([-chord[..., 1], chord[..., 0]], axis=-1))
+    direction = view.tables.direction(np.stack([-chord[..., 1], chord[..., 0]], axis=-1))
     fraction = (np.arange(samples) + 0.5) / samples
     points = pixel[..., :1, :] + fraction[:, None] * chord[..., None, :]
     number = np.arange(len(view.configuration))[photographs][:, None, None]
@@ -392,7 +392,7 @@ class _Look(NamedTuple):
         )
 
 
-def _descend(
+def descend(
     view: StationView,
     candidates: Array,
     photographs: Integers,
@@ -415,7 +415,7 @@ def _descend(
     return candidates
 
 
-def _settled(
+def settle(
     view: StationView, candidates: Array, photographs: Integers, samples: int, steps: int
 ) -> Array:
     """The same to the most evidence: how far edges scatter is learnt on the way."""
@@ -437,7 +437,7 @@ def _first_mixture(count: int) -> _Mixture:
     return _Mixture(np.full(count, 0.5), np.full(count, LAST_REACH / 2))
 
 
-def _evidence(view: StationView, candidates: Array, photographs: Integers, samples: int) -> Array:
+def evidence_of(view: StationView, candidates: Array, photographs: Integers, samples: int) -> Array:
     """Evidence (H, K) of candidates (H, 4, 4) in each photograph."""
     look = _look(view, candidates, photographs, samples)
     mixture = look.mixture(_first_mixture(len(candidates)), rounds=10)
@@ -461,7 +461,7 @@ def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -
 
 def settled(view: StationView, T_camera_base: Array) -> Array:
     """The pose (4, 4) with the most evidence near another."""
-    return _settled(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0]
+    return settle(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0]
 
 
 def evidence_nearby(
@@ -477,9 +477,9 @@ def evidence_nearby(
     elif wide:
         tried = [_random_search(view, T, rng, FEWER_TRIES)[:8] for T in starts]
         starts = np.concatenate(tried)
-    starts = _descend(view, starts, few, 4, (12, 10, 8, 6, 5))
-    starts = _settled(view, _best(view, starts, few, reach=5, keep=8), few, 4, 3)
-    return float(_evidence(view, starts, few, 5).sum(axis=-1).max())
+    starts = descend(view, starts, few, 4, (12, 10, 8, 6, 5))
+    starts = settle(view, _best(view, starts, few, reach=5, keep=8), few, 4, 3)
+    return float(evidence_of(view, starts, few, 5).sum(axis=-1).max())
 
 
 def _surely(
@@ -541,7 +541,7 @@ def _look(view: StationView, candidates: Array, photographs: Integers, samples: 
         view.machine, candidates[:, None], view.poses[photographs], view.joints[photographs]
     )
     points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
-    direction = direction_of(points.outward)
+    direction = view.tables.direction(points.outward)
     step = points.outward * view.tables.scale
     found, inside = view.tables.look_smooth(direction, points.pixel, number)
     ahead, _ = view.tables.look_smooth(direction, points.pixel + step, number)

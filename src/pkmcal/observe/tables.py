@@ -55,6 +55,11 @@ class DistanceTables:
     edges: tuple[PictureEdges, ...]
     moving: Array
     chance: Array
+    turn: float = np.pi
+
+    def direction(self, normal: Array) -> Integers:
+        """Direction number of edges whose image normals are (..., 2)."""
+        return direction_of(normal, self.tables.shape[1], self.turn)
 
     def look(
         self, direction: Integers, pixel: Array, photograph: Integers
@@ -118,42 +123,59 @@ class DistanceTables:
         )
 
 
-def direction_of(normal: Array) -> Integers:
-    """Direction number of edges whose image normals are (..., 2); the sign does not matter."""
-    angle = np.arctan2(normal[..., 1], normal[..., 0]) % np.pi
-    number = np.floor(np.nan_to_num(angle) * (DIRECTIONS / np.pi))
-    return number.astype(np.intp) % DIRECTIONS
+def direction_of(normal: Array, count: int = DIRECTIONS, turn: float = np.pi) -> Integers:
+    """Direction number, of ``count``, of edges whose image normals are (..., 2); turn : pi where
+    the sign does not matter, 2 pi where it does.
+    """
+    angle = np.arctan2(normal[..., 1], normal[..., 0]) % turn
+    number = np.floor(np.nan_to_num(angle) * (count / turn))
+    return number.astype(np.intp) % count
 
 
-def distances(pixel: Integers, number: Integers, shape: tuple[int, int]) -> Array:
+def distances(
+    pixel: Integers, number: Integers, shape: tuple[int, int], count: int = DIRECTIONS
+) -> Array:
     """Distance tables (DIRECTIONS, h, w) of edge points at whole pixels (n, 2), x first.
 
     number : (n,) their directions. shape : (h, w).
     """
     import cv2
 
-    tables = np.empty((DIRECTIONS, *shape), dtype=np.float32)
-    for k in range(DIRECTIONS):
-        near = np.isin(number, [(k - 1) % DIRECTIONS, k, (k + 1) % DIRECTIONS])
+    tables = np.empty((count, *shape), dtype=np.float32)
+    for k in range(count):
+        near = np.isin(number, [(k - 1) % count, k, (k + 1) % count])
         mask = np.ones(shape, dtype=np.uint8)
         mask[pixel[near, 1], pixel[near, 0]] = 0
         tables[k] = cv2.distanceTransform(mask, cv2.DIST_L2, 3) if near.any() else 1e3
     return tables
 
 
-def distance_tables(images: list[Integers]) -> DistanceTables:
+def distance_tables(
+    images: list[Integers],
+    width: int = WORKING_WIDTH,
+    directions: int = DIRECTIONS,
+    turn: float = np.pi,
+) -> DistanceTables:
     """Tables of one station's photographs, K arrays (height, width) uint8 of one size."""
     import cv2
 
-    scale = max(images[0].shape[1] / WORKING_WIDTH, 1.0)
+    scale = max(images[0].shape[1] / width, 1.0)
     size = (round(images[0].shape[1] / scale), round(images[0].shape[0] / scale))
     small = [_levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)) for image in images]
     still = np.median(np.stack(small), axis=0) if len(small) >= ENOUGH_TO_COMPARE else None
     edges = tuple(_edges_of(image, still) for image in small)
     tables = np.stack(
-        [distances(e.pixel.astype(int), direction_of(e.normal), small[0].shape) for e in edges]
+        [
+            distances(
+                e.pixel.astype(int),
+                direction_of(e.normal, directions, turn),
+                small[0].shape,
+                directions,
+            )
+            for e in edges
+        ]
     )
-    return DistanceTables(tables, scale, edges, _moving(small, still, edges), _chance(tables))
+    return DistanceTables(tables, scale, edges, _moving(small, still, edges), _chance(tables), turn)
 
 
 def _levels(image: Any) -> Integers:
@@ -199,7 +221,7 @@ def _chance(tables: Array) -> Array:
     count = np.stack(
         [
             np.histogram(np.minimum(tables[:, k], FURTHEST - BIN / 2), bins)[0]
-            for k in range(DIRECTIONS)
+            for k in range(tables.shape[1])
         ]
     )
     count = count + 1.0  # a distance that no place has is not impossible

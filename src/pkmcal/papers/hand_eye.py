@@ -95,7 +95,9 @@ class PairProblem:
             np.zeros((1, 1, 1, 6, 0)),
         )  # fmt: skip
         camera, mount = state.T_camera_base[:, None], state.T_mount[:, None]
-        rows = pose_rows(blocks, data, camera, self.body, mount, np.zeros((1, 1, 0)))
+        rows = pose_rows(
+            blocks, data, camera, self.body, mount, np.zeros((1, 1, 0)), np.zeros((1, 0))
+        )
         value = rows.value[:, :, 0]
         return Linear(
             value,

@@ -6,7 +6,8 @@ any work is spent; each fault is an `InputError` with file, line and field.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import CsvTable, Document, Keys, read_csv, read_yaml, shown, validate, wanted_file
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.session.exif import EXIF, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings
@@ -52,10 +54,12 @@ _LEAST_ANGLE = np.deg2rad(1.0)
 class Station:
     """One camera in one place.
 
-    camera_file : as session.yaml names it.
+    camera_file : as session.yaml names it; made up where EXIF tells the camera.
     T_camera_base : (4, 4) rough pose, base to camera coordinates in m; None where not given.
     photographs : by configuration and repeat.
-    observe : legs, board, or both, in this order.
+    observe : legs, board, or both, in this order. entry : its name in session.yaml, which is that
+    of many stations where the camera was held by hand, each of one photograph. handheld : whether.
+    from_exif : whether no more is known of the camera than what EXIF tells.
     """
 
     name: str
@@ -64,6 +68,9 @@ class Station:
     T_camera_base: Array | None
     photographs: tuple[Photograph, ...]
     observe: tuple[str, ...]
+    entry: str = ""
+    handheld: bool = False
+    from_exif: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,6 +108,13 @@ class Session:
         """Names of all stations, trackers last, as measurements number them."""
         return tuple(station.name for station in (*self.stations, *self.trackers))
 
+    def of_stations(self, numbers: Sequence[int], warnings: tuple[str, ...] = ()) -> Session:
+        """The session with some of its stations that have a camera, and what is to be known of
+        the others.
+        """
+        stations = tuple(self.stations[k] for k in numbers)
+        return replace(self, stations=stations, warnings=self.warnings + warnings)
+
     def other_model(self, name: str | None) -> Machine:
         """Another model of the same machine."""
         return load_mechanism(self.mechanism, model=name)
@@ -120,9 +134,11 @@ def load_session(folder: Path | str, model: str | None = None) -> Session:
     board = _board(folder, document, schema)
     warnings += _of_little_use(document, schema)
     stations = tuple(
-        _station(folder, document, name, station, table.names)
+        made
         for name, station in schema.cameras.items()
+        for made in _stations(folder, document, name, station, table.names)
     )
+    warnings += _turned(folder, stations)
     trackers: list[PoseTable] = []
     for name, station in schema.trackers.items():
         given, keys = station.tracker, ("stations", name, "tracker", "poses")
@@ -130,6 +146,7 @@ def load_session(folder: Path | str, model: str | None = None) -> Session:
         measured = read_poses(path, given.poses, table.names, noise.position, noise.rotation, name)
         trackers.append(measured)
     _check_distinct(document, stations)
+    _check_names(document, (*stations, *trackers))
     warnings += _unphotographed(table, stations, tuple(trackers))
     return Session(
         folder=folder,
@@ -280,40 +297,96 @@ def _of_little_use(document: Document, schema: SessionDocument) -> list[str]:
     return []
 
 
-def _station(
+def _stations(
     folder: Path, document: Document, name: str, station: StationDocument, names: tuple[str, ...]
-) -> Station:
+) -> list[Station]:
+    """An entry's station; where the camera was held by hand, one for each photograph."""
     keys: Keys = ("stations", name)
-    camera_file = _existing(folder, document, station.camera, (*keys, "camera"))
-    camera = load_camera(camera_file, label=station.camera)
+    where = document.where(*keys, "images")
+    photographs = find_photographs(folder, station.images, names, where)
+    from_exif = station.camera == EXIF
+    if from_exif:
+        label = document.where(*keys, "camera")
+        camera = camera_by_exif([(p.path, _inside(folder, p.path)) for p in photographs], label)
+        camera_file = f"exif/{name}.yaml"
+    else:
+        path = _existing(folder, document, station.camera, (*keys, "camera"))
+        camera, camera_file = load_camera(path, label=station.camera), station.camera
+    for photo in photographs:
+        _check_size(folder, photo, camera, camera_file)
     T_camera_base = None
+    if station.handheld:
+        _check_handheld(document, name, station)
     if station.pose is not None:
         try:
             T_camera_base = look_at_pose(**station.pose.model_dump())
         except InputError as error:
             raise error.located(document.where(*keys, "pose")) from None
-    where = document.where(*keys, "images")
-    photographs = find_photographs(folder, station.images, names, where)
-    for photo in photographs:
-        _check_size(folder, photo, camera, station.camera)
-    return Station(name, camera, station.camera, T_camera_base, photographs, station.observe)
+    whole = Station(
+        name, camera, camera_file, T_camera_base, photographs, station.observe, name,
+        station.handheld, from_exif,
+    )  # fmt: skip
+    if not station.handheld:
+        return [whole]
+    return [
+        replace(whole, name=_name_of(name, names[photo.configuration], photo), photographs=(photo,))
+        for photo in photographs
+    ]
+
+
+def _name_of(entry: str, configuration: str, photo: Photograph) -> str:
+    """What a hand-held photograph is called as a station."""
+    return "-".join([entry, configuration] + ([photo.repeat] if photo.repeat else []))
+
+
+def _check_handheld(document: Document, name: str, station: StationDocument) -> None:
+    """What a camera that is held by hand cannot have."""
+    keys: Keys = ("stations", name)
+    if station.pose is not None:
+        raise InputError(
+            "a camera that is held by hand has no one pose",
+            where=document.where(*keys, "pose"),
+            found="handheld: true, and a pose",
+            expected="one of them",
+            next_step="Remove the pose, or handheld where all photographs are from one place",
+        )
+    if "legs" not in station.observe:
+        raise InputError(
+            "photographs by hand of a board alone tell nothing of the machine",
+            where=document.where(*keys, "observe"),
+            found="board",
+            expected="legs, or [legs, board]: only the legs tell where the board or the camera is",
+        )
 
 
 def _check_size(folder: Path, photo: Photograph, camera: Camera, camera_file: str) -> None:
     label = _inside(folder, photo.path)
     width, height = size = photograph_header(photo.path, label)
-    if size == tuple(camera.image_size):
+    if tuple(camera.image_size) in (size, (height, width)):
         return
-    turned = (height, width) == tuple(camera.image_size)
     raise InputError(
         "the photograph has another size than its camera",
         where=label,
         found=f"{width}x{height}",
         expected=f"{camera.image_size[0]}x{camera.image_size[1]} ({camera_file})",
-        next_step="It was turned by a quarter; keep photographs as the sensor gives them"
-        if turned
-        else "Use unscaled, uncropped photographs, or the camera file of this resolution",
+        next_step="Use unscaled, uncropped photographs, or the camera file of this resolution",
     )
+
+
+def _turned(folder: Path, stations: tuple[Station, ...]) -> list[str]:
+    """Photographs that were turned by a quarter after they were taken."""
+    turned = [
+        _inside(folder, photo.path)
+        for station in stations
+        for photo in station.photographs
+        if photograph_header(photo.path) != tuple(station.camera.image_size)
+    ]
+    if not turned:
+        return []
+    return [
+        f"{turned[0]}: turned by a quarter against its camera file, and turned back"
+        f" ({len(turned)} such photographs)."
+    ]
 
 
 def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
@@ -329,6 +402,20 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
                     found=photo.path.name,
                     expected="its own photographs; a station is one camera in one place",
                 )
+
+
+def _check_names(document: Document, stations: tuple[Station | PoseTable, ...]) -> None:
+    """A photograph by hand is a station of its own, and must not have another one's name."""
+    names = [station.name for station in stations]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(
+            "two stations, or photographs by hand, have the same name",
+            where=document.where("stations"),
+            found=twice,
+            expected="names that differ; a photograph by hand is called by its station,"
+            " configuration and repeat",
+        )
 
 
 def _unphotographed(
@@ -363,9 +450,10 @@ def _resolved(
     document["joints"]["columns"] = list(table.columns)
     document["joints"]["readings"] = dict(zip(table.names, table.values.tolist(), strict=True))
     for station in stations:
-        entry = document["stations"][station.name]
+        entry = document["stations"][station.entry]
         entry["observe"] = station.observe[0] if len(station.observe) == 1 else station.observe
-        entry["photographs"] = [_inside(folder, photo.path) for photo in station.photographs]
+        files = [_inside(folder, photo.path) for photo in station.photographs]
+        entry["photographs"] = entry.get("photographs", []) + files
     return document
 
 

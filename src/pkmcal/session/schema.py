@@ -48,14 +48,15 @@ def _words(value: Any) -> tuple[str, ...]:
 
 
 class StationDocument(Schema):
-    """One entry of ``stations``: a camera in one place."""
+    """One entry of ``stations``: a camera in one place, or by hand, one place a photograph."""
 
-    camera: str = Field(description="the camera's file, for example cameras/front.yaml")
+    camera: str = Field(description="the camera's file, for example cameras/front.yaml, or exif")
     images: str = Field(description="a pattern such as images/front/{configuration}.png")
     observe: Annotated[tuple[str, ...], BeforeValidator(_words)] = Field(
         description="legs, board, or [legs, board]"
     )
     pose: PoseDocument | None = None
+    handheld: bool = False
 
 
 class NoiseDocument(Schema):

@@ -52,6 +52,15 @@ SPARE = 1.18
 FULL = 1.1
 """The same where the machine's own takes in where its motors move it."""
 
+BY_HAND = (np.deg2rad(5), np.deg2rad(45))
+"""Lowest and highest view of a person who walks about a machine with a telephone."""
+STEPS = (1.0, 1.35)
+"""Nearest and furthest, in the distance at which the machine fills the picture."""
+ROLL = np.deg2rad(15)
+"""Roll at most, of the telephone upright or on its side."""
+UPRIGHT = 1 / 3
+"""Share of the photographs for which the telephone is held upright: the sensor lies on its side."""
+
 Vector = tuple[float, float, float]
 
 
@@ -223,6 +232,36 @@ def default_stations(
             azimuth = start + turn + np.deg2rad(rng.uniform(-8, 8))
             poses.append(_outside(space, away, azimuth, rng))
     return tuple(poses)
+
+
+def places_by_hand(
+    machine: Machine, cameras: tuple[Camera, ...], rng: np.random.Generator
+) -> tuple[StationPlace, ...]:
+    """A place for each photograph of someone who walks round the machine, evenly but for a step."""
+    space = np.concatenate(_space(machine))
+    centre = (space.min(axis=0) + space.max(axis=0)) / 2
+    radius = float(np.linalg.norm(space - centre, axis=1).max())
+    start, out = rng.uniform(0, 2 * np.pi), []
+    # three turns about the machine, so that photographs of one configuration are not side by side
+    turn = 2 * np.pi * 3 / len(cameras) * (1 + 1 / (3 * len(cameras)))
+    for k, camera in enumerate(cameras):
+        azimuth = start + turn * (k + rng.uniform(-0.3, 0.3))
+        elevation = rng.uniform(*BY_HAND)
+        away = _distance(machine, min(view_angle(camera), NEAREST), None) * rng.uniform(*STEPS)
+        level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        way = np.cos(elevation) * level + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+        position = centre + away * radius * way
+        target = centre + rng.uniform(-0.08, 0.08, 3) * radius
+        forward = (target - position) / np.linalg.norm(target - position)
+        roll = rng.uniform(-ROLL, ROLL)
+        if rng.uniform() < UPRIGHT:
+            roll += np.pi / 2 * rng.choice([-1, 1])
+        up = rotation(roll * forward) @ np.array([0.0, 0.0, 1.0])
+        up = up - (up @ forward) * forward
+        out.append(
+            StationPlace(_rounded(position), _rounded(target), _rounded(up / np.linalg.norm(up)))
+        )
+    return tuple(out)
 
 
 def _space(machine: Machine) -> tuple[Array, Array]:

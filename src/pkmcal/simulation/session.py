@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.files import csv_text, staged_folder, yaml_text
+from pkmcal.files import Exif, csv_text, staged_folder, with_exif, yaml_text
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.simulation.board import board_part, holder_part
@@ -23,10 +23,20 @@ from pkmcal.simulation.placement import one_a_station
 from pkmcal.simulation.render import PixelRays, ScenePart, Sensor, photograph, render
 from pkmcal.simulation.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
 from pkmcal.simulation.surfaces import SmoothNoise
-from pkmcal.simulation.truth import FILE, Settings, Truth, draw_truth, stream, truth_document
+from pkmcal.simulation.truth import (
+    FILE,
+    HANDHELD,
+    Settings,
+    Truth,
+    draw_truth,
+    stream,
+    truth_document,
+)
 from pkmcal.wording import listed
 
 Progress = Callable[[int, int], None]
+QUALITY = 95
+"""Of JPEG files by hand, as telephones write them."""
 
 
 def simulate_session(
@@ -49,15 +59,26 @@ def simulate_session(
     cameras = one_a_station(camera, settings.n_stations)
     _check(folder, drawing)
     truth = draw_truth(drawing, cameras, settings, seed)
+    lenses = cameras
+    if truth.focal_scale is not None:
+        pairs = zip(cameras, truth.focal_scale, strict=True)
+        lenses = tuple(_breathed(one, float(scale)) for one, scale in pairs)
     with staged_folder(folder) as stage:
         _write_texts(stage, drawing, cameras, settings, truth)
-        _write_photographs(stage, cameras, settings, truth, workers, progress)
+        _write_photographs(stage, lenses, settings, truth, workers, progress)
     return truth
+
+
+def _breathed(camera: Camera, scale: float) -> Camera:
+    """The camera with other focal lengths."""
+    focal = [name.startswith("focal.") for name in camera.parameter_names]
+    return replace(camera, parameters=np.where(focal, scale, 1.0) * camera.parameters)
 
 
 @dataclass(frozen=True)
 class Studio:
-    """Everything that photographs of one session share; views : by station; fixed : to the base;
+    """Everything that photographs of one session share; cameras : by station; views : of each
+    camera that has more than one photograph, by its id; fixed : to the base;
     as_built : with motors, rings and cables on the legs.
     """
 
@@ -65,7 +86,8 @@ class Studio:
     discs: Discs
     finish: Finish
     room: Room
-    views: tuple[PixelRays, ...]
+    cameras: tuple[Camera, ...]
+    views: Mapping[int, PixelRays]
     sensor: Sensor
     fixed: tuple[ScenePart, ...] = ()
     board: Board | None = None
@@ -84,17 +106,16 @@ class Studio:
         lit_from = float(np.arctan2(way[1], way[0])) if read else None
         rng = np.random.default_rng(seeds[1])
         room = room_of(discs, reach, noise, rng, lit_from, settings.light)
-        known = {
-            id(camera): PixelRays.of(camera) for camera in {id(c): c for c in cameras}.values()
-        }
-        views = tuple(known[id(camera)] for camera in cameras)
+        views = {}
+        if truth.focal_scale is None:
+            views = {key: PixelRays.of(c) for key, c in {id(c): c for c in cameras}.items()}
         fixed: tuple[ScenePart, ...] = ()
         if settings.board is not None and truth.T_base_board is not None:
             fixed = (board_part(settings.board, truth.T_base_board),)
         flat = truth.machine.document.motion == "planar"
         finish = Finish.from_noise(noise, flat, settings.finish)
-        board, built = settings.board, settings.as_built
-        return cls(truth, discs, finish, room, views, settings.sensor, fixed, board, built)
+        board, built, eyes = settings.board, settings.as_built, tuple(cameras)
+        return cls(truth, discs, finish, room, eyes, views, settings.sensor, fixed, board, built)
 
     def photographs(self, index: int, shake: tuple[float, float] = (0.0, 0.0)) -> list[Integers]:
         """The repeats (8 bits, (H, W)) of the session's photograph number ``index``.
@@ -125,7 +146,9 @@ class Studio:
             parts.append(board_part(self.board, poses[k] @ on_platform))
             parts.append(holder_part(self.board, on_platform, poses[k], self.discs))
         scene = self.room.with_machine([*parts, *self.fixed])
-        return render(scene, self.views[station], T_camera_base, rng)
+        camera = self.cameras[station]
+        view = self.views.get(id(camera)) or PixelRays.of(camera)
+        return render(scene, view, T_camera_base, rng)
 
 
 def _shaken(shake: tuple[float, float], rng: np.random.Generator) -> Array:
@@ -200,23 +223,34 @@ def _session_document(
 ) -> dict[str, Any]:
     board = settings.board is not None
     name_of = "{configuration}" + _repeat_part(settings, "{repeat}")
+    observe = list(settings.observe) if board else "legs"
+    stations: dict[str, Any] = {
+        name: {
+            "camera": camera_files[name],
+            "images": f"images/{name}/{name_of}.png",
+            "observe": observe,
+            "pose": {
+                "position": list(pose.position),
+                "look_at": list(pose.look_at),
+                "up": list(pose.up),
+            },
+        }
+        for name, pose in zip(truth.stations, truth.rough, strict=True)
+    }
+    if settings.handheld:
+        stations = {
+            HANDHELD: {
+                "camera": camera_files[truth.stations[0]],
+                "images": f"images/{HANDHELD}/{{configuration}}-{{repeat}}.jpg",
+                "observe": observe,
+                "handheld": True,
+            }
+        }
     return {
         "pkmcal": 1,
         "mechanism": "mechanism.yaml",
         "joints": {"file": "joints.csv", "noise": settings.joint_noise},
-        "stations": {
-            name: {
-                "camera": camera_files[name],
-                "images": f"images/{name}/{name_of}.png",
-                "observe": list(settings.observe) if board else "legs",
-                "pose": {
-                    "position": list(pose.position),
-                    "look_at": list(pose.look_at),
-                    "up": list(pose.up),
-                },
-            }
-            for name, pose in zip(truth.stations, truth.rough, strict=True)
-        },
+        "stations": stations,
         **({"board": {"file": "board.yaml", "fixed_to": settings.board_on}} if board else {}),
     }
 
@@ -231,7 +265,7 @@ def _write_photographs(
 ) -> None:
     """Render and write all photographs; NumPy releases the interpreter, so threads are enough."""
     studio = Studio.of(truth, cameras, settings)
-    for name in truth.stations:
+    for name in [HANDHELD] if settings.handheld else truth.stations:
         (stage / "images" / name).mkdir(parents=True)
     total = len(truth.photographs)
     with ThreadPoolExecutor(max(1, workers)) as pool:
@@ -251,6 +285,13 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
 
     truth = studio.truth
     station, k = truth.photographs[index]
+    if settings.handheld:
+        (picture,) = studio.photographs(index)
+        name = truth.stations[station].removeprefix(f"{HANDHELD}-")
+        path = stage / "images" / HANDHELD / f"{name}.jpg"
+        camera, T_camera_base = studio.cameras[station], truth.T_camera_base[station]
+        path.write_bytes(_as_by_telephone(picture, camera, T_camera_base))
+        return
     folder = stage / "images" / truth.stations[station]
     for repeat, picture in enumerate(studio.photographs(index, settings.shake)):
         ok, data = cv2.imencode(".png", picture)
@@ -258,6 +299,22 @@ def _write_one(stage: Path, studio: Studio, settings: Settings, index: int) -> N
             raise OSError(f"photograph {index} could not be encoded as PNG")
         name = f"{truth.configurations[k]}{_repeat_part(settings, str(repeat + 1))}.png"
         (folder / name).write_bytes(data.tobytes())
+
+
+def _as_by_telephone(picture: Integers, camera: Camera, T_camera_base: Array) -> bytes:
+    """A JPEG file with EXIF: how the telephone was held, and its focal length in whole mm."""
+    import cv2
+
+    ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not ok:
+        raise OSError("a photograph could not be encoded as JPEG")
+    # where up is in the picture as stored: viewers turn it so that it is above
+    right, down = T_camera_base[:2, 2]
+    upright, lying = 1 if down < 0 else 3, 6 if right < 0 else 8
+    orientation = upright if abs(down) >= abs(right) else lying
+    film = float(np.hypot(36.0, 24.0) / np.hypot(*camera.image_size))
+    exif = Exif(orientation, float(camera.parameters[0]) * film)
+    return with_exif(data.tobytes(), exif)
 
 
 def _repeat_part(settings: Settings, text: str) -> str:

@@ -19,6 +19,7 @@ from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
+from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.session.schema import Body
 from pkmcal.simulation.board import place_board
@@ -26,6 +27,7 @@ from pkmcal.simulation.placement import (
     StationPlace,
     default_stations,
     draw_configurations,
+    places_by_hand,
     rough_pose,
     share_in_image,
     unfolded,
@@ -34,7 +36,11 @@ from pkmcal.simulation.render import Sensor
 from pkmcal.simulation.surfaces import Light, Style
 
 FILE = "truth.json"
-STREAMS = ("machine", "stations", "configurations", "readings", "room", "photographs", "board")
+STREAMS = (
+    "machine", "stations", "configurations", "readings", "room", "photographs", "board", "focal",
+)  # fmt: skip
+HANDHELD = "phone"
+"""The name in session.yaml of a station whose camera is held by hand."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,9 @@ class Settings:
     photographs of each configuration from each station, with sensor noise of their own. shake :
     standard deviations (m, rad) by which the camera moves between them. finish, light : of the
     legs and of the room. as_built : motors, rings and cables, which no drawing shows, on the legs.
+    handheld : each photograph
+    from a place of its own about the machine, ``repeats`` of each configuration, with focal lengths
+    that differ by ``breathing``, one standard deviation; ``stations`` then says nothing.
     """
 
     stations: int | tuple[StationPlace, ...] = 3
@@ -70,10 +79,14 @@ class Settings:
     finish: Style = "mixed"
     light: Light = "usual"
     as_built: bool = False
+    handheld: bool = False
+    breathing: float = BREATHING_SIGMA
 
     @property
     def n_stations(self) -> int:
         """Number of stations."""
+        if self.handheld:
+            return self.configurations * self.repeats
         return self.stations if isinstance(self.stations, int) else len(self.stations)
 
 
@@ -86,7 +99,7 @@ class Truth:
     T_base_platform : (K, 4, 4). joints : (K, m) exact readings. readings : (K, m) with noise.
     photographs : (M, 2) station and configuration of each photograph. seed : of everything.
     T_base_board, T_platform_board : (4, 4) of the board, where there is one. repeats : photographs
-    of each pair.
+    of each pair. focal_scale : (S,) of photographs by hand, times their camera's focal lengths.
     """
 
     machine: Machine
@@ -102,6 +115,7 @@ class Truth:
     T_base_board: Array | None = None
     repeats: int = 1
     T_platform_board: Array | None = None
+    focal_scale: Array | None = None
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
@@ -123,11 +137,15 @@ def true_machine(drawing: Machine, scale: float, rng: np.random.Generator) -> Ma
 def draw_truth(
     drawing: Machine, cameras: tuple[Camera, ...], settings: Settings, seed: int
 ) -> Truth:
-    """A true machine, stations, configurations and readings; cameras : one a station."""
+    """A true machine, stations, configurations and readings; cameras : one a station, by hand
+    without its breathing.
+    """
     rngs = {name: np.random.default_rng(stream(seed, name)) for name in STREAMS}
     machine = true_machine(drawing, settings.tolerance, rngs["machine"])
     poses = settings.stations
-    if isinstance(poses, int):
+    if settings.handheld:
+        poses = places_by_hand(drawing, cameras, rngs["stations"])
+    elif isinstance(poses, int):
         seen = settings.board_on if settings.board is not None else None
         poses = default_stations(drawing, cameras, rngs["stations"], seen)
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
@@ -157,10 +175,17 @@ def draw_truth(
             rngs["board"],
         )
     noise = settings.joint_noise * rngs["readings"].standard_normal(joints.shape)
+    configurations = tuple(f"{k:04d}" for k in range(len(joints)))
+    names = tuple(f"station{k + 1}" for k in range(len(poses)))
+    if settings.handheld:
+        taken = enumerate(photographs[:, 1].tolist())
+        names = tuple(
+            f"{HANDHELD}-{configurations[k]}-{s % settings.repeats + 1}" for s, k in taken
+        )
     return Truth(
         machine=machine,
-        stations=tuple(f"station{k + 1}" for k in range(len(poses))),
-        configurations=tuple(f"{k:04d}" for k in range(len(joints))),
+        stations=names,
+        configurations=configurations,
         T_camera_base=T_camera_base,
         rough=rough,
         T_base_platform=T_base_platform,
@@ -169,8 +194,11 @@ def draw_truth(
         photographs=photographs,
         seed=seed,
         T_base_board=board if settings.board_on == "base" else None,
-        repeats=settings.repeats,
+        repeats=1 if settings.handheld else settings.repeats,
         T_platform_board=board if settings.board_on == "platform" else None,
+        focal_scale=1 + settings.breathing * rngs["focal"].standard_normal(len(poses))
+        if settings.handheld
+        else None,
     )
 
 
@@ -186,8 +214,8 @@ def _configurations(
 
     A controller that moves the machine by its drawing only goes where that closes.
     """
-    n = settings.configurations
-    wanted = n if settings.shared else n * len(cameras)
+    n, repeats = settings.configurations, settings.repeats
+    wanted = n if settings.shared or settings.handheld else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
     by_drawing = drawing.forward_result(joints)
     reached = by_drawing.converged & unfolded(drawing, by_drawing.T_base_platform)
@@ -201,6 +229,8 @@ def _configurations(
     # a leg may lose its end to the border; a picture with half a machine is a bad photograph
     seen = (share.mean(axis=-1) > 0.8) & (share.min(axis=-1) > 0.4)
     groups = [seen.all(axis=0)] if settings.shared else list(seen)
+    if settings.handheld:  # each configuration by its own photographs
+        n, groups = 1, list(seen.reshape(n, repeats, -1).all(axis=1))
     taken = np.zeros(len(poses), dtype=bool)
     chosen: list[Integers] = []
     for k, good in enumerate(groups):
@@ -215,11 +245,12 @@ def _configurations(
         taken[rows] = True
         chosen.append(rows)
     stations = range(len(cameras))
-    pairs = (
-        [(s, k) for s in stations for k in range(n)]
-        if settings.shared
-        else [(s, s * n + k) for s in stations for k in range(n)]
-    )
+    if settings.handheld:
+        pairs = [(s, s // repeats) for s in stations]
+    elif settings.shared:
+        pairs = [(s, k) for s in stations for k in range(n)]
+    else:
+        pairs = [(s, s * n + k) for s in stations for k in range(n)]
     rows = np.concatenate(chosen)
     return poses[rows], joints[rows], np.array(pairs, dtype=int).reshape(-1, 2)
 
@@ -241,8 +272,11 @@ def truth_document(truth: Truth) -> dict[str, Any]:
         "mechanism": truth.machine.name,
         "parameters": dict(zip(names, truth.machine.values.tolist(), strict=True)),
         "stations": {
-            name: {"T_camera_base": T.tolist()}
-            for name, T in zip(truth.stations, truth.T_camera_base, strict=True)
+            name: {
+                "T_camera_base": T.tolist(),
+                **({} if truth.focal_scale is None else {"focal_scale": truth.focal_scale[s]}),
+            }
+            for s, (name, T) in enumerate(zip(truth.stations, truth.T_camera_base, strict=True))
         },
         "configurations": {
             name: {"T_base_platform": T.tolist(), "joints": q.tolist()}
@@ -276,6 +310,7 @@ def load_truth(folder: Path | str, drawing: Machine) -> Truth:
     stations, configurations = tuple(data["stations"]), tuple(data["configurations"])
     joints = np.array([c["joints"] for c in data["configurations"].values()])
     T_camera_base = np.array([s["T_camera_base"] for s in data["stations"].values()])
+    focal = [s["focal_scale"] for s in data["stations"].values() if "focal_scale" in s]
     return Truth(
         machine=drawing.with_values(np.array(values)),
         stations=stations,
@@ -292,4 +327,5 @@ def load_truth(folder: Path | str, drawing: Machine) -> Truth:
         T_base_board=np.array(data["T_base_board"]) if "T_base_board" in data else None,
         repeats=data.get("repeats", 1),
         T_platform_board=np.array(data["T_platform_board"]) if "T_platform_board" in data else None,
+        focal_scale=np.array(focal) if focal else None,
     )

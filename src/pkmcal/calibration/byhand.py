@@ -1,0 +1,187 @@
+"""Where photographs by hand were taken from.
+
+Each photograph is searched by itself (:mod:`pkmcal.observe.alone`), for nothing but the machine
+joins it to others. A board on the base places those that see it beside one that is placed. What is
+unsure is left out and told, for one photograph in a wrong place spoils the rest; and where the
+joint estimate gives up most of a photograph's edges, it was in a wrong place.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.boards.views import Boards
+from pkmcal.calibration.recognise import WORKERS
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import dot, pose_difference
+from pkmcal.identify.estimate import Estimate
+from pkmcal.measurements import Measurements
+from pkmcal.observe import legs
+from pkmcal.observe.alone import ALIKE, Alone, find_alone
+from pkmcal.observe.predict import tubes_of
+from pkmcal.observe.stations import StationView
+from pkmcal.observe.tables import distance_tables
+from pkmcal.session.load import Session
+from pkmcal.session.photographs import label_of
+from pkmcal.wording import listed
+
+SURE = 1e-2
+"""Probability that a photograph shows the machine from another place, below which it is believed:
+of a hundred one may be wrong, and the joint estimate finds that one out."""
+
+
+FEWEST_EDGES = 4
+"""Edges of a photograph that tell its place: two numbers each, of which a pose and a focal length
+take seven."""
+
+
+class Placed(NamedTuple):
+    """A session without the photographs by hand that could not be placed, its photographs and
+    boards numbered alike, and poses T_camera_base (S, 4, 4) of its stations.
+    """
+
+    session: Session
+    photographs: list[legs.Photographs]
+    boards: Boards
+    T_camera_base: Array
+
+
+def place_by_hand(
+    session: Session,
+    photographs: list[legs.Photographs],
+    poses: Array,
+    boards: Boards,
+    known: Array,
+) -> Placed:
+    """Find the places of the photographs by hand; those that are not found are left out and told.
+
+    photographs : of all stations that observe legs. poses : T_base_platform (K, 4, 4) by the
+    drawing. known : T_camera_base (S, 4, 4) of the stations that are placed already, NaN for the
+    others. Raises `InputError` where no photograph by hand is placed.
+    """
+    at = {p.station: p for p in photographs}
+    by_hand = [k for k in at if session.stations[k].handheld]
+    tubes = tubes_of(session.machine)
+
+    def search(k: int) -> Alone:
+        p, tables = at[k], distance_tables(at[k].images)
+        view = StationView(
+            session.machine, p.camera, tubes, p.configuration, session.joints, poses, tables
+        )
+        return find_alone(view, p.images[0])
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        found = dict(zip(by_hand, pool.map(search, by_hand), strict=True))
+    believed = _believed(found, boards, known)
+    lost = {k: _why(found[k]) for k in by_hand if np.isnan(believed[k]).any()}
+    return _without(session, photographs, boards, believed, lost)
+
+
+def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
+    """Poses T_camera_base (S, 4, 4) with those of photographs of whose place there is little
+    doubt, and those that a board on the base joins to them; NaN for the others.
+    """
+    out = known.copy()
+    for k, one in found.items():
+        if one.doubt < SURE:
+            out[k] = one.T_camera_base[0]
+    seen = [None if np.isnan(T).any() else T for T in out]
+    joined = boards.joined(seen)
+    return np.stack([np.full((4, 4), np.nan) if T is None else T for T in joined])
+
+
+def misplaced(
+    session: Session, measurements: Measurements, estimate: Estimate, T_camera_base: Array
+) -> list[int]:
+    """Photographs by hand of which the joint estimate has given up most edges, has too few to tell
+    their place, or finds the camera looking another way than where it was placed, T_camera_base.
+    """
+    turn = pose_difference(estimate.state.T_camera_base, T_camera_base)[:, :3]
+    astray = np.sqrt(dot(turn, turn)) > ALIKE / 2
+    station = measurements.edges.station
+    kept = np.bincount(station, estimate.edge_weights, len(session.stations))
+    count = np.bincount(station, minlength=len(session.stations))
+    lost = (2 * kept < count) | (kept < FEWEST_EDGES)
+    return [k for k, s in enumerate(session.stations) if s.handheld and (lost[k] or astray[k])]
+
+
+def without_misplaced(
+    session: Session,
+    photographs: list[legs.Photographs],
+    boards: Boards,
+    T_camera_base: Array,
+    wrong: list[int],
+) -> Placed:
+    """The session without these photographs, each told."""
+    why = dict.fromkeys(wrong, "too few of its edges agree with the other photographs")
+    return _without(session, photographs, boards, T_camera_base[: len(session.stations)], why)
+
+
+def _of(
+    session: Session,
+    photographs: list[legs.Photographs],
+    boards: Boards,
+    known: Array,
+    kept: list[int],
+    warnings: tuple[str, ...] = (),
+) -> Placed:
+    """Some of the stations, numbered anew."""
+    number = {k: new for new, k in enumerate(kept)}
+    return Placed(
+        session.of_stations(kept, warnings),
+        [replace(p, station=number[p.station]) for p in photographs if p.station in number],
+        boards.of(np.array(kept, dtype=int)),
+        known[kept],
+    )
+
+
+def _why(found: Alone) -> str:
+    """Why a photograph could not be placed, in words."""
+    return (
+        "its edges fit the legs nearly as well from another place, which with probability"
+        f" {found.doubt:.2f} is the right one"
+    )
+
+
+def _without(
+    session: Session,
+    photographs: list[legs.Photographs],
+    boards: Boards,
+    known: Array,
+    lost: dict[int, str],
+) -> Placed:
+    """The session without the photographs that are lost, each told; an error where none is left."""
+    by_hand = [k for k, station in enumerate(session.stations) if station.handheld]
+
+    def label(k: int) -> str:
+        return label_of(session.folder, session.stations[k].photographs[0].path)
+
+    if len(lost) == len(by_hand):
+        raise InputError(
+            "the machine is recognised in none of the photographs by hand",
+            where=f"session.yaml, stations.{session.stations[by_hand[0]].entry}",
+            found=f"{label(by_hand[0])}: {lost[by_hand[0]]}",
+            expected="one place for each where its legs lie on edges of the picture far oftener"
+            " than elsewhere",
+            next_step="Check that these photographs show this machine's legs, large and sharp, that"
+            " each bears the name of its configuration, and that the drawing is this machine's",
+        )
+    warnings = tuple(f"{label(k)}: left out, for {why}." for k, why in lost.items())
+    kept = [k for k in range(len(session.stations)) if k not in lost]
+    placed = _of(session, photographs, boards, known, kept, warnings)
+    seen = {photo.configuration for s in placed.session.stations for photo in s.photographs}
+    if len(seen) < 2:
+        names = [session.configurations[k] for k in sorted(seen)]
+        raise InputError(
+            "the photographs that are recognised show one configuration only",
+            where=f"session.yaml, stations.{session.stations[by_hand[0]].entry}",
+            found=f"{listed(names)}; {warnings[0]}" if warnings else listed(names),
+            expected="two at least",
+            next_step="Take photographs in which all legs are large and before a plain background",
+        )
+    return placed

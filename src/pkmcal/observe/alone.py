@@ -1,0 +1,259 @@
+"""The machine in one photograph alone, of which nothing is known: the places that it could show.
+
+Places all round the machine, at distances from which it fills the picture or a third of it, turns
+about the line of sight and places in the picture are tried, by the middles of the tubes on a chart
+of what could be tubes (:mod:`pkmcal.observe.tubes`). The best few thousand descend as those of a
+station do (:mod:`pkmcal.observe.stations`), on tables that tell three times as many directions
+apart; the best of these again on twice and four times as fine a picture, where texture yields far
+less evidence and the machine more.
+
+How surely the best is the machine, the second best tells: what is not the machine in a picture full
+of edges is rarely alone, and a machine of equal parts looks much the same from several sides. What
+the drawing has wrong moves all edges of a leg together, so each half of a leg counts as one
+measurement of that comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import dot, inverse, pose, rotation
+from pkmcal.observe.places import PLACES, TURNS, frame_of, sphere
+from pkmcal.observe.predict import edge_points, legs_in_camera, visible_stretch
+from pkmcal.observe.stations import StationView, apart, descend, evidence_of, settle
+from pkmcal.observe.tables import WORKING_WIDTH, distance_tables
+from pkmcal.observe.tubes import CELL, DIRECTIONS, TubeChart, tube_chart
+
+FILLS = (0.3, 1.5)
+"""Share of the picture that the machine fills: from a third, to where its ends lie outside."""
+WIDEST = 1.2
+"""Half the angle (rad) under which it is seen at most."""
+FURTHER = 1.18
+"""Factor from one distance to the next: half of that moves a leg's end by half its width."""
+OFF = 0.2
+"""Share of the chart's size by which the machine may lie off its middle, to each side."""
+STRIDE = 2
+"""Cells of the chart from one place in the picture to the next."""
+EACH = 2
+"""Places in the picture that are kept for each place and turn of the camera."""
+KEPT = 2000
+"""Hypotheses that descend: in a cluttered laboratory the machine's is among the first thousand."""
+FEWER, FEW = 400, 120
+"""How many go on after the first descents, and to the finer picture."""
+MANY_DIRECTIONS = 24
+"""Directions of the tables: each takes its neighbours in, so edges within 11 degrees count."""
+FEWEST = 40
+"""How many go on to the finest picture, and beside them the look-alikes of the first two."""
+ALIKE = np.radians(20.0)
+"""Turn within which two places are one: look-alikes are turned by 60 degrees at least."""
+FOLDS = (2, 3, 4, 6)
+"""Equal parts that a machine may have."""
+ONTO = 0.2
+"""Distance, in the base's radius, within which joints fall on joints: no two machines' parts are so
+equal that they could be exchanged, and yet from a photograph they could."""
+BATCH = 214
+"""Places that are looked up together: some ten megabytes."""
+
+
+class Alone(NamedTuple):
+    """Places that a photograph could show, the one with the most evidence first.
+
+    T_camera_base : (H, 4, 4), none near the first. evidence : (H,) as
+    :mod:`pkmcal.observe.stations` has it. unit : evidence that counts as one measurement.
+    """
+
+    T_camera_base: Array
+    evidence: Array
+    unit: float
+
+    @property
+    def doubt(self) -> float:
+        """Probability that the second is the machine's place and not the first."""
+        second = float(self.evidence[1]) if len(self.evidence) > 1 else 0.0
+        return 1 / (1 + float(np.exp(min((self.evidence[0] - second) / self.unit, 500.0))))
+
+
+def find_alone(view: StationView, image: Integers) -> Alone:
+    """The likeliest places of the camera of one photograph; view : of it alone."""
+    one = np.zeros(1, dtype=int)
+    coarse = replace(view, tables=distance_tables([image], WORKING_WIDTH, MANY_DIRECTIONS))
+    fine = replace(view, tables=distance_tables([image], 2 * WORKING_WIDTH, MANY_DIRECTIONS))
+    found = _hypotheses(view, tube_chart(image, view.camera))
+    found = descend(coarse, found, one, 2, (16, 14, 12, 10))
+    found = _most(coarse, found, 4, FEWER)
+    found = descend(coarse, found, one, 4, (8, 7, 6, 5, 5))
+    found = _most(coarse, found, 5, FEW)
+    found = settle(fine, found, one, 8, 6)
+    found = _most(fine, found, 8, FEW)
+    found = found[apart(fine, found, one)][:FEWEST]
+    return weighed(view, image, np.concatenate([found, turned_about(view, found[:2])]))
+
+
+def weighed(view: StationView, image: Integers, found: Array) -> Alone:
+    """Places (H, 4, 4) settled on the finest tables, those that are not the same place."""
+    one = np.zeros(1, dtype=int)
+    view = replace(view, tables=distance_tables([image], 4 * WORKING_WIDTH, MANY_DIRECTIONS))
+    found = settle(view, found, one, 16, 6)
+    evidence = evidence_of(view, found, one, 16).sum(axis=-1)
+    order = np.argsort(-evidence)
+    order = order[evidence[order] > 0]
+    if not len(order):
+        order = np.array([int(np.argmax(evidence))])
+    order = order[apart(view, found[order], one)]
+    found, evidence = found[order], evidence[order]
+    turned = found[0, :3, :3] @ found[:, :3, :3].mT
+    angle = np.arccos(np.clip((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
+    # near the first lies the same place, less well settled
+    keep = (angle >= ALIKE) | (np.arange(len(found)) == 0)
+    return Alone(found[keep], evidence[keep], _unit(view, found[:1]))
+
+
+def _unit(view: StationView, found: Array) -> float:
+    """Reduced pixels of silhouette that count as one measurement: half a leg's."""
+    look = edge_points(
+        view.machine, view.camera, legs_in_camera(view.machine, found[0], view.poses, view.joints),
+        view.tubes, 2,
+    )  # fmt: skip
+    chord = look.pixel[0, :, 1] - look.pixel[0, :, 0]
+    length = np.nan_to_num(2 * np.hypot(chord[:, 0], chord[:, 1]) / view.tables.scale)
+    return float(length.sum()) / (2 * len(np.unique(view.tubes.leg)))
+
+
+def _most(view: StationView, found: Array, samples: int, count: int) -> Array:
+    evidence = evidence_of(view, found, np.zeros(1, dtype=int), samples).sum(axis=-1)
+    return found[np.argsort(-evidence)[:count]]
+
+
+class _Tubes(NamedTuple):
+    """Tubes of the machine in the photograph's configuration, T of them, base frame.
+
+    ends : (T, 3, 3) first, middle and last point that can be seen. radius : (T,). centre : (3,) of
+    all. size : m, from there to the furthest.
+    """
+
+    ends: Array
+    radius: Array
+    centre: Array
+    size: float
+
+
+def _hypotheses(view: StationView, chart: TubeChart) -> Array:
+    """Poses T_camera_base (KEPT, 4, 4), best first."""
+    tubes = _tubes(view)
+    width, height = chart.size
+    half = min(width, height) / 2 / chart.scale
+    near, far = (tubes.size / np.sin(min(half * fill, WIDEST)) for fill in reversed(FILLS))
+    count = int(np.ceil(np.log(far / near) / np.log(FURTHER))) + 1
+    distance = np.geomspace(near, far, count)
+    direction = sphere(PLACES)
+    look = frame_of(-direction)
+    # what is looked up: each place in the picture is a shift of the maps
+    steps = [np.arange(-int(OFF * n / CELL), int(OFF * n / CELL) + 1, STRIDE) for n in chart.size]
+    windows = _windows(chart.rarity, steps)
+    values: list[Array] = []
+    shifts: list[Integers] = []
+    for away in distance:
+        point = tubes.ends - (tubes.centre + direction * away)[:, None, None]
+        seen = np.einsum("pij,ptnj->ptni", look, point)
+        for turn in range(TURNS):
+            score = _scores(seen, tubes.radius, 2 * np.pi * turn / TURNS, chart, windows)
+            best = np.argpartition(score, -EACH, axis=-1)[:, -EACH:]
+            shifts += [best]
+            values += [np.take_along_axis(score, best, axis=-1)]
+    value, best = np.stack(values), np.stack(shifts)  # (distance * turn, place, EACH)
+    order = np.argsort(-value.ravel())[:KEPT]
+    step, place, which = np.unravel_index(order, value.shape)
+    shift = best[step, place, which]
+    dx, dy = steps[0][shift % len(steps[0])], steps[1][shift // len(steps[0])]
+    x, y, zero = dx * CELL / chart.scale, dy * CELL / chart.scale, np.zeros(len(order))
+    tilt = rotation(np.stack([-y, x, zero], axis=-1))
+    roll = rotation(np.stack([zero, zero, 2 * np.pi / TURNS * (step % TURNS)], axis=-1))
+    rot = tilt @ roll @ look[place]
+    stand = tubes.centre + direction[place] * distance[step // TURNS][:, None]
+    return pose(rot, -(rot @ stand[..., None])[..., 0])
+
+
+def _tubes(view: StationView) -> _Tubes:
+    tubes = view.tubes
+    legs = legs_in_camera(view.machine, np.eye(4), view.poses[:1], view.joints[:1])
+    one = np.flatnonzero(tubes.side == 0)
+    a, b, u = (v[0][tubes.leg] for v in (legs.a, legs.b, legs.u))
+    first, last = visible_stretch(a, b, tubes)
+    place = first[:, None] + np.maximum(last - first, 0.0)[:, None] * [0.0, 0.5, 1.0]
+    ends = (a[:, None] + place[..., None] * u[:, None])[one]
+    corner = ends.reshape(-1, 3)
+    centre = (corner.min(axis=0) + corner.max(axis=0)) / 2
+    size = float(np.sqrt(dot(corner - centre, corner - centre).max()))
+    return _Tubes(ends, view.machine.values[tubes.radius[one]], centre, size)
+
+
+def _windows(rarity: Integers, steps: Sequence[Integers]) -> Integers:
+    """The maps so that [width, direction, y, x] is a whole window of shifts, (Sy, Sx); y, x count
+    from the chart's corner less what :func:`_border` says.
+    """
+    border = _border(rarity)
+    padded = np.pad(rarity, ((0, 0), (0, 0), (border, border), (border, border)))
+    nx, ny = (len(s) for s in steps)
+    shape = (*rarity.shape[:2], padded.shape[2] - STRIDE * ny, padded.shape[3] - STRIDE * nx)
+    stride = padded.strides
+    return np.lib.stride_tricks.as_strided(
+        padded, (*shape, ny, nx), (*stride, STRIDE * stride[2], STRIDE * stride[3]), writeable=False
+    )
+
+
+def _border(rarity: Integers) -> int:
+    """Cells put about the maps, on which nothing is a tube."""
+    return max(rarity.shape[2:])
+
+
+def _scores(seen: Array, radius: Array, turn: float, chart: TubeChart, windows: Integers) -> Array:
+    """Mean worth (P, shifts) of the tubes' middles; seen : (P, T, 3, 3) first, middle and last
+    points from each place. Long tubes count more.
+    """
+    beside = np.hypot(seen[..., 0], seen[..., 1])
+    angle = np.arctan2(beside, seen[..., 2])
+    cell = seen[..., :2] * (chart.scale * angle / np.maximum(beside, 1e-12))[..., None]
+    cell = cell @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    chord = cell[:, :, 2] - cell[:, :, 0]
+    normal = np.arctan2(chord[..., 0], -chord[..., 1])
+    number = np.rint(normal % np.pi * (DIRECTIONS / np.pi)).astype(np.intp) % DIRECTIONS
+    width = 2 * radius * chart.scale / np.sqrt(dot(seen[:, :, 1], seen[:, :, 1]))
+    weight = np.hypot(chord[..., 0], chord[..., 1])
+    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    at = np.floor((cell[:, :, 1] + chart.middle) / CELL).astype(np.intp)
+    shifts = windows.shape[-2:]
+    first = _border(chart.rarity) - STRIDE * (np.array(shifts[::-1]) // 2)
+    at = np.clip(at + first, 0, np.array(windows.shape[3:1:-1]) - 1)
+    which = chart.width_number(width)
+    out = np.empty((len(seen), shifts[0] * shifts[1]), dtype=np.float32)
+    for k in range(0, len(seen), BATCH):
+        part = slice(k, k + BATCH)
+        worth = windows[which[part], number[part], at[part, :, 1], at[part, :, 0]]
+        worth = worth.reshape(*worth.shape[:2], -1).astype(np.float32)
+        out[part] = np.matmul(weight[part, None], worth)[:, 0]
+    return out
+
+
+def turned_about(view: StationView, found: Array) -> Array:
+    """Places (H, 4, 4) with the machine turned about its own axis onto itself, all such turns of
+    each: a machine of equal parts looks much the same from there.
+    """
+    machine = view.machine
+    base = machine.base_centers()
+    middle = base.mean(axis=0)
+    axis = np.linalg.svd(base - middle)[2][2]  # across the plane in which they lie, nearly
+    near = ONTO * np.sqrt(dot(base - middle, base - middle).max())
+    turns: list[Array] = []
+    for angle in 2 * np.pi * np.unique([k / n for n in FOLDS for k in range(1, n)]):
+        turn = rotation(angle * axis)
+        moved = (base - middle) @ turn.T + middle
+        apart = np.sqrt(dot(moved[:, None] - base, moved[:, None] - base))
+        if apart.min(axis=1).max() < near:
+            turns.append(pose(turn, middle - turn @ middle))
+    about = np.array(turns).reshape(-1, 4, 4)
+    return (found[:, None] @ inverse(about)).reshape(-1, 4, 4)

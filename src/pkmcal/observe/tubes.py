@@ -1,0 +1,185 @@
+"""Where tubes could lie in one photograph: two parallel edges at a tube's width, and how rare.
+
+Nothing moves in a single photograph, so nothing tells the machine from what stands about it but its
+looks: a leg shows two straight edges side by side, the one from dark to bright, the other back. For
+each of a few widths and directions a map tells how well a place is the middle of such a pair, along
+a stretch of some widths. A shelf shows many pairs upright and level, and few oblique: so what a
+place is worth is how rarely its width and direction are found so clear in this photograph.
+
+All that is on a chart of angles from the middle of the picture, the same for any lens, on which a
+turn of the camera is nearly a shift.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.cameras import Camera
+
+CHART = 384
+"""Cells of the fine chart along the longer side of the picture: a leg that is a fiftieth of the
+picture wide, as where a machine fills it, has its edges eight cells apart."""
+CELL = 6
+"""Fine cells that are one cell of the maps, which are looked up 15 degrees and 8 degrees apart."""
+COARSE = 2
+"""Fine cells between the places whose support is worked out."""
+DIRECTIONS = 24
+"""Directions of a pair: 7.5 degrees apart."""
+WIDTHS = 3.2 * np.sqrt(2.0) ** np.arange(6)
+"""Widths (fine cells) of a pair: nearer, its edges run together."""
+SLENDER = 4.0
+"""Length, in widths, along which a pair's support is averaged: tubes are longer."""
+SHORTEST = 12.0
+"""Fine cells along which it is averaged at least."""
+SLOPE = 2.5
+"""Levels a fine cell at which an edge counts half of a strong one: levels are roots (255 stays),
+whose noise is even and half a level at most, so five times that."""
+ASIDE = 2.0
+"""Times that a slope along a pair counts against one across it: directions within 27 degrees."""
+CLEAR = 0.24
+"""Support below which a place is no pair at all: one place in four of its length."""
+RAREST = 4.0
+"""Logarithm of rarity beyond which rarer ones count no more: one leg must not outvote six."""
+WORTH = 60
+"""Steps of the maps' numbers for each factor of e in rarity."""
+
+
+class TubeChart(NamedTuple):
+    """rarity : (W, D, h, w) uint8, minus the logarithm of how rare so clear a pair is, in steps.
+    scale : fine cells a radian. size : (w, h) of the fine chart.
+    """
+
+    rarity: Integers
+    scale: float
+    size: tuple[int, int]
+
+    @property
+    def middle(self) -> Array:
+        """The chart's middle, fine cells (2,)."""
+        return (np.array(self.size) - 1) / 2
+
+    def width_number(self, width: Array) -> Integers:
+        """The numbers of widths (...), fine cells."""
+        apart = np.abs(np.log(np.maximum(width, 1e-9))[..., None] - np.log(WIDTHS))
+        return apart.argmin(axis=-1)
+
+
+def tube_chart(image: Integers, camera: Camera) -> TubeChart:
+    """Of one photograph (height, width)."""
+    grey, scale = _on_chart(image, camera)
+    return TubeChart(_rarity(_support(grey)), scale, (grey.shape[1], grey.shape[0]))
+
+
+def _on_chart(image: Integers, camera: Camera) -> tuple[Array, float]:
+    """Levels (h, w) on the fine chart: angles from the optical axis, evenly; and its scale."""
+    import cv2
+
+    height, width = image.shape
+    across = np.stack([np.linspace(0, width - 1, 65), np.full(65, (height - 1) / 2)], axis=-1)
+    along = np.stack([np.full(65, (width - 1) / 2), np.linspace(0, height - 1, 65)], axis=-1)
+    half = [float(np.nanmax(np.abs(_angle(camera.ray(line))))) for line in (across, along)]
+    scale = CHART / (2 * max(half))
+    w, h = (int(2 * angle * scale) for angle in half)
+    x, y = np.meshgrid((np.arange(w) - (w - 1) / 2) / scale, (np.arange(h) - (h - 1) / 2) / scale)
+    away = np.hypot(x, y)
+    sine = np.sinc(away / np.pi)
+    pixel = camera.project(np.stack([x * sine, y * sine, np.cos(away)], axis=-1))
+    pixel = np.nan_to_num(pixel, nan=-1e4).astype(np.float32)
+    blur = 0.4 * width / w  # of what a cell of the chart cannot show
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur) if blur > 0.4 else image
+    smooth = np.asarray(smooth, dtype=np.float32)
+    grey = cv2.remap(
+        smooth, np.ascontiguousarray(pixel[..., 0]), np.ascontiguousarray(pixel[..., 1]),
+        cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return np.sqrt(255.0 * np.asarray(grey)), scale
+
+
+def _angle(rays: Array) -> Array:
+    """Angles (...) of rays (..., 3) from the optical axis."""
+    return np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
+
+
+def _support(grey: Array) -> Array:
+    """How clear a pair lies about each place, (WIDTHS, DIRECTIONS, h, w), 0 to 1; places lie COARSE
+    fine cells apart.
+    """
+    import cv2
+
+    dx, dy = (cv2.Sobel(grey.astype(np.float32), cv2.CV_32F, *way) / 8 for way in ((1, 0), (0, 1)))
+    height, width = (n // COARSE for n in grey.shape)
+    out = np.empty((len(WIDTHS), DIRECTIONS, height, width), dtype=np.float32)
+    for k in range(DIRECTIONS):
+        angle = np.pi * k / DIRECTIONS
+        n = np.array([np.cos(angle), np.sin(angle)])
+        slope, other = dx * n[0] + dy * n[1], np.abs(dy * n[0] - dx * n[1])
+        rising, falling = (_strength(sign * slope - ASIDE * other) for sign in (1, -1))
+        for w, wide in enumerate(WIDTHS):
+            # at x + n wide/2 and x - n wide/2: a bright tube rises inwards, a dark one falls
+            step = np.rint(n * wide / 2).astype(int)
+            bright = np.minimum(_shifted(falling, step), _shifted(rising, -step))
+            dark = np.minimum(_shifted(rising, step), _shifted(falling, -step))
+            pair = np.maximum(bright, dark)[: height * COARSE, : width * COARSE]
+            pair = pair.reshape(height, COARSE, width, COARSE).max(axis=(1, 3))
+            length = max(SLENDER * wide, SHORTEST) / COARSE
+            out[w, k] = cv2.filter2D(pair, -1, _line(np.array([-n[1], n[0]]), length))
+    return out
+
+
+def _strength(slope: Array) -> Array:
+    """Strength 0 to 1 of edges; a cell beside one counts too."""
+    import cv2
+
+    up = np.square(np.maximum(slope, 0.0))
+    wide = cv2.dilate(up / (up + SLOPE**2), np.ones((3, 3), np.uint8))
+    return np.asarray(wide, dtype=np.float32)
+
+
+def _shifted(values: Array, step: Integers) -> Array:
+    """Values (h, w) at x + step, zero beyond the border."""
+    x, y = (int(s) for s in step)
+    height, width = values.shape
+    out = np.zeros_like(values)
+    out[max(-y, 0) : height - max(y, 0), max(-x, 0) : width - max(x, 0)] = values[
+        max(y, 0) : height - max(-y, 0), max(x, 0) : width - max(-x, 0)
+    ]
+    return out
+
+
+def _line(along: Array, length: float) -> Array:
+    """Weights that average along a line."""
+    half = int(np.ceil(length / 2))
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), dtype=np.float32)
+    for place in np.linspace(-length / 2, length / 2, 8 * half):
+        x, y = np.rint(half + place * along).astype(int)
+        kernel[y, x] = 1.0
+    return kernel / kernel.sum()
+
+
+def _rarity(support: Array) -> Integers:
+    """The maps of :class:`TubeChart` from supports (W, DIRECTIONS, h, w).
+
+    A cell takes the best about it, and neighbouring directions, for hypotheses lie so far apart.
+    """
+    import cv2
+
+    cell = CELL // COARSE
+    height, width = (n // cell for n in support.shape[-2:])
+    around = np.ones((cell + 2, cell + 2), np.uint8)
+    rows, columns = (slice(cell // 2, n * cell, cell) for n in (height, width))
+    best = np.stack(
+        [[np.asarray(cv2.dilate(m, around))[rows, columns] for m in maps] for maps in support]
+    )
+    best = np.maximum(best, np.maximum(np.roll(best, 1, axis=1), np.roll(best, -1, axis=1)))
+    level = np.rint(255 * np.clip(best, 0, 1)).astype(np.intp)
+    out = np.empty(best.shape, dtype=np.uint8)
+    for place in np.ndindex(level.shape[:2]):
+        count = np.bincount(level[place].ravel(), minlength=256)
+        share = count[::-1].cumsum()[::-1] / count.sum()
+        worth = np.minimum(-np.log(np.maximum(share, 1e-9)), RAREST)
+        worth[: round(255 * CLEAR)] = 0.0
+        out[place] = np.rint(WORTH * worth)[level[place]]
+    return out

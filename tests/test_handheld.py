@@ -1,0 +1,484 @@
+"""Photographs by hand: the format, EXIF, and a session in which each has a place of its own."""
+
+import re
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from pkmcal.boards.views import Boards
+from pkmcal.calibration import byhand
+from pkmcal.calibration.byhand import Placed, misplaced, without_misplaced
+from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.gather import focal_part
+from pkmcal.calibration.recognise import platform_poses, read_photographs
+from pkmcal.calibration.results import document_of
+from pkmcal.errors import InputError
+from pkmcal.files import Exif, read_exif, with_exif
+from pkmcal.geometry.rigid import apply, perturb, pose_difference
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.gauge import default_gauge
+from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.observe import legs
+from pkmcal.observe.alone import Alone, find_alone, turned_about
+from pkmcal.observe.images import decode
+from pkmcal.observe.predict import tubes_of
+from pkmcal.observe.stations import DOUBT, StationView
+from pkmcal.observe.tables import distance_tables
+from pkmcal.observe.tubes import DIRECTIONS, WORTH, tube_chart
+from pkmcal.session.exif import camera_by_exif
+from pkmcal.session.load import load_session
+from pkmcal.simulation import Settings
+from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.placement import places_by_hand
+from pkmcal.simulation.truth import load_truth
+from rendered import rendered
+
+SESSION = """\
+pkmcal: 1
+mechanism: gough-stewart
+joints: {file: joints.csv, noise: 3.0e-6}
+stations:
+  phone:
+    camera: cameras/phone.yaml
+    images: images/phone/{configuration}-{repeat}.jpg
+    observe: legs
+    handheld: true
+"""
+CAMERA = "model: pinhole\nimage_size: [8, 6]\nfocal: [9.0, 9.0]\ncenter: [3.5, 2.5]\n"
+JOINTS = """\
+configuration,leg1,leg2,leg3,leg4,leg5,leg6
+0000,0.36,0.37,0.38,0.39,0.40,0.41
+0001,0.46,0.45,0.44,0.43,0.42,0.40
+"""
+EASIEST = 0
+"""The simulated photograph that shows its legs best."""
+PICTURE = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
+
+
+def jpeg(path, exif=None, picture=PICTURE):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ok, data = cv2.imencode(".jpg", picture)
+    assert ok
+    path.write_bytes(data.tobytes() if exif is None else with_exif(data.tobytes(), exif))
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two configurations, one of them photographed from two places."""
+    (tmp_path / "cameras").mkdir()
+    (tmp_path / "session.yaml").write_text(SESSION)
+    (tmp_path / "cameras" / "phone.yaml").write_text(CAMERA)
+    (tmp_path / "joints.csv").write_text(JOINTS)
+    for name in ("0000-1", "0000-2", "0001-1"):
+        jpeg(tmp_path / "images" / "phone" / f"{name}.jpg", Exif(6, 26.0))
+    return tmp_path
+
+
+def change(folder, old, new):
+    path = folder / "session.yaml"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def fault(folder):
+    with pytest.raises(InputError) as caught:
+        load_session(folder)
+    return str(caught.value)
+
+
+# EXIF
+
+
+def test_exif_is_read_as_it_was_written(tmp_path):
+    data = jpeg(tmp_path / "a.jpg").read_bytes()
+    assert read_exif(data) == Exif(1, None)
+    assert read_exif(with_exif(data, Exif(8, 26.0))) == Exif(8, 26.0)
+    assert read_exif(with_exif(data, Exif(3, None))) == Exif(3, None)
+
+
+def test_exif_of_either_byte_order():
+    """A segment as telephones write it in little-endian, built by hand from the standard."""
+
+    def entry(tag, kind, value):
+        return b"".join(
+            n.to_bytes(size, "little") for n, size in ((tag, 2), (kind, 2), (1, 4), (value, 4))
+        )
+
+    first = (2).to_bytes(2, "little") + entry(0x0112, 3, 6) + entry(0x8769, 4, 38) + bytes(4)
+    own = (1).to_bytes(2, "little") + entry(0xA405, 3, 28) + bytes(4)
+    block = b"Exif\0\0II*\0" + (8).to_bytes(4, "little") + first + own
+    data = b"\xff\xd8\xff\xe1" + (len(block) + 2).to_bytes(2, "big") + block + b"\xff\xda"
+    assert read_exif(data) == Exif(6, 28.0)
+
+
+@pytest.mark.parametrize("cut", [0, 2, 12, 20, 30, 40])
+def test_spoilt_exif_counts_as_not_said(tmp_path, cut):
+    data = with_exif(jpeg(tmp_path / "a.jpg").read_bytes(), Exif(6, 26.0))
+    assert read_exif(data[:cut]) in (Exif(1, None), Exif(6, None))
+
+
+# the format
+
+
+def test_each_photograph_by_hand_is_a_station(folder):
+    session = load_session(folder)
+    names = ["phone-0000-1", "phone-0000-2", "phone-0001-1"]
+    assert [station.name for station in session.stations] == names
+    for station in session.stations:
+        assert station.entry == "phone"
+        assert station.handheld
+        assert len(station.photographs) == 1
+        assert station.T_camera_base is None
+        assert station.camera_file == "cameras/phone.yaml"
+    written = session.document["stations"]["phone"]["photographs"]
+    assert written == [f"images/phone/{name}.jpg" for name in ("0000-1", "0000-2", "0001-1")]
+
+
+def test_a_pose_of_a_camera_by_hand(folder):
+    change(folder, "handheld: true", "handheld: true\n    pose: {position: [1, 0, 0], look_at:"
+           " [0, 0, 0]}")  # fmt: skip
+    message = fault(folder)
+    assert "stations.phone.pose: a camera that is held by hand has no one pose" in message
+
+
+def test_a_board_alone_by_hand(folder):
+    change(folder, "observe: legs", "observe: board")
+    change(folder, "stations:", "board: cameras/phone.yaml\nstations:")
+    assert "photographs by hand of a board alone tell nothing of the machine" in fault(folder)
+
+
+def test_two_stations_of_one_name(folder):
+    jpeg(folder / "other" / "0001.jpg")
+    change(
+        folder,
+        "stations:",
+        "stations:\n  phone-0001-1: {camera: cameras/phone.yaml,"
+        ' images: "other/{configuration}.jpg", observe: legs}',
+    )
+    message = fault(folder)
+    assert "two stations, or photographs by hand, have the same name; found phone-0001-1" in message
+
+
+# cameras by EXIF, and turned photographs
+
+
+def test_a_camera_by_exif(folder):
+    change(folder, "cameras/phone.yaml", "exif")
+    station = load_session(folder).stations[0]
+    assert station.from_exif
+    assert station.camera.image_size == (8, 6)
+    # a 26 mm lens sees as much along its picture's diagonal as on film of 36 x 24 mm
+    np.testing.assert_allclose(station.camera.parameters[:2], 26 * 10 / np.hypot(36, 24))
+    np.testing.assert_allclose(station.camera.parameters[2:4], [3.5, 2.5])
+    sigma = np.sqrt(np.diag(station.camera.covariance))
+    assert 0.02 < sigma[0] / station.camera.parameters[0] < 0.05
+
+
+def test_a_photograph_without_a_focal_length(folder):
+    change(folder, "cameras/phone.yaml", "exif")
+    jpeg(folder / "images/phone/0000-2.jpg", Exif(6, None))
+    message = fault(folder)
+    assert "0000-2.jpg: the photograph does not tell the focal length" in message
+
+
+def test_photographs_by_different_lenses(folder):
+    change(folder, "cameras/phone.yaml", "exif")
+    jpeg(folder / "images/phone/0001-1.jpg", Exif(6, 52.0))
+    message = fault(folder)
+    assert "tell different focal lengths or sizes" in message
+    assert "52 mm at 8x6, where images/phone/0000-1.jpg has 26 mm at 8x6" in message
+
+
+def test_the_sensors_picture_is_the_size_of_most(tmp_path):
+    files = [
+        (jpeg(tmp_path / "a.jpg", Exif(1, 26.0)), "a.jpg"),
+        (jpeg(tmp_path / "b.jpg", Exif(1, 26.0)), "b.jpg"),
+        (jpeg(tmp_path / "c.jpg", Exif(1, 26.0), np.rot90(PICTURE)), "c.jpg"),
+    ]
+    assert camera_by_exif(files, "session.yaml").image_size == (8, 6)
+
+
+@pytest.mark.parametrize(("orientation", "quarters"), [(None, 1), (6, -1), (8, 1)])
+def test_a_turned_photograph_is_turned_back(tmp_path, orientation, quarters):
+    """By its EXIF; without, a portrait picture of a landscape sensor was turned clockwise."""
+    portrait = np.rot90(PICTURE, -1)
+    exif = None if orientation is None else Exif(orientation, 26.0)
+    path = jpeg(tmp_path / "a.jpg", exif, portrait)
+    stored = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    np.testing.assert_array_equal(decode(path, (8, 6), "a.jpg"), np.rot90(stored, quarters))
+
+
+def test_a_turned_photograph_is_told(folder):
+    jpeg(folder / "images/phone/0000-2.jpg", Exif(1, 26.0), np.rot90(PICTURE))
+    (warning,) = load_session(folder).warnings
+    assert warning.startswith("images/phone/0000-2.jpg: turned by a quarter against its camera")
+
+
+# a simulated session, and what is estimated from it
+
+
+SETTINGS = Settings(configurations=3, repeats=1, handheld=True, tolerance=0.0)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """Three photographs by hand of a machine as drawn, with focal lengths that breathe."""
+    folder = tmp_path_factory.mktemp("byhand") / "session"
+    machine = load_mechanism("gough-stewart")
+    rendered(folder, machine, camera_of_size((640, 480)), SETTINGS, seed=7)
+    return folder
+
+
+def test_a_simulated_session_by_hand_loads(simulated):
+    session = load_session(simulated)
+    truth = load_truth(simulated, session.machine)
+    names = [f"phone-000{k}-1" for k in range(3)]
+    assert [station.name for station in session.stations] == list(truth.stations) == names
+    assert session.warnings == ()
+    assert np.ptp(truth.focal_scale) > 1e-3
+    np.testing.assert_array_equal(truth.photographs, [[0, 0], [1, 1], [2, 2]])
+
+
+def test_simulated_photographs_say_how_they_were_held(simulated):
+    """What EXIF asks viewers to do puts the platform above the base."""
+    session = load_session(simulated)
+    truth = load_truth(simulated, session.machine)
+    asked = {1: (0, -1), 3: (0, 1), 6: (-1, 0), 8: (1, 0)}  # where up is in the stored picture
+    for station, T in zip(session.stations, truth.T_camera_base, strict=True):
+        exif = read_exif(station.photographs[0].path.read_bytes())
+        assert T[:2, 2] @ asked[exif.orientation] > np.cos(np.pi / 4) * np.linalg.norm(T[:2, 2])
+        assert exif.focal_35mm == pytest.approx(705 / 1000 * np.hypot(36, 24), rel=0.03)
+
+
+def test_places_by_hand_are_drawn_apart_and_rolled():
+    """With few photographs too: one to three of a configuration, all from places of their own."""
+    machine, camera = load_mechanism("gough-stewart"), camera_of_size((400, 300))
+    places = places_by_hand(machine, (camera,) * 24, np.random.default_rng(0))
+    at = np.array([place.position for place in places])
+    apart = np.linalg.norm(at[:, None] - at, axis=-1) + 9 * np.eye(24)
+    assert apart.min() > 0.02
+    up = np.array([place.T_camera_base()[:2, 2] for place in places])
+    roll = np.abs(np.degrees(np.arctan2(up[:, 0], -up[:, 1])))
+    held_upright = np.abs(roll - 90) < 16
+    assert np.all(held_upright | (roll < 16))
+    assert 3 <= held_upright.sum() <= 14
+
+
+def at_truth(monkeypatch, folder, off=2e-3):
+    """Let photographs by hand be placed where they were taken, nearly."""
+    rng = np.random.default_rng(1)
+
+    def place(session, photographs, _poses, boards, _known):
+        truth = load_truth(folder, session.machine).T_camera_base
+        return Placed(session, photographs, boards, perturb(truth, off * rng.normal(size=(3, 6))))
+
+    monkeypatch.setattr("pkmcal.calibration.calibrate.place_by_hand", place)
+
+
+@pytest.fixture
+def breathed(simulated, monkeypatch, tmp_path):
+    """The calibration of a machine that is known exactly, so that photographs tell all they can of
+    their focal lengths."""
+    folder = tmp_path / "session"
+    shutil.copytree(simulated, folder)
+    text = (folder / "mechanism.yaml").read_text()
+    (folder / "mechanism.yaml").write_text(
+        re.sub(r"(?m)^tolerance:.*$", "tolerance: {center: 1e-5, offset: 1e-5, radius: 1e-5}", text)
+    )
+    at_truth(monkeypatch, folder)
+    return calibrate(folder), load_truth(folder, load_mechanism("gough-stewart"))
+
+
+def test_focal_lengths_are_found_within_their_deviations(breathed):
+    calibration, truth = breathed
+    stations = document_of(calibration)["stations"]
+    found = np.array([station["focal_scale"] for station in stations])
+    sigma = np.array([station["sigma_focal_scale"] for station in stations])
+    assert np.all(sigma <= BREATHING_SIGMA)  # no data take away what is known beforehand
+    assert sigma.min() < 0.99 * BREATHING_SIGMA
+    assert np.all(np.abs(found - truth.focal_scale) < 3.5 * sigma)
+
+
+def test_normals_turn_with_the_focal_length_as_stated(looked):
+    """The same photograph measured with a camera whose focal lengths are larger by a thousandth."""
+    session, photographs, _, truth = looked
+    p, excess = photographs[EASIEST], 1e-3
+    T, pose = truth.T_camera_base[EASIEST], truth.T_base_platform[[EASIEST]]
+    wider = replace(p.camera, parameters=p.camera.parameters + excess * focal_part(p.camera))
+    first, other = (
+        legs.measure(replace(p, camera=camera), session.machine, T, pose, 0.7, refine_camera=True)
+        for camera in (p.camera, wider)
+    )
+    same = [
+        int(np.flatnonzero(hit)[0])
+        if (hit := (other.edges.leg == e.leg[k]) & (other.edges.tube == e.tube[k])
+            & (other.edges.side == e.side[k])).any()
+        else -1
+        for e in [first.edges] for k in range(len(e))
+    ]  # fmt: skip
+    mine = np.flatnonzero(np.array(same) >= 0)
+    turned = other.edges.normal[np.array(same)[mine]] - first.edges.normal[mine]
+    turned = np.einsum("nji,nj->ni", first.edges.basis[mine], turned)[:, 0]
+    stated = (first.edges.by_intrinsics[mine] @ focal_part(p.camera))[:, 0] * excess
+    assert np.abs(stated).max() > 1e-4
+    slope = (turned @ stated) / (stated @ stated)
+    assert slope == pytest.approx(1.0, abs=0.1)
+
+
+def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
+    """The chain from a photograph's focal length to the rows, against differences of the rows."""
+    calibration, _ = breathed
+    assembled = assemble(
+        calibration.session.machine,
+        calibration.measurements,
+        default_gauge(calibration.session.machine),
+    )
+    state = batch_of(calibration.session.machine, assembled, calibration.estimate.state)
+    problem, u = assembled.problem, assembled.problem.unknowns
+    linear = problem.linearize(state)
+    step = 1e-3
+    for s in range(3):
+        change = np.zeros((1, u.count))
+        change[0, u.breathing.start + s] = step
+        moved = problem.moved(state, change, np.zeros((1, 3, 6)))
+        slope = (problem.residuals(moved).value - problem.residuals(state).value) / step
+        here = linear.by_shared[..., u.breathing.start + s]
+        np.testing.assert_allclose(slope[linear.usable], here[linear.usable], atol=1e-6)
+        assert np.abs(here).max() > 0.1
+
+
+def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
+    """Where each edge is its station's only one, no unknown stands for its shading."""
+    calibration, _ = breathed
+    machine = calibration.session.machine
+    assembled = assemble(machine, calibration.measurements, default_gauge(machine))
+    assert assembled.problem.unknowns.n_lines == 0
+    plain = replace(calibration.measurements, shaded=False)
+    noise = [
+        np.linalg.inv(assemble(machine, m, default_gauge(machine)).problem.data.whiten[0, 0, 0])
+        for m in (calibration.measurements, plain)
+    ]
+    first = int(np.flatnonzero(calibration.measurements.edges.configuration == 0)[0])
+    shift = SHADING_SIGMA * calibration.measurements.edges.shift[first]
+    grown = noise[0] @ noise[0].T - noise[1] @ noise[1].T
+    np.testing.assert_allclose(grown, np.outer(shift, shift), rtol=1e-6, atol=1e-18)
+
+
+# recognition
+
+
+@pytest.fixture(scope="module")
+def looked(simulated):
+    """The session, its photographs, the platform's poses and the truth."""
+    session = load_session(simulated)
+    truth = load_truth(simulated, session.machine)
+    return session, read_photographs(session), platform_poses(session), truth
+
+
+def placed(looked, monkeypatch, doubts):
+    """Places of photographs that are found where they were taken, with doubts; none: elsewhere."""
+    session, photographs, poses, truth = looked
+    left = iter(zip(truth.T_camera_base, doubts, strict=True))
+
+    def find(_view, _image):
+        T, doubt = next(left)
+        lead = np.log(1 / doubt - 1)
+        return Alone(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
+
+    monkeypatch.setattr(byhand, "find_alone", find)
+    monkeypatch.setattr(byhand, "WORKERS", 1)
+    nowhere = np.full((3, 4, 4), np.nan)
+    return byhand.place_by_hand(session, photographs, poses, Boards(), nowhere)
+
+
+def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
+    found = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4])
+    assert [s.name for s in found.session.stations] == ["phone-0000-1", "phone-0002-1"]
+    assert [p.station for p in found.photographs] == [0, 1]
+    np.testing.assert_array_equal(found.T_camera_base, looked[3].T_camera_base[[0, 2]])
+    (warning,) = found.session.warnings
+    assert warning.startswith(
+        "images/phone/0001-1.jpg: left out, for its edges fit the legs nearly"
+    )
+    assert "probability 0.30" in warning
+
+
+def test_no_photograph_by_hand_is_recognised(looked, monkeypatch):
+    with pytest.raises(InputError, match="recognised in none of the photographs by hand"):
+        placed(looked, monkeypatch, [0.3, 0.3, 0.3])
+
+
+def test_photographs_of_one_configuration_are_recognised(looked, monkeypatch):
+    with pytest.raises(InputError, match="are recognised show one configuration only"):
+        placed(looked, monkeypatch, [0.3, 1e-4, 0.3])
+
+
+def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
+    """One whose edges the estimate gives up, or that it moves away, is left out."""
+    calibration, _ = breathed
+    session, measurements = calibration.session, calibration.measurements
+    estimate, T = calibration.estimate, calibration.estimate.state.T_camera_base
+    assert misplaced(session, measurements, estimate, T) == []
+    weights = estimate.edge_weights.copy()
+    weights[measurements.edges.station == 1] *= 0.4
+    given_up = replace(estimate, edge_weights=weights)
+    wrong = misplaced(session, measurements, given_up, T)
+    assert wrong == [1]
+    turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
+    assert misplaced(session, measurements, estimate, perturb(T, turn)) == [2]
+    rest = without_misplaced(session, [], Boards(), T, wrong)
+    assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
+    assert "too few of its edges agree" in rest.session.warnings[-1]
+
+
+def test_tubes_stand_out_of_a_chart():
+    """A bright bar is a pair of its width and direction, and the rarest thing in the picture."""
+    image = np.full((300, 400), 60, np.uint8)
+    cv2.line(image, (100, 220), (300, 80), 200, 10, cv2.LINE_AA)
+    chart = tube_chart(image, camera_of_size((400, 300)))
+    clear = chart.rarity.max(axis=(2, 3))
+    wide = int(chart.width_number(np.array(10.0)))
+    normal = round(np.arctan2(200, 140) % np.pi * DIRECTIONS / np.pi)
+    assert clear[wide, normal] > WORTH * np.log(20)
+    assert clear[wide, (normal + DIRECTIONS // 2) % DIRECTIONS] == 0
+
+
+def test_one_photograph_is_found_from_nothing(looked):
+    """Ten seconds: all places about the machine, of the easiest of the three photographs."""
+    session, photographs, poses, truth = looked
+    k = EASIEST
+    p = photographs[k]
+    view = StationView(
+        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
+        poses, distance_tables(p.images),
+    )  # fmt: skip
+    found = find_alone(view, p.images[0])
+    off = pose_difference(found.T_camera_base[0], truth.T_camera_base[k])
+    assert found.doubt < DOUBT
+    assert np.degrees(np.linalg.norm(off[:3])) < 4
+    assert np.linalg.norm(off[3:]) < 0.1
+
+
+def test_turns_of_a_machine_onto_itself(looked):
+    """A hexapod has equal thirds: two other places from which it looks alike."""
+    session, photographs, poses, truth = looked
+    p = photographs[0]
+    view = StationView(
+        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
+        poses, distance_tables(p.images),
+    )  # fmt: skip
+    alike = turned_about(view, truth.T_camera_base[:1])
+    assert len(alike) == 2
+    base = session.machine.base_centers()
+    seen = apply(alike[:, None], base)
+    first = apply(truth.T_camera_base[0], base)
+    for turned in seen:
+        apart = np.linalg.norm(turned[:, None] - first, axis=-1)
+        assert np.all(apart.min(axis=1) < 0.06)
+        assert np.all(apart.argmin(axis=1) != np.arange(6))
