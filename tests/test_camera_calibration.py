@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import cv2
@@ -223,14 +222,6 @@ def test_lines_are_great_circles(true):
     shifted[10] += [0.3, 0.4]
     off = line_offsets(true, shifted, BOARD.lines)
     assert 0.1 < np.abs(off).max() < 0.5
-
-
-def test_ten_views_in_time():
-    true = TRUE["unified"]
-    found = detections(true, poses_for(true, 10, 1), 2)
-    began = time.process_time()
-    calibrate_camera(found, BOARD)
-    assert time.process_time() - began < 5
 
 
 # What is refused, and what is only said
