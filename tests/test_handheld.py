@@ -15,6 +15,7 @@ from pkmcal.calibration.calibrate import calibrate
 from pkmcal.calibration.gather import focal_part
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.results import document_of
+from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
 from pkmcal.files import Exif, read_exif, with_exif
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
@@ -381,9 +382,8 @@ def looked(simulated):
     return session, read_photographs(session), platform_poses(session), truth
 
 
-def placed(looked, monkeypatch, doubts):
-    """Places of photographs that are found where they were taken, with doubts; none: elsewhere."""
-    session, photographs, poses, truth = looked
+def found_with(monkeypatch, truth, doubts):
+    """Photographs are found where they were taken, with doubts."""
     left = iter(zip(truth.T_camera_base, doubts, strict=True))
 
     def find(_view, _image):
@@ -393,6 +393,12 @@ def placed(looked, monkeypatch, doubts):
 
     monkeypatch.setattr(byhand, "find_alone", find)
     monkeypatch.setattr(byhand, "WORKERS", 1)
+
+
+def placed(looked, monkeypatch, doubts):
+    """Places of photographs that are found where they were taken, with doubts; none: elsewhere."""
+    session, photographs, poses, truth = looked
+    found_with(monkeypatch, truth, doubts)
     nowhere = np.full((3, 4, 4), np.nan)
     return byhand.place_by_hand(session, photographs, poses, Boards(), nowhere)
 
@@ -407,6 +413,17 @@ def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
         "images/phone/0001-1.jpg: left out, for its edges fit the legs nearly"
     )
     assert "probability 0.30" in warning
+
+
+def test_check_tells_which_photographs_are_sure(simulated, looked, monkeypatch):
+    found_with(monkeypatch, looked[3], [1e-4, 0.3, 1e-4])
+    found = check_session(simulated)
+    assert [station.recognised for station in found.stations] == [True, False, True]
+    assert found.stations[0].legs > 2
+    said = [finding.text for finding in found.findings]
+    assert any(text.startswith("phone-0001-1 is left out, for its edges fit") for text in said)
+    assert not any("not recognised" in text for text in said)
+    assert found.forecast is None
 
 
 def test_no_photograph_by_hand_is_recognised(looked, monkeypatch):

@@ -33,8 +33,6 @@ from pkmcal.wording import listed
 SURE = 1e-2
 """Probability that a photograph shows the machine from another place, below which it is believed:
 of a hundred one may be wrong, and the joint estimate finds that one out."""
-
-
 FEWEST_EDGES = 4
 """Edges of a photograph that tell its place: two numbers each, of which a pose and a focal length
 take seven."""
@@ -64,6 +62,16 @@ def place_by_hand(
     drawing. known : T_camera_base (S, 4, 4) of the stations that are placed already, NaN for the
     others. Raises `InputError` where no photograph by hand is placed.
     """
+    found = found_alone(session, photographs, poses)
+    believed = _believed(found, boards, known)
+    lost = {k: why_lost(one) for k, one in found.items() if np.isnan(believed[k]).any()}
+    return _without(session, photographs, boards, believed, lost)
+
+
+def found_alone(
+    session: Session, photographs: list[legs.Photographs], poses: Array
+) -> dict[int, Alone]:
+    """The places that each photograph by hand could show, by its station's number."""
     at = {p.station: p for p in photographs}
     by_hand = [k for k in at if session.stations[k].handheld]
     tubes = tubes_of(session.machine)
@@ -76,10 +84,7 @@ def place_by_hand(
         return find_alone(view, p.images[0])
 
     with ThreadPoolExecutor(WORKERS) as pool:
-        found = dict(zip(by_hand, pool.map(search, by_hand), strict=True))
-    believed = _believed(found, boards, known)
-    lost = {k: _why(found[k]) for k in by_hand if np.isnan(believed[k]).any()}
-    return _without(session, photographs, boards, believed, lost)
+        return dict(zip(by_hand, pool.map(search, by_hand), strict=True))
 
 
 def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
@@ -140,7 +145,7 @@ def _of(
     )
 
 
-def _why(found: Alone) -> str:
+def why_lost(found: Alone) -> str:
     """Why a photograph could not be placed, in words."""
     return (
         "its edges fit the legs nearly as well from another place, which with probability"

@@ -19,11 +19,11 @@ from threadpoolctl import threadpool_limits
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards, StationBoard, board_of, station_board
+from pkmcal.calibration.byhand import found_alone, why_lost
 from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.doubts import check_poses, richer_models, turning
 from pkmcal.calibration.gather import measurements_of, refinement_of
 from pkmcal.calibration.recognise import (
-    Recognition,
     board_images,
     check_observable,
     known_stations,
@@ -46,6 +46,7 @@ from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.observe import legs
 from pkmcal.observe.images import decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
+from pkmcal.observe.stations import FoundStation
 from pkmcal.outcome import (
     Finding,
     Level,
@@ -83,8 +84,8 @@ END = 0.15
 FEW_CONFIGURATIONS = 8
 """Configurations below which standard deviations are large and mistakes go unnoticed."""
 STATION_LEGEND = (
-    "By chance: probability of other readings fitting as well; good below 0.001,",
-    "or 0.01 near a pose by hand.",
+    "By chance: probability of other readings fitting as well (of a photograph by",
+    "hand, another place); good below 0.001, or 0.01 near a pose or by hand.",
     "Moved: from the pose by hand to the one found. Legs: found in a photograph.",
     "White, black: of the legs' pixels. Blur: of the sharpest edges.",
 )
@@ -226,7 +227,8 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
     stations, joints = seen.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
     told("What such photographs will give", 0.8)
-    expected = forecast(seen.look) if seen.look else None
+    by_hand = any(station.handheld for station in session.stations)  # no place to come back to
+    expected = forecast(seen.look) if seen.look and not by_hand else None
     for station in stations:
         findings += _station_findings(station, session.machine.n_legs)
     return SessionCheck(
@@ -356,27 +358,36 @@ def _observed(
         starts = None if lost else known_stations(session, boards.boards)
     except PkmcalError as error:
         return _Observed(unlooked(), (wrong(error), *boards.findings))
-    found = recognise(session, whole, poses, rngs[1:], boards.boards, starts)
+    fixed = [p for p in whole if not session.stations[p.station].handheld]
+    recognition = recognise(session, fixed, poses, rngs[1 : len(fixed) + 1], boards.boards, starts)
+    places = {p.station: found for p, found in zip(fixed, recognition.found, strict=True)}
+    alone = found_alone(session, whole, poses)
+    for k, one in alone.items():  # what chance is to others, another place is to one alone
+        places[k] = FoundStation(
+            one.T_camera_base[0], math.nan, float(one.evidence[0]), one.doubt, told=True
+        )
+        if not places[k].good:
+            name = session.stations[k].name
+            told = (*told, doubtful(f"{name} is left out, for {why_lost(one)}.", name))
     stations = [  # as it is known of one that observes no legs
         StationCheck(station.name, len(station.photographs), k in boards.checks)
         for k, station in enumerate(session.stations)
     ]
     looks: list[StationLook] = []
     for p in whole:
-        stations[p.station], look = _station(session, p, found, poses)
+        stations[p.station], look = _station(session, p, places[p.station], poses)
         looks.append(look)
     stations = tuple(replace(s, board=boards.checks.get(k)) for k, s in enumerate(stations))
     look = Look(session, poses, tuple(looks)) if looks else None
-    mistake = mistake_in(session, whole, found, rngs[0])
+    mistake = mistake_in(session, fixed, recognition, rngs[0])
     return _Observed(stations, (*([wrong(mistake)] if mistake else []), *told), look)
 
 
 def _station(
-    session: Session, photographs: legs.Photographs, recognition: Recognition, poses: Array
+    session: Session, photographs: legs.Photographs, pose: FoundStation, poses: Array
 ) -> tuple[StationCheck, StationLook]:
     """One station in which the machine was looked for."""
     number = photographs.station
-    pose = recognition.found[legs_stations(session).index(number)]
     station, machine = session.stations[number], session.machine
     by_hand = station.T_camera_base
     look = StationLook(station.name, photographs, by_hand, pose.T_camera_base, None)
