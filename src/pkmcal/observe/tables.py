@@ -55,11 +55,10 @@ class DistanceTables:
     edges: tuple[PictureEdges, ...]
     moving: Array
     chance: Array
-    turn: float = np.pi
 
     def direction(self, normal: Array) -> Integers:
         """Direction number of edges whose image normals are (..., 2)."""
-        return direction_of(normal, self.tables.shape[1], self.turn)
+        return direction_of(normal, self.tables.shape[1])
 
     def look(
         self, direction: Integers, pixel: Array, photograph: Integers
@@ -123,12 +122,12 @@ class DistanceTables:
         )
 
 
-def direction_of(normal: Array, count: int = DIRECTIONS, turn: float = np.pi) -> Integers:
-    """Direction number, of ``count``, of edges whose image normals are (..., 2); turn : pi where
-    the sign does not matter, 2 pi where it does.
+def direction_of(normal: Array, count: int = DIRECTIONS) -> Integers:
+    """Direction number, of ``count``, of edges whose image normals are (..., 2); the sign does not
+    matter.
     """
-    angle = np.arctan2(normal[..., 1], normal[..., 0]) % turn
-    number = np.floor(np.nan_to_num(angle) * (count / turn))
+    angle = np.arctan2(normal[..., 1], normal[..., 0]) % np.pi
+    number = np.floor(np.nan_to_num(angle) * (count / np.pi))
     return number.astype(np.intp) % count
 
 
@@ -154,7 +153,6 @@ def distance_tables(
     images: list[Integers],
     width: int = WORKING_WIDTH,
     directions: int = DIRECTIONS,
-    turn: float = np.pi,
 ) -> DistanceTables:
     """Tables of one station's photographs, K arrays (height, width) uint8 of one size."""
     import cv2
@@ -168,14 +166,14 @@ def distance_tables(
         [
             distances(
                 e.pixel.astype(int),
-                direction_of(e.normal, directions, turn),
+                direction_of(e.normal, directions),
                 small[0].shape,
                 directions,
             )
             for e in edges
         ]
     )
-    return DistanceTables(tables, scale, edges, _moving(small, still, edges), _chance(tables), turn)
+    return DistanceTables(tables, scale, edges, _moving(small, still, edges), _chance(tables))
 
 
 def _levels(image: Any) -> Integers:
