@@ -20,6 +20,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import CsvTable, Document, Keys, read_csv, read_yaml, shown, validate, wanted_file
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.mechanisms.region import Region
 from pkmcal.session.exif import EXIF, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
@@ -87,6 +88,7 @@ class Session:
     trackers : what measured without photographs; in numbers of stations they follow these.
     model : the machine's model by its name in the mechanism file, None for the file's own.
     mechanism : where the machine came from, for other models of it.
+    workspace : where the tool is to be right, None where the file does not say.
     """
 
     folder: Path
@@ -102,6 +104,7 @@ class Session:
     trackers: tuple[PoseTable, ...] = ()
     model: str | None = None
     mechanism: Path | str = ""
+    workspace: Region | None = None
 
     @property
     def station_names(self) -> tuple[str, ...]:
@@ -162,6 +165,7 @@ def load_session(folder: Path | str, model: str | None = None) -> Session:
         trackers=tuple(trackers),
         model=model,
         mechanism=source,
+        workspace=_workspace(document, schema),
     )
 
 
@@ -280,6 +284,15 @@ def _check_base_board(document: Document, schema: SessionDocument, users: list[s
         next_step="If the board is on the platform, write board: {file: "
         f"{schema.board.file if schema.board else 'board.yaml'}, fixed_to: platform}}",
     )
+
+
+def _workspace(document: Document, schema: SessionDocument) -> Region | None:
+    if schema.workspace is None:
+        return None
+    try:
+        return Region(**schema.workspace.model_dump())
+    except InputError as error:
+        raise error.located(document.where("workspace")) from None
 
 
 def _of_little_use(document: Document, schema: SessionDocument) -> list[str]:
