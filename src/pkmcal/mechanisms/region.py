@@ -144,17 +144,14 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
         kept.append(poses)
         found, tried = found + len(poses), tried + more
     if not found:
+        home = ", ".join(f"{x:.0f}" for x in np.round(1e3 * limits.home[:3, 3]) + 0.0)
         raise InputError(
             what="the machine can take no pose of the workspace that was asked for",
             found=f"{region}; {tried} poses tried",
-            expected=f"a part of its own: about home, {_told(limits.home[:3, 3])} m",
+            expected=f"a part of the machine's own, which is about home, [{home}] mm",
             next_step="widen the workspace, or check the ranges in the mechanism file",
         )
     return np.concatenate(kept)[:count]
-
-
-def _told(place: Array) -> str:
-    return "[" + ", ".join(f"{x:.3g}" for x in place) + "]"
 
 
 def _turn(limits: Limits) -> float:
