@@ -113,7 +113,7 @@ def _exact_edges(
     with np.errstate(invalid="ignore"):
         seen = camera.in_image(camera.project(points))
         seen &= (leg_is_seen(a_e, b_e, radius) & (last > first))[..., None]
-    seen &= ~_hidden(points, tubes, radius, a, b, _pixel_angle(camera))
+    seen &= ~hidden(points, tubes.leg, tubes.tube, tubes, radius, a, b, pixel_angle(camera))
     begin, count = _longest_run(seen)
     photo, edge = np.nonzero(count >= LEAST_SEEN)
     begin, count = begin[photo, edge], count[photo, edge]
@@ -133,17 +133,20 @@ def _exact_edges(
     return edges, rays
 
 
-def _hidden(
-    points: Array, tubes: TubeList, radius: Array, a: Array, b: Array, pixel: float
-) -> Booleans:
-    """(M, E, n) True where a tube of another leg, or of the own one, is in front of a point.
+def hidden(
+    points: Array, leg: Integers, tube: Integers, tubes: TubeList, radius: Array,
+    a: Array, b: Array, pixel: float,
+) -> Booleans:  # fmt: skip
+    """(M, G, n) True where a tube of another leg, or of the own one, is in front of a point.
 
-    pixel : angle of a pixel, rad; another leg hides what comes within CLEARANCE of it, too.
+    points : (M, G, n, 3), camera frame, m. leg, tube : (G,) what they lie on, -1 for nothing of the
+    machine. radius : (E,) of the tubes. a, b : (M, L, 3) the legs' ends. pixel : angle of a pixel,
+    rad; another leg hides what comes within CLEARANCE of it, too.
     """
     distance = np.sqrt(dot(points, points))
     margin = CLEARANCE * pixel * distance
     d = points / distance[..., None]
-    hidden = np.zeros(distance.shape, dtype=bool)
+    out = np.zeros(distance.shape, dtype=bool)
     for e in range(0, len(tubes.leg), 2):  # both sides of a tube are one cylinder
         j = tubes.leg[e]
         start, end = a[:, None, None, j], b[:, None, None, j]
@@ -153,18 +156,18 @@ def _hidden(
         # |t d - start|^2 across u, as a quadratic in t
         qa = np.maximum(1 - du**2, 1e-12)
         qb = dot(d, start) - du * au
-        other = (tubes.leg != j)[:, None]
+        other = (leg != j)[:, None]
         qc = dot(start, start) - au**2 - (radius[e] + other * margin) ** 2
         disc = qb**2 - qa * qc
         t = (qb - np.sqrt(np.maximum(disc, 0.0))) / qa
         s = t * du - au
         inside = (s > tubes.start[e]) & (s < np.minimum(tubes.stop[e], length))
         meets = (disc > 0) & inside & (t > 0) & (t < distance)
-        hidden |= meets & (other | (tubes.tube != tubes.tube[e])[:, None])
-    return hidden
+        out |= meets & (other | (tube != tubes.tube[e])[:, None])
+    return out
 
 
-def _pixel_angle(camera: Camera) -> float:
+def pixel_angle(camera: Camera) -> float:
     """Angle (rad) between neighbouring pixels in the middle of the image."""
     middle = (np.array(camera.image_size) - 1) / 2
     rays = camera.ray(middle + np.array([[0.0, 0.0], [1.0, 0.0]]))

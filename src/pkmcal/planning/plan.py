@@ -1,0 +1,497 @@
+"""The next configurations worth measuring, and where to put the camera: ``pkmcal plan``.
+
+Configurations are chosen among many that the machine can take, then bettered about where they are;
+places of a camera among those on a sphere, or among a session's stations. What the plan promises is
+the covariance that the joint estimate would state of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import InputError
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.region import Region, poses_in
+from pkmcal.planning.candidates import Configurations, configurations, neighbours, places
+from pkmcal.planning.exchange import INDICES, Told, exchanged, greedy
+from pkmcal.planning.information import CandidateRows, Candidates, Known, information_of
+from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
+from pkmcal.planning.route import distances, length, shortest_way
+from pkmcal.planning.subject import Subject
+from pkmcal.simulation.placement import StationPlace, usable
+from pkmcal.wording import listed
+
+CAPTURE = 15
+"""Configurations from each place, unless told."""
+CANDIDATES = 400
+"""Configurations among which is chosen."""
+AT_WORK = 60
+"""Poses of the workspace at which the tool counts."""
+BETTERED = 2
+"""Rounds in which the chosen configurations are moved."""
+FOR_PLACES = 24
+"""Configurations by which places of a camera are compared."""
+RANDOM = 10
+"""Choices by chance that a plan is compared with."""
+TIMES = (2, 4)
+"""How many times as many photographs are told as well."""
+PAYS = 0.01
+"""Part of its standard deviation by which one more configuration from each place has to better the
+tool to be worth it: the hundredth that a hundred others would add up to."""
+BETWEEN = 8
+"""Poses looked at on the way from one configuration to the next."""
+REROUTED = 5
+"""Times that another way is looked for where one is blocked."""
+PREFIXES = ("p", "q", "plan", "next-")
+"""Of new configurations' names, the first that no configuration of the session has."""
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Standard deviations of the platform's position (m) and turn (rad), mean over the workspace,
+    with ``count`` configurations from each place.
+    """
+
+    count: float
+    position: float
+    orientation: float
+
+
+@dataclass(frozen=True)
+class TriedPlace:
+    """A camera's place that was tried. alone : m, the platform's position with all configurations
+    from there. chosen : whether it is part of the plan.
+    """
+
+    place: StationPlace
+    alone: float
+    chosen: bool
+
+
+@dataclass(frozen=True)
+class MeasurementPlan:
+    """What to measure next, in this order.
+
+    source : what it is for; with the chosen places where these were free. stations : names that
+    measure each configuration, (n,) tuples. names, joints (n, m), T_base_platform (n, 4, 4) : the
+    configurations, of which those of ``rank`` up to k are the best k from each place. index : what
+    was made small. value : its value, and at_random : that of
+    configurations drawn evenly over the joints' ranges, mean. now, promised, by_chance : accuracy
+    before, with the plan, with such configurations. curve : with fewer and with more. region : the
+    workspace. blocked : (n,) True where the straight way to a configuration leaves what the machine
+    can take, or its legs touch. travel : how long the slowest motor moves in all, in parts of its
+    range, and by chance. tried : places of a camera.
+    """
+
+    source: Subject
+    stations: tuple[tuple[str, ...], ...]
+    names: tuple[str, ...]
+    joints: Array
+    T_base_platform: Array
+    rank: Integers
+    index: str
+    value: float
+    at_random: float
+    now: Accuracy
+    promised: Accuracy
+    by_chance: Accuracy
+    curve: tuple[Accuracy, ...]
+    region: Region
+    work: Array
+    blocked: Booleans
+    travel: tuple[float, float]
+    tried: tuple[TriedPlace, ...] = ()
+    together: bool = False
+
+    @property
+    def pays_until(self) -> float | None:
+        """Configurations from each place after which one more betters the tool by less than
+        :data:`PAYS`; None where all of those planned pay.
+        """
+        for before, after in pairwise(self.curve):
+            each = 1 - (after.position / before.position) ** (1 / (after.count - before.count))
+            if each < PAYS and after.count <= self.promised.count:
+                return before.count
+        return None
+
+
+def plan(
+    source: Subject,
+    *,
+    count: int = CAPTURE,
+    index: str = "tool",
+    region: Region | None = None,
+    together: bool | None = None,
+    free_places: int | None = None,
+    best_of: int | None = None,
+    seed: int = SEED,
+    told: Told | None = None,
+) -> MeasurementPlan:
+    """The plan.
+
+    count : configurations from each place; of all stations, where these measure together. index :
+    one of :data:`~pkmcal.planning.exchange.INDICES`. region : where the tool counts; the whole
+    reach if absent. together : whether all stations measure every configuration; by default where
+    they have cameras or trackers of their own. free_places : how many places of the camera to
+    choose on a sphere about the machine. best_of : how many of the source's stations to choose.
+    seed : of what is drawn. told : called with the share done.
+    Raises InputError for what cannot be planned.
+    """
+    told = told or (lambda _share: None)
+    rig, rng = source.rig, np.random.default_rng(seed)
+    _check(rig, count, index, free_places, best_of)
+    region = region or Region()
+    work = poses_in(rig.machine.limits(), region, AT_WORK, seed)
+    drawn = configurations(rig.machine, CANDIDATES, rng)
+    told(0.1)
+    tried: tuple[TriedPlace, ...] = ()
+    if free_places or best_of:
+        rig, known, tried = _with_places(source, work, drawn, count, index, free_places, best_of)
+        source = replace(source, rig=rig, known=known)
+    told(0.3)
+    joined = _together(rig) if together is None else together
+    stations = range(len(rig.names))
+    groups = (tuple(stations),) if joined else tuple((s,) for s in stations)
+    made = _Making(rig, source.known, groups, count, index, work)
+    pool = made.pool(drawn)
+    made.check_seen(pool)
+    found = made.chosen(pool, rng, lambda share: told(0.3 + 0.6 * share))
+    told(0.9)
+    return _ordered(source, made, found, pool, region, joined, tried, rng)
+
+
+def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
+    if index not in INDICES:
+        raise InputError(
+            "there is no such index", where="--index", found=index, expected=", ".join(INDICES)
+        )
+    if count < 2:
+        raise InputError(
+            "a plan needs two configurations or more", where="--configurations", found=str(count)
+        )
+    cameras = [one for one in rig.instruments if isinstance(one, LegsFrom | BoardFrom)]
+    if free_places and not cameras:
+        raise InputError(
+            "there is no camera whose place could be chosen",
+            where="--places",
+            next_step="Leave it out; where a tracker stands does not change what it tells",
+        )
+    if best_of and not 1 <= best_of <= len(rig.names):
+        raise InputError(
+            "there are not so many stations to choose from",
+            where="--best-of",
+            found=str(best_of),
+            expected=f"1 to {len(rig.names)}",
+        )
+
+
+def _together(rig: Rig) -> bool:
+    """One camera is carried from place to place; several, or a tracker, measure at once."""
+    tracked = any(isinstance(one, TargetFrom) for one in rig.instruments)
+    return len(rig.names) > 1 and (tracked or len(np.unique(rig.camera_of_station)) > 1)
+
+
+class _Pool(NamedTuple):
+    """Configurations, and what each tells by each group of stations."""
+
+    drawn: Configurations
+    group: Integers
+    info: CandidateRows
+
+    def configuration(self, candidates: Integers) -> Integers:
+        """Numbers of candidates' configurations."""
+        return candidates % len(self.drawn.joints)
+
+    def of(self, candidates: Integers) -> Configurations:
+        """Candidates' configurations."""
+        return Configurations(*(part[self.configuration(candidates)] for part in self.drawn))
+
+
+@dataclass(frozen=True)
+class _Making:
+    """What is chosen, and by what."""
+
+    rig: Rig
+    known: Known | None
+    groups: tuple[tuple[int, ...], ...]
+    count: int
+    index: str
+    work: Array
+
+    def pool(self, drawn: Configurations, rng: np.random.Generator | None = None) -> _Pool:
+        """Candidates with what they tell; rng : as of :func:`information_of`."""
+        candidates = Candidates(*drawn, self.groups)
+        info = information_of(self.rig, candidates, self.work, self.known, rng)
+        return _Pool(drawn, candidates.group, info)
+
+    def chosen(self, pool: _Pool, rng: np.random.Generator, told: Told) -> tuple[_Pool, Integers]:
+        """The best of a pool, bettered about where they are: another pool, and its candidates."""
+        index = INDICES[self.index](pool.info)
+        first = greedy(pool.info, pool.group, self.count, index, lambda x: told(0.4 * x)).chosen
+        chosen = exchanged(pool.info, pool.group, first, index)
+        for k in range(BETTERED):
+            told(0.5 + 0.5 * k / BETTERED)
+            now = pool.of(chosen)
+            near = neighbours(self.rig.machine, now, rng)
+            number, group = np.arange(len(chosen)), pool.group[chosen]
+            pool = self.pool(Configurations(*map(np.concatenate, zip(now, near, strict=True))))
+            chosen = exchanged(
+                pool.info, pool.group, group * len(pool.drawn.joints) + number, index
+            )
+        return pool, chosen
+
+    def check_seen(self, pool: _Pool) -> None:
+        """Raise `InputError` where a group of stations measures nothing anywhere."""
+        for g, group in enumerate(self.groups):
+            if np.any(pool.info.rows[pool.group == g]):
+                continue
+            names = [self.rig.names[s] for s in group]
+            raise InputError(
+                f"from {listed(names)} nothing is seen in any configuration",
+                where=f"session.yaml, stations.{names[0]}",
+                found="no leg, or board, in the picture",
+                expected="a camera that looks at the machine",
+                next_step="Check its pose, or let places be chosen: --places 3",
+            )
+
+
+def _accuracy(info: CandidateRows, covariance: Array, count: float) -> Accuracy:
+    return Accuracy(count, *info.tool(covariance))
+
+
+def _ordered(
+    source: Subject,
+    made: _Making,
+    found: tuple[_Pool, Integers],
+    drawn: _Pool,
+    region: Region,
+    together: bool,
+    tried: tuple[TriedPlace, ...],
+    rng: np.random.Generator,
+) -> MeasurementPlan:
+    """The plan of what was chosen: in the order of the shortest way, with what it promises."""
+    machine, count, groups = source.rig.machine, made.count, made.groups
+    pool, chosen = found
+    index = INDICES[made.index](pool.info)
+    # as good as such photographs turn out, one by one, not as they are on average
+    final = pool.of(chosen)
+    drawn_info = made.pool(final, np.random.default_rng(SEED)).info
+    group = pool.group[chosen]
+    own = drawn_info.only(group * len(chosen) + np.arange(len(chosen)))
+    nested = greedy(own, group, count, index)
+    curve = [_accuracy(own, nested.path[c * len(groups) - 1], c) for c in range(2, count)]
+    everything = np.arange(len(chosen))
+    covariance = own.covariance(own.of(everything))
+    promised = _accuracy(own, covariance, count)
+    more = [_accuracy(own, own.covariance(own.of(everything, t)), t * count) for t in TIMES]
+    by_chance, at_random = _by_chance(made, drawn, rng)
+    rank = np.empty(len(chosen), dtype=int)
+    rank[nested.chosen] = np.arange(len(chosen)) // len(groups) + 1
+    order, blocked, travel = _route(machine, final, group, rng)
+    width = len(str(len(order)))
+    prefix = next(p for p in PREFIXES if not any(name.startswith(p) for name in source.names))
+    return MeasurementPlan(
+        source=source,
+        stations=tuple(tuple(source.rig.names[s] for s in groups[group[k]]) for k in order),
+        names=tuple(f"{prefix}{n + 1:0{width}d}" for n in range(len(order))),
+        joints=final.joints[order],
+        T_base_platform=final.T_base_platform[order],
+        rank=rank[order],
+        index=made.index,
+        value=float(index.value(covariance)),
+        at_random=at_random,
+        now=_accuracy(own, own.covariance(own.known), 0),
+        promised=promised,
+        by_chance=by_chance,
+        curve=(*curve, promised, *more),
+        region=region,
+        work=made.work,
+        blocked=blocked,
+        travel=travel,
+        tried=tried,
+        together=together,
+    )
+
+
+def _by_chance(made: _Making, drawn: _Pool, rng: np.random.Generator) -> tuple[Accuracy, float]:
+    """What configurations drawn evenly over the joints' ranges would give, mean of a few draws."""
+    index = INDICES[made.index](drawn.info)
+    n = len(drawn.drawn.joints)
+    evenly = np.arange(n // 2, n)  # the first half are at the ends of the ranges
+    count = min(made.count, len(evenly))
+    found: list[tuple[float, float, float]] = []
+    for _ in range(RANDOM):
+        rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(len(made.groups))]
+        covariance = drawn.info.covariance(drawn.info.of(np.concatenate(rows)))
+        found.append((*drawn.info.tool(covariance), float(index.value(covariance))))
+    position, orientation, value = np.mean(found, axis=0).tolist()
+    return Accuracy(made.count, position, orientation), value
+
+
+# ------------------------------------------------------------------ the way between them
+
+
+def _route(
+    machine: Machine, found: Configurations, group: Integers, rng: np.random.Generator
+) -> tuple[Integers, Booleans, tuple[float, float]]:
+    """The order (n,), group by group; which steps are blocked (n,); and how long the way is, and
+    one by chance.
+    """
+    home = machine.inverse(machine.home()[None])[0]
+    order: list[Integers] = []
+    barred: list[Booleans] = []
+    own, chance = 0.0, 0.0
+    for g in range(int(group.max()) + 1):
+        rows = np.flatnonzero(group == g)
+        joints, poses = (part[rows] for part in found)
+        apart = distances(np.concatenate([joints, home[None]]), machine.joint_ranges)
+        way, blocked = _free_way(machine, joints, poses, home, apart)
+        order.append(rows[way])
+        barred.append(blocked)
+        own += length(way, apart[:-1, :-1], apart[-1, :-1])
+        chance += length(rng.permutation(len(rows)), apart[:-1, :-1], apart[-1, :-1])
+    return np.concatenate(order), np.concatenate(barred), (own, chance)
+
+
+def _free_way(
+    machine: Machine, joints: Array, poses: Array, home: Array, apart: Array
+) -> tuple[Integers, Booleans]:
+    """A short way that avoids steps on which legs touch or the machine is lost, where that can be;
+    and which of its steps are such.
+    """
+    bars = np.zeros((len(joints), len(joints)), dtype=bool)
+    first = apart[-1, :-1].copy()
+    way = shortest_way(apart[:-1, :-1], first, bars)
+    blocked = _blocked(machine, joints[way], poses[way], home)
+    for _ in range(REROUTED):
+        steps = np.flatnonzero(blocked[1:])
+        if not len(steps) and not blocked[0]:
+            break
+        bars[way[steps], way[steps + 1]] = bars[way[steps + 1], way[steps]] = True
+        if blocked[0]:
+            first[way[0]] += len(joints) * apart.max()
+        way = shortest_way(apart[:-1, :-1], first, bars)
+        blocked = _blocked(machine, joints[way], poses[way], home)
+    return way, blocked
+
+
+def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Booleans:
+    """(n,) whether on the way to each, motors moving evenly, the machine is lost or legs touch."""
+    before = np.concatenate([home[None], joints[:-1]])
+    share = (np.arange(BETWEEN) + 0.5)[:, None, None] / BETWEEN
+    between = (before + share * (joints - before)).reshape(-1, joints.shape[1])
+    found = machine.forward_result(between, np.tile(poses, (BETWEEN, 1, 1)))
+    good = found.converged.copy()
+    at = np.flatnonzero(good)
+    good[at] = usable(machine, found.T_base_platform[at], between[at])
+    return np.asarray(~good.reshape(BETWEEN, -1).all(axis=0))
+
+
+# ------------------------------------------------------------------ places of the camera
+
+
+def _with_places(
+    source: Subject,
+    work: Array,
+    drawn: Configurations,
+    count: int,
+    index: str,
+    free_places: int | None,
+    best_of: int | None,
+) -> tuple[Rig, Known | None, tuple[TriedPlace, ...]]:
+    """The rig with the best places: free ones on a sphere, or some of its own.
+
+    Each place is an information of its own on the machine, its station's place and shading
+    eliminated, from configurations spread over all; the best set of them is chosen as
+    configurations are.
+    """
+    rig = source.rig
+    if free_places:
+        wide, spots = _around(rig)
+    else:
+        wide, spots = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
+    few = np.unique(np.linspace(0, len(drawn.joints) - 1, FOR_PLACES).astype(int))
+    part = Configurations(*(x[few] for x in drawn))
+    told: list[Array] = []
+    alone: list[float] = []
+    info = None
+    for s in range(len(wide.names)):
+        candidates = Candidates(*part, ((0,),))
+        info = information_of(wide.only([s]), candidates, work, _of_machine(source.known))
+        start = np.linalg.inv(info.covariance(info.known))
+        after = info.covariance(info.of(np.arange(len(few)), count / len(few)))
+        told.append(np.linalg.inv(after) - start)
+        alone.append(info.tool(after)[0])
+    if info is None:
+        raise AssertionError("a rig has a station")
+    start = np.linalg.inv(info.covariance(info.known))
+    roots = np.stack([_padded_root(matrix) for matrix in told])
+    whole = CandidateRows(roots, start, np.eye(len(start)), info.work)
+    same = np.zeros(len(roots), dtype=int)
+    rule = INDICES[index](whole)
+    number = free_places or best_of or 1
+    best = exchanged(whole, same, greedy(whole, same, number, rule).chosen, rule)
+    best = np.sort(best)
+    tried = tuple(
+        TriedPlace(place, value, bool(k in best))
+        for k, (place, value) in enumerate(zip(spots, alone, strict=True))
+    )
+    chosen = wide.only(best.tolist())
+    if free_places:
+        names = tuple(f"place{n + 1}" for n in range(len(best)))
+        return replace(chosen, names=names), _of_machine(source.known), tried
+    return chosen, _kept(source.known, best, len(source.rig.names)), tried
+
+
+def _padded_root(information: Array) -> Array:
+    """(p, p) rows R with R^T R = information, whose smallest eigenvalues may be rounding."""
+    values, vectors = np.linalg.eigh(information)
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+
+
+def _of_machine(known: Known | None) -> Known | None:
+    """What is known without any station's place."""
+    if known is None:
+        return None
+    n = len(known.covariance) - 6 * len(known.stations)
+    return Known(known.covariance[:n, :n], np.zeros(0, dtype=int))
+
+
+def _kept(known: Known | None, best: Integers, _count: int) -> Known | None:
+    """What is known, with the stations that are left, by their new numbers."""
+    if known is None or not len(known.stations):
+        return known
+    n = len(known.covariance) - 6 * len(known.stations)
+    there = [k for k, s in enumerate(known.stations) if s in best]
+    at = np.concatenate([np.arange(n), *(n + 6 * k + np.arange(6) for k in there)])
+    numbers = np.array([int(np.flatnonzero(best == known.stations[k])[0]) for k in there], int)
+    return Known(known.covariance[np.ix_(at, at)], numbers)
+
+
+def _around(rig: Rig) -> tuple[Rig, tuple[StationPlace, ...]]:
+    """The rig's first camera at every place of a sphere, with what it sees there."""
+    one = next(one for one in rig.instruments if isinstance(one, LegsFrom | BoardFrom))
+    board = "platform" if isinstance(one, BoardFrom) else None
+    spots = places(rig.machine, one.camera, board)
+    T = np.stack([spot.T_camera_base() for spot in spots])
+    mine = [other for other in rig.instruments if other.station == one.station]
+    instruments = tuple(
+        replace(other, station=s, T_camera_base=T[s])
+        for s in range(len(spots))
+        for other in mine
+        if isinstance(other, LegsFrom | BoardFrom)
+    )
+    wide = replace(
+        rig,
+        names=tuple(f"place{s + 1}" for s in range(len(spots))),
+        T_station_base=T,
+        camera_of_station=np.zeros(len(spots), dtype=int),
+        instruments=instruments,
+    )
+    return wide, spots
