@@ -8,6 +8,7 @@ the covariance that the joint estimate would state of it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import count as count_from
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -47,8 +48,8 @@ BETWEEN = 8
 """Poses looked at on the way from one configuration to the next."""
 REROUTED = 5
 """Times that another way is looked for where one is blocked."""
-PREFIXES = ("p", "q", "plan", "next-")
-"""Of new configurations' names, the first that no configuration of the session has."""
+LETTERS = "abcdefghijklmnopqrstuvwxyz"
+"""First letters of new configurations' names, one a group of stations."""
 SEED = 0
 
 
@@ -78,7 +79,7 @@ class TriedPlace:
 class MeasurementPlan:
     """What to measure next, in this order.
 
-    source : what it is for; with the chosen places where these were free. stations : names that
+    subject : what it is for; with the chosen places where these were free. stations : names that
     measure each configuration, (n,) tuples. names, joints (n, m), T_base_platform (n, 4, 4) : the
     configurations, of which those of ``rank`` up to k are the best k from each place. index : what
     was made small. value : its value, and at_random : that of
@@ -89,7 +90,7 @@ class MeasurementPlan:
     range, and by chance. tried : places of a camera.
     """
 
-    source: Subject
+    subject: Subject
     stations: tuple[tuple[str, ...], ...]
     names: tuple[str, ...]
     joints: Array
@@ -122,7 +123,7 @@ class MeasurementPlan:
 
 
 def plan(
-    source: Subject,
+    subject: Subject,
     *,
     count: int = CAPTURE,
     index: str = "tool",
@@ -139,12 +140,12 @@ def plan(
     one of :data:`~pkmcal.planning.exchange.INDICES`. region : where the tool counts; the whole
     reach if absent. together : whether all stations measure every configuration; by default where
     they have cameras or trackers of their own. free_places : how many places of the camera to
-    choose on a sphere about the machine. best_of : how many of the source's stations to choose.
+    choose on a sphere about the machine. best_of : how many of the rig's stations to choose.
     seed : of what is drawn. told : called with the share done.
     Raises InputError for what cannot be planned.
     """
     told = told or (lambda _share: None)
-    rig, rng = source.rig, np.random.default_rng(seed)
+    rig, rng = subject.rig, np.random.default_rng(seed)
     _check(rig, count, index, free_places, best_of)
     region = region or Region()
     work = poses_in(rig.machine.limits(), region, AT_WORK, seed)
@@ -152,18 +153,18 @@ def plan(
     told(0.1)
     tried: tuple[TriedPlace, ...] = ()
     if free_places or best_of:
-        rig, known, tried = _with_places(source, work, drawn, count, index, free_places, best_of)
-        source = replace(source, rig=rig, known=known)
+        rig, known, tried = _with_places(subject, work, drawn, count, index, free_places, best_of)
+        subject = replace(subject, rig=rig, known=known)
     told(0.3)
     joined = _together(rig) if together is None else together
     stations = range(len(rig.names))
     groups = (tuple(stations),) if joined else tuple((s,) for s in stations)
-    made = _Making(rig, source.known, groups, count, index, work)
+    made = _Making(rig, subject.known, groups, count, index, work)
     pool = made.pool(drawn)
     made.check_seen(pool)
     found = made.chosen(pool, rng, lambda share: told(0.3 + 0.6 * share))
     told(0.9)
-    return _ordered(source, made, found, pool, region, joined, tried, rng)
+    return _ordered(subject, made, found, pool, region, joined, tried, rng)
 
 
 def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: int | None) -> None:
@@ -266,7 +267,7 @@ def _accuracy(info: CandidateRows, covariance: Array, count: float) -> Accuracy:
 
 
 def _ordered(
-    source: Subject,
+    subject: Subject,
     made: _Making,
     found: tuple[_Pool, Integers],
     drawn: _Pool,
@@ -276,7 +277,7 @@ def _ordered(
     rng: np.random.Generator,
 ) -> MeasurementPlan:
     """The plan of what was chosen: in the order of the shortest way, with what it promises."""
-    machine, count, groups = source.rig.machine, made.count, made.groups
+    machine, count, groups = subject.rig.machine, made.count, made.groups
     pool, chosen = found
     index = INDICES[made.index](pool.info)
     # as good as such photographs turn out, one by one, not as they are on average
@@ -294,12 +295,10 @@ def _ordered(
     rank = np.empty(len(chosen), dtype=int)
     rank[nested.chosen] = np.arange(len(chosen)) // len(groups) + 1
     order, blocked, travel = _route(machine, final, group, rng)
-    width = len(str(len(order)))
-    prefix = next(p for p in PREFIXES if not any(name.startswith(p) for name in source.names))
     return MeasurementPlan(
-        source=source,
-        stations=tuple(tuple(source.rig.names[s] for s in groups[group[k]]) for k in order),
-        names=tuple(f"{prefix}{n + 1:0{width}d}" for n in range(len(order))),
+        subject=subject,
+        stations=tuple(tuple(subject.rig.names[s] for s in groups[group[k]]) for k in order),
+        names=_new_names(group[order], subject.names),
         joints=final.joints[order],
         T_base_platform=final.T_base_platform[order],
         rank=rank[order],
@@ -317,6 +316,18 @@ def _ordered(
         tried=tried,
         together=together,
     )
+
+
+def _new_names(group: Integers, taken: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of configurations, a letter a group and a number, that none has yet."""
+    out: list[str] = []
+    used = set(taken)
+    for g in group.tolist():
+        letter = LETTERS[g % len(LETTERS)] * (1 + g // len(LETTERS))
+        name = next(f"{letter}{n:02d}" for n in count_from(1) if f"{letter}{n:02d}" not in used)
+        used.add(name)
+        out.append(name)
+    return tuple(out)
 
 
 def _by_chance(made: _Making, drawn: _Pool, rng: np.random.Generator) -> tuple[Accuracy, float]:
@@ -397,7 +408,7 @@ def _blocked(machine: Machine, joints: Array, poses: Array, home: Array) -> Bool
 
 
 def _with_places(
-    source: Subject,
+    subject: Subject,
     work: Array,
     drawn: Configurations,
     count: int,
@@ -411,7 +422,7 @@ def _with_places(
     eliminated, from configurations spread over all; the best set of them is chosen as
     configurations are.
     """
-    rig = source.rig
+    rig = subject.rig
     if free_places:
         wide, spots = _around(rig)
     else:
@@ -423,7 +434,7 @@ def _with_places(
     info = None
     for s in range(len(wide.names)):
         candidates = Candidates(*part, ((0,),))
-        info = information_of(wide.only([s]), candidates, work, _of_machine(source.known))
+        info = information_of(wide.only([s]), candidates, work, _of_machine(subject.known))
         start = np.linalg.inv(info.covariance(info.known))
         after = info.covariance(info.of(np.arange(len(few)), count / len(few)))
         told.append(np.linalg.inv(after) - start)
@@ -445,8 +456,8 @@ def _with_places(
     chosen = wide.only(best.tolist())
     if free_places:
         names = tuple(f"place{n + 1}" for n in range(len(best)))
-        return replace(chosen, names=names), _of_machine(source.known), tried
-    return chosen, _kept(source.known, best, len(source.rig.names)), tried
+        return replace(chosen, names=names), _of_machine(subject.known), tried
+    return chosen, _kept(subject.known, best), tried
 
 
 def _padded_root(information: Array) -> Array:
@@ -463,7 +474,7 @@ def _of_machine(known: Known | None) -> Known | None:
     return Known(known.covariance[:n, :n], np.zeros(0, dtype=int))
 
 
-def _kept(known: Known | None, best: Integers, _count: int) -> Known | None:
+def _kept(known: Known | None, best: Integers) -> Known | None:
     """What is known, with the stations that are left, by their new numbers."""
     if known is None or not len(known.stations):
         return known

@@ -233,13 +233,11 @@ def of_session(
         for s, pool in zip(legs, pools, strict=True):
             instruments.append(LegsFrom(s, session.stations[s].camera, T_camera_base[s], pool))
     for s, table in enumerate(session.trackers, start=len(session.stations)):
-        one = table.poses(s, len(mounts))
         place = _saved_target(saved, table.name)
         mounts.append(Mount(table.name, "platform"))
         T_mount.append(np.eye(4) if place is None else place)
-        sigma = np.repeat([table.rotation or 1.0, table.position], 3)
-        whiten = np.diag(np.where(np.any(one.whiten != 0, axis=(0, 1)), 1 / sigma, 0.0))
-        instruments.append(TargetFrom(s, T_camera_base[s], T_mount[-1], whiten, len(mounts) - 1))
+        target = TargetFrom(s, T_camera_base[s], T_mount[-1], table.whiten, len(mounts) - 1)
+        instruments.append(target)
     files = [station.camera_file for station in session.stations]
     numbers = [list(dict.fromkeys(files)).index(f) for f in files] + [0] * len(session.trackers)
     rig = Rig(

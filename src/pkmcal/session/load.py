@@ -123,34 +123,43 @@ class Session:
         return load_mechanism(self.mechanism, model=name)
 
 
-def load_session(folder: Path | str, model: str | None = None) -> Session:
+def load_session(folder: Path | str, model: str | None = None, *, measured: bool = True) -> Session:
     """Read and check the session in `folder` (session.yaml itself may be named instead).
 
-    model : one of the models that the mechanism file names.
+    model : one of the models that the mechanism file names. measured : whether there have to be
+    photographs, or poses, of two configurations at least; a plan is made before.
     """
     folder, document = _read(Path(folder))
     schema = validate(document, SessionDocument)
     machine, source = _machine(folder, document, schema.mechanism, model)
-    joints_file = _existing(folder, document, schema.joints.file, ("joints", "file"))
-    table = read_csv(joints_file, label=schema.joints.file)
-    warnings = check_readings(table, machine.joint_ranges, schema.joints.noise, machine.joint_units)
+    if measured or (folder / schema.joints.file).exists():
+        path = _existing(folder, document, schema.joints.file, ("joints", "file"))
+        table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
+        warnings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
+    else:
+        none, columns = np.zeros((0, machine.n_joints)), machine.joint_names
+        table, warnings = CsvTable(schema.joints.file, columns, (), none, ()), []
     board = _board(folder, document, schema)
     warnings += _of_little_use(document, schema)
     stations = tuple(
         made
         for name, station in schema.cameras.items()
-        for made in _stations(folder, document, name, station, table.names)
+        for made in _stations(folder, document, name, station, table.names, measured)
     )
     warnings += _turned(folder, stations)
     trackers: list[PoseTable] = []
     for name, station in schema.trackers.items():
         given, keys = station.tracker, ("stations", name, "tracker", "poses")
-        path, noise = _existing(folder, document, given.poses, keys), given.noise
-        measured = read_poses(path, given.poses, table.names, noise.position, noise.rotation, name)
-        trackers.append(measured)
+        noise = given.noise.position, given.noise.rotation
+        if measured or (folder / given.poses).exists():
+            path = _existing(folder, document, given.poses, keys)
+            trackers.append(read_poses(path, given.poses, table.names, *noise, name))
+        else:
+            trackers.append(PoseTable.to_come(name, given.poses, *noise))
     _check_distinct(document, stations)
     _check_names(document, (*stations, *trackers))
-    warnings += _unphotographed(table, stations, tuple(trackers))
+    if measured:
+        warnings += _unphotographed(table, stations, tuple(trackers))
     return Session(
         folder=folder,
         machine=machine,
@@ -311,12 +320,17 @@ def _of_little_use(document: Document, schema: SessionDocument) -> list[str]:
 
 
 def _stations(
-    folder: Path, document: Document, name: str, station: StationDocument, names: tuple[str, ...]
+    folder: Path,
+    document: Document,
+    name: str,
+    station: StationDocument,
+    names: tuple[str, ...],
+    measured: bool,
 ) -> list[Station]:
     """An entry's station; where the camera was held by hand, one for each photograph."""
     keys: Keys = ("stations", name)
     where = document.where(*keys, "images")
-    photographs = find_photographs(folder, station.images, names, where)
+    photographs = find_photographs(folder, station.images, names, where, needed=measured)
     from_exif = station.camera == EXIF
     if from_exif:
         label = document.where(*keys, "camera")
