@@ -24,7 +24,7 @@ from pkmcal.identify.covariance import (
     machine_covariance,
 )
 from pkmcal.identify.estimate import Estimate, State, Statistics
-from pkmcal.identify.gauge import Gauge, apply, default_gauge, told_unknowns
+from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, settled_weights
 from pkmcal.identify.rows import Kinds
@@ -291,8 +291,6 @@ def _estimate(
     state = apply(machine, solved, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     identified = machine.with_values(state.theta)
-    told = told_unknowns(solved)
-    covariance = full[told.machine, told.machine]
     problem, u = result.problem, result.problem.unknowns
     optics = own_blocks(result.info.covariance[0], u.optics, u.n_optics)
     factor = measurements.intrinsics_factor
@@ -306,20 +304,18 @@ def _estimate(
     return Estimate(
         machine=identified,
         state=_with_unseen_poses(identified, measurements, assembled, state),
-        covariance=covariance,
-        station_covariance=own_blocks(full, told.stations, 6),
+        joint_covariance=full,
         edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
         edge_residuals=residuals.edges,
         edge_weights=weights.edges,
         joint_residuals=joints,
-        data_share=data_share(machine, state.theta, covariance, gauge),
+        data_share=data_share(machine, state.theta, full, gauge),
         configurations=assembled.seen,
         statistics=_statistics(result, assembled),
         gauge=gauge.name,
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
-        mount_covariance=own_blocks(full, told.mounts, 6),
         line_shading=result.problem.data.shading[0],
         breathing_sigma=np.sqrt(np.diagonal(result.info.covariance[0])[u.breathing]),
     )

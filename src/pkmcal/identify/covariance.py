@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.estimate import State
+from pkmcal.identify.estimate import State, told_unknowns
 from pkmcal.identify.gauge import (
     Gauge,
     alignment,
@@ -23,7 +23,6 @@ from pkmcal.identify.gauge import (
     generators,
     move_generators,
     projector,
-    told_unknowns,
     transformation,
 )
 from pkmcal.identify.problem import Problem
@@ -122,7 +121,7 @@ def machine_covariance(
     problem: Problem, machine: Machine, before: State, shared: Array, gauge: Gauge
 ) -> Array:
     """Covariance (n, n) of parameters, stations and mounts, told in the gauge; n = P + 6 S + 6 M,
-    in the order of :func:`~pkmcal.identify.gauge.told_unknowns`.
+    in the order of :func:`~pkmcal.identify.estimate.told_unknowns`.
 
     before : the solution as the solver left it. shared : (na, na) covariance there.
     """
