@@ -22,10 +22,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.planning.information import CandidateRows
 
-TRIED = 64
+TRIED = 24
 """Candidates that are tried exactly; the others are farther by what the index' slope promises."""
 PASSES = 12
 """Rounds of exchanges; they end before, as a rule after three."""
@@ -136,20 +136,17 @@ class Greedy(NamedTuple):
     path: Array
 
 
-def greedy(
-    info: CandidateRows, group: Integers, count: int, index: Index, told: Told | None = None
-) -> Greedy:
+def greedy(info: CandidateRows, count: int, index: Index, told: Told | None = None) -> Greedy:
     """``count`` candidates of each group, the best next one of each group in turn.
 
-    group : (n,) of the candidates, which have ``count`` each or more. told : called with the share
-    done.
+    Each group has ``count`` candidates or more. told : called with the share done.
     """
-    work, groups = _Work(info, index), int(group.max()) + 1
-    free = np.ones(len(group), dtype=bool)
+    work, groups = _Work(info, index), int(info.group.max()) + 1
+    free = np.ones(len(info.group), dtype=bool)
     chosen, path = list[int](), list[Array]()
     work.begin([])
     for k in range(count * groups):
-        best = work.best(np.flatnonzero(free & (group == k % groups)))
+        best = work.best(k % groups, free)
         free[best] = False
         work.add(best, 1.0)
         chosen.append(best)
@@ -159,16 +156,19 @@ def greedy(
     return Greedy(np.array(chosen), np.array(path))
 
 
-def exchanged(info: CandidateRows, group: Integers, chosen: Integers, index: Index) -> Integers:
+def exchanged(info: CandidateRows, chosen: Integers, index: Index) -> Integers:
     """A choice (n,) bettered: each is put back for the best of its group, until none gains."""
     work, now = _Work(info, index), [int(c) for c in chosen]
+    free = np.ones(len(info.group), dtype=bool)
+    free[now] = False
     work.begin(now)
     value = float(index.value(work.machine))
     for _ in range(PASSES):
         for k, old in enumerate(now):
             work.add(old, -1.0)
-            rest = np.setdiff1d(np.flatnonzero(group == group[old]), now)
-            now[k] = work.best(np.append(rest, old))
+            free[old] = True
+            now[k] = work.best(int(info.group[old]), free)
+            free[now[k]] = False
             work.add(now[k], 1.0)
         work.begin(now)  # without the rounding of so many steps
         before, value = value, float(index.value(work.machine))
@@ -186,6 +186,7 @@ class _Work:
         diagonal = np.diag(info.known) + np.einsum("nri,nri->i", info.rows, info.rows)
         self._unit = np.sqrt(diagonal)
         self._rows = info.rows / self._unit
+        self._group = info.group
         self._known = info.known / np.outer(self._unit, self._unit)
         self._way = info.machine / self._unit
         self._index = index
@@ -210,15 +211,18 @@ class _Work:
         inner = np.eye(len(rows)) + sign * across @ rows.T
         self._covariance = self._covariance - sign * across.T @ np.linalg.solve(inner, across)
 
-    def best(self, free: Integers) -> int:
-        """The candidate whose coming makes the index smallest."""
+    def best(self, group: int, free: Booleans) -> int:
+        """The free candidate of a group whose coming makes the index smallest."""
         now = self.machine
         to_slope = self._covariance @ (self._way.T @ self._index.slope(now))
-        first = np.sum((self._rows[free] @ to_slope) ** 2, axis=(1, 2))
-        free = free[np.argsort(-first, kind="stable")[:TRIED]]
-        rows = self._rows[free]
+        begin, end = np.searchsorted(self._group, [group, group + 1])
+        rows = self._rows[begin:end]  # a view: copies of all would cost more than the sums
+        first = (rows.reshape(-1, rows.shape[-1]) @ to_slope).reshape(len(rows), -1)
+        gain = np.where(free[begin:end], np.einsum("nk,nk->n", first, first), -1.0)
+        top = np.argsort(-gain, kind="stable")[: min(TRIED, int(free[begin:end].sum()))]
+        rows = rows[top]
         across = rows @ self._covariance
         inner = np.eye(rows.shape[1]) + across @ rows.mT
         moved = across @ self._way.T
         after = now - moved.mT @ np.linalg.solve(inner, moved)
-        return int(free[np.argmin(self._index.value(after))])
+        return int(begin + top[np.argmin(self._index.value(after))])

@@ -52,28 +52,37 @@ class Known:
 
 @dataclass(frozen=True)
 class Candidates:
-    """What could be measured: each of K configurations by each of G groups of stations.
+    """What could be measured: n configurations, each by one of G groups of stations.
 
-    joints : (K, m). T_base_platform : (K, 4, 4). groups : stations that all measure a
-    configuration. Candidate ``g * K + k`` is configuration k by group g.
+    groups : stations that all measure a configuration. group : (n,) by which of them, in increasing
+    order. joints : (n, m). T_base_platform : (n, 4, 4).
     """
 
+    groups: tuple[tuple[int, ...], ...]
+    group: Integers
     joints: Array
     T_base_platform: Array
-    groups: tuple[tuple[int, ...], ...]
 
-    def __len__(self) -> int:
-        return len(self.groups) * len(self.joints)
+    @classmethod
+    def of_all(
+        cls, groups: tuple[tuple[int, ...], ...], joints: Array, T_base_platform: Array
+    ) -> Candidates:
+        """Each of K configurations by each of the groups."""
+        n = len(groups)
+        group = np.repeat(np.arange(n), len(joints))
+        poses = np.tile(T_base_platform, (n, 1, 1))
+        return cls(groups, group, np.tile(joints, (n, 1)), poses)
+
+    def only(self, chosen: Integers) -> Candidates:
+        """Some of them; their groups in increasing order."""
+        parts = self.group[chosen], self.joints[chosen], self.T_base_platform[chosen]
+        return Candidates(self.groups, *parts)
 
     @property
-    def group(self) -> Integers:
-        """(G K) the group of each candidate."""
-        return np.repeat(np.arange(len(self.groups)), len(self.joints))
-
-    @property
-    def configuration(self) -> Integers:
-        """(G K) the configuration of each candidate."""
-        return np.tile(np.arange(len(self.joints)), len(self.groups))
+    def pairs(self) -> Integers:
+        """(M, 2) stations and the candidates that they measure."""
+        rows = [np.flatnonzero(self.group == g) for g in range(len(self.groups))]
+        return np.concatenate([all_pairs(s, k) for s, k in zip(self.groups, rows, strict=True)])
 
 
 class Directions(NamedTuple):
@@ -90,20 +99,22 @@ class Directions(NamedTuple):
 class CandidateRows:
     """Rows of all candidates, and what they are for.
 
-    rows : (n, r, na) on the shared unknowns in their own units. known : (na, na) information
+    rows : (n, r, na) on the shared unknowns in their own units. group : (n,) in increasing order,
+    which group of stations measures each. known : (na, na) information
     beforehand, with the drawing's. machine : (p, na) the machine's directions, of which the drawing
     alone knows each to one. work : (M, 6, p) turn and shift of the platform at M poses of the
     workspace by each direction, rad and m.
     """
 
     rows: Array
+    group: Integers
     known: Array
     machine: Array
     work: Array
 
     def only(self, chosen: Integers) -> CandidateRows:
         """Of some candidates."""
-        return replace(self, rows=self.rows[chosen])
+        return replace(self, rows=self.rows[chosen], group=self.group[chosen])
 
     def of(self, chosen: Integers, times: float = 1.0) -> Array:
         """(na, na) information of a choice of candidates, each measured ``times`` over."""
@@ -139,13 +150,8 @@ def information_of(
     knows of the machine, in place of its drawing. rng : as for
     :meth:`~pkmcal.planning.rig.Instrument.measure`.
     """
-    machine, groups, count = rig.machine, candidates.groups, len(candidates.joints)
-    joints = np.tile(candidates.joints, (len(groups), 1))
-    poses = np.tile(candidates.T_base_platform, (len(groups), 1, 1))
-    pairs = np.concatenate(
-        [all_pairs(group, g * count + np.arange(count)) for g, group in enumerate(groups)]
-    )
-    measurements = rig.measured(joints, poses, pairs, rng)
+    machine, joints, poses = rig.machine, candidates.joints, candidates.T_base_platform
+    measurements = rig.measured(joints, poses, candidates.pairs, rng)
     assembled, state = rig.assembled(measurements, joints, poses)
     problem = assembled.problem
     way, u = directions(machine, problem), problem.unknowns
@@ -165,6 +171,7 @@ def information_of(
     directed[:, u.machine] = way.of_z
     return CandidateRows(
         rows=rows,
+        group=candidates.group,
         known=total,
         machine=directed,
         work=tool_by_free(rig, problem, machine.inverse(work), work) @ way.to_z,

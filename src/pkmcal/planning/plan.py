@@ -160,7 +160,7 @@ def plan(
     stations = range(len(rig.names))
     groups = (tuple(stations),) if joined else tuple((s,) for s in stations)
     made = _Making(rig, subject.known, groups, count, index, work)
-    pool = made.pool(drawn)
+    pool = made.pool(Candidates.of_all(groups, *drawn))
     made.check_seen(pool)
     found = made.chosen(pool, rng, lambda share: told(0.3 + 0.6 * share))
     told(0.9)
@@ -199,19 +199,10 @@ def _together(rig: Rig) -> bool:
 
 
 class _Pool(NamedTuple):
-    """Configurations, and what each tells by each group of stations."""
+    """Candidates, and what each tells."""
 
-    drawn: Configurations
-    group: Integers
+    candidates: Candidates
     info: CandidateRows
-
-    def configuration(self, candidates: Integers) -> Integers:
-        """Numbers of candidates' configurations."""
-        return candidates % len(self.drawn.joints)
-
-    def of(self, candidates: Integers) -> Configurations:
-        """Candidates' configurations."""
-        return Configurations(*(part[self.configuration(candidates)] for part in self.drawn))
 
 
 @dataclass(frozen=True)
@@ -225,32 +216,41 @@ class _Making:
     index: str
     work: Array
 
-    def pool(self, drawn: Configurations, rng: np.random.Generator | None = None) -> _Pool:
+    def pool(self, candidates: Candidates, rng: np.random.Generator | None = None) -> _Pool:
         """Candidates with what they tell; rng : as of :func:`information_of`."""
-        candidates = Candidates(*drawn, self.groups)
-        info = information_of(self.rig, candidates, self.work, self.known, rng)
-        return _Pool(drawn, candidates.group, info)
+        return _Pool(candidates, information_of(self.rig, candidates, self.work, self.known, rng))
 
-    def chosen(self, pool: _Pool, rng: np.random.Generator, told: Told) -> tuple[_Pool, Integers]:
-        """The best of a pool, bettered about where they are: another pool, and its candidates."""
+    def chosen(self, pool: _Pool, rng: np.random.Generator, told: Told) -> Candidates:
+        """The best of a pool, bettered about where they are."""
         index = INDICES[self.index](pool.info)
-        first = greedy(pool.info, pool.group, self.count, index, lambda x: told(0.4 * x)).chosen
-        chosen = exchanged(pool.info, pool.group, first, index)
+        first = greedy(pool.info, self.count, index, lambda x: told(0.4 * x)).chosen
+        best = pool.candidates.only(np.sort(exchanged(pool.info, first, index)))
         for k in range(BETTERED):
             told(0.5 + 0.5 * k / BETTERED)
-            now = pool.of(chosen)
+            pool, start = self._about(best, rng)
+            best = pool.candidates.only(np.sort(exchanged(pool.info, start, index)))
+        return best
+
+    def _about(self, best: Candidates, rng: np.random.Generator) -> tuple[_Pool, Integers]:
+        """Chosen candidates and others about each, by the same group; and where those stand."""
+        parts: list[Configurations] = []
+        group: list[Integers] = []
+        start: list[Integers] = []
+        for g in range(len(self.groups)):
+            own = np.flatnonzero(best.group == g)
+            now = Configurations(best.joints[own], best.T_base_platform[own])
             near = neighbours(self.rig.machine, now, rng)
-            number, group = np.arange(len(chosen)), pool.group[chosen]
-            pool = self.pool(Configurations(*map(np.concatenate, zip(now, near, strict=True))))
-            chosen = exchanged(
-                pool.info, pool.group, group * len(pool.drawn.joints) + number, index
-            )
-        return pool, chosen
+            start.append(sum(map(len, group)) + np.arange(len(own)))
+            group.append(np.full(len(own) + len(near.joints), g))
+            parts += [now, near]
+        joints, poses = map(np.concatenate, zip(*parts, strict=True))
+        candidates = Candidates(self.groups, np.concatenate(group), joints, poses)
+        return self.pool(candidates), np.concatenate(start)
 
     def check_seen(self, pool: _Pool) -> None:
         """Raise `InputError` where a group of stations measures nothing anywhere."""
         for g, group in enumerate(self.groups):
-            if np.any(pool.info.rows[pool.group == g]):
+            if np.any(pool.info.rows[pool.info.group == g]):
                 continue
             names = [self.rig.names[s] for s in group]
             raise InputError(
@@ -269,7 +269,7 @@ def _accuracy(info: CandidateRows, covariance: Array, count: float) -> Accuracy:
 def _ordered(
     subject: Subject,
     made: _Making,
-    found: tuple[_Pool, Integers],
+    found: Candidates,
     drawn: _Pool,
     region: Region,
     together: bool,
@@ -278,29 +278,24 @@ def _ordered(
 ) -> MeasurementPlan:
     """The plan of what was chosen: in the order of the shortest way, with what it promises."""
     machine, count, groups = subject.rig.machine, made.count, made.groups
-    pool, chosen = found
-    index = INDICES[made.index](pool.info)
     # as good as such photographs turn out, one by one, not as they are on average
-    final = pool.of(chosen)
-    drawn_info = made.pool(final, np.random.default_rng(SEED)).info
-    group = pool.group[chosen]
-    own = drawn_info.only(group * len(chosen) + np.arange(len(chosen)))
-    nested = greedy(own, group, count, index)
+    own = made.pool(found, np.random.default_rng(SEED)).info
+    index, every = INDICES[made.index](own), np.arange(len(found.group))
+    nested = greedy(own, count, index)
     curve = [_accuracy(own, nested.path[c * len(groups) - 1], c) for c in range(2, count)]
-    everything = np.arange(len(chosen))
-    covariance = own.covariance(own.of(everything))
+    covariance = own.covariance(own.of(every))
     promised = _accuracy(own, covariance, count)
-    more = [_accuracy(own, own.covariance(own.of(everything, t)), t * count) for t in TIMES]
+    more = [_accuracy(own, own.covariance(own.of(every, t)), t * count) for t in TIMES]
     by_chance, at_random = _by_chance(made, drawn, rng)
-    rank = np.empty(len(chosen), dtype=int)
-    rank[nested.chosen] = np.arange(len(chosen)) // len(groups) + 1
-    order, blocked, travel = _route(machine, final, group, rng)
+    rank = np.empty(len(every), dtype=int)
+    rank[nested.chosen] = every // len(groups) + 1
+    order, blocked, travel = _route(machine, found, rng)
     return MeasurementPlan(
         subject=subject,
-        stations=tuple(tuple(subject.rig.names[s] for s in groups[group[k]]) for k in order),
-        names=_new_names(group[order], subject.names),
-        joints=final.joints[order],
-        T_base_platform=final.T_base_platform[order],
+        stations=tuple(tuple(subject.rig.names[s] for s in groups[found.group[k]]) for k in order),
+        names=_new_names(found.group[order], subject.names),
+        joints=found.joints[order],
+        T_base_platform=found.T_base_platform[order],
         rank=rank[order],
         index=made.index,
         value=float(index.value(covariance)),
@@ -332,13 +327,13 @@ def _new_names(group: Integers, taken: tuple[str, ...]) -> tuple[str, ...]:
 
 def _by_chance(made: _Making, drawn: _Pool, rng: np.random.Generator) -> tuple[Accuracy, float]:
     """What configurations drawn evenly over the joints' ranges would give, mean of a few draws."""
-    index = INDICES[made.index](drawn.info)
-    n = len(drawn.drawn.joints)
+    index, n_groups = INDICES[made.index](drawn.info), len(made.groups)
+    n = len(drawn.info.group) // n_groups
     evenly = np.arange(n // 2, n)  # the first half are at the ends of the ranges
     count = min(made.count, len(evenly))
     found: list[tuple[float, float, float]] = []
     for _ in range(RANDOM):
-        rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(len(made.groups))]
+        rows = [g * n + rng.choice(evenly, count, replace=False) for g in range(n_groups)]
         covariance = drawn.info.covariance(drawn.info.of(np.concatenate(rows)))
         found.append((*drawn.info.tool(covariance), float(index.value(covariance))))
     position, orientation, value = np.mean(found, axis=0).tolist()
@@ -349,7 +344,7 @@ def _by_chance(made: _Making, drawn: _Pool, rng: np.random.Generator) -> tuple[A
 
 
 def _route(
-    machine: Machine, found: Configurations, group: Integers, rng: np.random.Generator
+    machine: Machine, found: Candidates, rng: np.random.Generator
 ) -> tuple[Integers, Booleans, tuple[float, float]]:
     """The order (n,), group by group; which steps are blocked (n,); and how long the way is, and
     one by chance.
@@ -358,9 +353,9 @@ def _route(
     order: list[Integers] = []
     barred: list[Booleans] = []
     own, chance = 0.0, 0.0
-    for g in range(int(group.max()) + 1):
-        rows = np.flatnonzero(group == g)
-        joints, poses = (part[rows] for part in found)
+    for g in range(len(found.groups)):
+        rows = np.flatnonzero(found.group == g)
+        joints, poses = found.joints[rows], found.T_base_platform[rows]
         apart = distances(np.concatenate([joints, home[None]]), machine.joint_ranges)
         way, blocked = _free_way(machine, joints, poses, home, apart)
         order.append(rows[way])
@@ -433,7 +428,7 @@ def _with_places(
     alone: list[float] = []
     info = None
     for s in range(len(wide.names)):
-        candidates = Candidates(*part, ((0,),))
+        candidates = Candidates.of_all(((0,),), *part)
         info = information_of(wide.only([s]), candidates, work, _of_machine(subject.known))
         start = np.linalg.inv(info.covariance(info.known))
         after = info.covariance(info.of(np.arange(len(few)), count / len(few)))
@@ -443,11 +438,11 @@ def _with_places(
         raise AssertionError("a rig has a station")
     start = np.linalg.inv(info.covariance(info.known))
     roots = np.stack([_padded_root(matrix) for matrix in told])
-    whole = CandidateRows(roots, start, np.eye(len(start)), info.work)
     same = np.zeros(len(roots), dtype=int)
+    whole = CandidateRows(roots, same, start, np.eye(len(start)), info.work)
     rule = INDICES[index](whole)
     number = free_places or best_of or 1
-    best = exchanged(whole, same, greedy(whole, same, number, rule).chosen, rule)
+    best = exchanged(whole, greedy(whole, number, rule).chosen, rule)
     best = np.sort(best)
     tried = tuple(
         TriedPlace(place, value, bool(k in best))

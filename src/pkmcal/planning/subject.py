@@ -384,22 +384,8 @@ def _board_place(
 
 def _known(saved: SavedCalibration, session: Session, same_place: bool) -> Known:
     """What a calibration knows: of the machine, and of the stations that stand as they stood."""
-    n = len(saved.machine.values)
     if not same_place:
         return Known(saved.covariance, np.zeros(0, dtype=int))
-    names = [station.name for station in saved.stations]
-    kept = [k for k, name in enumerate(session.station_names) if name in names]
-    joint, numbers = (
-        saved.covariance_with_stations,
-        [names.index(session.station_names[k]) for k in kept],
-    )
-    if joint is None:
-        raise InputError(
-            "this calibration does not tell how its stations' places go with the machine",
-            where=str(saved.path),
-            expected="covariance_with_stations, as this version writes it",
-            next_step="Calibrate again, or leave --same-place out",
-        )
-    own = [np.arange(n), *(n + 6 * number + np.arange(6) for number in numbers)]
-    at = np.concatenate(own)
-    return Known(joint[np.ix_(at, at)], np.array(kept, dtype=int))
+    kept = [k for k, name in enumerate(session.station_names) if name in saved.placed]
+    names = [session.station_names[k] for k in kept]
+    return Known(saved.with_stations(names), np.array(kept, dtype=int))

@@ -32,6 +32,8 @@ from pkmcal.wording import SCALES, amount, brief, count, listed, number
 
 TABLE, DOCUMENT, PAGE_FILE, PLACES = "plan.csv", "plan.json", "plan.html", "stations.yaml"
 FORMAT = 1
+FINEST = 6
+"""Decimals of a reading in metres or radians."""
 INDEX_NAMES = {
     "tool": "the variance of the tool's position over the workspace",
     "D": "the determinant of the machine's covariance (D)",
@@ -54,7 +56,7 @@ HOW = (
 
 def outcome_of(found: MeasurementPlan) -> Outcome:
     """Everything that ``pkmcal plan`` tells and writes."""
-    texts = {TABLE: csv_text(found.subject.columns, found.names, found.joints)}
+    texts = {TABLE: csv_text(found.subject.columns, found.names, found.joints.round(FINEST))}
     parts = [_order(found), _curve(found)]
     if found.tried:
         texts[PLACES] = yaml_text(stations_document(found))
