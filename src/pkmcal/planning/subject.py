@@ -54,7 +54,7 @@ class Subject:
 
     rig : what measures. known : what an earlier calibration knows. columns : of joints.csv.
     measured : how many configurations there are already, and names : how those are called. words :
-    where its numbers come from, in sentences.
+    where its numbers come from, in sentences. board : fields of the board's file, if one is seen.
     """
 
     rig: Rig
@@ -63,6 +63,7 @@ class Subject:
     measured: int
     names: tuple[str, ...]
     words: tuple[str, ...]
+    board: dict[str, Any] | None = None
 
 
 class _Noise(NamedTuple):
@@ -107,7 +108,15 @@ def of_machine(
         T_platform_board,
     )  # fmt: skip
     what = f"corners of the board to {corner:g} px" if board else f"edges of legs to {edge:g} px"
-    return Subject(rig, None, tuple(columns), 0, (), (f"{noise}, {what}: an assumption.",))
+    return Subject(
+        rig,
+        None,
+        tuple(columns),
+        0,
+        (),
+        (f"{noise}, {what}: an assumption.",),
+        board.document if board else None,
+    )
 
 
 def _length(sigma: float) -> str:
@@ -212,6 +221,7 @@ def of_session(
     mounts: list[Mount] = []
     T_mount: list[Array] = []
     has_board = any("board" in s.observe for s in session.stations)
+    board: Board | None = None
     if has_board and session.board is not None and session.board_body == "platform":
         board = load_board(session.board)
         mounts.append(Mount(BOARD, "platform"))
@@ -255,7 +265,8 @@ def of_session(
     columns = tuple(session.document["joints"]["columns"])
     measured = int(saved.used.sum()) if saved is not None else 0
     names = session.configurations
-    return Subject(rig, known, columns, measured, names, tuple(words))
+    fields = board.document if board else None
+    return Subject(rig, known, columns, measured, names, tuple(words), fields)
 
 
 class _Photographed(NamedTuple):

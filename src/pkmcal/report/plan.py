@@ -428,6 +428,7 @@ def document_of(found: MeasurementPlan) -> dict[str, Any]:
                 for one in found.tried
             ],
             "assumptions": list(found.subject.words),
+            "board": found.subject.board,
             "mechanism": rig.machine.to_document(),
         }
     )  # fmt: skip
