@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -185,6 +187,7 @@ def _order(found: MeasurementPlan) -> Part:
 def _curve(found: MeasurementPlan) -> Part:
     """How the tool's deviation falls with the number of configurations."""
     x = [a.count for a in found.curve]
+    y = [a.position * 1e3 for a in found.curve]
     here, axis = found.promised, {**AXIS, "type": "log"}
     figure = {
         "data": [
@@ -193,7 +196,7 @@ def _curve(found: MeasurementPlan) -> Part:
                 "mode": "lines+markers",
                 "name": "the best of the plan; beyond it, each again",
                 "x": x,
-                "y": [a.position * 1e3 for a in found.curve],
+                "y": y,
                 "line": {"color": "--calibrated"},
                 "marker": {"color": "--calibrated", "size": 5},
                 "hovertemplate": "%{x} from each place: %{y:.3g} mm<extra></extra>",
@@ -211,8 +214,8 @@ def _curve(found: MeasurementPlan) -> Part:
         "layout": {
             **LOOKS,
             "margin": {"l": 60, "r": 10, "t": 10, "b": 45},
-            "xaxis": {**axis, "dtick": "D1", "title": {"text": "configurations from each place"}},
-            "yaxis": {**axis, "dtick": "D2", "title": {"text": "σ of the tool's position (mm)"}},
+            "xaxis": {**axis, **_ticks(x), "title": {"text": "configurations from each place"}},
+            "yaxis": {**axis, **_ticks(y), "title": {"text": "σ of the tool's position (mm)"}},
             "legend": {
                 "orientation": "h", "y": 1.02, "yanchor": "bottom", "bgcolor": "rgba(0,0,0,0)",
             },
@@ -246,6 +249,15 @@ def _curve(found: MeasurementPlan) -> Part:
         " ranks. More: these again, as often.",
     )
     return Part("curve", "How many", plots=(plot,), tables=(table,))
+
+
+def _ticks(values: Sequence[float]) -> dict[str, Any]:
+    """Round places along a logarithmic axis, written out."""
+    low, high = min(values), max(values)
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    places = [m * 10.0**k for k in decades for m in (1, 2, 5)]
+    places = [p for p in places if 0.5 * low <= p <= 2 * high]
+    return {"tickvals": places, "ticktext": [f"{p:g}" for p in places]}
 
 
 def _cameras(found: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
@@ -350,7 +362,6 @@ def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
         "size": 4,
         "color": np.log10(value).round(3).tolist(),
         "colorscale": "Blues",
-        "reversescale": True,
         "opacity": 0.7,
     }
     hover = [f"alone {brief(v)} mm" for v in value]
@@ -360,7 +371,7 @@ def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
 def stations_document(found: MeasurementPlan) -> dict[str, Any]:
     """The chosen places as entries of session.yaml."""
     rig, out = found.subject.rig, dict[str, Any]()
-    for name, camera, T_camera_base in _cameras(found):
+    for name, _, T_camera_base in _cameras(found):
         place = StationPlace.of(T_camera_base)
         observe = [
             word
@@ -368,13 +379,13 @@ def stations_document(found: MeasurementPlan) -> dict[str, Any]:
             if any(isinstance(x, kind) and rig.names[x.station] == name for x in rig.instruments)
         ]
         out[name] = {
-            "camera": f"cameras/{camera.model}.yaml",
+            "camera": "cameras/camera.yaml",
             "images": f"images/{name}/{{configuration}}.png",
             "observe": observe[0] if len(observe) == 1 else observe,
             "pose": {
-                "position": [round(x, 3) for x in place.position],
-                "look_at": [round(x, 3) for x in place.look_at],
-                "up": [round(x, 3) for x in place.up],
+                "position": [round(x, 3) + 0.0 for x in place.position],
+                "look_at": [round(x, 3) + 0.0 for x in place.look_at],
+                "up": [round(x, 3) + 0.0 for x in place.up],
             },
         }
     return {"stations": out}
