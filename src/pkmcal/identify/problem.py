@@ -140,49 +140,104 @@ class Problem:
 
     def linearize(self, state: BatchState) -> Linear:
         """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
-        c, u = self.closure(state), self.unknowns
+        c, d = self.closure(state), self.layout.own_motion.shape[1]
         edges, poses = self._edges(state, c), self._poses(state)
         value = self._values(state, c, edges, poses)
-        blocks, boards = self.blocks, self.pose_blocks
-        lines = [(u.shading, np.maximum(blocks.line, 0), edges.by_line)] if u.n_lines else []
-        if u.n_breathing:
-            lines.append((u.breathing, blocks.station, edges.by_breathing))
-        breathing = [(u.breathing, boards.station, poses.by_breathing)] if u.n_breathing else []
-        closures = self._to_free([(c.index[None], c.by_theta[..., None, :])])[..., 0, :]
-        by_shared = (
-            self._columns(
-                self._to_free(edges.by_machine),
-                (u.stations, blocks.station, edges.by_station),
-                (u.optics, blocks.camera, edges.by_optics),
-                *lines,
-            ),
-            self._columns(self._by_noise(c, closures)[..., None, :]),
-            self._columns(
-                np.zeros((*poses.value.shape, u.n_free)),
-                (u.stations, boards.station, poses.by_station),
-                (u.optics, boards.camera, poses.by_optics),
-                (u.mounts, boards.mount, poses.by_mount),
-                *breathing,
-            ),
-        )
-        by_own = (
-            _in_rows(edges.by_own(self._to_own(c.ends.b_by_pose, c.ends.b_by_internal))),
-            self._by_noise(c, self.layout.by_own(c)),
-            _in_rows(self._to_own(poses.by_platform)),
-        )
-        by_shared = np.concatenate(by_shared, axis=-2)
-        by_own = np.concatenate(by_own, axis=-2)
+        by_shared = np.zeros((*value.shape, self._width))
+        by_own = np.zeros((*value.shape, d))
+        self._put_edges(by_shared, by_own, edges)
+        self._put_closures(by_shared, by_own, c)
+        if self.pose_blocks.present.size:
+            self._put_poses(by_shared, by_own, poses)
+        if self._choice is None:
+            machine = by_shared[..., self.unknowns.count : -1]
+            by_shared[..., self.unknowns.machine] = machine @ self.free
         # padding may lie anywhere, so its derivatives need not be finite though its row is zero
         usable = np.isfinite(value) & self._in_use()
         lost = ~np.isfinite(value + by_shared.sum(axis=-1))
+        if lost.any():
+            by_shared[lost], by_own[lost] = 0.0, 0.0
         return Linear(
             np.where(usable, value, 0.0),
-            np.where(lost[..., None], 0.0, by_shared),
-            np.where(lost[..., None], 0.0, by_own),
+            by_shared[..., : self.unknowns.count],
+            by_own,
             usable,
             self.prior_values(state) - self.prior_target,
             self.prior,
         )
+
+    def _put_edges(self, by_shared: Array, by_own: Array, edges: EdgeRows) -> None:
+        """Writes the edges' derivatives into their rows."""
+        u, blocks = self.unknowns, self.blocks
+        parts = [(self._column[index], values) for index, values in edges.by_machine]
+        others = [
+            (u.stations, blocks.station, edges.by_station),
+            (u.optics, blocks.camera, _blocks_last(edges.by_optics)),
+        ]
+        if u.n_lines:
+            line = np.maximum(blocks.line, 0)
+            others.append((u.shading, line, _blocks_last(edges.by_line)))
+        if u.n_breathing:
+            others.append((u.breathing, blocks.station, _blocks_last(edges.by_breathing)))
+        for part, number, values in others:
+            width = len(values)
+            parts.append((part.start + width * number[..., None] + np.arange(width), values))
+        n_runs, (k, g), n = len(by_shared), blocks.leg.shape, blocks.side.shape[-1] * 2
+        row = by_shared.shape[2] * np.arange(k)[:, None] + n * np.arange(g)
+        row = row + np.arange(n)[:, None, None]
+        column = np.concatenate([np.moveaxis(index, -1, 0) for index, _ in parts])
+        where = row * self._width + column[:, None]
+        values = [np.broadcast_to(v, (*v.shape[:2], n_runs, k, g)) for _, v in parts]
+        flat = by_shared.reshape(n_runs, -1)
+        flat[:, where] = np.moveaxis(np.concatenate(values), 2, 0)
+        own = np.moveaxis(edges.by_own(self.layout.freedoms), (0, 1), (-1, -2))
+        by_own[:, :, : g * n] = own.reshape(n_runs, k, g * n, -1)
+
+    def _put_closures(self, by_shared: Array, by_own: Array, c: Closure) -> None:
+        """The same of the closure's."""
+        rows, machine = self.closure_rows, slice(0, self.unknowns.n_free)
+        if self._choice is None:
+            machine = slice(self.unknowns.count, self._width)
+        number = np.arange(rows.start, rows.stop)[:, None]
+        by_shared[:, :, number, self._column[c.index]] = c.by_theta
+        by_shared[:, :, rows, machine] = self._by_noise(c, by_shared[:, :, rows, machine])
+        by_own[:, :, rows] = self._by_noise(c, self.layout.by_own(c))
+
+    def _put_poses(self, by_shared: Array, by_own: Array, poses: PoseRows) -> None:
+        """The same of the boards' poses."""
+        u, boards, first = self.unknowns, self.pose_blocks, self.closure_rows.stop
+        parts = [
+            (u.stations, boards.station, poses.by_station),
+            (u.optics, boards.camera, poses.by_optics),
+            (u.mounts, boards.mount, poses.by_mount),
+        ]
+        if u.n_breathing:
+            parts.append((u.breathing, boards.station, poses.by_breathing))
+        shape = (*poses.value.shape, by_shared.shape[-1])
+        out = by_shared[:, :, first:].reshape(shape)
+        for part, number, values in parts:
+            width = values.shape[-1]
+            columns = part.start + width * number[..., None] + np.arange(width)
+            np.put_along_axis(out, columns[None, :, :, None, :], values, axis=-1)
+        by_shared[:, :, first:] = out.reshape(by_shared[:, :, first:].shape)
+        own = poses.by_platform[..., self.layout.freedoms]
+        by_own[:, :, first:, : own.shape[-1]] = own.reshape(*own.shape[:2], -1, own.shape[-1])
+
+    @cached_property
+    def _width(self) -> int:
+        """Columns of a row while it is written: the shared unknowns', where parameters are tied or
+        are axes one for each parameter besides, and one for what is no unknown.
+        """
+        return self.unknowns.count + 1 + (0 if self._choice is not None else self.drawing.size)
+
+    @cached_property
+    def _column(self) -> Integers:
+        """Where each parameter's derivatives are written, (P + 1,); the last is no parameter's."""
+        if self._choice is None:
+            return self.unknowns.count + np.arange(self.drawing.size + 1)
+        out = np.full(self.drawing.size + 1, self.unknowns.count)
+        out[self._choice] = np.arange(len(self._choice))
+        return out
 
     def unweighted(self, state: BatchState) -> Kinds[Array]:
         """Whitened residuals of each kind of measurement without their weights, (B, K, G, n)."""
@@ -208,7 +263,7 @@ class Problem:
 
     def _edges(self, state: BatchState, c: Closure) -> EdgeRows:
         radius = self.theta(state)[:, self.blocks.radius]
-        return edge_rows(self.blocks, self.data, c.ends, radius, state.T_camera_base)
+        return edge_rows(self.blocks, self.data, c, radius, state.T_camera_base)
 
     def _poses(self, state: BatchState) -> PoseRows:
         return pose_rows(
@@ -244,50 +299,11 @@ class Problem:
         parts = [np.broadcast_to(part, (runs, n, part.shape[-1])) for part in parts]
         return np.concatenate(parts, axis=-1)
 
-    def _columns(self, machine: Array, *others: tuple[slice, Integers, Array]) -> Array:
-        """Derivatives put into the columns of the shared unknowns, rows in one, (B, K, G n, na).
-
-        machine : (B, K, G, n, nz). others : which unknowns, whose of them (K, G), and the
-        derivatives (B, K, G, n, w) by that one's.
-        """
-        out = np.zeros((*machine.shape[:-1], self.unknowns.count))
-        out[..., self.unknowns.machine] = machine
-        for part, number, values in others:
-            width = values.shape[-1]
-            columns = part.start + width * number[..., None] + np.arange(width)
-            np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
-        return _in_rows(out)
-
-    def _to_free(self, parts: list[tuple[Integers, Array]]) -> Array:
-        """Derivatives by machine parameters put into the free unknowns' columns.
-
-        parts : positions (K or 1, G, n) and derivatives (B, K, G, rows, n).
-        """
-        shape = np.broadcast_shapes(*(values.shape[:-1] for _, values in parts))
-        n = self.drawing.size
-        full = np.zeros((*shape, n + 1))  # the last column takes what is no parameter's
-        for index, values in parts:
-            np.put_along_axis(full, index[None, :, :, None, :], values, axis=-1)
-        if self._choice is not None:  # no ties, no axes: a choice of columns, far cheaper
-            return full[..., self._choice]
-        return full[..., :n] @ self.free
-
     @cached_property
     def _choice(self) -> Integers | None:
         """The parameter of each free unknown where each moves one parameter alone."""
         alone = np.all((self.free != 0).sum(axis=0) == 1) and np.all(self.free.sum(axis=0) == 1)
         return np.argmax(self.free, axis=0) if alone else None
-
-    def _to_own(self, by_pose: Array, by_internal: Array | None = None) -> Array:
-        """Derivatives (..., 6) by the pose, and (..., n) by what is internal, as those by the
-        configuration's own unknowns, (..., d + n).
-        """
-        out = by_pose @ self.layout.motion
-        if not self.layout.n_internal:
-            return out
-        if by_internal is None:
-            by_internal = np.zeros((*out.shape[:-1], self.layout.n_internal))
-        return np.concatenate([out, by_internal], axis=-1)
 
     def moved(self, state: BatchState, shared: Array, own: Array) -> BatchState:
         """The state after a step (B, na) and (B, K, d), taken along what bends.
@@ -372,6 +388,6 @@ class Problem:
         return trial
 
 
-def _in_rows(parts: Array) -> Array:
-    """Rows (B, K, G, n, w) of G places one after the other, (B, K, G n, w)."""
-    return parts.reshape(*parts.shape[:2], parts.shape[2] * parts.shape[3], parts.shape[4])
+def _blocks_last(values: Array) -> Array:
+    """Derivatives (B, K, G, n, w) with the blocks last, (w, n, B, K, G)."""
+    return np.moveaxis(values, (-1, -2), (0, 1))

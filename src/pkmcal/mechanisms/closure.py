@@ -506,22 +506,82 @@ class LimbEnds:
 class Closure:
     """The closure's rows, (..., E): lengths of the legs that close, then the axes' equations.
 
-    value : m. u : (..., L, 3) unit directions from A to B of all legs. distance : (..., L) m.
-    by_pose : (..., E, 6). by_internal : (..., E, n), n = 0 for a rigid platform.
-    by_reading : (..., E) by the leg's own reading, zero where it has none.
-    index, by_theta : (E, n) parameters that each row depends on, P where there is none, and the
-    derivatives (..., E, n) by them.
+    Made from the machine (layout, theta), readings, poses and internal coordinates: what the
+    readings decide (base), what the pose decides (platform), and the rows between them. Derivatives
+    by the parameters are found when they are asked for: a search that only tries a step does not.
     """
 
-    value: Array
-    u: Array
-    distance: Array
-    by_pose: Array
-    by_internal: Array
-    by_reading: Array
-    index: Integers
-    by_theta: Array
-    ends: LimbEnds
+    layout: LimbLayout
+    theta: Array
+    readings: Array
+    poses: Array
+    internal: Array | None
+    base: BaseEnds
+    platform: PlatformEnds
+    rows: Rows
+
+    @property
+    def value(self) -> Array:
+        """(..., E) m."""
+        return self.rows.value
+
+    @property
+    def u(self) -> Array:
+        """(..., L, 3) unit directions from A to B of all legs."""
+        return self.rows.u
+
+    @property
+    def distance(self) -> Array:
+        """(..., L) m."""
+        return self.rows.distance
+
+    @property
+    def by_pose(self) -> Array:
+        """(..., E, 6)."""
+        return self.rows.by_pose
+
+    @property
+    def by_internal(self) -> Array:
+        """(..., E, n), n = 0 for a rigid platform."""
+        return self.rows.by_internal
+
+    @cached_property
+    def by_reading(self) -> Array:
+        """(..., E) by the leg's own reading, zero where it has none."""
+        return by_readings(self.layout, self.base, self.rows)
+
+    @cached_property
+    def ends(self) -> LimbEnds:
+        """The limbs' ends with their derivatives."""
+        return _with_parameters(
+            self.layout,
+            self.theta,
+            self.readings,
+            self.poses,
+            self.internal,
+            self.base,
+            self.platform,
+        )
+
+    @property
+    def index(self) -> Integers:
+        """(E, n) parameters that each row depends on, P where there is none."""
+        return self._by_parameters[0]
+
+    @property
+    def by_theta(self) -> Array:
+        """(..., E, n) derivatives by them."""
+        return self._by_parameters[1]
+
+    @cached_property
+    def _by_parameters(self) -> tuple[Integers, Array]:
+        layout = self.layout
+        lengths = _length_parameters(layout, self.rows.u, self.ends)
+        if not len(layout.angles):
+            return lengths
+        line = (self.ends.b - self.ends.a)[..., layout.angles.leg, :]
+        angles = _angle_parameters(layout, self.theta, self.poses, line, self.ends)
+        return _padded(layout, lengths, angles)
 
 
 def limb_ends(
@@ -601,23 +661,7 @@ def closure(
     base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
     rows = rows_between(layout, theta, base, platform, poses)
-    ends = _with_parameters(layout, theta, readings, poses, internal, base, platform)
-    index, by_theta = _length_parameters(layout, rows.u, ends)
-    if len(layout.angles):
-        line = (ends.b - ends.a)[..., layout.angles.leg, :]
-        angles = _angle_parameters(layout, theta, poses, line, ends)
-        index, by_theta = _padded(layout, (index, by_theta), angles)
-    return Closure(
-        value=rows.value,
-        u=rows.u,
-        distance=rows.distance,
-        by_pose=rows.by_pose,
-        by_internal=rows.by_internal,
-        by_reading=by_readings(layout, base, rows),
-        index=index,
-        by_theta=by_theta,
-        ends=ends,
-    )
+    return Closure(layout, theta, readings, poses, internal, base, platform, rows)
 
 
 def _length_parameters(layout: LimbLayout, u: Array, ends: LimbEnds) -> tuple[Integers, Array]:
