@@ -24,10 +24,11 @@ in metres, radians and pixels are not to be compared otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from enum import Enum
-from typing import Any, NamedTuple, Protocol, TypeVar, cast
+from functools import reduce
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 
@@ -48,6 +49,10 @@ is its rounding, where a direction is a millionth as well known as the others.""
 
 ROUNDING = 1e-13
 """Of the cost, relative."""
+
+ROWS = 8192
+"""Rows of the Jacobian that stand in memory at once, some megabytes of a processor's cache: beyond,
+as many runs or configurations are worked on as have so many."""
 
 FULL, NONE = 4.0, 6.5
 """Final weights are 1 up to FULL and 0 from NONE standard deviations: of clean pairs of residuals
@@ -116,6 +121,42 @@ class LeastSquares(Protocol):
         ...
 
 
+class Memory:
+    """Arrays that are written over again and again.
+
+    A fresh array of megabytes costs the system as much time as it takes to fill it.
+    """
+
+    def __init__(self) -> None:
+        self._flat: dict[str, Array] = {}
+
+    def empty(self, name: str, shape: tuple[int, ...]) -> Array:
+        """An array of this shape with anything in it; what had the name before is lost."""
+        size = int(np.prod(shape))
+        if name not in self._flat or self._flat[name].size < size:
+            self._flat[name] = np.empty(size)
+        return self._flat[name][:size].reshape(shape)
+
+
+@runtime_checkable
+class Divisible(LeastSquares, Protocol):
+    """A problem of which some configurations can be looked at alone, so that the Jacobian of all
+    never stands in memory at once.
+    """
+
+    def among(self, configurations: slice) -> Divisible:
+        """The problem of some configurations, with all that they share."""
+        ...
+
+    def state_among(self, state: Any, configurations: slice) -> Any:
+        """What that problem needs of a state."""
+        ...
+
+    def linearize(self, state: Any, memory: Memory | None = None) -> Linear:
+        """Of :class:`LeastSquares`; written into ``memory``, where that is given."""
+        ...
+
+
 def take(state: Runs, runs: Integers) -> Runs:
     """The state of some runs."""
     return _each(lambda array: array[runs], state)
@@ -154,6 +195,7 @@ class Reduced(NamedTuple):
     rows : (B, K, r', na) reduced Jacobian; the data's rows come first, the damping's after.
     value : (B, K, r) what of the residuals the own unknowns cannot take up.
     q, r : QR factors of the own Jacobian, q restricted to the data's rows.
+    along, fitted : q^T by_shared (B, K, d, na) and q^T value (B, K, d).
     gradient : (B, na) of half the cost, own unknowns eliminated.
     """
 
@@ -161,6 +203,8 @@ class Reduced(NamedTuple):
     value: Array
     q: Array
     r: Array
+    along: Array
+    fitted: Array
     gradient: Array
 
 
@@ -186,21 +230,27 @@ def own_factors(by_own: Array, damping: Array) -> tuple[Array, Array]:
     return np.linalg.qr(np.concatenate([by_own, extra], axis=-2))
 
 
-def eliminate(linear: Linear, damping: Array) -> Reduced:
-    """Own unknowns eliminated with Marquardt damping (B,), zero for none."""
-    n_rows = linear.by_own.shape[-2]
+def eliminate(linear: Linear, damping: Array, memory: Memory | None = None) -> Reduced:
+    """Own unknowns eliminated with Marquardt damping (B,), zero for none; the rows are written into
+    ``memory``, where that is given.
+    """
+    *batch, n_rows, na = linear.by_shared.shape
     q, r = own_factors(linear.by_own, damping)
     top, bottom = q[..., :n_rows, :], q[..., n_rows:, :]
-    along = top.mT @ linear.by_shared
-    rows = linear.by_shared - top @ along
-    if np.any(damping > 0):
-        rows = np.concatenate([rows, -bottom @ along], axis=-2)
-    value = linear.value[..., None]
+    along, fitted = top.mT @ linear.by_shared, top.mT @ linear.value[..., None]
+    damped = bottom.shape[-2] if np.any(damping > 0) else 0
+    memory = memory or Memory()
+    rows = memory.empty("reduced rows", (*batch, n_rows + damped, na))
+    data = np.matmul(top, along, out=rows[..., :n_rows, :])
+    np.subtract(linear.by_shared, data, out=data)
+    if damped:
+        np.matmul(-bottom, along, out=rows[..., n_rows:, :])
     # the damping's rows carry no residual of their own, only -bottom top^T value
-    left = value - top @ (top.mT @ value)
-    gradient = (linear.by_shared.mT @ left)[..., 0].sum(axis=1)
+    left = linear.value - (top @ fitted)[..., 0]
+    by_shared = linear.by_shared.reshape(len(left), -1, na)
+    gradient = (left.reshape(len(left), 1, -1) @ by_shared)[:, 0]
     gradient = gradient + linear.shared_value @ linear.shared_by
-    return Reduced(rows, left[..., 0], top, r, gradient)
+    return Reduced(rows, left, top, r, along, fitted[..., 0], gradient)
 
 
 def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
@@ -220,17 +270,86 @@ def reduced_normal(linear: Linear, reduced: Reduced) -> Array:
     return rows.mT @ rows + linear.shared_by.T @ linear.shared_by
 
 
+class _Part(NamedTuple):
+    """What a step needs of some configurations once their rows are forgotten.
+
+    usable : (B, K, r). along, fitted, r : of :class:`Reduced`. damped : (B, K, d) the damping's
+    part of the own unknowns' squares.
+    """
+
+    usable: Booleans
+    along: Array
+    fitted: Array
+    r: Array
+    damped: Array
+
+    def own(self, shared: Array) -> Array:
+        """The own unknowns' step (B, K, d) after the shared one (B, na)."""
+        right = self.fitted + (self.along @ shared[:, None, :, None])[..., 0]
+        return -np.linalg.solve(self.r, right[..., None])[..., 0]
+
+
+class _Normal(NamedTuple):
+    """The reduced problem's normal equations: matrix (B, na, na) and gradient (B, na) of the shared
+    unknowns, the cost (B,), and the parts that own unknowns were eliminated in.
+    """
+
+    matrix: Array
+    gradient: Array
+    cost: Array
+    parts: list[_Part]
+
+    def step(self, damping: Array) -> tuple[Array, list[Array]]:
+        """Levenberg-Marquardt step: shared (B, na) and own (B, K, d) of each part."""
+        scaled, scale = _unit_diagonal(self.matrix)
+        # at least a few rounding units, so that an unidentified direction gives no step
+        ridge = np.maximum(damping, 1e-15)[:, None, None] * np.eye(scale.shape[1])
+        right = (self.gradient / scale)[..., None]
+        shared = -np.linalg.solve(scaled + ridge, right)[..., 0] / scale
+        return shared, [part.own(shared) for part in self.parts]
+
+    def promise(self, shared: Array, own: list[Array]) -> tuple[Array, Array]:
+        """By how much the linear model lessens the cost along a step, to first order, and the
+        square of its change of all residuals, (B,) each.
+
+        With ``by_own = Q R`` the residuals' change is ``rows shared - Q fitted``, so that both
+        follow from what is left of the rows; the damping's own share is taken out.
+        """
+        fitted = _total(np.sum(part.fitted**2, axis=(1, 2)) for part in self.parts)
+        damped = zip(self.parts, own, strict=True)
+        size2 = (shared[:, None] @ self.matrix @ shared[..., None])[:, 0, 0] + fitted
+        size2 = size2 - _total(np.sum(part.damped * y**2, axis=(1, 2)) for part, y in damped)
+        first = 2 * (fitted - np.sum(shared * self.gradient, axis=1))
+        return first, np.maximum(size2, 0.0)
+
+
+def _total(parts: Iterable[Array]) -> Array:
+    return reduce(np.add, parts)
+
+
+def _normal(linears: Iterable[Linear], damping: Array, memory: Memory) -> _Normal:
+    """The normal equations of all parts, each eliminated before the next is asked for.
+
+    The rows on shared unknowns only stand in the first part.
+    """
+    matrix, gradient, cost, parts = [], [], [], list[_Part]()
+    for linear in linears:
+        if parts:
+            none = linear.shared_value[:, :0], linear.shared_by[:0]
+            linear = linear._replace(shared_value=none[0], shared_by=none[1])
+        reduced = eliminate(linear, damping, memory)
+        matrix.append(reduced_normal(linear, reduced))
+        gradient.append(reduced.gradient)
+        cost.append(_cost(Values(linear.value, linear.shared_value), linear.usable))
+        damped = damping[:, None, None] * np.sum(linear.by_own**2, axis=-2)
+        parts.append(_Part(linear.usable, reduced.along, reduced.fitted, reduced.r, damped))
+    return _Normal(_total(matrix), _total(gradient), _total(cost), parts)
+
+
 def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
     """Levenberg-Marquardt step: shared (B, na) and own (B, K, d)."""
-    reduced = eliminate(linear, damping)
-    scaled, scale = _unit_diagonal(reduced_normal(linear, reduced))
-    # at least a few rounding units, so that an unidentified direction gives no step
-    ridge = np.maximum(damping, 1e-15)[:, None, None] * np.eye(scale.shape[1])
-    shared = -np.linalg.solve(scaled + ridge, (reduced.gradient / scale)[..., None])[..., 0] / scale
-    fitted = linear.value + (linear.by_shared @ shared[:, None, :, None])[..., 0]
-    right = (reduced.q.mT @ fitted[..., None])[..., 0]
-    own = -np.linalg.solve(reduced.r, right[..., None])[..., 0]
-    return shared, own
+    shared, own = _normal([linear], damping, Memory()).step(damping)
+    return shared, own[0]
 
 
 def minimise(
@@ -238,7 +357,72 @@ def minimise(
 ) -> Solution:
     """Least squares from ``start``, all runs at once; each stops on its own."""
     values = problem.residuals(start)
-    n_runs = values.shared_value.shape[0]
+    n_runs, *rows = values.value.shape
+    few = max(1, ROWS // max(1, int(np.prod(rows))))
+    if n_runs <= few:
+        return _minimised(_Divided.of(problem, values), start, values, max_steps, damping)
+    found: list[Solution] = []
+    for first in range(0, n_runs, few):
+        runs = np.arange(first, min(first + few, n_runs))
+        part, at, here = problem.select(runs), take(start, runs), take(values, runs)
+        found.append(_minimised(_Divided.of(part, here), at, here, max_steps, damping))
+    return Solution(
+        _each(lambda *states: np.concatenate(states), *(one.state for one in found)),
+        np.concatenate([one.cost for one in found]),
+        np.concatenate([one.steps for one in found]),
+        tuple(reason for one in found for reason in one.stop),
+    )
+
+
+class _Divided(NamedTuple):
+    """A problem with its parts of some configurations each, small enough for the processor's cache,
+    and the memory that they write to in turn.
+    """
+
+    problem: LeastSquares
+    parts: list[tuple[slice, LeastSquares]]
+    memory: Memory
+
+    @classmethod
+    def of(cls, problem: LeastSquares, values: Values) -> _Divided:
+        """The problem whose residuals are like these, divided where it can be."""
+        n_runs, count, rows = values.value.shape
+        each = max(1, ROWS // max(1, n_runs * rows))
+        if not isinstance(problem, Divisible) or count <= each:
+            return cls(problem, [(slice(0, count), problem)], Memory())
+        cuts = [slice(first, min(first + each, count)) for first in range(0, count, each)]
+        return cls(problem, [(cut, problem.among(cut)) for cut in cuts], Memory())
+
+    def select(self, runs: Integers) -> _Divided:
+        """The same of some runs."""
+        parts = [(cut, part.select(runs)) for cut, part in self.parts]
+        return self._replace(problem=self.problem.select(runs), parts=parts)
+
+    def linears(self, state: Any) -> Iterator[Linear]:
+        """Residuals and Jacobian of one part after the other; the next is written over it."""
+        for cut, part in self.parts:
+            if isinstance(part, Divisible):
+                yield part.linearize(part.state_among(state, cut), self.memory)
+            else:
+                yield part.linearize(state)
+
+    def cost(self, state: Any, usable: list[Booleans]) -> Array:
+        """Sum of squares (B,) of the rows that were usable."""
+        total: list[Array] = []
+        for (cut, part), use in zip(self.parts, usable, strict=True):
+            here = part.state_among(state, cut) if isinstance(part, Divisible) else state
+            values = part.residuals(here)
+            if total:
+                values = values._replace(shared_value=values.shared_value[:, :0])
+            total.append(_cost(values, use))
+        return _total(total)
+
+
+def _minimised(
+    problem: _Divided, start: Any, values: Values, max_steps: int, damping: float
+) -> Solution:
+    """The same of few runs."""
+    n_runs = len(values.shared_value)
     cost = _cost(values, np.isfinite(values.value))
     steps = np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
@@ -271,22 +455,14 @@ class _Gain(NamedTuple):
     stop: list[Stop]
 
 
-def _try(problem: LeastSquares, state: Any, damping: Array) -> tuple[Any, _Gain]:
+def _try(problem: _Divided, state: Any, damping: Array) -> tuple[Any, _Gain]:
     """One damped step of every run; returns the accepted runs' new states and what came of it."""
-    linear = problem.linearize(state)
-    shared, own = damped_step(linear, damping)
-    trial = problem.moved(state, shared, own)
-    usable = linear.usable
-    cost = _cost(Values(linear.value, linear.shared_value), usable)
-    cost_trial = _cost(problem.residuals(trial), usable)
-    change = (linear.by_shared @ shared[:, None, :, None])[..., 0]
-    change = change + (linear.by_own @ own[..., None])[..., 0]
-    shared_change = shared @ linear.shared_by.T
-    size2 = np.sum(change**2, axis=(1, 2)) + np.sum(shared_change**2, axis=1)
-    descent = -2 * (
-        np.sum(change * linear.value, axis=(1, 2))
-        + np.sum(shared_change * linear.shared_value, axis=1)
-    )
+    normal = _normal(problem.linears(state), damping, problem.memory)
+    shared, own = normal.step(damping)
+    trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
+    usable = [part.usable for part in normal.parts]
+    cost, cost_trial = normal.cost, problem.cost(trial, usable)
+    descent, size2 = normal.promise(shared, own)
     ratio = (cost - cost_trial) / np.maximum(descent - size2, 1e-300)
     small = np.sqrt(size2) < STEP_TOLERANCE * (1 + 1e-3 * np.sqrt(cost))
     # a step near the end changes the cost by less than its rounding, and then it cannot be judged
@@ -297,7 +473,7 @@ def _try(problem: LeastSquares, state: Any, damping: Array) -> tuple[Any, _Gain]
         accepted, damping * np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2)), damping * 8
     )
     next_damping = np.clip(next_damping, LEAST_DAMPING, MOST_DAMPING)
-    any_usable = np.sum(usable, axis=(1, 2)) > 0
+    any_usable = _total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
     new = take(trial, np.flatnonzero(accepted))
     return new, _Gain(accepted, np.where(accepted, cost_trial, cost), next_damping, stop)

@@ -40,7 +40,7 @@ from pkmcal.identify.rows import (
 )
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, on_tangents
-from pkmcal.solver import Linear, Values, of_runs
+from pkmcal.solver import Linear, Memory, Values, of_runs
 
 CLOSINGS = 2
 """Newton steps back onto the closures; each squares what is left."""
@@ -90,6 +90,24 @@ class Problem:
         """The problem of some runs only."""
         return replace(self, data=of_runs(self.data, runs), pose_data=of_runs(self.pose_data, runs))
 
+    def among(self, configurations: slice) -> Problem:
+        """The problem of some configurations only."""
+        return replace(
+            self,
+            blocks=self.blocks.among(configurations),
+            data=self.data.among(configurations),
+            pose_blocks=self.pose_blocks.among(configurations),
+            pose_data=self.pose_data.among(configurations),
+        )
+
+    def state_among(self, state: BatchState, configurations: slice) -> BatchState:
+        """What that problem needs of a state."""
+        return replace(
+            state,
+            T_base_platform=state.T_base_platform[:, configurations],
+            internal=state.internal[:, configurations],
+        )
+
     def weighted(self, weight: Kinds[Array]) -> Problem:
         """The same problem with other weights (B, K, G) of each kind's measurements."""
         return replace(
@@ -138,12 +156,16 @@ class Problem:
         value = self._values(state, c, self._edges(state, c), self._poses(state))
         return Values(value, self.prior_values(state) - self.prior_target)
 
-    def linearize(self, state: BatchState) -> Linear:
-        """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
+    def linearize(self, state: BatchState, memory: Memory | None = None) -> Linear:
+        """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there.
+
+        memory : that of :class:`pkmcal.solver.Divisible`.
+        """
         c, d = self.closure(state), self.layout.own_motion.shape[1]
         edges, poses = self._edges(state, c), self._poses(state)
         value = self._values(state, c, edges, poses)
-        by_shared = np.zeros((*value.shape, self._width))
+        by_shared = (memory or Memory()).empty("by shared", (*value.shape, self._width))
+        by_shared.fill(0.0)
         by_own = np.zeros((*value.shape, d))
         self._put_edges(by_shared, by_own, edges)
         self._put_closures(by_shared, by_own, c)
@@ -219,7 +241,6 @@ class Problem:
             width = values.shape[-1]
             columns = part.start + width * number[..., None] + np.arange(width)
             np.put_along_axis(out, columns[None, :, :, None, :], values, axis=-1)
-        by_shared[:, :, first:] = out.reshape(by_shared[:, :, first:].shape)
         own = poses.by_platform[..., self.layout.freedoms]
         by_own[:, :, first:, : own.shape[-1]] = own.reshape(*own.shape[:2], -1, own.shape[-1])
 

@@ -19,7 +19,7 @@ Measurements stand in K configurations of G places each, padded to a common coun
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar
 
@@ -37,6 +37,7 @@ PERFECT = 1e-6
 a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
 
 Item = TypeVar("Item", covariant=True)
+Numbers = TypeVar("Numbers", "EdgeBlocks", "EdgeData", "PoseBlocks", "PoseData")
 
 
 class Kinds(NamedTuple, Generic[Item]):
@@ -71,6 +72,15 @@ class Kind:
         return np.any(self.whiten[0] != 0, axis=-1).sum(axis=-1)
 
 
+def _among(numbers: Numbers, configurations: slice, axis: int) -> Numbers:
+    """All arrays of a dataclass cut along the configurations' axis; what is the same for all of
+    them, a single one or none, stays.
+    """
+    cut = (slice(None),) * axis + (configurations,)
+    found = ((f.name, getattr(numbers, f.name)) for f in fields(numbers))
+    return replace(numbers, **{name: x[cut] for name, x in found if x.shape[axis] > 1})
+
+
 @dataclass(frozen=True)
 class EdgeBlocks:
     """Where the edges are: K configurations of G blocks, padded; the same for all runs.
@@ -93,6 +103,10 @@ class EdgeBlocks:
     present: Booleans
     line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
 
+    def among(self, configurations: slice) -> EdgeBlocks:
+        """Those of some configurations."""
+        return _among(self, configurations, 0)
+
 
 @dataclass(frozen=True)
 class EdgeData:
@@ -114,6 +128,10 @@ class EdgeData:
     weight: Array
     shading: Array = field(default_factory=lambda: np.full((1, 1), SHADING_SIGMA))
     breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 1)))
+
+    def among(self, configurations: slice) -> EdgeData:
+        """Those of some configurations."""
+        return replace(_among(self, configurations, 1), shading=self.shading)
 
     @cached_property
     def weighed(self) -> Array:
@@ -332,6 +350,10 @@ class PoseBlocks:
     on_platform: Booleans
     camera: Integers
 
+    def among(self, configurations: slice) -> PoseBlocks:
+        """Those of some configurations."""
+        return replace(_among(self, configurations, 0), on_platform=self.on_platform)
+
 
 @dataclass(frozen=True)
 class PoseData:
@@ -347,6 +369,10 @@ class PoseData:
     weight: Array
     optics: Array
     breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 6, 0)))
+
+    def among(self, configurations: slice) -> PoseData:
+        """Those of some configurations."""
+        return _among(self, configurations, 1)
 
 
 class PoseRows(NamedTuple):
