@@ -47,6 +47,7 @@ REFUSED = 1e-3
 """The same of a step that is refused, though the linear model promises something of it: that little
 is its rounding, where a direction is a millionth as well known as the others."""
 
+EPSILON = float(np.finfo(float).eps)
 ROUNDING = 1e-13
 """Of the cost, relative."""
 
@@ -210,12 +211,17 @@ class Reduced(NamedTuple):
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of a search: state, cost (B,), steps (B,), stop (B,) of Stop."""
+    """Result of a search: state, cost (B,), steps (B,), stop (B,) of Stop.
+
+    normal : (B, na, na) the reduced normal matrix where the last step was made, which is at the end
+    but for that step.
+    """
 
     state: Any
     cost: Array
     steps: Integers
     stop: tuple[Stop, ...]
+    normal: Array
 
 
 def own_factors(by_own: Array, damping: Array) -> tuple[Array, Array]:
@@ -371,6 +377,7 @@ def minimise(
         np.concatenate([one.cost for one in found]),
         np.concatenate([one.steps for one in found]),
         tuple(reason for one in found for reason in one.stop),
+        np.concatenate([one.normal for one in found]),
     )
 
 
@@ -426,16 +433,17 @@ def _minimised(
     cost = _cost(values, np.isfinite(values.value))
     steps = np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
-    dampings = np.full(n_runs, damping)
+    dampings, sizes = np.full(n_runs, damping), np.full(n_runs, np.inf)
     state, active = start, np.arange(n_runs)
     part, here = problem, start
+    normal: Array | None = None
     for _ in range(max_steps):
-        new, gain = _try(part, here, dampings[active])
+        new, gain = _try(part, here, dampings[active], sizes[active])
         steps[active] += 1
         here = put(here, np.flatnonzero(gain.accepted), new)
         state = put(state, active, here)
-        cost[active] = gain.cost
-        dampings[active] = gain.damping
+        cost[active], dampings[active], sizes[active] = gain.cost, gain.damping, gain.size
+        normal = gain.normal if normal is None else put(normal, active, gain.normal)
         for run, reason in zip(active, gain.stop, strict=True):
             stop[run] = reason
         keep = np.flatnonzero([reason is Stop.RUNNING for reason in gain.stop])
@@ -445,18 +453,27 @@ def _minimised(
             active = active[keep]
             part, here = problem.select(active), take(state, active)
     final = tuple(Stop.STEPS if s is Stop.RUNNING else s for s in stop)
-    return Solution(state, cost, steps, final)
+    return Solution(state, cost, steps, final, cast(Array, normal))
 
 
 class _Gain(NamedTuple):
+    """What came of a step. size : of its change of all residuals, infinite where it was refused."""
+
     accepted: Booleans
     cost: Array
     damping: Array
+    size: Array
+    normal: Array
     stop: list[Stop]
 
 
-def _try(problem: _Divided, state: Any, damping: Array) -> tuple[Any, _Gain]:
-    """One damped step of every run; returns the accepted runs' new states and what came of it."""
+def _try(problem: _Divided, state: Any, damping: Array, before: Array) -> tuple[Any, _Gain]:
+    """One damped step of every run; returns the accepted runs' new states and what came of it.
+
+    before : size of the last step, infinite where there is none. Steps that shrink by a factor q
+    each leave ``q / (1 - q)`` of the last one to go (Hairer and Wanner, Solving Ordinary
+    Differential Equations II, IV.8).
+    """
     normal = _normal(problem.linears(state), damping, problem.memory)
     shared, own = normal.step(damping)
     trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
@@ -464,11 +481,14 @@ def _try(problem: _Divided, state: Any, damping: Array) -> tuple[Any, _Gain]:
     cost, cost_trial = normal.cost, problem.cost(trial, usable)
     descent, size2 = normal.promise(shared, own)
     ratio = (cost - cost_trial) / np.maximum(descent - size2, 1e-300)
-    small = np.sqrt(size2) < STEP_TOLERANCE * (1 + 1e-3 * np.sqrt(cost))
+    size, tolerance = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
+    small = size < STEP_TOLERANCE * tolerance
     # a step near the end changes the cost by less than its rounding, and then it cannot be judged
     small |= np.abs(descent - size2) < ROUNDING * cost
     accepted = cost_trial <= cost * (1 + ROUNDING)
-    small |= ~accepted & (descent - size2 < (REFUSED * (1 + 1e-3 * np.sqrt(cost))) ** 2)
+    shrinks = accepted & np.isfinite(before) & (size < before)
+    small |= shrinks & (size**2 < STEP_TOLERANCE * tolerance * (before - size))
+    small |= ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2)
     next_damping = np.where(
         accepted, damping * np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2)), damping * 8
     )
@@ -476,7 +496,8 @@ def _try(problem: _Divided, state: Any, damping: Array) -> tuple[Any, _Gain]:
     any_usable = _total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
     new = take(trial, np.flatnonzero(accepted))
-    return new, _Gain(accepted, np.where(accepted, cost_trial, cost), next_damping, stop)
+    cost, size = np.where(accepted, cost_trial, cost), np.where(accepted, size, np.inf)
+    return new, _Gain(accepted, cost, next_damping, size, normal.matrix, stop)
 
 
 def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
@@ -550,6 +571,20 @@ def normal_root(normal: Array, least: float, *, loose: bool) -> Array:
     limit = least * values[..., -1:]
     inverse = 1 / np.maximum(values, limit) if loose else _of_known(values, limit)
     return vectors * np.sqrt(inverse)[..., None, :] / scale[..., None]
+
+
+def normal_inverse(normal: Array) -> tuple[Array, Booleans]:
+    """Inverses of normal matrices (B, m, m), unknowns scaled, and where they hold half of their
+    digits or more, (B,).
+    """
+    scaled, scale = _unit_diagonal(normal)
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        return np.full_like(normal, np.nan), np.zeros(len(normal), dtype=bool)
+    size = np.abs(scaled).sum(axis=-1).max(axis=-1) * np.abs(inverse).sum(axis=-1).max(axis=-1)
+    inverse = 0.5 * (inverse + inverse.mT)
+    return inverse / (scale[:, :, None] * scale[:, None, :]), size < 1 / np.sqrt(EPSILON)
 
 
 def _of_known(values: Array, limit: Array) -> Array:

@@ -103,6 +103,10 @@ class EdgeBlocks:
     present: Booleans
     line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
 
+    def place(self, n_legs: int) -> Integers:
+        """Where each block's leg stands among those of all configurations, (K, G)."""
+        return n_legs * np.arange(len(self.leg))[:, None] + self.leg
+
     def among(self, configurations: slice) -> EdgeBlocks:
         """Those of some configurations."""
         return _among(self, configurations, 0)
@@ -215,15 +219,15 @@ class EdgeRows:
     def by_station(self) -> Array:
         """By their station's (omega, tau), (6, 2g, ...)."""
         n, origin = self.normals.n, self.T_camera_base[:, 3]
-        by_a, by_b = (np.concatenate([_moments(p - origin, n), n], axis=1) for p in (self.a, self.b))
-        return self._by_a(by_a) + self._by_b(by_b)
+        a, b = (np.concatenate([_moments(p - origin, n), n], axis=1) for p in (self.a, self.b))
+        return self._by_a(a) + self._by_b(b)
 
     def by_own(self, freedoms: slice) -> Array:
         """By the configuration's own unknowns (d, 2g, ...): the platform's freedoms of its six, and
         what is internal.
         """
         platform = self.closure.platform
-        arm = _at(platform.arm, 1, self._row, self.blocks.leg)
+        arm = _at(platform.arm, 1, self._place)
         by = np.concatenate([_moments(arm, self._n_base), self._n_base], axis=1)[:, freedoms]
         if platform.by_internal.shape[-1]:
             by = np.concatenate([by, self._along(platform.by_internal)], axis=1)
@@ -236,12 +240,12 @@ class EdgeRows:
 
     def _along(self, by: Array) -> Array:
         """Derivatives of the limbs' ends (B, K, L, 3, n), along the blocks' normals (g, n, ...)."""
-        own = _at(by, 2, self._row, self.blocks.leg)
+        own = _at(by, 2, self._place)
         return np.einsum("ej...,jc...->ec...", self._n_base, own)
 
     @property
-    def _row(self) -> Integers:
-        return np.arange(len(self.blocks.leg))[:, None]
+    def _place(self) -> Integers:
+        return self.blocks.place(self.closure.layout.n_legs)
 
     @cached_property
     def _pulls(self) -> tuple[Array, Array]:
@@ -265,14 +269,16 @@ class EdgeRows:
         return np.einsum("eir...,ei...->er...", self.data.of_normals, vectors)
 
 
-def _at(array: Array, components: int, row: Integers, leg: Integers) -> Array:
-    """Legs' vectors or matrices (B, K, L, ...) at the blocks: components first, blocks last."""
+def _at(array: Array, components: int, place: Integers) -> Array:
+    """Vectors or matrices of a row of legs or stations (B, ..., n, c) at the blocks' places among
+    them, (K, G): components first, blocks last.
+    """
     first = np.moveaxis(array, range(-components, 0), range(components))
-    return first[..., row, leg]
+    return np.take(first.reshape(*first.shape[: components + 1], -1), place, axis=-1)
 
 
 def _moments(arm: Array, n: Array) -> Array:
-    """arm x n of arms (3, ...) and the blocks' normals (g, 3, ...)."""
+    """Moments ``arm x n`` of arms (3, ...) and the blocks' normals (g, 3, ...)."""
     return np.moveaxis(cross(np.moveaxis(arm, 0, -1), np.moveaxis(n, 1, -1)), -1, 1)
 
 
@@ -282,11 +288,11 @@ def edge_rows(
     """Rows of the edges from the machine's closure (B, K), the blocks' radii (B, K, G) and the
     stations (B, S, 4, 4).
     """
-    row, b = np.arange(len(blocks.leg))[:, None], c.platform.b
-    station = np.moveaxis(T_camera_base[..., :3, :], (-2, -1), (0, 1))[..., blocks.station]
+    place, ends = blocks.place(c.layout.n_legs), np.broadcast_arrays(c.base.a, c.platform.b)
+    station = _at(T_camera_base[..., :3, :], 2, blocks.station)
     a, b = (
-        np.einsum("ij...,j...->i...", station[:, :3], _at(end, 1, row, blocks.leg)) + station[:, 3]
-        for end in (np.broadcast_to(c.base.a, b.shape), b)
+        np.einsum("ij...,j...->i...", station[:, :3], _at(end, 1, place)) + station[:, 3]
+        for end in ends
     )
     side = np.moveaxis(blocks.side, -1, 0)[:, None]
     found = edge_normal_jacobians(np.moveaxis(a, 0, -1), np.moveaxis(b, 0, -1), radius, side)
