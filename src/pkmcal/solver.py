@@ -28,6 +28,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from enum import Enum
 from functools import reduce
+from itertools import product
+from math import prod
 from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
@@ -51,9 +53,12 @@ EPSILON = float(np.finfo(float).eps)
 ROUNDING = 1e-13
 """Of the cost, relative."""
 
-ROWS = 8192
-"""Rows of the Jacobian that stand in memory at once, some megabytes of a processor's cache: beyond,
-as many runs or configurations are worked on as have so many."""
+ROWS = 2**15
+"""Rows that are worked on at once: as many runs, or configurations of one, as have so many. A call
+of NumPy then costs little beside its arithmetic, and what it works on stays in the processor."""
+PIECE = 2**15
+"""Numbers of the Jacobian that are written at once, a quarter of a megabyte: it is read four times
+before it is forgotten, and the fastest cache that holds so much is half a megabyte or more."""
 
 FULL, NONE = 4.0, 6.5
 """Final weights are 1 up to FULL and 0 from NONE standard deviations: of clean pairs of residuals
@@ -133,10 +138,38 @@ class Memory:
 
     def empty(self, name: str, shape: tuple[int, ...]) -> Array:
         """An array of this shape with anything in it; what had the name before is lost."""
-        size = int(np.prod(shape))
+        size = prod(shape)
         if name not in self._flat or self._flat[name].size < size:
             self._flat[name] = np.empty(size)
         return self._flat[name][:size].reshape(shape)
+
+
+class Compact(NamedTuple):
+    """As :class:`Linear`, but for the Jacobian by the shared unknowns, of which few numbers a row
+    stand in memory until it is wanted.
+
+    n_shared : na. write : by_shared (k, r, na) of one run and some configurations, written into
+    memory where the next is written as well.
+    """
+
+    value: Array
+    by_own: Array
+    usable: Booleans
+    shared_value: Array
+    shared_by: Array
+    n_shared: int
+    write: Callable[[int, slice, Memory], Array]
+
+
+def compact(linear: Linear) -> Compact:
+    """The same of a Jacobian that stands in memory."""
+
+    def write(run: int, configurations: slice, memory: Memory) -> Array:
+        del memory
+        return linear.by_shared[run, configurations]
+
+    rest = linear.usable, linear.shared_value, linear.shared_by, linear.by_shared.shape[-1]
+    return Compact(linear.value, linear.by_own, *rest, write)
 
 
 @runtime_checkable
@@ -153,8 +186,8 @@ class Divisible(LeastSquares, Protocol):
         """What that problem needs of a state."""
         ...
 
-    def linearize(self, state: Any, memory: Memory | None = None) -> Linear:
-        """Of :class:`LeastSquares`; written into ``memory``, where that is given."""
+    def compact(self, state: Any) -> Compact:
+        """As :meth:`linearize`."""
         ...
 
 
@@ -196,7 +229,6 @@ class Reduced(NamedTuple):
     rows : (B, K, r', na) reduced Jacobian; the data's rows come first, the damping's after.
     value : (B, K, r) what of the residuals the own unknowns cannot take up.
     q, r : QR factors of the own Jacobian, q restricted to the data's rows.
-    along, fitted : q^T by_shared (B, K, d, na) and q^T value (B, K, d).
     gradient : (B, na) of half the cost, own unknowns eliminated.
     """
 
@@ -204,8 +236,6 @@ class Reduced(NamedTuple):
     value: Array
     q: Array
     r: Array
-    along: Array
-    fitted: Array
     gradient: Array
 
 
@@ -236,27 +266,32 @@ def own_factors(by_own: Array, damping: Array) -> tuple[Array, Array]:
     return np.linalg.qr(np.concatenate([by_own, extra], axis=-2))
 
 
-def eliminate(linear: Linear, damping: Array, memory: Memory | None = None) -> Reduced:
-    """Own unknowns eliminated with Marquardt damping (B,), zero for none; the rows are written into
-    ``memory``, where that is given.
-    """
-    *batch, n_rows, na = linear.by_shared.shape
+def eliminate(linear: Linear, damping: Array) -> Reduced:
+    """Own unknowns eliminated with Marquardt damping (B,), zero for none."""
+    n_rows, damped = linear.by_own.shape[-2], bool(np.any(damping > 0))
     q, r = own_factors(linear.by_own, damping)
-    top, bottom = q[..., :n_rows, :], q[..., n_rows:, :]
-    along, fitted = top.mT @ linear.by_shared, top.mT @ linear.value[..., None]
-    damped = bottom.shape[-2] if np.any(damping > 0) else 0
-    memory = memory or Memory()
-    rows = memory.empty("reduced rows", (*batch, n_rows + damped, na))
-    data = np.matmul(top, along, out=rows[..., :n_rows, :])
-    np.subtract(linear.by_shared, data, out=data)
-    if damped:
-        np.matmul(-bottom, along, out=rows[..., n_rows:, :])
+    along = q[..., :n_rows, :].mT @ linear.by_shared
+    rows = _left_of(linear.by_shared, q, along, damped, Memory())
+    top, value = q[..., :n_rows, :], linear.value[..., None]
     # the damping's rows carry no residual of their own, only -bottom top^T value
-    left = linear.value - (top @ fitted)[..., 0]
-    by_shared = linear.by_shared.reshape(len(left), -1, na)
-    gradient = (left.reshape(len(left), 1, -1) @ by_shared)[:, 0]
+    left = value - top @ (top.mT @ value)
+    gradient = (linear.by_shared.mT @ left)[..., 0].sum(axis=1)
     gradient = gradient + linear.shared_value @ linear.shared_by
-    return Reduced(rows, left, top, r, along, fitted[..., 0], gradient)
+    return Reduced(rows, left[..., 0], top, r, gradient)
+
+
+def _left_of(by_shared: Array, q: Array, along: Array, damped: bool, memory: Memory) -> Array:
+    """The reduced rows ``(I - Q Q^T) by_shared`` (..., r', na), the damping's where there are any.
+
+    along : Q^T by_shared, (..., d, na).
+    """
+    *batch, n_rows, na = by_shared.shape
+    out = memory.empty("reduced rows", (*batch, q.shape[-2] if damped else n_rows, na))
+    data = np.matmul(q[..., :n_rows, :], along, out=out[..., :n_rows, :])
+    np.subtract(by_shared, data, out=data)
+    if damped:
+        np.negative(np.matmul(q[..., n_rows:, :], along), out=out[..., n_rows:, :])
+    return out
 
 
 def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
@@ -277,12 +312,17 @@ def reduced_normal(linear: Linear, reduced: Reduced) -> Array:
 
 
 class _Part(NamedTuple):
-    """What a step needs of some configurations once their rows are forgotten.
+    """The normal equations of some configurations' rows, their own unknowns eliminated, and what a
+    step needs of them once the rows are forgotten.
 
-    usable : (B, K, r). along, fitted, r : of :class:`Reduced`. damped : (B, K, d) the damping's
-    part of the own unknowns' squares.
+    matrix : (B, na, na) and gradient (B, na) of the shared unknowns. cost : (B,). usable :
+    (B, K, r). along, fitted : Q^T by_shared (B, K, d, na) and Q^T value (B, K, d), with
+    ``by_own = Q R``. r : (B, K, d, d). damped : (B, K, d) the damping of the own unknowns' squares.
     """
 
+    matrix: Array
+    gradient: Array
+    cost: Array
     usable: Booleans
     along: Array
     fitted: Array
@@ -295,10 +335,35 @@ class _Part(NamedTuple):
         return -np.linalg.solve(self.r, right[..., None])[..., 0]
 
 
-class _Normal(NamedTuple):
-    """The reduced problem's normal equations: matrix (B, na, na) and gradient (B, na) of the shared
-    unknowns, the cost (B,), and the parts that own unknowns were eliminated in.
+def _part(rows: Compact, damping: Array, memory: Memory) -> _Part:
+    """A part's normal equations. The Jacobian is written, reduced and forgotten in pieces that stay
+    in the processor's cache.
     """
+    (n_runs, count, n_rows, d), na = rows.by_own.shape, rows.n_shared
+    q, r = own_factors(rows.by_own, damping)
+    top, damped = q[..., :n_rows, :], bool(np.any(damping > 0))
+    fitted = (top.mT @ rows.value[..., None])[..., 0]
+    # the damping's rows carry no residual of their own, only -bottom top^T value
+    left = rows.value - (top @ fitted[..., None])[..., 0]
+    along = np.empty((n_runs, count, d, na))
+    matrix = np.tile(rows.shared_by.T @ rows.shared_by, (n_runs, 1, 1))
+    gradient = rows.shared_value @ rows.shared_by
+    pieces = -(-count * n_rows * na // PIECE)
+    cuts = [slice(count * k // pieces, count * (k + 1) // pieces) for k in range(pieces)]
+    for run, cut in product(range(n_runs), cuts):
+        by_shared = rows.write(run, cut, memory)
+        np.matmul(top[run, cut].mT, by_shared, out=along[run, cut])
+        reduced = _left_of(by_shared, q[run, cut], along[run, cut], damped, memory)
+        reduced = reduced.reshape(-1, na)
+        matrix[run] += reduced.T @ reduced
+        gradient[run] += left[run, cut].ravel() @ by_shared.reshape(-1, na)
+    cost = _cost(Values(rows.value, rows.shared_value), rows.usable)
+    own = damping[:, None, None] * np.sum(rows.by_own**2, axis=-2)
+    return _Part(matrix, gradient, cost, rows.usable, along, fitted, r, own)
+
+
+class _Normal(NamedTuple):
+    """The normal equations of all parts; see :class:`_Part`."""
 
     matrix: Array
     gradient: Array
@@ -333,28 +398,22 @@ def _total(parts: Iterable[Array]) -> Array:
     return reduce(np.add, parts)
 
 
-def _normal(linears: Iterable[Linear], damping: Array, memory: Memory) -> _Normal:
-    """The normal equations of all parts, each eliminated before the next is asked for.
-
-    The rows on shared unknowns only stand in the first part.
-    """
-    matrix, gradient, cost, parts = [], [], [], list[_Part]()
-    for linear in linears:
-        if parts:
-            none = linear.shared_value[:, :0], linear.shared_by[:0]
-            linear = linear._replace(shared_value=none[0], shared_by=none[1])
-        reduced = eliminate(linear, damping, memory)
-        matrix.append(reduced_normal(linear, reduced))
-        gradient.append(reduced.gradient)
-        cost.append(_cost(Values(linear.value, linear.shared_value), linear.usable))
-        damped = damping[:, None, None] * np.sum(linear.by_own**2, axis=-2)
-        parts.append(_Part(linear.usable, reduced.along, reduced.fitted, reduced.r, damped))
-    return _Normal(_total(matrix), _total(gradient), _total(cost), parts)
+def _normal(parts: Iterable[Compact], damping: Array, memory: Memory) -> _Normal:
+    """The normal equations of all parts, each reduced before the next is asked for."""
+    done: list[_Part] = []
+    for rows in parts:
+        if done:  # the rows on shared unknowns only stand in the first part
+            none = rows.shared_value[:, :0], rows.shared_by[:0]
+            rows = rows._replace(shared_value=none[0], shared_by=none[1])
+        done.append(_part(rows, damping, memory))
+    sums = zip(*((part.matrix, part.gradient, part.cost) for part in done), strict=True)
+    matrix, gradient, cost = (_total(each) for each in sums)
+    return _Normal(matrix, gradient, cost, done)
 
 
 def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
     """Levenberg-Marquardt step: shared (B, na) and own (B, K, d)."""
-    shared, own = _normal([linear], damping, Memory()).step(damping)
+    shared, own = _normal([compact(linear)], damping, Memory()).step(damping)
     return shared, own[0]
 
 
@@ -405,13 +464,13 @@ class _Divided(NamedTuple):
         parts = [(cut, part.select(runs)) for cut, part in self.parts]
         return self._replace(problem=self.problem.select(runs), parts=parts)
 
-    def linears(self, state: Any) -> Iterator[Linear]:
-        """Residuals and Jacobian of one part after the other; the next is written over it."""
+    def rows(self, state: Any) -> Iterator[Compact]:
+        """Residuals and Jacobian of one part after the other."""
         for cut, part in self.parts:
             if isinstance(part, Divisible):
-                yield part.linearize(part.state_among(state, cut), self.memory)
+                yield part.compact(part.state_among(state, cut))
             else:
-                yield part.linearize(state)
+                yield compact(part.linearize(state))
 
     def cost(self, state: Any, usable: list[Booleans]) -> Array:
         """Sum of squares (B,) of the rows that were usable."""
@@ -474,7 +533,7 @@ def _try(problem: _Divided, state: Any, damping: Array, before: Array) -> tuple[
     each leave ``q / (1 - q)`` of the last one to go (Hairer and Wanner, Solving Ordinary
     Differential Equations II, IV.8).
     """
-    normal = _normal(problem.linears(state), damping, problem.memory)
+    normal = _normal(problem.rows(state), damping, problem.memory)
     shared, own = normal.step(damping)
     trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
     usable = [part.usable for part in normal.parts]

@@ -40,7 +40,7 @@ from pkmcal.identify.rows import (
 )
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, on_tangents
-from pkmcal.solver import Linear, Memory, Values, of_runs
+from pkmcal.solver import Compact, Linear, Memory, Values, of_runs
 
 CLOSINGS = 2
 """Newton steps back onto the closures; each squares what is left."""
@@ -156,98 +156,127 @@ class Problem:
         value = self._values(state, c, self._edges(state, c), self._poses(state))
         return Values(value, self.prior_values(state) - self.prior_target)
 
-    def linearize(self, state: BatchState, memory: Memory | None = None) -> Linear:
-        """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there.
-
-        memory : that of :class:`pkmcal.solver.Divisible`.
-        """
-        c, d = self.closure(state), self.layout.own_motion.shape[1]
-        edges, poses = self._edges(state, c), self._poses(state)
-        value = self._values(state, c, edges, poses)
-        by_shared = (memory or Memory()).empty("by shared", (*value.shape, self._width))
-        by_shared.fill(0.0)
-        by_own = np.zeros((*value.shape, d))
-        self._put_edges(by_shared, by_own, edges)
-        self._put_closures(by_shared, by_own, c)
-        if self.pose_blocks.present.size:
-            self._put_poses(by_shared, by_own, poses)
-        if self._choice is None:
-            machine = by_shared[..., self.unknowns.count : -1]
-            by_shared[..., self.unknowns.machine] = machine @ self.free
-        # padding may lie anywhere, so its derivatives need not be finite though its row is zero
-        usable = np.isfinite(value) & self._in_use()
-        lost = ~np.isfinite(value + by_shared.sum(axis=-1))
-        if lost.any():
-            by_shared[lost], by_own[lost] = 0.0, 0.0
+    def linearize(self, state: BatchState) -> Linear:
+        """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
+        rows = self.compact(state)
+        by_shared = np.empty((*rows.value.shape, rows.n_shared))
+        for run, out in enumerate(by_shared):
+            out[...] = rows.write(run, slice(None), Memory())
         return Linear(
-            np.where(usable, value, 0.0),
-            by_shared[..., : self.unknowns.count],
-            by_own,
-            usable,
-            self.prior_values(state) - self.prior_target,
-            self.prior,
+            rows.value, by_shared, rows.by_own, rows.usable, rows.shared_value, rows.shared_by
         )
 
-    def _put_edges(self, by_shared: Array, by_own: Array, edges: EdgeRows) -> None:
-        """Writes the edges' derivatives into their rows."""
-        u, blocks = self.unknowns, self.blocks
-        parts = [(self._column[index], values) for index, values in edges.by_machine]
-        others = [
-            (u.stations, blocks.station, edges.by_station),
-            (u.optics, blocks.camera, _blocks_last(edges.by_optics)),
-        ]
-        if u.n_lines:
-            line = np.maximum(blocks.line, 0)
-            others.append((u.shading, line, _blocks_last(edges.by_line)))
-        if u.n_breathing:
-            others.append((u.breathing, blocks.station, _blocks_last(edges.by_breathing)))
-        for part, number, values in others:
-            width = len(values)
-            parts.append((part.start + width * number[..., None] + np.arange(width), values))
-        n_runs, (k, g), n = len(by_shared), blocks.leg.shape, blocks.side.shape[-1] * 2
-        row = by_shared.shape[2] * np.arange(k)[:, None] + n * np.arange(g)
-        row = row + np.arange(n)[:, None, None]
-        column = np.concatenate([np.moveaxis(index, -1, 0) for index, _ in parts])
-        where = row * self._width + column[:, None]
-        values = [np.broadcast_to(v, (*v.shape[:2], n_runs, k, g)) for _, v in parts]
-        flat = by_shared.reshape(n_runs, -1)
-        flat[:, where] = np.moveaxis(np.concatenate(values), 2, 0)
-        own = np.moveaxis(edges.by_own(self.layout.freedoms), (0, 1), (-1, -2))
-        by_own[:, :, : g * n] = own.reshape(n_runs, k, g * n, -1)
+    def compact(self, state: BatchState) -> Compact:
+        """The same, with the derivatives by the shared unknowns of all rows that have few of them
+        in few numbers.
+        """
+        c = self.closure(state)
+        edges, poses = self._edges(state, c), self._poses(state)
+        value = self._values(state, c, edges, poses)
+        usable = np.isfinite(value) & self._in_use()
+        few, own = self._of_edges(edges)
+        wide, by_pose = self._of_closures(c)
+        if self.pose_blocks.present.size:
+            boards = self._of_boards(poses)
+            wide, by_pose = (
+                np.concatenate(both, axis=2) for both in zip((wide, by_pose), boards, strict=True)
+            )
+        by_own = np.concatenate([own, by_pose], axis=2)
+        # padding may lie anywhere, so its derivatives need not be finite though its row is zero
+        lost = ~np.isfinite(wide.sum(axis=-1) + value[:, :, self.closure_rows.start :])
+        wide[lost] = 0.0
+        by_own[~np.isfinite(value + by_own.sum(axis=-1))] = 0.0
 
-    def _put_closures(self, by_shared: Array, by_own: Array, c: Closure) -> None:
-        """The same of the closure's."""
-        rows, machine = self.closure_rows, slice(0, self.unknowns.n_free)
+        def write(run: int, configurations: slice, memory: Memory) -> Array:
+            return self._written(few[:, :, run], wide[run], configurations, memory)
+
+        shared_value = self.prior_values(state) - self.prior_target
+        value = np.where(usable, value, 0.0)
+        count = self.unknowns.count
+        return Compact(value, by_own, usable, shared_value, self.prior, count, write)
+
+    def _written(self, few: Array, wide: Array, some: slice, memory: Memory) -> Array:
+        """Derivatives (k, r, na) of some configurations of one run by the shared unknowns, from
+        those of the edges (n, 2g, K, G) and those of all other rows (K, r', na).
+        """
+        first, count = self.closure_rows.start, self.unknowns.count
+        where, wide = self._edge_places[:, :, some], wide[some]
+        k = len(wide)
+        out = memory.empty("by shared", (k, first + wide.shape[1], self._width))
+        out.fill(0.0)
+        if where.size:
+            out.reshape(-1)[where - (some.start or 0) * out[0].size] = few[:, :, some]
         if self._choice is None:
-            machine = slice(self.unknowns.count, self._width)
-        number = np.arange(rows.start, rows.stop)[:, None]
-        by_shared[:, :, number, self._column[c.index]] = c.by_theta
-        by_shared[:, :, rows, machine] = self._by_noise(c, by_shared[:, :, rows, machine])
-        by_own[:, :, rows] = self._by_noise(c, self.layout.by_own(c))
+            out[:, :first, self.unknowns.machine] = out[:, :first, count:-1] @ self.free
+        out[:, first:, :count] = wide
+        return out[..., :count]
 
-    def _put_poses(self, by_shared: Array, by_own: Array, poses: PoseRows) -> None:
-        """The same of the boards' poses."""
-        u, boards, first = self.unknowns, self.pose_blocks, self.closure_rows.stop
+    @cached_property
+    def _edge_places(self) -> Integers:
+        """Where the edges' derivatives are written among all of a run, (n, 2g, K, G)."""
+        u, blocks, layout = self.unknowns, self.blocks, self.layout
+        index = (layout.a_index[blocks.leg], layout.b_index[blocks.leg], blocks.radius[..., None])
+        columns = [self._column[part] for part in index]
+        columns.append(_columns(u.stations, blocks.station, 6))
+        columns.append(_columns(u.optics, blocks.camera, u.n_optics))
+        if u.n_lines:
+            columns.append(_columns(u.shading, np.maximum(blocks.line, 0), 1))
+        if u.n_breathing:
+            columns.append(_columns(u.breathing, blocks.station, 1))
+        (k, g), n = blocks.leg.shape, 2 * blocks.side.shape[-1]
+        rows = self.closure_rows.stop + self.pose_blocks.present.shape[1] * 6
+        row = rows * np.arange(k)[:, None] + n * np.arange(g) + np.arange(n)[:, None, None]
+        return row * self._width + np.moveaxis(np.concatenate(columns, axis=-1), -1, 0)[:, None]
+
+    def _of_edges(self, edges: EdgeRows) -> tuple[Array, Array]:
+        """The edges' derivatives (n, 2g, B, K, G) by what :attr:`_edge_places` says, and by the
+        configuration's own unknowns, (B, K, G 2g, d); zero where they are lost.
+        """
+        parts = [*edges.by_machine, edges.by_station, _blocks_last(edges.by_optics)]
+        if self.unknowns.n_lines:
+            parts.append(_blocks_last(edges.by_line))
+        if self.unknowns.n_breathing:
+            parts.append(_blocks_last(edges.by_breathing))
+        own = edges.by_own(self.layout.freedoms)
+        blocks = own.shape[1:]
+        out = np.concatenate([np.broadcast_to(part, (len(part), *blocks)) for part in parts])
+        lost = ~np.isfinite(out.sum(axis=0))
+        if lost.any():
+            out[:, lost] = 0.0
+        return out, _in_rows(np.moveaxis(own, (0, 1), (-1, -2)))
+
+    def _of_closures(self, c: Closure) -> tuple[Array, Array]:
+        """The closures' derivatives by the shared unknowns (B, K, E, na) and by the own ones."""
+        n = self.drawing.size
+        full = np.zeros((*c.value.shape, n + 1))  # the last column takes what is no parameter's
+        full[:, :, np.arange(c.value.shape[-1])[:, None], c.index] = c.by_theta
+        out = np.zeros((*c.value.shape, self.unknowns.count))
+        free = full[..., :n] @ self.free if self._choice is None else full[..., self._choice]
+        out[..., self.unknowns.machine] = self._by_noise(c, free)
+        return out, self._by_noise(c, self.layout.by_own(c))
+
+    def _of_boards(self, poses: PoseRows) -> tuple[Array, Array]:
+        """The same of the boards' poses, (B, K, 6 G, na)."""
+        u, boards = self.unknowns, self.pose_blocks
         parts = [
-            (u.stations, boards.station, poses.by_station),
-            (u.optics, boards.camera, poses.by_optics),
-            (u.mounts, boards.mount, poses.by_mount),
+            (_columns(u.stations, boards.station, 6), poses.by_station),
+            (_columns(u.optics, boards.camera, u.n_optics), poses.by_optics),
+            (_columns(u.mounts, boards.mount, 6), poses.by_mount),
         ]
         if u.n_breathing:
-            parts.append((u.breathing, boards.station, poses.by_breathing))
-        shape = (*poses.value.shape, by_shared.shape[-1])
-        out = by_shared[:, :, first:].reshape(shape)
-        for part, number, values in parts:
-            width = values.shape[-1]
-            columns = part.start + width * number[..., None] + np.arange(width)
-            np.put_along_axis(out, columns[None, :, :, None, :], values, axis=-1)
-        own = poses.by_platform[..., self.layout.freedoms]
-        by_own[:, :, first:, : own.shape[-1]] = own.reshape(*own.shape[:2], -1, own.shape[-1])
+            parts.append((_columns(u.breathing, boards.station, 1), poses.by_breathing))
+        out = np.zeros((*poses.value.shape, u.count))
+        for columns, values in parts:
+            np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
+        own = np.zeros((*poses.value.shape, self.layout.own_motion.shape[1]))
+        by_pose = poses.by_platform[..., self.layout.freedoms]
+        own[..., : by_pose.shape[-1]] = by_pose
+        return _in_rows(out), _in_rows(own)
 
     @cached_property
     def _width(self) -> int:
-        """Columns of a row while it is written: the shared unknowns', where parameters are tied or
-        are axes one for each parameter besides, and one for what is no unknown.
+        """Columns of an edge's row while it is written: the shared unknowns', where parameters are
+        tied or are axes one for each parameter besides, and one for what is no unknown.
         """
         return self.unknowns.count + 1 + (0 if self._choice is not None else self.drawing.size)
 
@@ -407,6 +436,16 @@ class Problem:
                 internal=trial.internal + step[..., 6:],
             )
         return trial
+
+
+def _columns(part: slice, number: Integers, width: int) -> Integers:
+    """Columns (K, G, width) of unknowns ``width`` wide each, by which one it is, (K, G)."""
+    return part.start + width * number[..., None] + np.arange(width)
+
+
+def _in_rows(parts: Array) -> Array:
+    """Rows (B, K, G, n, w) of G places one after the other, (B, K, G n, w)."""
+    return parts.reshape(*parts.shape[:2], parts.shape[2] * parts.shape[3], parts.shape[4])
 
 
 def _blocks_last(values: Array) -> Array:

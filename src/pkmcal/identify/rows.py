@@ -205,15 +205,11 @@ class EdgeRows:
         return self.data.weighed @ self.data.breathing
 
     @property
-    def by_machine(self) -> list[tuple[Integers, Array]]:
-        """By parameters at positions (K, G, n): (n, 2g, ...) of both ends and of the radius."""
-        legs, ends = self.blocks.leg, self.closure.ends
+    def by_machine(self) -> tuple[Array, Array, Array]:
+        """By the parameters of both ends and by the radius, (n, 2g, ...) each."""
+        ends = self.closure.ends
         radius = np.sum(self._pulls[0] + self._pulls[1], axis=0)[None]
-        return [
-            (ends.a_index[legs], self._by_a(self._along(ends.a_by))),
-            (ends.b_index[legs], self._by_b(self._along(ends.b_by))),
-            (self.blocks.radius[..., None], radius),
-        ]
+        return self._by_a(self._along(ends.a_by)), self._by_b(self._along(ends.b_by)), radius
 
     @property
     def by_station(self) -> Array:

@@ -148,6 +148,23 @@ class LimbLayout:
         return out
 
     @cached_property
+    def a_index(self) -> Integers:
+        """(L, n) parameters that each limb's end A depends on, P where there are fewer."""
+        return self._ends_index(self.base)
+
+    @cached_property
+    def b_index(self) -> Integers:
+        """(L, n) the same of B."""
+        return self._ends_index(self.platform)
+
+    def _ends_index(self, groups: tuple[CarrierGroup, ...]) -> Integers:
+        width = max(g.index.shape[1] for g in groups)
+        index = np.full((self.n_legs, width), self.n_parameters)
+        for group in groups:
+            index[group.legs, : group.index.shape[1]] = group.index
+        return index
+
+    @cached_property
     def free(self) -> Booleans:
         """(6,) which of (omega, tau) the motion has."""
         return np.asarray(self.motion.any(axis=1))
@@ -613,8 +630,6 @@ def _with_parameters(
         g.carrier.by_parameters(g.of(theta), at_legs, own_internal(layout, g, internal))
         for g in layout.platform
     ]
-    all_a_by, a_index = _gather(layout, layout.base, a_by)
-    all_b_by, b_index = _gather(layout, layout.platform, b_by)
     shape = np.broadcast_shapes(theta.shape[:-1], readings.shape[:-1])
     a, by_reading = (
         np.broadcast_to(x, (*shape, layout.n_legs, 3)) for x in (base.a, base.by_reading)
@@ -622,10 +637,10 @@ def _with_parameters(
     return LimbEnds(
         a,
         platform.b,
-        a_index,
-        b_index,
-        all_a_by,
-        all_b_by,
+        layout.a_index,
+        layout.b_index,
+        _padded_to(layout.a_index.shape, layout.base, a_by),
+        _padded_to(layout.b_index.shape, layout.platform, b_by),
         by_reading,
         platform.arm,
         layout.n_parameters,
@@ -633,21 +648,17 @@ def _with_parameters(
     )
 
 
-def _gather(
-    layout: LimbLayout, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]
-) -> tuple[Array, Integers]:
-    """Carriers' derivatives put in the order of the legs, parameters padded to a common count."""
+def _padded_to(
+    shape: tuple[int, ...], groups: tuple[CarrierGroup, ...], by_parameters: list[Array]
+) -> Array:
+    """Carriers' derivatives in the order of the legs, for n parameters each; shape is (L, n)."""
     if len(groups) == 1:
-        return by_parameters[0], groups[0].index
-    width = max(g.index.shape[1] for g in groups)
-    index = np.full((layout.n_legs, width), layout.n_parameters)
-    shape = np.broadcast_shapes(*(by.shape[:-3] for by in by_parameters))
-    out = np.zeros((*shape, layout.n_legs, 3, width))
+        return by_parameters[0]
+    lead = np.broadcast_shapes(*(by.shape[:-3] for by in by_parameters))
+    out = np.zeros((*lead, shape[0], 3, shape[1]))
     for group, by in zip(groups, by_parameters, strict=True):
-        n = group.index.shape[1]
-        index[group.legs, :n] = group.index
-        out[..., group.legs, :, :n] = by
-    return out, index
+        out[..., group.legs, :, : by.shape[-1]] = by
+    return out
 
 
 def closure(
