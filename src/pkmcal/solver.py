@@ -36,10 +36,11 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 
-FIRST_DAMPING = 1e-5
-RESTART_DAMPING = 1e-9
-"""First damping where the start is an answer already, to slightly other weights."""
 LEAST_DAMPING = 1e-14
+"""Damping that a search begins with, as good as none: near an answer, and starts mostly are, a full
+step is the best, and any damping costs steps along what is known little of."""
+USEFUL_DAMPING = 1e-5
+"""Damping after a step that did not keep its promise, at least: much less changes no step."""
 MOST_DAMPING = 1e9
 """Damping beyond which a step is below rounding: nothing downhill was found."""
 STEP_TOLERANCE = 1e-7
@@ -417,20 +418,18 @@ def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
     return shared, own[0]
 
 
-def minimise(
-    problem: LeastSquares, start: Any, max_steps: int = 100, damping: float = FIRST_DAMPING
-) -> Solution:
+def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solution:
     """Least squares from ``start``, all runs at once; each stops on its own."""
     values = problem.residuals(start)
     n_runs, *rows = values.value.shape
     few = max(1, ROWS // max(1, int(np.prod(rows))))
     if n_runs <= few:
-        return _minimised(_Divided.of(problem, values), start, values, max_steps, damping)
+        return _minimised(_Divided.of(problem, values), start, values, max_steps)
     found: list[Solution] = []
     for first in range(0, n_runs, few):
         runs = np.arange(first, min(first + few, n_runs))
         part, at, here = problem.select(runs), take(start, runs), take(values, runs)
-        found.append(_minimised(_Divided.of(part, here), at, here, max_steps, damping))
+        found.append(_minimised(_Divided.of(part, here), at, here, max_steps))
     return Solution(
         _each(lambda *states: np.concatenate(states), *(one.state for one in found)),
         np.concatenate([one.cost for one in found]),
@@ -484,15 +483,13 @@ class _Divided(NamedTuple):
         return _total(total)
 
 
-def _minimised(
-    problem: _Divided, start: Any, values: Values, max_steps: int, damping: float
-) -> Solution:
+def _minimised(problem: _Divided, start: Any, values: Values, max_steps: int) -> Solution:
     """The same of few runs."""
     n_runs = len(values.shared_value)
     cost = _cost(values, np.isfinite(values.value))
     steps = np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
-    dampings, sizes = np.full(n_runs, damping), np.full(n_runs, np.inf)
+    dampings, sizes = np.full(n_runs, LEAST_DAMPING), np.full(n_runs, np.inf)
     state, active = start, np.arange(n_runs)
     part, here = problem, start
     normal: Array | None = None
@@ -548,9 +545,9 @@ def _try(problem: _Divided, state: Any, damping: Array, before: Array) -> tuple[
     shrinks = accepted & np.isfinite(before) & (size < before)
     small |= shrinks & (size**2 < STEP_TOLERANCE * tolerance * (before - size))
     small |= ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2)
-    next_damping = np.where(
-        accepted, damping * np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2)), damping * 8
-    )
+    less = damping * np.where(ratio > 0.5, 0.05, 0.5)
+    more = np.maximum(damping * np.where(accepted, 2.0, 8.0), USEFUL_DAMPING)
+    next_damping = np.where(accepted & (ratio > 0.2), less, more)
     next_damping = np.clip(next_damping, LEAST_DAMPING, MOST_DAMPING)
     any_usable = _total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]

@@ -32,8 +32,6 @@ from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import (
-    FIRST_DAMPING,
-    RESTART_DAMPING,
     Solution,
     Stop,
     minimise,
@@ -76,12 +74,10 @@ def solve_batch(
     *,
     robust: bool = True,
     scale_noise: bool = True,
-    damping: float = FIRST_DAMPING,
     hopeless: float = np.inf,
 ) -> BatchResult:
     """All runs of a problem from their starts; see :func:`bundle` for the options.
 
-    damping : the search's first; less where the start is near, as after the four steps.
     hopeless : all runs are left as they are where, after a search, the poses' noise has to be
     larger than stated by more than this factor.
     """
@@ -100,7 +96,7 @@ def solve_batch(
         found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
         state, weight, steps = found.state, found.weight, steps + found.steps
         scale = found.scale if scale_noise else ones
-    fit = _solved(problem, state, weight, scale, steps, RESTART_DAMPING if robust else damping)
+    fit = _solved(problem, state, weight, scale, steps)
     for _ in range(ROUNDS if robust or scale_noise else 0):
         scale = _noise_scale(fit) if scale_noise else fit.scale
         if scale.poses.min() > hopeless:
@@ -118,7 +114,7 @@ def solve_batch(
             units = problem.data.shading / shading  # the same shifts in other units
             state = replace(state, shading=state.shading * units)
             problem = problem.shaded(shading)
-        fit = _solved(problem, state, weight, scale, fit.solution.steps, RESTART_DAMPING)
+        fit = _solved(problem, state, weight, scale, fit.solution.steps)
     steps = fit.solution.steps
     return BatchResult(fit.info.problem, fit.solution, fit.weight, fit.scale, steps, fit.info)
 
@@ -152,12 +148,11 @@ def _solved(
     weight: Kinds[Array],
     scale: Kinds[Array],
     steps: Integers,
-    damping: float,
 ) -> _Fit:
     """The problem solved with these weights, from a state that ``steps`` (B,) have led to."""
     parts = zip(weight, scale, strict=True)
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
-    found = minimise(used, state, damping=damping)
+    found = minimise(used, state)
     found = replace(found, steps=steps + found.steps)
     return _Fit(found, weight, scale, information(used, found.state, found.normal))
 
