@@ -32,11 +32,8 @@ from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import (
-    FIRST_DAMPING,
-    RESTART_DAMPING,
     Solution,
     Stop,
-    eliminate,
     minimise,
 )
 
@@ -77,12 +74,10 @@ def solve_batch(
     *,
     robust: bool = True,
     scale_noise: bool = True,
-    damping: float = FIRST_DAMPING,
     hopeless: float = np.inf,
 ) -> BatchResult:
     """All runs of a problem from their starts; see :func:`bundle` for the options.
 
-    damping : the search's first; less where the start is near, as after the four steps.
     hopeless : all runs are left as they are where, after a search, the poses' noise has to be
     larger than stated by more than this factor.
     """
@@ -96,46 +91,43 @@ def solve_batch(
     least = problem.data.shading[:, :1]
     if estimates_shading:
         problem = problem.shaded(np.full((n_runs, problem.unknowns.n_lines), SHIFT_SIGMA))
-    fit = _Fit(problem, start, every, ones, np.zeros(n_runs, dtype=int), ())
+    state, weight, scale, steps = start, every, ones, np.zeros(n_runs, dtype=int)
     if robust:
         found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
-        scale = found.scale if scale_noise else fit.scale
-        fit = fit._replace(state=found.state, weight=found.weight, scale=scale, steps=found.steps)
-    fit = _solved(problem, fit, RESTART_DAMPING if robust else damping)
+        state, weight, steps = found.state, found.weight, steps + found.steps
+        scale = found.scale if scale_noise else ones
+    fit = _solved(problem, state, weight, scale, steps)
     for _ in range(ROUNDS if robust or scale_noise else 0):
         scale = _noise_scale(fit) if scale_noise else fit.scale
         if scale.poses.min() > hopeless:
             fit = fit._replace(scale=scale)
             break
-        weight, shading = fit.weight, problem.data.shading
+        state, weight, shading = fit.info.state, fit.weight, problem.data.shading
         if robust:
-            weight = settled_weights(problem, fit.state, scale)
+            weight = settled_weights(problem, state, scale)
         if estimates_shading:
             shading = _shading_of(fit, least)
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
         if found_shading and _settled(scale, fit.scale, weight, fit.weight):
             break
-        state = fit.state
         if estimates_shading:
             units = problem.data.shading / shading  # the same shifts in other units
             state = replace(state, shading=state.shading * units)
             problem = problem.shaded(shading)
-        new = fit._replace(state=state, weight=weight, scale=scale)
-        fit = _solved(problem, new, RESTART_DAMPING)
-    info = information(fit.problem, fit.state)
-    solution = Solution(fit.state, info.cost(), fit.steps, fit.stop)
-    return BatchResult(fit.problem, solution, fit.weight, fit.scale, fit.steps, info)
+        fit = _solved(problem, state, weight, scale, fit.solution.steps)
+    steps = fit.solution.steps
+    return BatchResult(fit.info.problem, fit.solution, fit.weight, fit.scale, steps, fit.info)
 
 
 class _Fit(NamedTuple):
-    """A solve with fixed weights (B, K, G) and noise scales (B,), counted steps (B,)."""
+    """A solution with fixed weights (B, K, G) and noise scales (B,), the steps of all solutions
+    before it counted, and what its problem says there.
+    """
 
-    problem: Problem
-    state: BatchState
+    solution: Solution
     weight: Kinds[Array]
     scale: Kinds[Array]
-    steps: Integers
-    stop: tuple[Stop, ...]
+    info: Information
 
 
 def _settled(
@@ -150,13 +142,19 @@ def _settled(
     return max(change) < 1e-3
 
 
-def _solved(problem: Problem, fit: _Fit, damping: float) -> _Fit:
-    """The problem solved with the fit's weights, from its state."""
-    parts = zip(fit.weight, fit.scale, strict=True)
-    used = problem.weighted(Kinds(*(weight / scale[:, None, None] ** 2 for weight, scale in parts)))
-    found = minimise(used, fit.state, damping=damping)
-    steps = fit.steps + found.steps
-    return fit._replace(problem=used, state=found.state, steps=steps, stop=found.stop)
+def _solved(
+    problem: Problem,
+    state: BatchState,
+    weight: Kinds[Array],
+    scale: Kinds[Array],
+    steps: Integers,
+) -> _Fit:
+    """The problem solved with these weights, from a state that ``steps`` (B,) have led to."""
+    parts = zip(weight, scale, strict=True)
+    used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
+    found = minimise(used, state)
+    found = replace(found, steps=steps + found.steps)
+    return _Fit(found, weight, scale, information(used, found.state, found.normal))
 
 
 def _noise_scale(fit: _Fit) -> Kinds[Array]:
@@ -166,12 +164,11 @@ def _noise_scale(fit: _Fit) -> Kinds[Array]:
     The variance component of a group with redundancies as weights; kept as it is where fewer
     than five degrees of freedom remain to judge it.
     """
-    linear = fit.problem.linearize(fit.state)
-    reduced = eliminate(linear, np.zeros(len(fit.steps)))
-    used = counts(fit.problem, fit.weight)
+    problem = fit.info.problem
+    used = counts(problem, fit.weight)
     out: list[Array] = []
-    for kind, number, scale in zip(fit.problem.kinds, used, fit.scale, strict=True):
-        chi2, freedom = group_fit(linear, reduced, kind.rows, number)
+    for kind, number, scale in zip(problem.kinds, used, fit.scale, strict=True):
+        chi2, freedom = group_fit(fit.info.linear, fit.info.reduced, kind.rows, number)
         new = scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
         out.append(np.where(freedom > 5, np.maximum(new, LEAST_SCALE), scale))
     return Kinds(*out)
@@ -204,10 +201,9 @@ def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float
 
 def _shading_of(fit: _Fit, least: Array) -> Array:
     """The fit's :func:`common_shading`."""
-    problem, unit = fit.problem, fit.problem.data.shading
-    info = information(problem, fit.state)
-    variance = np.diagonal(info.covariance, axis1=-2, axis2=-1)[:, problem.unknowns.shading]
-    return common_shading(unit * fit.state.shading, variance, unit, least)
+    problem, unit = fit.info.problem, fit.info.problem.data.shading
+    variance = np.diagonal(fit.info.covariance, axis1=-2, axis2=-1)[:, problem.unknowns.shading]
+    return common_shading(unit * fit.info.state.shading, variance, unit, least)
 
 
 def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:

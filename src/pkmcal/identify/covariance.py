@@ -8,7 +8,7 @@ of the model (joint clearance, bending, a wrong lens).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 
@@ -35,9 +35,11 @@ from pkmcal.solver import (
     column_space,
     eliminate,
     inverse_root,
+    normal_inverse,
     normal_root,
     reduced_normal,
     stacked,
+    take,
 )
 
 NULL = 1e-12
@@ -46,29 +48,48 @@ UNKNOWN = 1e-13
 """Same, for eigenvalues of the scaled normal matrix, which hold half of the digits."""
 
 
-class Information(NamedTuple):
-    """The problem at the solution.
+@dataclass(frozen=True)
+class Information:
+    """What a problem says at a state: its rows, and what the shared unknowns' covariance is.
 
-    linear, reduced : its rows and their elimination. covariance : (B, na, na) of the shared
-    unknowns; a direction that nothing fixes has a huge variance.
+    normal : (B, na, na) the reduced normal matrix, where it is known already.
     """
 
-    linear: Linear
-    reduced: Reduced
-    covariance: Array
+    problem: Problem
+    state: BatchState
+    normal: Array | None = None
 
-    def cost(self) -> Array:
-        """Sum of squares of all residuals, (B,)."""
-        own = np.sum(self.linear.value**2, axis=(1, 2))
-        return own + np.sum(self.linear.shared_value**2, axis=1)
+    @cached_property
+    def linear(self) -> Linear:
+        """Residuals and Jacobian."""
+        return self.problem.linearize(self.state)
+
+    @cached_property
+    def reduced(self) -> Reduced:
+        """The same with the configurations' own unknowns eliminated."""
+        return eliminate(self.linear, np.zeros(len(self.state.z)))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (B, na, na) of the shared unknowns before any gauge is applied; a direction
+        that nothing fixes has a huge variance.
+
+        By the normal matrix where it leaves half of the digits, else by the rows, which leave all.
+        """
+        if self.normal is not None:
+            inverse, sure = normal_inverse(self.normal)
+            rest = np.flatnonzero(~sure)
+            if rest.size < len(sure):
+                part = Information(self.problem.select(rest), take(self.state, rest))
+                inverse[rest] = part.covariance if rest.size else 0.0
+                return inverse
+        half = inverse_root(stacked(self.linear, self.reduced)[0], NULL, loose=True)
+        return half @ half.mT
 
 
-def information(problem: Problem, state: BatchState) -> Information:
-    """Covariance of the shared unknowns before any gauge is applied."""
-    linear = problem.linearize(state)
-    reduced = eliminate(linear, np.zeros(len(state.z)))
-    half = inverse_root(stacked(linear, reduced)[0], NULL, loose=True)
-    return Information(linear, reduced, half @ half.mT)
+def information(problem: Problem, state: BatchState, normal: Array | None = None) -> Information:
+    """What a problem says at a state."""
+    return Information(problem, state, normal)
 
 
 def reduced_rows(

@@ -32,7 +32,7 @@ from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver import RANK_TOLERANCE, RESTART_DAMPING, Stop, column_space, minimise
+from pkmcal.solver import RANK_TOLERANCE, Stop, column_space, minimise
 
 RATIO = 1e-3
 """Of a magnification, or another ratio: the size against which it counts as seen."""
@@ -148,7 +148,7 @@ def hold(
         problem, found = result.problem, result.solution
     else:
         problem = assembled.trusting(trust.weights)
-        found = minimise(problem, begin, damping=RESTART_DAMPING)
+        found = minimise(problem, begin)
     if found.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(
             "the platform's poses were not found with the calibrated machine:"
