@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.errors import InputError
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import (
     BestFit,
@@ -28,9 +29,11 @@ from pkmcal.identify.gauge import (
 )
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.tool import pose_by_parameters, without_frames
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
 from pkmcal.solver import eliminate
+from pkmcal.wording import listed
 
 PLACE = 1.0
 """m and rad; how well the place of a station, or a board, is known at least: before any
@@ -148,10 +151,12 @@ def information_of(
 
     work : T_base_platform (M, 4, 4) where the tool counts. known : what an earlier calibration
     knows of the machine, in place of its drawing. rng : as for
-    :meth:`~pkmcal.planning.rig.Instrument.measure`.
+    :meth:`~pkmcal.planning.rig.Instrument.measure`. Raises InputError where a group of stations
+    measures nothing at any configuration.
     """
     machine, joints, poses = rig.machine, candidates.joints, candidates.T_base_platform
     measurements = rig.measured(joints, poses, candidates.pairs, rng)
+    _check_seen(rig, candidates, measurements)
     assembled, state = rig.assembled(measurements, joints, poses)
     problem = assembled.problem
     way, u = directions(machine, problem), problem.unknowns
@@ -175,6 +180,23 @@ def information_of(
         known=total,
         machine=directed,
         work=tool_by_free(rig, problem, machine.inverse(work), work) @ way.to_z,
+    )
+
+
+def _check_seen(rig: Rig, candidates: Candidates, measurements: Measurements) -> None:
+    """Raise `InputError` where a group of stations measures nothing anywhere."""
+    edges, poses = measurements.edges.configuration, measurements.poses.configuration
+    seen = np.unique(candidates.group[np.concatenate([edges, poses])])
+    lost = np.setdiff1d(candidates.group, seen)
+    if not lost.size:
+        return
+    names = [rig.names[s] for s in candidates.groups[lost[0]]]
+    raise InputError(
+        f"from {listed(names)} nothing is seen in any configuration",
+        where=f"session.yaml, stations.{names[0]}",
+        found="no leg, or board, in the picture",
+        expected="a camera that looks at the machine",
+        next_step="Check its pose, or let places be chosen: --places 3",
     )
 
 

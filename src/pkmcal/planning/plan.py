@@ -25,7 +25,6 @@ from pkmcal.planning.rig import BoardFrom, LegsFrom, Rig, TargetFrom
 from pkmcal.planning.route import distances, length, shortest_way
 from pkmcal.planning.subject import Subject
 from pkmcal.simulation.placement import StationPlace, usable
-from pkmcal.wording import listed
 
 CAPTURE = 15
 """Configurations from each place, unless told."""
@@ -161,7 +160,6 @@ def plan(
     groups = (tuple(stations),) if joined else tuple((s,) for s in stations)
     made = _Making(rig, subject.known, groups, count, index, work)
     pool = made.pool(Candidates.of_all(groups, *drawn))
-    made.check_seen(pool)
     found = made.chosen(pool, rng, lambda share: told(0.3 + 0.6 * share))
     told(0.9)
     return _ordered(subject, made, found, pool, region, joined, tried, rng)
@@ -246,20 +244,6 @@ class _Making:
         joints, poses = map(np.concatenate, zip(*parts, strict=True))
         candidates = Candidates(self.groups, np.concatenate(group), joints, poses)
         return self.pool(candidates), np.concatenate(start)
-
-    def check_seen(self, pool: _Pool) -> None:
-        """Raise `InputError` where a group of stations measures nothing anywhere."""
-        for g, group in enumerate(self.groups):
-            if np.any(pool.info.rows[pool.info.group == g]):
-                continue
-            names = [self.rig.names[s] for s in group]
-            raise InputError(
-                f"from {listed(names)} nothing is seen in any configuration",
-                where=f"session.yaml, stations.{names[0]}",
-                found="no leg, or board, in the picture",
-                expected="a camera that looks at the machine",
-                next_step="Check its pose, or let places be chosen: --places 3",
-            )
 
 
 def _accuracy(info: CandidateRows, covariance: Array, count: float) -> Accuracy:
@@ -424,35 +408,48 @@ def _with_places(
         wide, spots = rig, tuple(StationPlace.of(T) for T in rig.T_station_base)
     few = np.unique(np.linspace(0, len(drawn.joints) - 1, FOR_PLACES).astype(int))
     part = Configurations(*(x[few] for x in drawn))
-    told: list[Array] = []
-    alone: list[float] = []
-    info = None
-    for s in range(len(wide.names)):
-        candidates = Candidates.of_all(((0,),), *part)
-        info = information_of(wide.only([s]), candidates, work, _of_machine(subject.known))
-        start = np.linalg.inv(info.covariance(info.known))
-        after = info.covariance(info.of(np.arange(len(few)), count / len(few)))
-        told.append(np.linalg.inv(after) - start)
-        alone.append(info.tool(after)[0])
-    if info is None:
-        raise AssertionError("a rig has a station")
-    start = np.linalg.inv(info.covariance(info.known))
-    roots = np.stack([_padded_root(matrix) for matrix in told])
+    known = _of_machine(subject.known)
+    infos = [_seen_from(wide.only([s]), part, work, known) for s in range(len(wide.names))]
+    first = next((info for info in infos if info is not None), None)
+    if first is None:
+        raise InputError(
+            "from no place about the machine anything is seen",
+            where="--places",
+            expected="a camera that sees the legs, or a board that faces some place",
+        )
+    start = np.linalg.inv(first.covariance(first.known))
+    told, alone = np.zeros((len(infos), *start.shape)), np.zeros(len(infos))
+    for s, info in enumerate(infos):
+        after = np.linalg.inv(start)
+        if info is not None:
+            after = info.covariance(info.of(np.arange(len(few)), count / len(few)))
+            told[s] = np.linalg.inv(after) - start
+        alone[s] = first.tool(after)[0]
+    roots = np.stack([_padded_root(told[s]) for s in range(len(told))])
     same = np.zeros(len(roots), dtype=int)
-    whole = CandidateRows(roots, same, start, np.eye(len(start)), info.work)
+    whole = CandidateRows(roots, same, start, np.eye(len(start)), first.work)
     rule = INDICES[index](whole)
     number = free_places or best_of or 1
     best = exchanged(whole, greedy(whole, number, rule).chosen, rule)
     best = np.sort(best)
     tried = tuple(
-        TriedPlace(place, value, bool(k in best))
-        for k, (place, value) in enumerate(zip(spots, alone, strict=True))
+        TriedPlace(place, float(alone[k]), bool(k in best)) for k, place in enumerate(spots)
     )
     chosen = wide.only(best.tolist())
     if free_places:
         names = tuple(f"place{n + 1}" for n in range(len(best)))
-        return replace(chosen, names=names), _of_machine(subject.known), tried
+        return replace(chosen, names=names), known, tried
     return chosen, _kept(subject.known, best), tried
+
+
+def _seen_from(
+    rig: Rig, part: Configurations, work: Array, known: Known | None
+) -> CandidateRows | None:
+    """What configurations tell from one place; None where nothing is seen from there."""
+    try:
+        return information_of(rig, Candidates.of_all(((0,),), *part), work, known)
+    except InputError:
+        return None
 
 
 def _padded_root(information: Array) -> Array:
