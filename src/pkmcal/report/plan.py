@@ -325,7 +325,7 @@ def _where(found: MeasurementPlan) -> Part:
         ]  # fmt: skip
     if found.tried:
         data.append(_tried(found.tried))
-    layout = space_layout({"x": 1.3, "y": -1.3, "z": 0.8})
+    layout = space_layout({"x": 1.0, "y": -1.0, "z": 0.6})
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     plot = Plot(
         "where",
