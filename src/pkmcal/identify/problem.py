@@ -306,7 +306,7 @@ class Problem:
             """Steps (B, n, 6) of poses without what the frame change y does to them."""
             return step - (by_frames @ y[:, None])[..., 0]
 
-        camera = shared[:, u.stations].reshape(-1, u.n_stations, 6)
+        camera = shared[:, u.stations].reshape(len(z), u.n_stations, 6)
         mount = shared[:, u.mounts].reshape(*state.T_mount.shape[:2], 6)
         motion = own @ layout.own_motion.T
         on_platform = self.pose_blocks.on_platform

@@ -148,6 +148,11 @@ class LimbLayout:
         return out
 
     @cached_property
+    def overdetermined(self) -> bool:
+        """Whether there are more rows than unknowns, so that readings with errors close none."""
+        return self.n_equations > self.own_motion.shape[1]
+
+    @cached_property
     def free(self) -> Booleans:
         """(6,) which of (omega, tau) the motion has."""
         return np.asarray(self.motion.any(axis=1))

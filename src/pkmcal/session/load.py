@@ -23,7 +23,7 @@ from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.session.exif import EXIF, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
-from pkmcal.session.readings import check_readings
+from pkmcal.session.readings import check_readings, without_repeats
 from pkmcal.session.schema import (
     Body,
     SessionDocument,
@@ -131,6 +131,10 @@ def load_session(folder: Path | str, model: str | None = None) -> Session:
     joints_file = _existing(folder, document, schema.joints.file, ("joints", "file"))
     table = read_csv(joints_file, label=schema.joints.file)
     warnings = check_readings(table, machine.joint_ranges, schema.joints.noise, machine.joint_units)
+    if not schema.stations:
+        _check_redundant(document, machine)
+        table, repeated = without_repeats(table, schema.joints.noise)
+        warnings += repeated
     board = _board(folder, document, schema)
     warnings += _of_little_use(document, schema)
     stations = tuple(
@@ -147,7 +151,8 @@ def load_session(folder: Path | str, model: str | None = None) -> Session:
         trackers.append(measured)
     _check_distinct(document, stations)
     _check_names(document, (*stations, *trackers))
-    warnings += _unphotographed(table, stations, tuple(trackers))
+    if schema.stations:
+        warnings += _unphotographed(table, stations, tuple(trackers))
     return Session(
         folder=folder,
         machine=machine,
@@ -245,6 +250,20 @@ def _machine(
         path = _existing(folder, document, source, ("mechanism",))
         return load_mechanism(path, label=source, model=model), path
     return load_mechanism(source, label=document.where("mechanism"), model=model), source
+
+
+def _check_redundant(document: Document, machine: Machine) -> None:
+    """Without a station, readings have only each other to be held against."""
+    if machine.redundancy > 0:
+        return
+    raise InputError(
+        "nothing was measured but the readings, and these cannot calibrate this machine: it has no"
+        " more of them than freedoms, so any geometry fits them",
+        where=document.where("stations"),
+        found=f"{machine.n_joints} readings for {machine.n_joints - machine.redundancy} freedoms",
+        expected="stations: a camera or a tracker, or a machine with more readings than freedoms",
+        next_step="Photograph the machine, or measure its platform, and name that under stations",
+    )
 
 
 def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | None:

@@ -120,7 +120,8 @@ def _candidates(
     ranges = machine.joint_ranges
     share = rng.uniform(*INSIDE, (n, machine.n_joints))
     ends = np.where(rng.random(share.shape) < 0.5, *INSIDE)
-    share = np.where(rng.random((n, 1)) < extreme, ends, share)
+    if not machine.layout.overdetermined:  # else no pose has every leg near an end
+        share = np.where(rng.random((n, 1)) < extreme, ends, share)
     if ranges.size and np.isfinite(ranges).all():
         wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
         found = machine.forward_result(wanted)
@@ -129,6 +130,8 @@ def _candidates(
         poses = _around_home(machine, n, rng)
     joints = machine.inverse(poses)
     finite = np.isfinite(joints).all(axis=-1)
+    if machine.layout.overdetermined:  # no pose has the readings wanted; near them it may have some
+        finite &= ~((joints < ranges[:, 0]) | (joints > ranges[:, 1])).any(axis=-1)
     return poses[finite], joints[finite]
 
 
