@@ -52,9 +52,9 @@ class Assembled:
     """A problem and where its rows come from.
 
     seen : (K,) configurations with at least one edge, or pose of a board on the platform, or all
-    without a station; only they are in the problem. places : where each kind's measurements stand among the seen ones.
-    priors : names of the kinds of the prior rows, (c,): drawing, camera, shading, breathing, mount
-    or gauge.
+    without a station; only they are in the problem. places : where each kind's measurements stand
+    among the seen ones. priors : names of the kinds of the prior rows, (c,): drawing, camera,
+    shading, breathing, mount or gauge.
     """
 
     problem: Problem
@@ -120,7 +120,7 @@ def assemble(
         unknowns=unknowns,
         blocks=blocks,
         data=data,
-        joint_noise=measurements.joint_noise,
+        joint_noise=np.array([measurements.joint_noise]),
         prior=prior,
         prior_target=target,
         frames=exact_moves(machine),

@@ -7,24 +7,25 @@ readings and the drawing, each divided by its standard deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
 from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
     Identifiability,
     Information,
     data_share,
-    group_fit,
     identifiability,
     information,
     machine_covariance,
 )
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge, told_unknowns
+from pkmcal.identify.noise import EDGES, FEWEST, POSES, READINGS, Components, components, counts
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, settled_weights
 from pkmcal.identify.rows import Kinds
@@ -45,6 +46,8 @@ LEAST_SCALE = 1.0
 lens) is partly taken up by the parameters, so residuals come out smaller than errors are: scaling
 down by them would promise too much."""
 ROUNDS = 30
+SCALE_CHANGE = 1e-3
+"""Relative change of a noise scale below which it counts as found."""
 SHADING_CHANGE = 0.02
 """Relative change of the shading's deviation below which it counts as found."""
 FREEDOM = 4.0
@@ -60,13 +63,15 @@ class BatchResult:
 
     problem : with the weights in use, noise scale included. solution : states, cost, stops.
     weight : (B, K, G) robust weights 0..1 of each kind of measurement. scale : (B,) factor on its
-    stated noise. steps : (B,). info : rows and covariance at the solution.
+    stated noise; reading_scale : (B,) on the readings'. steps : (B,). info : rows and
+    covariance at the solution.
     """
 
     problem: Problem
     solution: Solution
     weight: Kinds[Array]
     scale: Kinds[Array]
+    reading_scale: Array
     steps: Integers
     info: Information
 
@@ -77,11 +82,14 @@ def solve_batch(
     *,
     robust: bool = True,
     scale_noise: bool = True,
+    scale_readings: bool = True,
     damping: float = FIRST_DAMPING,
     hopeless: float = np.inf,
 ) -> BatchResult:
     """All runs of a problem from their starts; see :func:`bundle` for the options.
 
+    scale_readings : with ``scale_noise``, the readings' noise too; not where the machine is held,
+    whose changes would be taken for noise.
     damping : the search's first; less where the start is near, as after the four steps.
     hopeless : all runs are left as they are where, after a search, the poses' noise has to be
     larger than stated by more than this factor.
@@ -96,35 +104,24 @@ def solve_batch(
     least = problem.data.shading[:, :1]
     if estimates_shading:
         problem = problem.shaded(np.full((n_runs, problem.unknowns.n_lines), SHIFT_SIGMA))
-    fit = _Fit(problem, start, every, ones, np.zeros(n_runs, dtype=int), ())
+    fit = _Fit(problem, start, every, ones, np.ones(n_runs), np.zeros(n_runs, dtype=int), ())
     if robust:
         found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
         scale = found.scale if scale_noise else fit.scale
         fit = fit._replace(state=found.state, weight=found.weight, scale=scale, steps=found.steps)
     fit = _solved(problem, fit, RESTART_DAMPING if robust else damping)
-    for _ in range(ROUNDS if robust or scale_noise else 0):
-        scale = _noise_scale(fit) if scale_noise else fit.scale
-        if scale.poses.min() > hopeless:
-            fit = fit._replace(scale=scale)
-            break
-        weight, shading = fit.weight, problem.data.shading
-        if robust:
-            weight = settled_weights(problem, fit.state, scale)
-        if estimates_shading:
-            shading = _shading_of(fit, least)
-        found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
-        if found_shading and _settled(scale, fit.scale, weight, fit.weight):
-            break
-        state = fit.state
-        if estimates_shading:
-            units = problem.data.shading / shading  # the same shifts in other units
-            state = replace(state, shading=state.shading * units)
-            problem = problem.shaded(shading)
-        new = fit._replace(state=state, weight=weight, scale=scale)
-        fit = _solved(problem, new, RESTART_DAMPING)
+    if robust or scale_noise:
+        settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
+        fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
+        if scale_noise and scale_readings and fit.scale.poses.min() <= hopeless:
+            by_data = _readings_speak(fit)
+            if by_data.any():
+                fit = settle(fit, hopeless=hopeless, by_data=by_data)
     info = information(fit.problem, fit.state)
     solution = Solution(fit.state, info.cost(), fit.steps, fit.stop)
-    return BatchResult(fit.problem, solution, fit.weight, fit.scale, fit.steps, info)
+    return BatchResult(
+        fit.problem, solution, fit.weight, fit.scale, fit.reading_scale, fit.steps, info
+    )
 
 
 class _Fit(NamedTuple):
@@ -134,8 +131,63 @@ class _Fit(NamedTuple):
     state: BatchState
     weight: Kinds[Array]
     scale: Kinds[Array]
+    reading_scale: Array
     steps: Integers
     stop: tuple[Stop, ...]
+
+
+def _settle(
+    fit: _Fit,
+    by_data: Booleans,
+    *,
+    robust: bool,
+    scale_noise: bool,
+    least: Array,
+    hopeless: float,
+) -> _Fit:
+    """Weights, noise and solution in turns until none changes any more.
+
+    by_data : (B,) runs whose readings' noise is as the data show it, not as stated. least : px, of
+    the lines' shading.
+    """
+    for _ in range(ROUNDS):
+        problem, state, weight = fit.problem, fit.state, fit.weight
+        scale, factor = fit.scale, np.ones(len(by_data))
+        if scale_noise:
+            found = _noise(fit)
+            scale, factor = _scale(fit, found), np.where(by_data, found.factor(READINGS), 1.0)
+        if scale.poses.min() > hopeless:
+            return fit._replace(scale=scale)
+        shading = problem.data.shading
+        if robust:
+            weight = settled_weights(problem, state, scale)
+        if scale_noise and problem.unknowns.n_lines > 0:
+            shading = _shading_of(fit, least)
+        found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
+        found_readings = np.abs(factor - 1).max() < SCALE_CHANGE
+        if found_shading and found_readings and _settled(scale, fit.scale, weight, fit.weight):
+            break
+        if scale_noise and problem.unknowns.n_lines > 0:
+            units = problem.data.shading / shading  # the same shifts in other units
+            state = replace(state, shading=state.shading * units)
+            problem = problem.shaded(shading)
+        if by_data.any():
+            problem = replace(problem, joint_noise=problem.joint_noise * factor)
+        reading_scale = fit.reading_scale * factor
+        new = fit._replace(
+            problem=problem, state=state, weight=weight, scale=scale, reading_scale=reading_scale
+        )
+        fit = _solved(problem, new, RESTART_DAMPING)
+    return fit
+
+
+def _readings_speak(fit: _Fit) -> Booleans:
+    """Runs (B,) whose readings' noise the data tell: where they contradict the stated one, or where
+    nothing else was measured, so that it is only the unit of all deviations.
+    """
+    found = _noise(fit)
+    alone = not any(kind.present.any() for kind in fit.problem.kinds)
+    return (found.contradicts(READINGS) | alone) & (found.told[:, READINGS] > FEWEST)
 
 
 def _settled(
@@ -147,7 +199,7 @@ def _settled(
         0.1 * np.abs(new - old).max(initial=0.0)
         for new, old in zip(weight, old_weight, strict=True)
     ]
-    return max(change) < 1e-3
+    return max(change) < SCALE_CHANGE
 
 
 def _solved(problem: Problem, fit: _Fit, damping: float) -> _Fit:
@@ -159,22 +211,25 @@ def _solved(problem: Problem, fit: _Fit, damping: float) -> _Fit:
     return fit._replace(problem=used, state=found.state, steps=steps, stop=found.stop)
 
 
-def _noise_scale(fit: _Fit) -> Kinds[Array]:
-    """Factors on the stated noise of each kind that make its chi2 equal its degrees of freedom,
-    (B,) each.
-
-    The variance component of a group with redundancies as weights; kept as it is where fewer
-    than five degrees of freedom remain to judge it.
-    """
+def _noise(fit: _Fit) -> Components:
+    """What the fit leaves of each kind of rows."""
     linear = fit.problem.linearize(fit.state)
     reduced = eliminate(linear, np.zeros(len(fit.steps)))
-    used = counts(fit.problem, fit.weight)
-    out: list[Array] = []
-    for kind, number, scale in zip(fit.problem.kinds, used, fit.scale, strict=True):
-        chi2, freedom = group_fit(linear, reduced, kind.rows, number)
-        new = scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
-        out.append(np.where(freedom > 5, np.maximum(new, LEAST_SCALE), scale))
-    return Kinds(*out)
+    return components(fit.problem, fit.state, linear, reduced, fit.weight)
+
+
+def _scale(fit: _Fit, found: Components) -> Kinds[Array]:
+    """Factors on the stated noise of each kind that make its chi2 equal its degrees of freedom,
+    (B,) each; kept as they are where too few remain to judge it.
+    """
+    ratio = np.sqrt(found.chi2 / np.maximum(found.freedom, 1.0))
+    known = found.freedom > FEWEST
+    return Kinds(
+        *(
+            np.where(known[:, k], np.maximum(scale * ratio[:, k], LEAST_SCALE), scale)
+            for k, scale in zip((EDGES, POSES), fit.scale, strict=True)
+        )
+    )
 
 
 def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float) -> Array:
@@ -208,12 +263,6 @@ def _shading_of(fit: _Fit, least: Array) -> Array:
     info = information(problem, fit.state)
     variance = np.diagonal(info.covariance, axis1=-2, axis2=-1)[:, problem.unknowns.shading]
     return common_shading(unit * fit.state.shading, variance, unit, least)
-
-
-def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:
-    """Residuals of each kind in use, each counted by its robust weight, (B,)."""
-    parts = zip(problem.kinds, weight, strict=True)
-    return Kinds(*(np.sum(part * kind.count, axis=(1, 2)) for kind, part in parts))
 
 
 def bundle(
@@ -263,7 +312,7 @@ def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiab
     For words such as "these two values cannot be told apart": names and weights of what is
     unidentified, and of what the drawing knows better than the data.
     """
-    machine = estimate.machine
+    machine, measurements = estimate.machine, estimate.as_found(measurements)
     shading = estimate.line_shading if len(estimate.line_shading) else SHADING_SIGMA
     assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
     problem = assembled.trusting(
@@ -350,10 +399,9 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     n_drawing = int(np.sum(drawn))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))
     unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
-    freedom = [
-        float(group_fit(linear, result.info.reduced, part, np.array([float(number)]))[1][0])
-        for part, number in zip(rows, (n_edges, n_joints, n_poses), strict=True)
-    ]
+    state, reduced = result.solution.state, result.info.reduced
+    found = components(problem, state, linear, reduced, result.weight)
+    freedom = found.freedom[0].tolist()
     return Statistics(
         chi2=sum(chi2) + chi2_drawing,
         dof=n_edges + n_joints + n_poses + n_drawing - unknowns,
@@ -369,8 +417,17 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
         chi2_poses=chi2[2],
         n_poses=n_poses,
         pose_scale=float(result.scale.poses[0]),
-        dof_edges=freedom[0],
-        dof_joints=freedom[1],
-        dof_poses=freedom[2],
+        dof_edges=freedom[EDGES],
+        dof_joints=freedom[READINGS],
+        dof_poses=freedom[POSES],
+        reading_scale=float(result.reading_scale[0]),
+        reading_range=_range(found, READINGS, result.reading_scale),
+        pose_range=_range(found, POSES, result.scale.poses),
         shading=float(np.median(result.problem.data.shading[0])),
     )
+
+
+def _range(found: Components, kind: int, scale: Array) -> tuple[float, float | None]:
+    """Factors on a stated noise that the data allow, where ``scale`` (1,) is in use."""
+    low, high = (float((scale * end)[0]) for end in found.interval(kind))
+    return low, high if np.isfinite(high) else None

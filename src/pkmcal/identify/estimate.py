@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.measurements import SHADING_SIGMA
+from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 
 
@@ -47,6 +47,9 @@ class Statistics:
     pose_scale : the same factor of theirs. dof_edges, dof_joints, dof_poses : degrees of freedom
     that each kind of residual has left; their sum and the drawing's is ``dof``. shading : px,
     standard deviation of what the edges of one side of a tube at one station have in common.
+    reading_scale : factor on the readings' stated noise, 1 where the data do not contradict it.
+    reading_range, pose_range : factors on the stated noise that the data allow, smallest and
+    largest, None for no end (:mod:`pkmcal.identify.noise`).
     """
 
     chi2: float
@@ -67,6 +70,9 @@ class Statistics:
     dof_joints: float = 0.0
     dof_poses: float = 0.0
     shading: float = SHADING_SIGMA
+    reading_scale: float = 1.0
+    reading_range: tuple[float, float | None] = (0.0, None)
+    pose_range: tuple[float, float | None] = (0.0, None)
 
 
 @dataclass(frozen=True)
@@ -108,3 +114,8 @@ class Estimate:
     mount_covariance: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
     line_shading: Array = field(default_factory=lambda: np.zeros(0))
     breathing_sigma: Array = field(default_factory=lambda: np.zeros(0))
+
+    def as_found(self, measurements: Measurements) -> Measurements:
+        """The measurements with the readings' noise as the data show it."""
+        scale = self.statistics.reading_scale
+        return replace(measurements, joint_noise=measurements.joint_noise * scale)

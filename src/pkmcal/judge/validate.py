@@ -93,7 +93,8 @@ def validate(
         if not regions:
             _check_independent(known, _photographed(session))
         looked = look(saved, session, seed, told, 0.8)
-        data, estimate = looked.measurements, looked.estimate
+        estimate = looked.estimate
+        data = estimate.as_found(looked.measurements)
 
         told("Predicting the readings", 0.8)
         drawing = drawing_of(saved)
