@@ -47,9 +47,11 @@ SETTLED = 1e-15
 """A step of readings (rad) and hinges below which nothing changes any more."""
 SAME_EQUATION = 1e-9
 """Singular value of the scaled rows below which one of them says what the others do."""
-LEVEL = 1e-6
-"""Cosine of the angle between a closure error that no pose takes away and what poses can change:
-steps become that small where the error's square is within rounding of its least."""
+LEVELLING = 3
+"""Steps to the pose that closes more rows than it has unknowns best; each leaves of the way what
+the closure error is of a rod."""
+GAP = 0.05
+"""Of a rod, the closure error beyond which readings are no machine's with errors, but another's."""
 NEAR_SINGULAR = 0.02
 """Smallest singular value of the scaled inverse Jacobian below which a warning is due: a
 reading's error then moves the platform fifty times as far."""
@@ -196,8 +198,8 @@ class ForwardResult:
     """Poses found from readings, and how far to trust each.
 
     T_base_platform : (..., 4, 4); converged : (...); error : (...) largest closure error, m.
-    A machine with more rows than unknowns is closed as well as its readings allow: converged where
-    no pose nearby leaves less, by least squares.
+    A machine with more rows than unknowns is closed as well as its readings allow, by least
+    squares; converged where that leaves errors of readings and of drawings, see GAP.
     internal : (..., n) the hinges' turns of an articulated platform, rad; n = 0 for a rigid one.
     layout, theta, readings : the machine, and what it was closed at.
     """
@@ -330,16 +332,27 @@ def forward(
     error = found.error.reshape(shape)
     converged = error < CONVERGED
     if layout.overdetermined:
-        converged |= _least(pose_rows(layout, theta, readings, poses, inner), layout)
+        poses, inner, error = _at_least(layout, theta, readings, poses, inner)
+        rods = np.nanmedian(np.abs(rod_lengths(layout, theta, readings)), axis=-1)
+        converged = error < GAP * rods
     return ForwardResult(poses, converged, error, inner, layout, theta, readings)
 
 
-def _least(rows: Rows, layout: LimbLayout) -> Booleans:
-    """Where the rows' squares (...) have no slope along the pose's own freedoms."""
-    jac, value = layout.by_own(rows), rows.value[..., None]
-    slope = np.linalg.norm(jac.mT @ value, axis=(-1, -2))
-    most = np.linalg.norm(jac, axis=(-1, -2)) * np.linalg.norm(value, axis=(-1, -2))
-    return np.isfinite(most) & (slope <= LEVEL * most)
+def _at_least(
+    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array
+) -> Closed:
+    """Poses (..., 4, 4) near the least of the rows' squares, brought to it.
+
+    Gauss-Newton: near it the squares are level to rounding, and tell a search nothing.
+    """
+    for _ in range(LEVELLING):
+        rows = pose_rows(layout, theta, readings, poses, internal)
+        back = np.linalg.pinv(np.nan_to_num(layout.by_own(rows)))
+        step = (back @ np.nan_to_num(rows.value)[..., None])[..., 0] @ layout.own_motion.T
+        poses, internal = perturb(poses, -step[..., :6]), internal - step[..., 6:]
+    rows = pose_rows(layout, theta, readings, poses, internal)
+    worst = np.abs(rows.value).max(axis=-1)
+    return Closed(poses, internal, np.where(np.isfinite(worst), worst, np.inf))
 
 
 def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:

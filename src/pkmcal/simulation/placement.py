@@ -125,12 +125,14 @@ def _candidates(
     if ranges.size and np.isfinite(ranges).all():
         wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
         found = machine.forward_result(wanted)
-        poses = found.T_base_platform[found.converged]
+        # no pose has the readings wanted of more than its freedoms: what comes nearest to them
+        near = found.converged | machine.layout.overdetermined
+        poses = found.T_base_platform[near]
     else:
         poses = _around_home(machine, n, rng)
     joints = machine.inverse(poses)
     finite = np.isfinite(joints).all(axis=-1)
-    if machine.layout.overdetermined:  # no pose has the readings wanted; near them it may have some
+    if machine.layout.overdetermined and ranges.size:
         finite &= ~((joints < ranges[:, 0]) | (joints > ranges[:, 1])).any(axis=-1)
     return poses[finite], joints[finite]
 
