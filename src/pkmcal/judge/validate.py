@@ -135,8 +135,10 @@ def drawing_of(saved: SavedCalibration) -> Machine:
 
 
 def _photographed(session: Session) -> Booleans:
-    """(K,) configurations with a photograph; all where a tracker may have seen them."""
-    out = np.full(len(session.configurations), bool(session.trackers))
+    """(K,) configurations with a photograph; all where a tracker may have seen them, or where
+    readings alone were taken.
+    """
+    out = np.full(len(session.configurations), bool(session.trackers or not session.stations))
     for station in session.stations:
         out[[photo.configuration for photo in station.photographs]] = True
     return out
