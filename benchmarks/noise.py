@@ -2,8 +2,8 @@
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/noise.py [--runs N] [--stations N] [--configurations N]
 
-Hexapods (gough-stewart) with simulated edges of 0.1 px seen by the demonstration's camera from several
-places; the noise of the readings is one thing, what the session states another. For each pair:
+Hexapods (gough-stewart) with simulated edges of 0.1 px, seen by the demonstration's camera from
+several places; the noise of the readings is one thing, what the session states another. For each pair:
 
 - told: share of the sessions whose stated noise is contradicted, and by what factor (median);
 - tool: the platform's joints at given readings, off by (root mean square over sessions), and what
@@ -13,6 +13,7 @@ places; the noise of the readings is one thing, what the session states another.
 from __future__ import annotations
 
 import argparse
+
 import numpy as np
 
 from pkmcal.identify.bundle import bundle
@@ -64,7 +65,8 @@ def main() -> None:
             z.append(np.sum((vectors.T @ error)[known] ** 2 / values[known]) / known.sum())
         off, sigma, z = (1e3 * np.sqrt(np.mean(x)) for x in (off, sigma, z))
         print(
-            f"{true_noise * 1e6:7g} {stated * 1e6:7g}    {np.mean(told):5.0%} {np.median(factors):8.3g}"
+            f"{true_noise * 1e6:7g} {stated * 1e6:7g}    {np.mean(told):5.0%}"
+            f" {np.median(factors):8.3g}"
             f"  {off:8.4f} {sigma:8.4f} {z / 1e3:6.2f}",
             flush=True,
         )
