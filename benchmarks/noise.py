@@ -3,7 +3,7 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/noise.py [--runs N] [--stations N] [--configurations N]
 
 Hexapods (gough-stewart) with simulated edges of 0.1 px, seen by the demonstration's camera from
-several places; the noise of the readings is one thing, what the session states another. For each pair:
+several places; the noise of the readings is one thing, what the session states another. For each:
 
 - told: share of the sessions whose stated noise is contradicted, and by what factor (median);
 - tool: the platform's joints at given readings, off by (root mean square over sessions), and what
