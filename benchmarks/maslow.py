@@ -92,7 +92,7 @@ def anchors(calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("file", type=Path)
     parser.add_argument("--model", default="anchors")
     parser.add_argument("--noise", type=float, default=NOISE)

@@ -29,7 +29,7 @@ CASES = ((3e-6, 3e-6), (3e-6, 3e-3), (3e-6, 3e-8), (3e-4, 3e-4), (3e-4, 3e-6), (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--stations", type=int, default=3)
     parser.add_argument("--configurations", type=int, default=15)
