@@ -16,10 +16,11 @@ import pkmcal.report
 from conftest import run
 from pkmcal.check import advice as words
 from pkmcal.check.check import check_session, outcome_of
-from pkmcal.check.forecast import EdgesOf, Forecast, LegForecast, forecast
+from pkmcal.check.forecast import Forecast, LegForecast, forecast
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.outcome import Level
+from pkmcal.planning.first import EdgesOf
 from pkmcal.report.check import BAR, GAP, leg_colours, picture_names, with_pictures, write_pictures
 
 

@@ -11,6 +11,7 @@ from pkmcal.geometry.rigid import apply as move
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import information, machine_covariance
+from pkmcal.identify.estimate import told_unknowns
 from pkmcal.identify.gauge import (
     BestFit,
     ThreeCentres,
@@ -22,7 +23,6 @@ from pkmcal.identify.gauge import (
     freedoms,
     generators,
     station_generators,
-    told_unknowns,
     transformation,
 )
 from pkmcal.mechanisms.closure import closure

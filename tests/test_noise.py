@@ -10,7 +10,6 @@ import pytest
 from pkmcal.calibration.calibrate import calibrate
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.noise import EDGES, FEWEST, READINGS, Components, components
-from pkmcal.solver import eliminate
 from test_identify_scene import JOINT_NOISE, make_scene
 from test_pose_sessions import make
 
@@ -31,20 +30,13 @@ def batch(seed, true, stated, runs=RUNS, **options):
     return problem, truth
 
 
-def of(problem, result):
-    state = result.solution.state
-    linear = result.problem.linearize(state)
-    reduced = eliminate(linear, np.zeros(len(state.z)))
-    return components(result.problem, state, linear, reduced, result.weight)
-
-
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 def test_sums_of_squares_are_as_their_traces_say(factor):
     """Readings whose noise is ``factor`` times what they count for, beside edges about as sharp:
     means over a hundred runs, and with the stated noise their scatter."""
     problem, truth = batch(1, factor * 4e-5, 4e-5, runs=100)
     result = solve_batch(problem, truth, robust=False, scale_noise=False)
-    found = of(problem, result)
+    found = components(result.info, result.weight)
     own = found.square[:, READINGS, READINGS]
     assert own.mean() > FEWEST  # they do say something of it
     expected = found.freedom[:, READINGS] + (factor**2 - 1) * own
@@ -64,7 +56,7 @@ def test_a_noise_that_is_stated_wrong_is_found(true, stated):
     problem, truth = batch(2, true, stated)
     right = replace(problem, joint_noise=np.array([true]))
     found, best = (solve_batch(p, truth) for p in (problem, right))
-    low, high = of(problem, found).interval(READINGS)
+    low, high = components(found.info, found.weight).interval(READINGS)
     scale = found.reading_scale * stated / true  # of the noise in use, to the true one
     assert np.all((low * scale < 1) & (high * scale > 1))
     assert np.all(found.reading_scale != 1)
@@ -88,7 +80,7 @@ def test_where_the_data_cannot_tell_nothing_is_claimed():
     problem, truth = batch(4, 3e-6, 3e-8)
     found = solve_batch(problem, truth)
     np.testing.assert_array_equal(found.reading_scale, 1.0)
-    low, high = of(problem, found).interval(READINGS)
+    low, high = components(found.info, found.weight).interval(READINGS)
     assert np.all(low == 0)
     assert np.all(high > 100)
 

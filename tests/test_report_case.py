@@ -143,8 +143,7 @@ def make_estimate(machine, poses, T, edges, rng) -> Estimate:
     return Estimate(
         machine=machine,
         state=State(machine.values, T, poses, np.array([CAMERA_SHIFT])),
-        covariance=np.diag(sigma**2),
-        station_covariance=np.tile(np.diag([1e-8] * 3 + [4e-8] * 3), (len(T), 1, 1)),
+        joint_covariance=np.diag(np.r_[sigma**2, np.tile([1e-8] * 3 + [4e-8] * 3, len(T))]),
         edge_shift_sigma=np.array([0.012]),
         edge_residuals=rng.normal(size=(count, 2)),
         edge_weights=weights,

@@ -35,7 +35,7 @@ def make_estimate_stub():
     statistics = Statistics(0, 0, 0, 0, 0, 0, 0, 0, 0, "", 1.0)
     empty = load_mechanism("gough-stewart")
     return Estimate(
-        empty, make("gough-stewart", n=1).state(), none, none, none, none, none, none, none, none,
+        empty, make("gough-stewart", n=1).state(), none, none, none, none, none, none, none,
         statistics, "",
     )  # fmt: skip
 

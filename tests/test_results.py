@@ -187,7 +187,63 @@ def test_a_covariance_that_is_none(folder):
     def turn(data):
         data["covariance"][7][8] += 1e-6
 
-    assert "not symmetric, or negative" in rewritten(folder, turn)
+    assert "not symmetric, or a combination" in rewritten(folder, turn)
+
+
+def test_covariances_of_stations_come_back_with_the_machine(calibrated, tmp_path):
+    """In the estimator's own numbers, whole and by name."""
+    save(calibrated, tmp_path / "out")
+    saved, estimate = load(tmp_path / "out"), calibrated.estimate
+    assert saved.placed == calibrated.session.station_names
+    joint = estimate.joint_covariance
+    size = np.sqrt(np.outer(np.diag(joint), np.diag(joint)))
+    assert np.all(np.abs(saved.joint_covariance - joint) <= 1e-9 * size)
+    n, last = len(saved.covariance), len(saved.placed) - 1
+    one = saved.with_stations(saved.placed[-1:])
+    rows = np.r_[:n, n + 6 * last : n + 6 * last + 6]
+    assert np.array_equal(one, saved.joint_covariance[np.ix_(rows, rows)])
+    # the station is not independent of the machine that was found with it
+    unit = np.abs(one[n:, :n]) / np.sqrt(np.outer(np.diag(one)[n:], np.diag(one)[:n]) + 1e-300)
+    assert unit.max() > 0.3
+    found = np.sqrt(
+        np.diag(base_camera_covariance(estimate.state.T_camera_base[last], one[n:, n:]))
+    )
+    assert np.allclose(found[3:], saved.stations[last].sigma_translation, rtol=1e-9)
+    with pytest.raises(InputError, match=r"stood is not known .* found attic"):
+        saved.with_stations(["attic"])
+
+
+def test_a_file_without_the_stations_covariance_still_loads(folder):
+    data = everything(folder)
+    del data["station_covariance"]
+    (folder / "calibration.json").write_text(json.dumps(data))
+    saved = load(folder)
+    assert saved.placed == ()
+    assert np.array_equal(saved.joint_covariance, saved.covariance)
+    with pytest.raises(InputError, match="Calibrate once more"):
+        saved.with_stations([saved.stations[0].name])
+
+
+def test_a_covariance_of_stations_that_is_none(folder):
+    def shortened(data):
+        data["station_covariance"]["rows"].pop()
+
+    assert "another size than the lists of parameters and st" in rewritten(folder, shortened)
+
+
+@pytest.mark.parametrize("what", ["renamed", "stretched"])
+def test_stations_that_do_not_fit(folder, what):
+    def change(data):
+        if what == "renamed":
+            data["station_covariance"]["stations"][0] = "attic"
+            return
+        n = len(data["parameters"])
+        for row in data["station_covariance"]["rows"]:  # symmetric, with correlations above one
+            row[:n] = [3 * value for value in row[:n]]
+
+    said = rewritten(folder, change)
+    wanted = {"renamed": "expected names of the stations", "stretched": "a negative variance"}
+    assert wanted[what] in said
 
 
 def test_a_pose_that_is_none(folder):

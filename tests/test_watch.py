@@ -454,7 +454,7 @@ def test_poses_that_cannot_be_found(watched, monkeypatch):
     data = watched.seen(watched.true, rng)
     start = start_state(watched.true, data, watched.pool.T_camera_base)
     module = "pkmcal.judge.held.minimise"
-    monkeypatch.setattr(module, lambda *_, **__: Solution(None, None, None, (Stop.STALLED,)))
+    monkeypatch.setattr(module, lambda *_, **__: Solution(None, None, None, (Stop.STALLED,), None))
     with pytest.raises(ResultError, match="poses were not found with the calibrated machine"):
         hold(watched.true, data, start, Trust.full(data))
 

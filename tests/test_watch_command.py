@@ -28,6 +28,7 @@ from pkmcal.session.load import digests, load_session
 from pkmcal.simulation import Settings, load_truth, simulate_session
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.placement import StationPlace
 from pkmcal.simulation.truth import draw_truth
 from rendered import rendered
 
@@ -192,6 +193,60 @@ def test_no_calibration_there(again):
     done = run("watch", again, again)
     assert done.code == 2
     assert "there is no calibration here" in done.err
+
+
+# a camera that was left in place
+
+
+@pytest.fixture(scope="module")
+def stayed(demo, later):
+    """Photographed again by the demonstration's first camera, which nobody touched."""
+    drawing = load_mechanism(demo.session / "mechanism.yaml")
+    truth = load_truth(demo.session, drawing)
+    camera = load_camera(next((demo.session / "cameras").iterdir()))
+    place = StationPlace.of(truth.T_camera_base[0])
+    folder = later.folder / "stayed"
+    photographed(folder, drawing, truth.machine, camera, 35, stations=(place,))
+    assert load_session(folder).station_names == truth.stations[:1]
+    return SimpleNamespace(folder=folder, name=truth.stations[0])
+
+
+def test_a_camera_that_was_left_in_place_finds_less(demo, stayed, tmp_path):
+    found = [
+        run("watch", demo.calibration, stayed.folder, "-o", tmp_path / str(k), "--json", *more)
+        for k, more in enumerate([(), ("--same-place", stayed.name)])
+    ]
+    assert [done.code for done in found] == [0, 0]
+    assert found[0].json["same_place"] == []
+    assert found[1].json["same_place"] == [stayed.name]
+    assert found[1].json["moved_stations"] == []
+    least = [np.mean([leg["detectable"]["zero"] for leg in done.json["legs"]]) for done in found]
+    assert least[1] < 0.8 * least[0]
+    page = (tmp_path / "1" / "watch.html").read_text()
+    assert f"Left in place: {stayed.name}" in page
+    assert "Left in place" not in (tmp_path / "0" / "watch.html").read_text()
+
+
+def test_a_camera_that_stands_elsewhere_is_told(demo, later, stayed, tmp_path):
+    """Decimetres away, so far beyond what is linear: found anew, and no leg is blamed."""
+    done = run(
+        "watch", demo.calibration, later.same, "--same-place", stayed.name, "-o", tmp_path / "w",
+        "--json",
+    )  # fmt: skip
+    assert done.code == 0
+    assert done.json["same_place"] == []
+    assert [moved["name"] for moved in done.json["moved_stations"]] == [stayed.name]
+    assert "does not stand where the calibration had it" in done.json["verdict"]["warnings"][0]
+
+
+def test_a_station_that_is_none(demo, again, stayed, calibration):
+    done = run("watch", demo.calibration, again, "--same-place", "attic")
+    assert done.code == 2
+    assert "--same-place: the session has no station of this name; found attic" in done.err
+    spoiled(calibration, lambda document: document.pop("station_covariance"))
+    done = run("watch", calibration, again, "--same-place", stayed.name)
+    assert done.code == 2
+    assert "Calibrate once more" in done.err
 
 
 # the lens

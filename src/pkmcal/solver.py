@@ -24,19 +24,23 @@ in metres, radians and pixels are not to be compared otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from enum import Enum
-from typing import Any, NamedTuple, Protocol, TypeVar, cast
+from functools import reduce
+from itertools import product
+from math import prod
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 
-FIRST_DAMPING = 1e-5
-RESTART_DAMPING = 1e-9
-"""First damping where the start is an answer already, to slightly other weights."""
 LEAST_DAMPING = 1e-14
+"""Damping that a search begins with, as good as none: near an answer, and starts mostly are, a full
+step is the best, and any damping costs steps along what is known little of."""
+USEFUL_DAMPING = 1e-5
+"""Damping after a step that did not keep its promise, at least: much less changes no step."""
 MOST_DAMPING = 1e9
 """Damping beyond which a step is below rounding: nothing downhill was found."""
 STEP_TOLERANCE = 1e-7
@@ -46,8 +50,16 @@ REFUSED = 1e-3
 """The same of a step that is refused, though the linear model promises something of it: that little
 is its rounding, where a direction is a millionth as well known as the others."""
 
+EPSILON = float(np.finfo(float).eps)
 ROUNDING = 1e-13
 """Of the cost, relative."""
+
+ROWS = 2**15
+"""Rows that are worked on at once: as many runs, or configurations of one, as have so many. A call
+of NumPy then costs little beside its arithmetic, and what it works on stays in the processor."""
+PIECE = 2**15
+"""Numbers of the Jacobian that are written at once, a quarter of a megabyte: it is read four times
+before it is forgotten, and the fastest cache that holds so much is half a megabyte or more."""
 
 FULL, NONE = 4.0, 6.5
 """Final weights are 1 up to FULL and 0 from NONE standard deviations: of clean pairs of residuals
@@ -116,6 +128,70 @@ class LeastSquares(Protocol):
         ...
 
 
+class Memory:
+    """Arrays that are written over again and again.
+
+    A fresh array of megabytes costs the system as much time as it takes to fill it.
+    """
+
+    def __init__(self) -> None:
+        self._flat: dict[str, Array] = {}
+
+    def empty(self, name: str, shape: tuple[int, ...]) -> Array:
+        """An array of this shape with anything in it; what had the name before is lost."""
+        size = prod(shape)
+        if name not in self._flat or self._flat[name].size < size:
+            self._flat[name] = np.empty(size)
+        return self._flat[name][:size].reshape(shape)
+
+
+class Compact(NamedTuple):
+    """As :class:`Linear`, but for the Jacobian by the shared unknowns, of which few numbers a row
+    stand in memory until it is wanted.
+
+    n_shared : na. write : by_shared (k, r, na) of one run and some configurations, written into
+    memory where the next is written as well.
+    """
+
+    value: Array
+    by_own: Array
+    usable: Booleans
+    shared_value: Array
+    shared_by: Array
+    n_shared: int
+    write: Callable[[int, slice, Memory], Array]
+
+
+def compact(linear: Linear) -> Compact:
+    """The same of a Jacobian that stands in memory."""
+
+    def write(run: int, configurations: slice, memory: Memory) -> Array:
+        del memory
+        return linear.by_shared[run, configurations]
+
+    rest = linear.usable, linear.shared_value, linear.shared_by, linear.by_shared.shape[-1]
+    return Compact(linear.value, linear.by_own, *rest, write)
+
+
+@runtime_checkable
+class Divisible(LeastSquares, Protocol):
+    """A problem of which some configurations can be looked at alone, so that the Jacobian of all
+    never stands in memory at once.
+    """
+
+    def among(self, configurations: slice) -> Divisible:
+        """The problem of some configurations, with all that they share."""
+        ...
+
+    def state_among(self, state: Any, configurations: slice) -> Any:
+        """What that problem needs of a state."""
+        ...
+
+    def compact(self, state: Any) -> Compact:
+        """As :meth:`linearize`."""
+        ...
+
+
 def take(state: Runs, runs: Integers) -> Runs:
     """The state of some runs."""
     return _each(lambda array: array[runs], state)
@@ -166,12 +242,17 @@ class Reduced(NamedTuple):
 
 @dataclass(frozen=True)
 class Solution:
-    """Result of a search: state, cost (B,), steps (B,), stop (B,) of Stop."""
+    """Result of a search: state, cost (B,), steps (B,), stop (B,) of Stop.
+
+    normal : (B, na, na) the reduced normal matrix where the last step was made, which is at the end
+    but for that step.
+    """
 
     state: Any
     cost: Array
     steps: Integers
     stop: tuple[Stop, ...]
+    normal: Array
 
 
 def own_factors(by_own: Array, damping: Array) -> tuple[Array, Array]:
@@ -188,19 +269,30 @@ def own_factors(by_own: Array, damping: Array) -> tuple[Array, Array]:
 
 def eliminate(linear: Linear, damping: Array) -> Reduced:
     """Own unknowns eliminated with Marquardt damping (B,), zero for none."""
-    n_rows = linear.by_own.shape[-2]
+    n_rows, damped = linear.by_own.shape[-2], bool(np.any(damping > 0))
     q, r = own_factors(linear.by_own, damping)
-    top, bottom = q[..., :n_rows, :], q[..., n_rows:, :]
-    along = top.mT @ linear.by_shared
-    rows = linear.by_shared - top @ along
-    if np.any(damping > 0):
-        rows = np.concatenate([rows, -bottom @ along], axis=-2)
-    value = linear.value[..., None]
+    along = q[..., :n_rows, :].mT @ linear.by_shared
+    rows = _left_of(linear.by_shared, q, along, damped, Memory())
+    top, value = q[..., :n_rows, :], linear.value[..., None]
     # the damping's rows carry no residual of their own, only -bottom top^T value
     left = value - top @ (top.mT @ value)
     gradient = (linear.by_shared.mT @ left)[..., 0].sum(axis=1)
     gradient = gradient + linear.shared_value @ linear.shared_by
     return Reduced(rows, left[..., 0], top, r, gradient)
+
+
+def _left_of(by_shared: Array, q: Array, along: Array, damped: bool, memory: Memory) -> Array:
+    """The reduced rows ``(I - Q Q^T) by_shared`` (..., r', na), the damping's where there are any.
+
+    along : Q^T by_shared, (..., d, na).
+    """
+    *batch, n_rows, na = by_shared.shape
+    out = memory.empty("reduced rows", (*batch, q.shape[-2] if damped else n_rows, na))
+    data = np.matmul(q[..., :n_rows, :], along, out=out[..., :n_rows, :])
+    np.subtract(by_shared, data, out=data)
+    if damped:
+        np.negative(np.matmul(q[..., n_rows:, :], along), out=out[..., n_rows:, :])
+    return out
 
 
 def _flat(rows: Array) -> Array:
@@ -225,38 +317,194 @@ def reduced_normal(linear: Linear, reduced: Reduced) -> Array:
     return rows.mT @ rows + linear.shared_by.T @ linear.shared_by
 
 
+class _Part(NamedTuple):
+    """The normal equations of some configurations' rows, their own unknowns eliminated, and what a
+    step needs of them once the rows are forgotten.
+
+    matrix : (B, na, na) and gradient (B, na) of the shared unknowns. cost : (B,). usable :
+    (B, K, r). along, fitted : Q^T by_shared (B, K, d, na) and Q^T value (B, K, d), with
+    ``by_own = Q R``. r : (B, K, d, d). damped : (B, K, d) the damping of the own unknowns' squares.
+    """
+
+    matrix: Array
+    gradient: Array
+    cost: Array
+    usable: Booleans
+    along: Array
+    fitted: Array
+    r: Array
+    damped: Array
+
+    def own(self, shared: Array) -> Array:
+        """The own unknowns' step (B, K, d) after the shared one (B, na)."""
+        right = self.fitted + (self.along @ shared[:, None, :, None])[..., 0]
+        return -np.linalg.solve(self.r, right[..., None])[..., 0]
+
+
+def _part(rows: Compact, damping: Array, memory: Memory) -> _Part:
+    """A part's normal equations. The Jacobian is written, reduced and forgotten in pieces that stay
+    in the processor's cache.
+    """
+    (n_runs, count, n_rows, d), na = rows.by_own.shape, rows.n_shared
+    q, r = own_factors(rows.by_own, damping)
+    top, damped = q[..., :n_rows, :], bool(np.any(damping > 0))
+    fitted = (top.mT @ rows.value[..., None])[..., 0]
+    # the damping's rows carry no residual of their own, only -bottom top^T value
+    left = rows.value - (top @ fitted[..., None])[..., 0]
+    along = np.empty((n_runs, count, d, na))
+    matrix = np.tile(rows.shared_by.T @ rows.shared_by, (n_runs, 1, 1))
+    gradient = rows.shared_value @ rows.shared_by
+    pieces = -(-count * n_rows * na // PIECE)
+    cuts = [slice(count * k // pieces, count * (k + 1) // pieces) for k in range(pieces)]
+    for run, cut in product(range(n_runs), cuts):
+        by_shared = rows.write(run, cut, memory)
+        np.matmul(top[run, cut].mT, by_shared, out=along[run, cut])
+        reduced = _left_of(by_shared, q[run, cut], along[run, cut], damped, memory)
+        reduced = reduced.reshape(-1, na)
+        matrix[run] += reduced.T @ reduced
+        gradient[run] += left[run, cut].ravel() @ by_shared.reshape(-1, na)
+    cost = _cost(Values(rows.value, rows.shared_value), rows.usable)
+    own = damping[:, None, None] * np.sum(rows.by_own**2, axis=-2)
+    return _Part(matrix, gradient, cost, rows.usable, along, fitted, r, own)
+
+
+class _Normal(NamedTuple):
+    """The normal equations of all parts; see :class:`_Part`."""
+
+    matrix: Array
+    gradient: Array
+    cost: Array
+    parts: list[_Part]
+
+    def step(self, damping: Array) -> tuple[Array, list[Array]]:
+        """Levenberg-Marquardt step: shared (B, na) and own (B, K, d) of each part."""
+        scaled, scale = _unit_diagonal(self.matrix)
+        # at least a few rounding units, so that an unidentified direction gives no step
+        ridge = np.maximum(damping, 1e-15)[:, None, None] * np.eye(scale.shape[1])
+        right = (self.gradient / scale)[..., None]
+        shared = -np.linalg.solve(scaled + ridge, right)[..., 0] / scale
+        return shared, [part.own(shared) for part in self.parts]
+
+    def promise(self, shared: Array, own: list[Array]) -> tuple[Array, Array]:
+        """By how much the linear model lessens the cost along a step, to first order, and the
+        square of its change of all residuals, (B,) each.
+
+        With ``by_own = Q R`` the residuals' change is ``rows shared - Q fitted``, so that both
+        follow from what is left of the rows; the damping's own share is taken out.
+        """
+        fitted = _total(np.sum(part.fitted**2, axis=(1, 2)) for part in self.parts)
+        damped = zip(self.parts, own, strict=True)
+        size2 = (shared[:, None] @ self.matrix @ shared[..., None])[:, 0, 0] + fitted
+        size2 = size2 - _total(np.sum(part.damped * y**2, axis=(1, 2)) for part, y in damped)
+        first = 2 * (fitted - np.sum(shared * self.gradient, axis=1))
+        return first, np.maximum(size2, 0.0)
+
+
+def _total(parts: Iterable[Array]) -> Array:
+    return reduce(np.add, parts)
+
+
+def _normal(parts: Iterable[Compact], damping: Array, memory: Memory) -> _Normal:
+    """The normal equations of all parts, each reduced before the next is asked for."""
+    done: list[_Part] = []
+    for rows in parts:
+        if done:  # the rows on shared unknowns only stand in the first part
+            none = rows.shared_value[:, :0], rows.shared_by[:0]
+            rows = rows._replace(shared_value=none[0], shared_by=none[1])
+        done.append(_part(rows, damping, memory))
+    sums = zip(*((part.matrix, part.gradient, part.cost) for part in done), strict=True)
+    matrix, gradient, cost = (_total(each) for each in sums)
+    return _Normal(matrix, gradient, cost, done)
+
+
 def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
     """Levenberg-Marquardt step: shared (B, na) and own (B, K, d)."""
-    reduced = eliminate(linear, damping)
-    scaled, scale = _unit_diagonal(reduced_normal(linear, reduced))
-    # at least a few rounding units, so that an unidentified direction gives no step
-    ridge = np.maximum(damping, 1e-15)[:, None, None] * np.eye(scale.shape[1])
-    shared = -np.linalg.solve(scaled + ridge, (reduced.gradient / scale)[..., None])[..., 0] / scale
-    fitted = linear.value + (linear.by_shared @ shared[:, None, :, None])[..., 0]
-    right = (reduced.q.mT @ fitted[..., None])[..., 0]
-    own = -np.linalg.solve(reduced.r, right[..., None])[..., 0]
-    return shared, own
+    shared, own = _normal([compact(linear)], damping, Memory()).step(damping)
+    return shared, own[0]
 
 
-def minimise(
-    problem: LeastSquares, start: Any, max_steps: int = 100, damping: float = FIRST_DAMPING
-) -> Solution:
+def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solution:
     """Least squares from ``start``, all runs at once; each stops on its own."""
     values = problem.residuals(start)
-    n_runs = values.shared_value.shape[0]
+    n_runs, *rows = values.value.shape
+    few = max(1, ROWS // max(1, int(np.prod(rows))))
+    if n_runs <= few:
+        return _minimised(_Divided.of(problem, values), start, values, max_steps)
+    found: list[Solution] = []
+    for first in range(0, n_runs, few):
+        runs = np.arange(first, min(first + few, n_runs))
+        part, at, here = problem.select(runs), take(start, runs), take(values, runs)
+        found.append(_minimised(_Divided.of(part, here), at, here, max_steps))
+    return Solution(
+        _each(lambda *states: np.concatenate(states), *(one.state for one in found)),
+        np.concatenate([one.cost for one in found]),
+        np.concatenate([one.steps for one in found]),
+        tuple(reason for one in found for reason in one.stop),
+        np.concatenate([one.normal for one in found]),
+    )
+
+
+class _Divided(NamedTuple):
+    """A problem with its parts of some configurations each, small enough for the processor's cache,
+    and the memory that they write to in turn.
+    """
+
+    problem: LeastSquares
+    parts: list[tuple[slice, LeastSquares]]
+    memory: Memory
+
+    @classmethod
+    def of(cls, problem: LeastSquares, values: Values) -> _Divided:
+        """The problem whose residuals are like these, divided where it can be."""
+        n_runs, count, rows = values.value.shape
+        each = max(1, ROWS // max(1, n_runs * rows))
+        if not isinstance(problem, Divisible) or count <= each:
+            return cls(problem, [(slice(0, count), problem)], Memory())
+        cuts = [slice(first, min(first + each, count)) for first in range(0, count, each)]
+        return cls(problem, [(cut, problem.among(cut)) for cut in cuts], Memory())
+
+    def select(self, runs: Integers) -> _Divided:
+        """The same of some runs."""
+        parts = [(cut, part.select(runs)) for cut, part in self.parts]
+        return self._replace(problem=self.problem.select(runs), parts=parts)
+
+    def rows(self, state: Any) -> Iterator[Compact]:
+        """Residuals and Jacobian of one part after the other."""
+        for cut, part in self.parts:
+            if isinstance(part, Divisible):
+                yield part.compact(part.state_among(state, cut))
+            else:
+                yield compact(part.linearize(state))
+
+    def cost(self, state: Any, usable: list[Booleans]) -> Array:
+        """Sum of squares (B,) of the rows that were usable."""
+        total: list[Array] = []
+        for (cut, part), use in zip(self.parts, usable, strict=True):
+            here = part.state_among(state, cut) if isinstance(part, Divisible) else state
+            values = part.residuals(here)
+            if total:
+                values = values._replace(shared_value=values.shared_value[:, :0])
+            total.append(_cost(values, use))
+        return _total(total)
+
+
+def _minimised(problem: _Divided, start: Any, values: Values, max_steps: int) -> Solution:
+    """The same of few runs."""
+    n_runs = len(values.shared_value)
     cost = _cost(values, np.isfinite(values.value))
     steps = np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
-    dampings = np.full(n_runs, damping)
+    dampings, sizes = np.full(n_runs, LEAST_DAMPING), np.full(n_runs, np.inf)
     state, active = start, np.arange(n_runs)
     part, here = problem, start
+    normal: Array | None = None
     for _ in range(max_steps):
-        new, gain = _try(part, here, dampings[active])
+        new, gain = _try(part, here, dampings[active], sizes[active])
         steps[active] += 1
         here = put(here, np.flatnonzero(gain.accepted), new)
         state = put(state, active, here)
-        cost[active] = gain.cost
-        dampings[active] = gain.damping
+        cost[active], dampings[active], sizes[active] = gain.cost, gain.damping, gain.size
+        normal = gain.normal if normal is None else put(normal, active, gain.normal)
         for run, reason in zip(active, gain.stop, strict=True):
             stop[run] = reason
         keep = np.flatnonzero([reason is Stop.RUNNING for reason in gain.stop])
@@ -266,46 +514,51 @@ def minimise(
             active = active[keep]
             part, here = problem.select(active), take(state, active)
     final = tuple(Stop.STEPS if s is Stop.RUNNING else s for s in stop)
-    return Solution(state, cost, steps, final)
+    return Solution(state, cost, steps, final, cast(Array, normal))
 
 
 class _Gain(NamedTuple):
+    """What came of a step. size : of its change of all residuals, infinite where it was refused."""
+
     accepted: Booleans
     cost: Array
     damping: Array
+    size: Array
+    normal: Array
     stop: list[Stop]
 
 
-def _try(problem: LeastSquares, state: Any, damping: Array) -> tuple[Any, _Gain]:
-    """One damped step of every run; returns the accepted runs' new states and what came of it."""
-    linear = problem.linearize(state)
-    shared, own = damped_step(linear, damping)
-    trial = problem.moved(state, shared, own)
-    usable = linear.usable
-    cost = _cost(Values(linear.value, linear.shared_value), usable)
-    cost_trial = _cost(problem.residuals(trial), usable)
-    change = (linear.by_shared @ shared[:, None, :, None])[..., 0]
-    change = change + (linear.by_own @ own[..., None])[..., 0]
-    shared_change = shared @ linear.shared_by.T
-    size2 = np.sum(change**2, axis=(1, 2)) + np.sum(shared_change**2, axis=1)
-    descent = -2 * (
-        np.sum(change * linear.value, axis=(1, 2))
-        + np.sum(shared_change * linear.shared_value, axis=1)
-    )
+def _try(problem: _Divided, state: Any, damping: Array, before: Array) -> tuple[Any, _Gain]:
+    """One damped step of every run; returns the accepted runs' new states and what came of it.
+
+    before : size of the last step, infinite where there is none. Steps that shrink by a factor q
+    each leave ``q / (1 - q)`` of the last one to go (Hairer and Wanner, Solving Ordinary
+    Differential Equations II, IV.8).
+    """
+    normal = _normal(problem.rows(state), damping, problem.memory)
+    shared, own = normal.step(damping)
+    trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
+    usable = [part.usable for part in normal.parts]
+    cost, cost_trial = normal.cost, problem.cost(trial, usable)
+    descent, size2 = normal.promise(shared, own)
     ratio = (cost - cost_trial) / np.maximum(descent - size2, 1e-300)
-    small = np.sqrt(size2) < STEP_TOLERANCE * (1 + 1e-3 * np.sqrt(cost))
+    size, tolerance = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
+    small = size < STEP_TOLERANCE * tolerance
     # a step near the end changes the cost by less than its rounding, and then it cannot be judged
     small |= np.abs(descent - size2) < ROUNDING * cost
     accepted = cost_trial <= cost * (1 + ROUNDING)
-    small |= ~accepted & (descent - size2 < (REFUSED * (1 + 1e-3 * np.sqrt(cost))) ** 2)
-    next_damping = np.where(
-        accepted, damping * np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2)), damping * 8
-    )
+    shrinks = accepted & np.isfinite(before) & (size < before)
+    small |= shrinks & (size**2 < STEP_TOLERANCE * tolerance * (before - size))
+    small |= ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2)
+    less = damping * np.where(ratio > 0.5, 0.05, 0.5)
+    more = np.maximum(damping * np.where(accepted, 2.0, 8.0), USEFUL_DAMPING)
+    next_damping = np.where(accepted & (ratio > 0.2), less, more)
     next_damping = np.clip(next_damping, LEAST_DAMPING, MOST_DAMPING)
-    any_usable = np.sum(usable, axis=(1, 2)) > 0
+    any_usable = _total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
     new = take(trial, np.flatnonzero(accepted))
-    return new, _Gain(accepted, np.where(accepted, cost_trial, cost), next_damping, stop)
+    cost, size = np.where(accepted, cost_trial, cost), np.where(accepted, size, np.inf)
+    return new, _Gain(accepted, cost, next_damping, size, normal.matrix, stop)
 
 
 def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
@@ -379,6 +632,20 @@ def normal_root(normal: Array, least: float, *, loose: bool) -> Array:
     limit = least * values[..., -1:]
     inverse = 1 / np.maximum(values, limit) if loose else _of_known(values, limit)
     return vectors * np.sqrt(inverse)[..., None, :] / scale[..., None]
+
+
+def normal_inverse(normal: Array) -> tuple[Array, Booleans]:
+    """Inverses of normal matrices (B, m, m), unknowns scaled, and where they hold half of their
+    digits or more, (B,).
+    """
+    scaled, scale = _unit_diagonal(normal)
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        return np.full_like(normal, np.nan), np.zeros(len(normal), dtype=bool)
+    size = np.abs(scaled).sum(axis=-1).max(axis=-1) * np.abs(inverse).sum(axis=-1).max(axis=-1)
+    inverse = 0.5 * (inverse + inverse.mT)
+    return inverse / (scale[:, :, None] * scale[:, None, :]), size < 1 / np.sqrt(EPSILON)
 
 
 def _of_known(values: Array, limit: Array) -> Array:

@@ -37,8 +37,8 @@ AXES = (
 
 
 @dataclass(frozen=True)
-class Region:
-    """rows : (n,) configurations. name : where it is, in words."""
+class Neighbours:
+    """Configurations beside each other. rows : (n,) which. name : where, in words."""
 
     rows: Integers
     name: str
@@ -51,7 +51,7 @@ class LeftOut:
     region : which. measurements : of these and of those in use.
     """
 
-    region: Region
+    region: Neighbours
     measurements: Measurements
 
 
@@ -97,14 +97,14 @@ def spread(points: Array, n: int) -> Integers:
     return np.sort(np.array(chosen))
 
 
-def regions(points: Array, rows: Integers, n: int) -> tuple[Region, ...]:
+def regions(points: Array, rows: Integers, n: int) -> tuple[Neighbours, ...]:
     """The regions, n, of configurations ``rows`` at points (k, 6), see :func:`places`."""
     owner = clusters(points, n)
     scale = points.std(axis=0)
     scale = np.where(scale > 1e-6, scale, np.inf)  # a direction in which nothing moves
     found = [np.flatnonzero(owner == k) for k in range(n)]
     return tuple(
-        Region(rows[own], _named(points[own].mean(axis=0) / scale)) for own in found if own.size
+        Neighbours(rows[own], _named(points[own].mean(axis=0) / scale)) for own in found if own.size
     )
 
 
@@ -120,15 +120,15 @@ def _distances(points: Array, centres: Array) -> Array:
     return np.sum((points[:, None] - centres) ** 2, axis=-1)
 
 
-def chosen(drawing: Machine, whole: Estimate, n: int) -> Region:
+def chosen(drawing: Machine, whole: Estimate, n: int) -> Neighbours:
     """Some configurations, n, to hold out, spread over the workspace."""
     rows = np.flatnonzero(whole.configurations)
     _check(n, rows.size - n, rows.size, "configurations held out")
     points = places(drawing, whole.state.T_base_platform[rows])
-    return Region(rows[spread(points, n)], "spread over the workspace")
+    return Neighbours(rows[spread(points, n)], "spread over the workspace")
 
 
-def by_region(drawing: Machine, whole: Estimate, n: int) -> tuple[Region, ...]:
+def by_region(drawing: Machine, whole: Estimate, n: int) -> tuple[Neighbours, ...]:
     """The configurations that were seen, in n regions of the workspace."""
     rows = np.flatnonzero(whole.configurations)
     _check(n, rows.size - rows.size // n, rows.size, "regions")
@@ -169,7 +169,7 @@ def select(measurements: Measurements, keep: Booleans) -> Measurements:
     )
 
 
-def set_aside(drawing: Machine, turns: Turns, out: Region) -> Turns:
+def set_aside(drawing: Machine, turns: Turns, out: Neighbours) -> Turns:
     """What the last turn left, as if a region's configurations had not been taken.
 
     They did help to find legs in the photographs; no number of the estimate comes from them.

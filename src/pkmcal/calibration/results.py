@@ -154,6 +154,7 @@ def document_of(
         "not_identified": not_identified,
         "identifiability": identifiability_of(calibration.findings),
         "stations": _stations(calibration),
+        "station_covariance": _station_covariance(calibration),
         "targets": _targets(calibration),
         "cameras": _cameras(calibration),
         "configurations": _configurations(calibration),
@@ -245,6 +246,39 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
     return out
 
 
+def _station_covariance(calibration: Calibration) -> dict[str, Any]:
+    """Stations that a camera may be left in, by name, and their rows (6 k, P + 6 k) of the joint
+    covariance of all parameters and these stations, (omega, tau) of T_base_camera.
+    """
+    session, estimate = calibration.session, calibration.estimate
+    by_hand = {station.name for station in session.stations if station.handheld}
+    names = session.station_names
+    kept = np.array([k for k, name in enumerate(names) if name not in by_hand], dtype=int)
+    n = len(estimate.machine.parameters)
+    rows = _joint_rows(n, kept)
+    joint = _turned(
+        estimate.joint_covariance[np.ix_(rows, rows)], estimate.state.T_camera_base[kept]
+    )
+    return {"stations": [names[k] for k in kept], "rows": joint[n:]}
+
+
+def _joint_rows(n: int, stations: Integers) -> Integers:
+    """Rows of n parameters and then of some stations in a joint covariance."""
+    return np.concatenate([np.arange(n), (n + 6 * stations[:, None] + np.arange(6)).ravel()])
+
+
+def _turned(joint: Array, T_a_b: Array) -> Array:
+    """A joint covariance of parameters and poses (k, 4, 4), (omega, tau) of T_a_b, as that of the
+    parameters and (omega, tau) of T_b_a.
+    """
+    n = len(joint) - 6 * len(T_a_b)
+    by = np.eye(len(joint))
+    for k, transform in enumerate(T_a_b):
+        at = slice(n + 6 * k, n + 6 * k + 6)
+        by[at, at] = _inverse_errors(transform)
+    return by @ joint @ by.T
+
+
 def _focal_scale(calibration: Calibration, number: int) -> dict[str, Any]:
     """By how much a hand-held photograph's focal lengths are its camera's, and how well known."""
     cameras, estimate = calibration.cameras, calibration.estimate
@@ -277,15 +311,20 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def base_camera_covariance(T_camera_base: Array, covariance: Array) -> Array:
-    """Covariance (6, 6) of (omega, tau) of T_base_camera from that of T_camera_base, m and rad.
+    """Covariance (6, 6) of (omega, tau) of T_base_camera from that of T_camera_base, m and rad."""
+    return _turned(covariance, T_camera_base[None])
 
-    With R, t of T_camera_base: omega' = -R^T omega, tau' = -R^T ([t]x omega + tau).
+
+def _inverse_errors(transform: Array) -> Array:
+    """Errors (omega, tau) of an inverse pose by those of the pose (4, 4), (6, 6).
+
+    With its R and t: omega' = -R^T omega, tau' = -R^T ([t]x omega + tau).
     """
-    rot_t, t = T_camera_base[:3, :3].T, T_camera_base[:3, 3]
+    rot_t, t = transform[:3, :3].T, transform[:3, 3]
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3] = jacobian[3:, 3:] = -rot_t
     jacobian[3:, :3] = -rot_t @ skew(t)
-    return jacobian @ covariance @ jacobian.T
+    return jacobian
 
 
 def _cameras(calibration: Calibration) -> list[dict[str, Any]]:
@@ -403,7 +442,10 @@ class SavedStation:
 class SavedCalibration:
     """A calibration read back, in the frames that `gauge` names.
 
-    machine : with the calibrated values. drawing : (P,) values before. covariance : (P, P).
+    machine : with the calibrated values. drawing : (P,) values before.
+    placed : k stations whose covariance with the machine is known; none of an older file.
+    joint_covariance : (P + 6 k, P + 6 k) of the parameters and then of these stations, (omega, tau)
+    of T_camera_base, left perturbation, as :class:`~pkmcal.identify.estimate.Estimate` has it.
     data_share : (P,), NaN where it means nothing.
     configurations : K names. used : (K,). joints : (K, m). T_base_platform : (K, 4, 4).
     document : the whole file.
@@ -412,7 +454,8 @@ class SavedCalibration:
     path: Path
     machine: Machine
     drawing: Array
-    covariance: Array
+    placed: tuple[str, ...]
+    joint_covariance: Array
     data_share: Array
     gauge: str
     method: str
@@ -424,6 +467,33 @@ class SavedCalibration:
     joints: Array
     T_base_platform: Array
     document: dict[str, Any]
+
+    @property
+    def covariance(self) -> Array:
+        """(P, P) of the machine's parameters."""
+        n = len(self.machine.parameters)
+        return self.joint_covariance[:n, :n]
+
+    def with_stations(self, names: Sequence[str]) -> Array:
+        """Joint covariance (P + 6 n, P + 6 n) of the parameters and of n stations in their order,
+        (omega, tau) of T_camera_base. Raises InputError for one that is not ``placed``.
+        """
+        for name in names:
+            if name in self.placed:
+                continue
+            hand = any(station.name == name for station in self.stations) and self.placed
+            raise InputError(
+                "where this station stood is not known together with the machine",
+                where=str(self.path),
+                found=name,
+                expected=listed(self.placed, 8) or "a calibration that tells it",
+                next_step="A photograph by hand is no place that a camera is left in"
+                if hand
+                else "Calibrate once more with this pkmcal, or name a station of the calibration",
+            )
+        where = np.array([self.placed.index(name) for name in names], dtype=int)
+        rows = _joint_rows(len(self.machine.parameters), where)
+        return self.joint_covariance[np.ix_(rows, rows)]
 
     @property
     def sigma(self) -> Array:
@@ -452,6 +522,11 @@ class _Station(_Part):
     sigma_translation: Row3
 
 
+class _StationCovariance(_Part):
+    stations: tuple[str, ...]
+    rows: tuple[tuple[float, ...], ...]
+
+
 class _Configuration(_Part):
     name: str
     used: bool
@@ -468,6 +543,7 @@ class _Saved(_Part):
     parameters: tuple[_Parameter, ...]
     covariance: tuple[tuple[float, ...], ...]
     stations: tuple[_Station, ...]
+    station_covariance: _StationCovariance | None = None
     configurations: tuple[_Configuration, ...]
     mechanism: MechanismDocument
 
@@ -478,14 +554,15 @@ def load(source: Path | str) -> SavedCalibration:
     saved = validate(document, _Saved)
     machine = machine_from_document(saved.mechanism)
     _check_parameters(document, saved, machine)
-    covariance = _covariance(document, saved)
     for group in ("stations", "configurations"):
         _check_poses(document, group, getattr(saved, group))
+    placed, joint = _covariance(document, saved)
     return SavedCalibration(
         path=document.path,
         machine=machine,
         drawing=np.array([p.drawing for p in saved.parameters]),
-        covariance=covariance,
+        placed=placed,
+        joint_covariance=joint,
         data_share=np.array([p.data_share for p in saved.parameters], dtype=float),
         gauge=saved.gauge,
         method=saved.method,
@@ -540,24 +617,60 @@ def _check_parameters(document: Document, saved: _Saved, machine: Machine) -> No
         raise _edited(document, f"parameters[{k + 1}].value", f"the value of {names[k]}")
 
 
-def _covariance(document: Document, saved: _Saved) -> Array:
-    count = len(saved.parameters)
-    if {len(row) for row in saved.covariance} != {count} or len(saved.covariance) != count:
+def _covariance(document: Document, saved: _Saved) -> tuple[tuple[str, ...], Array]:
+    """Names of the stations that are known with the machine, and the covariance of both."""
+    count, known = len(saved.parameters), saved.station_covariance
+    _check_size(document, "covariance", saved.covariance, (count, count), "list of parameters")
+    if known is None:
+        matrix = np.array(saved.covariance)
+        _check_covariance(document, "covariance", matrix)
+        return (), matrix
+    poses = {station.name: np.array(station.T_base_camera) for station in saved.stations}
+    if not set(known.stations) <= set(poses):
+        raise _edited(document, "station_covariance.stations", "names of the stations")
+    more = 6 * len(known.stations)
+    key = "station_covariance"
+    _check_size(document, key, known.rows, (more, count + more), "lists of parameters and stations")
+    rows = np.array(known.rows).reshape(more, count + more)
+    upper = np.concatenate([np.array(saved.covariance), rows[:, :count].T], axis=1)
+    matrix = np.concatenate([upper, rows])
+    _check_covariance(document, "covariance", matrix[:count, :count])
+    _check_covariance(document, key, matrix)
+    found = np.array([poses[name] for name in known.stations]).reshape(-1, 4, 4)
+    return known.stations, _turned(matrix, found)
+
+
+def _check_size(
+    document: Document,
+    key: str,
+    rows: tuple[tuple[float, ...], ...],
+    shape: tuple[int, int],
+    of: str,
+) -> None:
+    if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
         raise InputError(
-            "the covariance has another size than the list of parameters",
-            where=document.where("covariance"),
-            expected=f"{count} rows of {count} numbers",
+            f"the covariance has another size than the {of}",
+            where=document.where(key),
+            expected=f"{shape[0]} rows of {shape[1]} numbers",
         )
-    matrix = np.array(saved.covariance)
+
+
+def _check_covariance(document: Document, key: str, matrix: Array) -> None:
+    """Raise `InputError` for a matrix that is not symmetric or not positive semidefinite."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    off = np.abs(matrix - matrix.T) > EXACT * scale[:, None] * scale
-    if off.any() or np.any(np.diag(matrix) < 0):
+    limit = scale[:, None] * scale
+    good = not np.any(np.abs(matrix - matrix.T) > EXACT * limit) and np.all(np.diag(matrix) >= 0)
+    if good:
+        unit = np.where(limit > 0, matrix / np.where(limit > 0, limit, 1.0), 0.0)
+        least = float(np.linalg.eigvalsh(0.5 * (unit + unit.T)).min(initial=0.0))
+        good = least > -EXACT * len(matrix)
+    if not good:
         raise InputError(
-            "the covariance is not that of any numbers: not symmetric, or negative on its diagonal",
-            where=document.where("covariance"),
+            "the covariance is not that of any numbers: not symmetric, or a combination of them has"
+            " a negative variance",
+            where=document.where(key),
             next_step="Calibrate again; this file was changed after it was written",
         )
-    return matrix
 
 
 def _check_poses(document: Document, group: str, items: tuple[Any, ...]) -> None:

@@ -28,7 +28,11 @@ from pkmcal.wording import listed
 
 def load_camera(path: Path | str, label: str | None = None) -> Camera:
     """Read a camera file; every fault is an InputError with its line."""
-    document = read_yaml(path, label)
+    return camera_from_document(read_yaml(path, label))
+
+
+def camera_from_document(document: Document) -> Camera:
+    """The camera of a file's fields, checked."""
     models = camera_models()
     name = document.data.get("model")
     if not isinstance(name, str) or name not in models:

@@ -10,13 +10,14 @@ import math
 
 import numpy as np
 
-from pkmcal.check.forecast import EdgesOf, Forecast, LegForecast
+from pkmcal.check.forecast import Forecast, LegForecast
 from pkmcal.check.look import Look, StationLook
 from pkmcal.geometry.rigid import inverse
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.profiles import SATURATED
 from pkmcal.observe.quality import BLACK
 from pkmcal.outcome import Figure, Level, Part, Row, Table
+from pkmcal.planning.first import EdgesOf
 from pkmcal.simulation.placement import PANORAMIC, view_angle
 from pkmcal.wording import brief, count, legs_named, listed
 

@@ -4,18 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from pkmcal.arrays import Array, Integers
 from pkmcal.observe.legs import Photographs
 from pkmcal.observe.quality import Quality
+from pkmcal.planning.first import spread_over
 from pkmcal.session.load import Session
-
-FIRST = 3
-"""Photographs of a station that are looked at closely: what people take before the long capture."""
-MEASURED = 6
-"""Photographs of all stations together whose edges tell a forecast: a hexapod shows forty edges of
-each kind in them, enough for their scatter to be known to a tenth."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +31,9 @@ class StationLook:
         """Whether the machine was recognised."""
         return self.quality is not None
 
-    def few(self, most: int = FIRST) -> Integers:
-        """Numbers of up to ``most`` photographs of different configurations, spread over all."""
-        first = np.sort(np.unique(self.photographs.configuration, return_index=True)[1])
-        return first[np.unique(np.linspace(0, len(first) - 1, min(most, len(first))).astype(int))]
+    def few(self) -> Integers:
+        """Numbers of the few photographs that are looked at closely."""
+        return spread_over(self.photographs.configuration)
 
 
 @dataclass(frozen=True)
@@ -55,5 +47,5 @@ class Look:
     @property
     def measured(self) -> tuple[Integers, ...]:
         """Numbers of the photographs that tell a forecast, by station."""
-        most = min(FIRST, -(-MEASURED // len(self.stations)))
-        return tuple(station.few(most) for station in self.stations)
+        n = len(self.stations)
+        return tuple(spread_over(s.photographs.configuration, n) for s in self.stations)

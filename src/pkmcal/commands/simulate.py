@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import re
 import shlex
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pkmcal.commands import console
 from pkmcal.errors import InputError
+
+if TYPE_CHECKING:
+    from pkmcal.cameras import Camera
 
 SMALLEST, LARGEST = 64, 8192
 """Pixels along a side: below, no leg is wide enough to have edges; above, no memory is enough."""
@@ -87,6 +91,10 @@ def simulate(
             "--handheld", help="Each photograph from its own place, --repeats of a configuration."
         ),
     ] = False,
+    plan: Annotated[
+        Path | None,
+        typer.Option(metavar="PLAN", help="What pkmcal plan asked for, with its machine."),
+    ] = None,
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
@@ -95,6 +103,7 @@ def simulate(
     from pkmcal.mechanisms import load_mechanism
     from pkmcal.simulation import Sensor, Settings, board_for, simulate_session, with_forearms
     from pkmcal.simulation.demo import camera_of_size
+    from pkmcal.simulation.rehearsal import rehearsal_of
 
     if not 0 < joint_noise < 1:
         raise InputError(
@@ -102,7 +111,8 @@ def simulate(
             expected="more than 0 and less than 1, such as 3e-6",
         )  # fmt: skip
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
-    drawing = load_mechanism(mechanism, label=None)
+    planned = rehearsal_of(plan) if plan else None
+    drawing = planned.machine if planned else load_mechanism(mechanism, label=None)
     machine = with_forearms(drawing)
     place = "platform" if on_platform else "base"
     settings = Settings(
@@ -120,9 +130,15 @@ def simulate(
         as_built=as_built,
         handheld=handheld,
     )
+    cameras: Camera | tuple[Camera, ...] = eye
+    if planned:
+        cameras = planned.cameras
+        settings = replace(settings, stations=planned.places, asked=planned.asked)
+        if planned.board:
+            settings = replace(settings, board=planned.board, board_on="platform")
     with console.progress() as told:
         truth = simulate_session(
-            folder, machine, eye, settings, seed=seed, progress=console.counted(told)
+            folder, machine, cameras, settings, seed=seed, progress=console.counted(told)
         )
     count = len(truth.photographs) * truth.repeats
     if as_json:

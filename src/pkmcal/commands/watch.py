@@ -29,6 +29,14 @@ def watch(
         float,
         typer.Option("--alpha", metavar="P", help="Share of false alarms."),
     ] = 0.01,
+    same_place: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--same-place",
+            metavar="STATION",
+            help="A station whose camera was not touched since the calibration; repeat for more.",
+        ),
+    ] = None,
     seed: console.Seed = 0,
     as_json: console.Json = False,
 ) -> int:
@@ -44,5 +52,12 @@ def watch(
     folder = out or loaded.folder / "watch"
     check_own_folder(folder, FILES, "what watch writes", "an earlier look")
     with console.progress(as_json) as told:
-        found = run(calibration, loaded, alpha=alpha, seed=seed, progress=told)
+        found = run(
+            calibration,
+            loaded,
+            alpha=alpha,
+            seed=seed,
+            same_place=same_place or (),
+            progress=told,
+        )
     return finish(outcome_of(found), folder, FILES, as_json=as_json)

@@ -23,12 +23,30 @@ SIDE_SIGNS = np.array([1.0, -1.0])
 
 
 class EdgeNormals(NamedTuple):
-    """Normals (..., 3) with their derivatives by axis points a, b (..., 3, 3) and R (..., 3)."""
+    """Normals n (..., 3) of edges, and how they move with the axis's points a, b and with R.
+
+    ``dn = by_a (n.da) + by_b (n.db) + (by_a + by_b) dR``, by_a and by_b (..., 3): an edge's plane
+    does not mind what a point does within it, so each derivative is of rank one.
+    """
 
     n: Array
-    dn_da: Array
-    dn_db: Array
-    dn_dradius: Array
+    by_a: Array
+    by_b: Array
+
+    @property
+    def dn_da(self) -> Array:
+        """(..., 3, 3)."""
+        return self.by_a[..., :, None] * self.n[..., None, :]
+
+    @property
+    def dn_db(self) -> Array:
+        """(..., 3, 3)."""
+        return self.by_b[..., :, None] * self.n[..., None, :]
+
+    @property
+    def dn_dradius(self) -> Array:
+        """(..., 3)."""
+        return self.by_a + self.by_b
 
 
 def line_through(a: Array, b: Array) -> tuple[Array, Array]:
@@ -91,12 +109,9 @@ def edge_normal_jacobians(a: Array, b: Array, radius: Array, side: Integers) -> 
     """
     u, m = line_through(a, b)
     n = edge_normal(u, m, radius, SIDE_SIGNS[side])
-    # columns of the inverse of the matrix with rows a, b, n
-    det = dot(cross(a, b), n)[..., None]
-    col_a, col_b = cross(b, n) / det, cross(n, a) / det
-    dn_da = -col_a[..., :, None] * n[..., None, :]
-    dn_db = -col_b[..., :, None] * n[..., None, :]
-    return EdgeNormals(n, dn_da, dn_db, -(col_a + col_b))
+    # less the columns of the inverse of the matrix with rows a, b, n
+    less = -1 / dot(cross(a, b), n)[..., None]
+    return EdgeNormals(n, cross(b, n) * less, cross(n, a) * less)
 
 
 def contour_point(a: Array, u: Array, n: Array, radius: Array, along: Array) -> Array:

@@ -24,7 +24,7 @@ from pkmcal.identify.covariance import (
     machine_covariance,
 )
 from pkmcal.identify.estimate import Estimate, State, Statistics
-from pkmcal.identify.gauge import Gauge, apply, default_gauge, told_unknowns
+from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.noise import EDGES, FEWEST, POSES, READINGS, Components, components, counts
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, settled_weights
@@ -33,11 +33,8 @@ from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.solver import (
-    FIRST_DAMPING,
-    RESTART_DAMPING,
     Solution,
     Stop,
-    eliminate,
     minimise,
 )
 
@@ -83,14 +80,12 @@ def solve_batch(
     robust: bool = True,
     scale_noise: bool = True,
     scale_readings: bool = True,
-    damping: float = FIRST_DAMPING,
     hopeless: float = np.inf,
 ) -> BatchResult:
     """All runs of a problem from their starts; see :func:`bundle` for the options.
 
     scale_readings : with ``scale_noise``, the readings' noise too; not where the machine is held,
     whose changes would be taken for noise.
-    damping : the search's first; less where the start is near, as after the four steps.
     hopeless : all runs are left as they are where, after a search, the poses' noise has to be
     larger than stated by more than this factor.
     """
@@ -104,12 +99,12 @@ def solve_batch(
     least = problem.data.shading[:, :1]
     if estimates_shading:
         problem = problem.shaded(np.full((n_runs, problem.unknowns.n_lines), SHIFT_SIGMA))
-    fit = _Fit(problem, start, every, ones, np.ones(n_runs), np.zeros(n_runs, dtype=int), ())
+    state, weight, scale, steps = start, every, ones, np.zeros(n_runs, dtype=int)
     if robust:
         found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
-        scale = found.scale if scale_noise else fit.scale
-        fit = fit._replace(state=found.state, weight=found.weight, scale=scale, steps=found.steps)
-    fit = _solved(problem, fit, RESTART_DAMPING if robust else damping)
+        state, weight, steps = found.state, found.weight, steps + found.steps
+        scale = found.scale if scale_noise else ones
+    fit = _solved(problem, state, weight, scale, steps)
     if robust or scale_noise:
         settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
         fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
@@ -117,23 +112,20 @@ def solve_batch(
             by_data = _readings_speak(fit)
             if by_data.any():
                 fit = settle(fit, hopeless=hopeless, by_data=by_data)
-    info = information(fit.problem, fit.state)
-    solution = Solution(fit.state, info.cost(), fit.steps, fit.stop)
-    return BatchResult(
-        fit.problem, solution, fit.weight, fit.scale, fit.reading_scale, fit.steps, info
-    )
+    used, steps = fit.info.problem, fit.solution.steps
+    readings = np.broadcast_to(used.joint_noise / problem.joint_noise, n_runs)
+    return BatchResult(used, fit.solution, fit.weight, fit.scale, readings, steps, fit.info)
 
 
 class _Fit(NamedTuple):
-    """A solve with fixed weights (B, K, G) and noise scales (B,), counted steps (B,)."""
+    """A solution with fixed weights (B, K, G) and noise scales (B,), the steps of all solutions
+    before it counted, and what its problem says there.
+    """
 
-    problem: Problem
-    state: BatchState
+    solution: Solution
     weight: Kinds[Array]
     scale: Kinds[Array]
-    reading_scale: Array
-    steps: Integers
-    stop: tuple[Stop, ...]
+    info: Information
 
 
 def _settle(
@@ -150,34 +142,31 @@ def _settle(
     by_data : (B,) runs whose readings' noise is as the data show it, not as stated. least : px, of
     the lines' shading.
     """
+    estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
     for _ in range(ROUNDS):
-        problem, state, weight = fit.problem, fit.state, fit.weight
+        problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, factor = fit.scale, np.ones(len(by_data))
         if scale_noise:
-            found = _noise(fit)
+            found = components(fit.info, weight)
             scale, factor = _scale(fit, found), np.where(by_data, found.factor(READINGS), 1.0)
         if scale.poses.min() > hopeless:
             return fit._replace(scale=scale)
         shading = problem.data.shading
         if robust:
             weight = settled_weights(problem, state, scale)
-        if scale_noise and problem.unknowns.n_lines > 0:
+        if estimates_shading:
             shading = _shading_of(fit, least)
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
         found_readings = np.abs(factor - 1).max() < SCALE_CHANGE
         if found_shading and found_readings and _settled(scale, fit.scale, weight, fit.weight):
             break
-        if scale_noise and problem.unknowns.n_lines > 0:
+        if estimates_shading:
             units = problem.data.shading / shading  # the same shifts in other units
             state = replace(state, shading=state.shading * units)
             problem = problem.shaded(shading)
         if by_data.any():
             problem = replace(problem, joint_noise=problem.joint_noise * factor)
-        reading_scale = fit.reading_scale * factor
-        new = fit._replace(
-            problem=problem, state=state, weight=weight, scale=scale, reading_scale=reading_scale
-        )
-        fit = _solved(problem, new, RESTART_DAMPING)
+        fit = _solved(problem, state, weight, scale, fit.solution.steps)
     return fit
 
 
@@ -185,8 +174,8 @@ def _readings_speak(fit: _Fit) -> Booleans:
     """Runs (B,) whose readings' noise the data tell: where they contradict the stated one, or where
     nothing else was measured, so that it is only the unit of all deviations.
     """
-    found = _noise(fit)
-    alone = not any(kind.present.any() for kind in fit.problem.kinds)
+    found = components(fit.info, fit.weight)
+    alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
     return (found.contradicts(READINGS) | alone) & (found.told[:, READINGS] > FEWEST)
 
 
@@ -202,20 +191,19 @@ def _settled(
     return max(change) < SCALE_CHANGE
 
 
-def _solved(problem: Problem, fit: _Fit, damping: float) -> _Fit:
-    """The problem solved with the fit's weights, from its state."""
-    parts = zip(fit.weight, fit.scale, strict=True)
-    used = problem.weighted(Kinds(*(weight / scale[:, None, None] ** 2 for weight, scale in parts)))
-    found = minimise(used, fit.state, damping=damping)
-    steps = fit.steps + found.steps
-    return fit._replace(problem=used, state=found.state, steps=steps, stop=found.stop)
-
-
-def _noise(fit: _Fit) -> Components:
-    """What the fit leaves of each kind of rows."""
-    linear = fit.problem.linearize(fit.state)
-    reduced = eliminate(linear, np.zeros(len(fit.steps)))
-    return components(fit.problem, fit.state, linear, reduced, fit.weight)
+def _solved(
+    problem: Problem,
+    state: BatchState,
+    weight: Kinds[Array],
+    scale: Kinds[Array],
+    steps: Integers,
+) -> _Fit:
+    """The problem solved with these weights, from a state that ``steps`` (B,) have led to."""
+    parts = zip(weight, scale, strict=True)
+    used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
+    found = minimise(used, state)
+    found = replace(found, steps=steps + found.steps)
+    return _Fit(found, weight, scale, information(used, found.state, found.normal))
 
 
 def _scale(fit: _Fit, found: Components) -> Kinds[Array]:
@@ -259,10 +247,9 @@ def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float
 
 def _shading_of(fit: _Fit, least: Array) -> Array:
     """The fit's :func:`common_shading`."""
-    problem, unit = fit.problem, fit.problem.data.shading
-    info = information(problem, fit.state)
-    variance = np.diagonal(info.covariance, axis1=-2, axis2=-1)[:, problem.unknowns.shading]
-    return common_shading(unit * fit.state.shading, variance, unit, least)
+    problem, unit = fit.info.problem, fit.info.problem.data.shading
+    variance = np.diagonal(fit.info.covariance, axis1=-2, axis2=-1)[:, problem.unknowns.shading]
+    return common_shading(unit * fit.info.state.shading, variance, unit, least)
 
 
 def bundle(
@@ -340,8 +327,6 @@ def _estimate(
     state = apply(machine, solved, gauge)
     state = replace(state, theta=machine.parameters.unit_axes(state.theta))
     identified = machine.with_values(state.theta)
-    told = told_unknowns(solved)
-    covariance = full[told.machine, told.machine]
     problem, u = result.problem, result.problem.unknowns
     optics = own_blocks(result.info.covariance[0], u.optics, u.n_optics)
     factor = measurements.intrinsics_factor
@@ -355,20 +340,18 @@ def _estimate(
     return Estimate(
         machine=identified,
         state=_with_unseen_poses(identified, measurements, assembled, state),
-        covariance=covariance,
-        station_covariance=own_blocks(full, told.stations, 6),
+        joint_covariance=full,
         edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
         edge_residuals=residuals.edges,
         edge_weights=weights.edges,
         joint_residuals=joints,
-        data_share=data_share(machine, state.theta, covariance, gauge),
+        data_share=data_share(machine, state.theta, full, gauge),
         configurations=assembled.seen,
         statistics=_statistics(result, assembled),
         gauge=gauge.name,
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
-        mount_covariance=own_blocks(full, told.mounts, 6),
         line_shading=result.problem.data.shading[0],
         breathing_sigma=np.sqrt(np.diagonal(result.info.covariance[0])[u.breathing]),
     )
@@ -399,8 +382,7 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     n_drawing = int(np.sum(drawn))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))
     unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
-    state, reduced = result.solution.state, result.info.reduced
-    found = components(problem, state, linear, reduced, result.weight)
+    found = components(result.info, result.weight)
     freedom = found.freedom[0].tolist()
     return Statistics(
         chi2=sum(chi2) + chi2_drawing,

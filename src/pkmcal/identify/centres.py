@@ -68,11 +68,14 @@ def joint_centres(drawing: Machine, calibrated: Machine, covariance: Array) -> t
     return tuple(found)
 
 
-def free_of_gauge(estimate: Estimate) -> Array:
-    """Covariance (P, P) of the parameters about the best fit of all centres to the drawing."""
-    n = len(estimate.covariance)
+def free_of_gauge(estimate: Estimate, covariance: Array | None = None) -> Array:
+    """Covariance (P, P) of the parameters about the best fit of all centres to the drawing; the
+    estimate's, or another in any frames.
+    """
+    covariance = estimate.covariance if covariance is None else covariance
+    n = len(covariance)
     keep = transformation(estimate.machine, estimate.state, BestFit())[:n, :n]
-    return keep @ estimate.covariance @ keep.T
+    return keep @ covariance @ keep.T
 
 
 def laid_over(source: Array, target: Array) -> Array:

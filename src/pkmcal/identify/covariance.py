@@ -8,12 +8,12 @@ of the model (joint clearance, bending, a wrong lens).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.identify.estimate import State
+from pkmcal.identify.estimate import State, told_unknowns
 from pkmcal.identify.gauge import (
     Gauge,
     alignment,
@@ -23,7 +23,6 @@ from pkmcal.identify.gauge import (
     generators,
     move_generators,
     projector,
-    told_unknowns,
     transformation,
 )
 from pkmcal.identify.problem import Problem
@@ -36,7 +35,9 @@ from pkmcal.solver import (
     column_space,
     eliminate,
     inverse_root,
+    normal_inverse,
     stacked,
+    take,
 )
 
 NULL = 1e-12
@@ -45,29 +46,48 @@ UNKNOWN = 1e-13
 """Same, for eigenvalues of the scaled normal matrix, which hold half of the digits."""
 
 
-class Information(NamedTuple):
-    """The problem at the solution.
+@dataclass(frozen=True)
+class Information:
+    """What a problem says at a state: its rows, and what the shared unknowns' covariance is.
 
-    linear, reduced : its rows and their elimination. covariance : (B, na, na) of the shared
-    unknowns; a direction that nothing fixes has a huge variance.
+    normal : (B, na, na) the reduced normal matrix, where it is known already.
     """
 
-    linear: Linear
-    reduced: Reduced
-    covariance: Array
+    problem: Problem
+    state: BatchState
+    normal: Array | None = None
 
-    def cost(self) -> Array:
-        """Sum of squares of all residuals, (B,)."""
-        own = np.sum(self.linear.value**2, axis=(1, 2))
-        return own + np.sum(self.linear.shared_value**2, axis=1)
+    @cached_property
+    def linear(self) -> Linear:
+        """Residuals and Jacobian."""
+        return self.problem.linearize(self.state)
+
+    @cached_property
+    def reduced(self) -> Reduced:
+        """The same with the configurations' own unknowns eliminated."""
+        return eliminate(self.linear, np.zeros(len(self.state.z)))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (B, na, na) of the shared unknowns before any gauge is applied; a direction
+        that nothing fixes has a huge variance.
+
+        By the normal matrix where it leaves half of the digits, else by the rows, which leave all.
+        """
+        if self.normal is not None:
+            inverse, sure = normal_inverse(self.normal)
+            rest = np.flatnonzero(~sure)
+            if rest.size < len(sure):
+                part = Information(self.problem.select(rest), take(self.state, rest))
+                inverse[rest] = part.covariance if rest.size else 0.0
+                return inverse
+        half = inverse_root(stacked(self.linear, self.reduced)[0], NULL, loose=True)
+        return half @ half.mT
 
 
-def information(problem: Problem, state: BatchState) -> Information:
-    """Covariance of the shared unknowns before any gauge is applied."""
-    linear = problem.linearize(state)
-    reduced = eliminate(linear, np.zeros(len(state.z)))
-    half = inverse_root(stacked(linear, reduced)[0], NULL, loose=True)
-    return Information(linear, reduced, half @ half.mT)
+def information(problem: Problem, state: BatchState, normal: Array | None = None) -> Information:
+    """What a problem says at a state."""
+    return Information(problem, state, normal)
 
 
 def reduced_rows(
@@ -106,7 +126,7 @@ def machine_covariance(
     problem: Problem, machine: Machine, before: State, shared: Array, gauge: Gauge
 ) -> Array:
     """Covariance (n, n) of parameters, stations and mounts, told in the gauge; n = P + 6 S + 6 M,
-    in the order of :func:`~pkmcal.identify.gauge.told_unknowns`.
+    in the order of :func:`~pkmcal.identify.estimate.told_unknowns`.
 
     before : the solution as the solver left it. shared : (na, na) covariance there.
     """

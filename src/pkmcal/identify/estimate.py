@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.unknowns import Unknowns, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 
@@ -33,6 +34,13 @@ class State:
     on_platform: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
     internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
     breathing: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def told_unknowns(state: State) -> Unknowns:
+    """The unknowns that results are told of: all parameters, stations and mounts."""
+    return Unknowns(
+        state.theta.size, len(state.T_camera_base), n_cameras=0, n_mounts=len(state.T_mount)
+    )
 
 
 @dataclass(frozen=True)
@@ -80,8 +88,9 @@ class Estimate:
     """An identification's result, in the frames that ``gauge`` names.
 
     machine : with the identified values. state : all unknowns.
-    covariance : (P, P) of the machine's parameters in that gauge; zero rows where fixed.
-    station_covariance : (S, 6, 6) of (omega, tau), left perturbation of T_camera_base.
+    joint_covariance : (n, n) of the machine's parameters, the stations and the mounts together, in
+        that gauge, n = P + 6 S + 6 M; zero rows where fixed. Poses by (omega, tau), left
+        perturbation of T_camera_base and T_mount.
     edge_shift_sigma : (C,) px. intrinsics_covariance : (C, n, n) of the cameras' intrinsics
     after refinement; n = 0 where they were held.
     edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1.
@@ -89,7 +98,6 @@ class Estimate:
     data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
         data decide; near 0, the value is the drawing's.
     pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
-    mount_covariance : (M, 6, 6) of (omega, tau), left perturbation of T_mount.
     line_shading : (n,) px, standard deviation of each tube's side's shading at each station.
     breathing_sigma : (S,) standard deviations of ``state.breathing``, in the same units.
     configurations : (K,) True where the configuration was seen and its pose estimated.
@@ -98,8 +106,7 @@ class Estimate:
 
     machine: Machine
     state: State
-    covariance: Array
-    station_covariance: Array
+    joint_covariance: Array
     edge_shift_sigma: Array
     edge_residuals: Array
     edge_weights: Array
@@ -111,7 +118,6 @@ class Estimate:
     intrinsics_covariance: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
     pose_weights: Array = field(default_factory=lambda: np.zeros(0))
-    mount_covariance: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
     line_shading: Array = field(default_factory=lambda: np.zeros(0))
     breathing_sigma: Array = field(default_factory=lambda: np.zeros(0))
 
@@ -119,3 +125,23 @@ class Estimate:
         """The measurements with the readings' noise as the data show it."""
         scale = self.statistics.reading_scale
         return replace(measurements, joint_noise=measurements.joint_noise * scale)
+
+    @property
+    def covariance(self) -> Array:
+        """(P, P) of the machine's parameters."""
+        at = self._told.machine
+        return self.joint_covariance[at, at]
+
+    @property
+    def station_covariance(self) -> Array:
+        """(S, 6, 6) of each station's own place, left perturbation of T_camera_base."""
+        return own_blocks(self.joint_covariance, self._told.stations, 6)
+
+    @property
+    def mount_covariance(self) -> Array:
+        """(M, 6, 6) of each mount's own place, left perturbation of T_mount."""
+        return own_blocks(self.joint_covariance, self._told.mounts, 6)
+
+    @property
+    def _told(self) -> Unknowns:
+        return told_unknowns(self.state)

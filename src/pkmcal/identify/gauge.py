@@ -28,8 +28,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
-from pkmcal.identify.estimate import State
-from pkmcal.identify.unknowns import Unknowns
+from pkmcal.identify.estimate import State, told_unknowns
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 
@@ -428,10 +427,3 @@ def transformation(machine: Machine, state: State, gauge: Gauge) -> Array:
     out = np.eye(len(moved))
     out[:, : change.shape[1]] -= moved @ change
     return out
-
-
-def told_unknowns(state: State) -> Unknowns:
-    """The unknowns that results are told of: all parameters, stations and mounts."""
-    return Unknowns(
-        state.theta.size, len(state.T_camera_base), n_cameras=0, n_mounts=len(state.T_mount)
-    )

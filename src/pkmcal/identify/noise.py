@@ -22,11 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.identify.covariance import UNKNOWN
+from pkmcal.identify.covariance import UNKNOWN, Information
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import Kinds, joint_rows
-from pkmcal.identify.unknowns import BatchState
-from pkmcal.solver import Linear, Reduced, normal_root, reduced_normal
+from pkmcal.solver import normal_root, reduced_normal
 
 EDGES, POSES, READINGS = range(3)
 """Kinds of rows in the last axes of :class:`Components`."""
@@ -99,16 +98,15 @@ class Components:
         return 1 + (chi2 - self.freedom[:, kind] - by_others) / np.maximum(own, TINY)
 
 
-def components(
-    problem: Problem, state: BatchState, linear: Linear, reduced: Reduced, weight: Kinds[Array]
-) -> Components:
-    """Those of a solution with weights (B, K, G) in use; reduced : without damping.
+def components(info: Information, weight: Kinds[Array]) -> Components:
+    """Those of a solution with weights (B, K, G) in use.
 
     H is Q Q^T of the own unknowns and S S^T of the shared ones, orthogonal to each other; what
     nothing fixes has no part in it. With G_k = [Q S]_k^T [Q S]_k, tr(H_kl H_lk) = tr(G_k G_l).
     """
+    problem, linear, reduced = info.problem, info.linear, info.reduced
     half = normal_root(reduced_normal(linear, reduced), UNKNOWN, loose=False)
-    by_reading = problem.closure(state).by_reading[..., None, :]
+    by_reading = problem.closure(info.state).by_reading[..., None, :]
 
     def readings(rows: Array) -> Array:
         """Of rows (B, K, r, n) those of the readings, (B, K, m, n)."""

@@ -40,7 +40,7 @@ from pkmcal.identify.rows import (
 )
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, on_tangents
-from pkmcal.solver import Linear, Values, of_runs
+from pkmcal.solver import Compact, Linear, Memory, Values, of_runs
 
 CLOSINGS = 2
 """Newton steps back onto the closures; each squares what is left."""
@@ -95,6 +95,24 @@ class Problem:
             joint_noise=of_runs(self.joint_noise, runs),
         )
 
+    def among(self, configurations: slice) -> Problem:
+        """The problem of some configurations only."""
+        return replace(
+            self,
+            blocks=self.blocks.among(configurations),
+            data=self.data.among(configurations),
+            pose_blocks=self.pose_blocks.among(configurations),
+            pose_data=self.pose_data.among(configurations),
+        )
+
+    def state_among(self, state: BatchState, configurations: slice) -> BatchState:
+        """What that problem needs of a state."""
+        return replace(
+            state,
+            T_base_platform=state.T_base_platform[:, configurations],
+            internal=state.internal[:, configurations],
+        )
+
     def weighted(self, weight: Kinds[Array]) -> Problem:
         """The same problem with other weights (B, K, G) of each kind's measurements."""
         return replace(
@@ -145,49 +163,136 @@ class Problem:
 
     def linearize(self, state: BatchState) -> Linear:
         """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
-        c, u = self.closure(state), self.unknowns
+        rows = self.compact(state)
+        by_shared = np.empty((*rows.value.shape, rows.n_shared))
+        for run, out in enumerate(by_shared):
+            out[...] = rows.write(run, slice(None), Memory())
+        return Linear(
+            rows.value, by_shared, rows.by_own, rows.usable, rows.shared_value, rows.shared_by
+        )
+
+    def compact(self, state: BatchState) -> Compact:
+        """The same, with the derivatives by the shared unknowns of all rows that have few of them
+        in few numbers.
+        """
+        c = self.closure(state)
         edges, poses = self._edges(state, c), self._poses(state)
         value = self._values(state, c, edges, poses)
-        blocks, boards = self.blocks, self.pose_blocks
-        lines = [(u.shading, np.maximum(blocks.line, 0), edges.by_line)] if u.n_lines else []
-        if u.n_breathing:
-            lines.append((u.breathing, blocks.station, edges.by_breathing))
-        breathing = [(u.breathing, boards.station, poses.by_breathing)] if u.n_breathing else []
-        closures = self._to_free([(c.index[None], c.by_theta[..., None, :])])[..., 0, :]
-        by_shared = (
-            self._columns(
-                self._to_free(edges.by_machine),
-                (u.stations, blocks.station, edges.by_station),
-                (u.optics, blocks.camera, edges.by_optics),
-                *lines,
-            ),
-            self._columns(self._by_noise(c, closures)[..., None, :]),
-            self._columns(
-                np.zeros((*poses.value.shape, u.n_free)),
-                (u.stations, boards.station, poses.by_station),
-                (u.optics, boards.camera, poses.by_optics),
-                (u.mounts, boards.mount, poses.by_mount),
-                *breathing,
-            ),
-        )
-        by_own = (
-            _in_rows(edges.by_own(self._to_own(c.ends.b_by_pose, c.ends.b_by_internal))),
-            self._by_noise(c, self.layout.by_own(c)),
-            _in_rows(self._to_own(poses.by_platform)),
-        )
-        by_shared = np.concatenate(by_shared, axis=-2)
-        by_own = np.concatenate(by_own, axis=-2)
-        # padding may lie anywhere, so its derivatives need not be finite though its row is zero
         usable = np.isfinite(value) & self._in_use()
-        lost = ~np.isfinite(value + by_shared.sum(axis=-1))
-        return Linear(
-            np.where(usable, value, 0.0),
-            np.where(lost[..., None], 0.0, by_shared),
-            np.where(lost[..., None], 0.0, by_own),
-            usable,
-            self.prior_values(state) - self.prior_target,
-            self.prior,
-        )
+        few, own = self._of_edges(edges)
+        wide, by_pose = self._of_closures(c)
+        if self.pose_blocks.present.size:
+            boards = self._of_boards(poses)
+            wide, by_pose = (
+                np.concatenate(both, axis=2) for both in zip((wide, by_pose), boards, strict=True)
+            )
+        by_own = np.concatenate([own, by_pose], axis=2)
+        # padding may lie anywhere, so its derivatives need not be finite though its row is zero
+        lost = ~np.isfinite(wide.sum(axis=-1) + value[:, :, self.closure_rows.start :])
+        wide[lost] = 0.0
+        by_own[~np.isfinite(value + by_own.sum(axis=-1))] = 0.0
+
+        def write(run: int, configurations: slice, memory: Memory) -> Array:
+            return self._written(few[:, :, run], wide[run], configurations, memory)
+
+        shared_value = self.prior_values(state) - self.prior_target
+        value = np.where(usable, value, 0.0)
+        count = self.unknowns.count
+        return Compact(value, by_own, usable, shared_value, self.prior, count, write)
+
+    def _written(self, few: Array, wide: Array, some: slice, memory: Memory) -> Array:
+        """Derivatives (k, r, na) of some configurations of one run by the shared unknowns, from
+        those of the edges (n, 2g, K, G) and those of all other rows (K, r', na).
+        """
+        first, count = self.closure_rows.start, self.unknowns.count
+        where, wide = self._edge_places[:, :, some], wide[some]
+        k = len(wide)
+        out = memory.empty("by shared", (k, first + wide.shape[1], self._width))
+        out.fill(0.0)
+        if where.size:
+            out.reshape(-1)[where - (some.start or 0) * out[0].size] = few[:, :, some]
+        if self._choice is None:
+            out[:, :first, self.unknowns.machine] = out[:, :first, count:-1] @ self.free
+        out[:, first:, :count] = wide
+        return out[..., :count]
+
+    @cached_property
+    def _edge_places(self) -> Integers:
+        """Where the edges' derivatives are written among all of a run, (n, 2g, K, G)."""
+        u, blocks, layout = self.unknowns, self.blocks, self.layout
+        index = (layout.a_index[blocks.leg], layout.b_index[blocks.leg], blocks.radius[..., None])
+        columns = [self._column[part] for part in index]
+        columns.append(_columns(u.stations, blocks.station, 6))
+        columns.append(_columns(u.optics, blocks.camera, u.n_optics))
+        if u.n_lines:
+            columns.append(_columns(u.shading, np.maximum(blocks.line, 0), 1))
+        if u.n_breathing:
+            columns.append(_columns(u.breathing, blocks.station, 1))
+        (k, g), n = blocks.leg.shape, 2 * blocks.side.shape[-1]
+        rows = self.closure_rows.stop + self.pose_blocks.present.shape[1] * 6
+        row = rows * np.arange(k)[:, None] + n * np.arange(g) + np.arange(n)[:, None, None]
+        return row * self._width + np.moveaxis(np.concatenate(columns, axis=-1), -1, 0)[:, None]
+
+    def _of_edges(self, edges: EdgeRows) -> tuple[Array, Array]:
+        """The edges' derivatives (n, 2g, B, K, G) by what :attr:`_edge_places` says, and by the
+        configuration's own unknowns, (B, K, G 2g, d); zero where they are lost.
+        """
+        parts = [*edges.by_machine, edges.by_station, _blocks_last(edges.by_optics)]
+        if self.unknowns.n_lines:
+            parts.append(_blocks_last(edges.by_line))
+        if self.unknowns.n_breathing:
+            parts.append(_blocks_last(edges.by_breathing))
+        own = edges.by_own(self.layout.freedoms)
+        blocks = own.shape[1:]
+        out = np.concatenate([np.broadcast_to(part, (len(part), *blocks)) for part in parts])
+        lost = ~np.isfinite(out.sum(axis=0))
+        if lost.any():
+            out[:, lost] = 0.0
+        return out, _in_rows(np.moveaxis(own, (0, 1), (-1, -2)))
+
+    def _of_closures(self, c: Closure) -> tuple[Array, Array]:
+        """The closures' derivatives by the shared unknowns (B, K, E, na) and by the own ones."""
+        n = self.drawing.size
+        full = np.zeros((*c.value.shape, n + 1))  # the last column takes what is no parameter's
+        full[:, :, np.arange(c.value.shape[-1])[:, None], c.index] = c.by_theta
+        out = np.zeros((*c.value.shape, self.unknowns.count))
+        free = full[..., :n] @ self.free if self._choice is None else full[..., self._choice]
+        out[..., self.unknowns.machine] = self._by_noise(c, free)
+        return out, self._by_noise(c, self.layout.by_own(c))
+
+    def _of_boards(self, poses: PoseRows) -> tuple[Array, Array]:
+        """The same of the boards' poses, (B, K, 6 G, na)."""
+        u, boards = self.unknowns, self.pose_blocks
+        parts = [
+            (_columns(u.stations, boards.station, 6), poses.by_station),
+            (_columns(u.optics, boards.camera, u.n_optics), poses.by_optics),
+            (_columns(u.mounts, boards.mount, 6), poses.by_mount),
+        ]
+        if u.n_breathing:
+            parts.append((_columns(u.breathing, boards.station, 1), poses.by_breathing))
+        out = np.zeros((*poses.value.shape, u.count))
+        for columns, values in parts:
+            np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
+        own = np.zeros((*poses.value.shape, self.layout.own_motion.shape[1]))
+        by_pose = poses.by_platform[..., self.layout.freedoms]
+        own[..., : by_pose.shape[-1]] = by_pose
+        return _in_rows(out), _in_rows(own)
+
+    @cached_property
+    def _width(self) -> int:
+        """Columns of an edge's row while it is written: the shared unknowns', where parameters are
+        tied or are axes one for each parameter besides, and one for what is no unknown.
+        """
+        return self.unknowns.count + 1 + (0 if self._choice is not None else self.drawing.size)
+
+    @cached_property
+    def _column(self) -> Integers:
+        """Where each parameter's derivatives are written, (P + 1,); the last is no parameter's."""
+        if self._choice is None:
+            return self.unknowns.count + np.arange(self.drawing.size + 1)
+        out = np.full(self.drawing.size + 1, self.unknowns.count)
+        out[self._choice] = np.arange(len(self._choice))
+        return out
 
     def unweighted(self, state: BatchState) -> Kinds[Array]:
         """Whitened residuals of each kind of measurement without their weights, (B, K, G, n)."""
@@ -213,7 +318,7 @@ class Problem:
 
     def _edges(self, state: BatchState, c: Closure) -> EdgeRows:
         radius = self.theta(state)[:, self.blocks.radius]
-        return edge_rows(self.blocks, self.data, c.ends, radius, state.T_camera_base)
+        return edge_rows(self.blocks, self.data, c, radius, state.T_camera_base)
 
     def _poses(self, state: BatchState) -> PoseRows:
         return pose_rows(
@@ -249,50 +354,11 @@ class Problem:
         parts = [np.broadcast_to(part, (runs, n, part.shape[-1])) for part in parts]
         return np.concatenate(parts, axis=-1)
 
-    def _columns(self, machine: Array, *others: tuple[slice, Integers, Array]) -> Array:
-        """Derivatives put into the columns of the shared unknowns, rows in one, (B, K, G n, na).
-
-        machine : (B, K, G, n, nz). others : which unknowns, whose of them (K, G), and the
-        derivatives (B, K, G, n, w) by that one's.
-        """
-        out = np.zeros((*machine.shape[:-1], self.unknowns.count))
-        out[..., self.unknowns.machine] = machine
-        for part, number, values in others:
-            width = values.shape[-1]
-            columns = part.start + width * number[..., None] + np.arange(width)
-            np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
-        return _in_rows(out)
-
-    def _to_free(self, parts: list[tuple[Integers, Array]]) -> Array:
-        """Derivatives by machine parameters put into the free unknowns' columns.
-
-        parts : positions (K or 1, G, n) and derivatives (B, K, G, rows, n).
-        """
-        shape = np.broadcast_shapes(*(values.shape[:-1] for _, values in parts))
-        n = self.drawing.size
-        full = np.zeros((*shape, n + 1))  # the last column takes what is no parameter's
-        for index, values in parts:
-            np.put_along_axis(full, index[None, :, :, None, :], values, axis=-1)
-        if self._choice is not None:  # no ties, no axes: a choice of columns, far cheaper
-            return full[..., self._choice]
-        return full[..., :n] @ self.free
-
     @cached_property
     def _choice(self) -> Integers | None:
         """The parameter of each free unknown where each moves one parameter alone."""
         alone = np.all((self.free != 0).sum(axis=0) == 1) and np.all(self.free.sum(axis=0) == 1)
         return np.argmax(self.free, axis=0) if alone else None
-
-    def _to_own(self, by_pose: Array, by_internal: Array | None = None) -> Array:
-        """Derivatives (..., 6) by the pose, and (..., n) by what is internal, as those by the
-        configuration's own unknowns, (..., d + n).
-        """
-        out = by_pose @ self.layout.motion
-        if not self.layout.n_internal:
-            return out
-        if by_internal is None:
-            by_internal = np.zeros((*out.shape[:-1], self.layout.n_internal))
-        return np.concatenate([out, by_internal], axis=-1)
 
     def moved(self, state: BatchState, shared: Array, own: Array) -> BatchState:
         """The state after a step (B, na) and (B, K, d), taken along what bends.
@@ -377,6 +443,16 @@ class Problem:
         return trial
 
 
+def _columns(part: slice, number: Integers, width: int) -> Integers:
+    """Columns (K, G, width) of unknowns ``width`` wide each, by which one it is, (K, G)."""
+    return part.start + width * number[..., None] + np.arange(width)
+
+
 def _in_rows(parts: Array) -> Array:
     """Rows (B, K, G, n, w) of G places one after the other, (B, K, G n, w)."""
     return parts.reshape(*parts.shape[:2], parts.shape[2] * parts.shape[3], parts.shape[4])
+
+
+def _blocks_last(values: Array) -> Array:
+    """Derivatives (B, K, G, n, w) with the blocks last, (w, n, B, K, G)."""
+    return np.moveaxis(values, (-1, -2), (0, 1))

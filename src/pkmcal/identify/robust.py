@@ -18,9 +18,7 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import Kind, Kinds
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.solver import (
-    FIRST_DAMPING,
     FULL,
-    RESTART_DAMPING,
     final_weights,
     minimise,
     soft_weights,
@@ -111,8 +109,7 @@ def anneal(problem: Problem, start: BatchState, least_scale: float) -> Anneal:
         settled = all(np.all(n > 0.8 * c) for n, c in zip(new, cut, strict=True))
         cut = new
         weight = Kinds(*(soft_weights(p, c[:, None, None]) for p, c in zip(d, cut, strict=True)))
-        damping = RESTART_DAMPING if steps else FIRST_DAMPING
-        found = minimise(problem.weighted(weight), state, max_steps=most, damping=damping)
+        found = minimise(problem.weighted(weight), state, max_steps=most)
         state, steps = found.state, steps + int(found.steps.max())
         d = distances(problem, state)
         if settled:

@@ -19,7 +19,7 @@ Measurements stand in K configurations of G places each, padded to a common coun
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Generic, NamedTuple, TypeVar
 
@@ -27,16 +27,17 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.cylinders import EdgeNormals, edge_normal_jacobians
-from pkmcal.geometry.rigid import dot, pose_difference, skew
+from pkmcal.geometry.rigid import cross, dot, pose_difference, skew
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA
-from pkmcal.mechanisms.closure import LimbEnds, LimbLayout
+from pkmcal.mechanisms.closure import Closure, LimbLayout
 
 PERFECT = 1e-6
 """Standard deviation (m) of closures without a reading: joints and rods without play. A third of
 a good encoder's noise, so nothing is lost, and not so sharp that digits are."""
 
 Item = TypeVar("Item", covariant=True)
+Numbers = TypeVar("Numbers", "EdgeBlocks", "EdgeData", "PoseBlocks", "PoseData")
 
 
 class Kinds(NamedTuple, Generic[Item]):
@@ -71,6 +72,15 @@ class Kind:
         return np.any(self.whiten[0] != 0, axis=-1).sum(axis=-1)
 
 
+def _among(numbers: Numbers, configurations: slice, axis: int) -> Numbers:
+    """All arrays of a dataclass cut along the configurations' axis; what is the same for all of
+    them, a single one or none, stays.
+    """
+    cut = (slice(None),) * axis + (configurations,)
+    found = ((f.name, getattr(numbers, f.name)) for f in fields(numbers))
+    return replace(numbers, **{name: x[cut] for name, x in found if x.shape[axis] > 1})
+
+
 @dataclass(frozen=True)
 class EdgeBlocks:
     """Where the edges are: K configurations of G blocks, padded; the same for all runs.
@@ -92,6 +102,14 @@ class EdgeBlocks:
     side: Integers
     present: Booleans
     line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
+
+    def place(self, n_legs: int) -> Integers:
+        """Where each block's leg stands among those of all configurations, (K, G)."""
+        return n_legs * np.arange(len(self.leg))[:, None] + self.leg
+
+    def among(self, configurations: slice) -> EdgeBlocks:
+        """Those of some configurations."""
+        return _among(self, configurations, 0)
 
 
 @dataclass(frozen=True)
@@ -115,21 +133,40 @@ class EdgeData:
     shading: Array = field(default_factory=lambda: np.full((1, 1), SHADING_SIGMA))
     breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 1)))
 
+    def among(self, configurations: slice) -> EdgeData:
+        """Those of some configurations."""
+        return replace(_among(self, configurations, 1), shading=self.shading)
+
+    @cached_property
+    def weighed(self) -> Array:
+        """The whitening with the weights, (B or 1, K, G, 2g, 2g)."""
+        return np.sqrt(self.weight)[..., None, None] * self.whiten
+
+    @cached_property
+    def of_normals(self) -> Array:
+        """Rows by changes of the normals, whitening and weights included, (g, 3, 2g, ...) with
+        the blocks (B or 1, K, G) last.
+        """
+        shape = self.weighed.shape
+        split = self.weighed.reshape(*shape[:-1], shape[-1] // 2, 2)
+        return np.einsum("...rej,...eij->eir...", split, self.basis, order="C")
+
 
 @dataclass(frozen=True)
 class EdgeRows:
     """The edges' rows at a state, and how they answer to what they depend on.
 
-    rot, origin : (B, K, G, 3, 3) and (..., 3) of T_camera_base. a, b : (B, K, G, 3) both ends of
-    their limbs in the camera frame. normals : predicted there, [B] eq. 3, with derivatives, last
-    axes (K, G, g).
+    In the arrays here the blocks (B, K, G) stand last and vectors' components before them: NumPy
+    then runs along rows of many blocks, and a block costs a few nanoseconds an operation.
+
+    T_camera_base : (3, 4, ...) of each block's station. a, b : (3, ...) both ends of their limbs
+    in the camera frame. normals : predicted there, [B] eq. 3, (g, 3, ...) each.
     """
 
     blocks: EdgeBlocks
     data: EdgeData
-    ends: LimbEnds
-    rot: Array
-    origin: Array
+    closure: Closure
+    T_camera_base: Array
     a: Array
     b: Array
     normals: EdgeNormals
@@ -139,8 +176,8 @@ class EdgeRows:
         focal lengths.
         """
         optics, shading, breathing = state.optics, state.shading, state.breathing
-        rows = self._whitened(self.normals.n[..., None])
-        rows = (rows + self.by_optics @ optics[:, self.blocks.camera, :, None])[..., 0]
+        rows = np.moveaxis(self._whitened(self.normals.n), 0, -1)
+        rows = rows + (self.by_optics @ optics[:, self.blocks.camera, :, None])[..., 0]
         if shading.shape[-1]:
             rows = rows + self.by_line[..., 0] * shading[:, self.blocks.line, None]
         if breathing.shape[-1]:
@@ -150,7 +187,7 @@ class EdgeRows:
     @cached_property
     def by_optics(self) -> Array:
         """By their camera's unknowns, (B or 1, K, G, 2g, w)."""
-        return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ self.data.optics)
+        return self.data.weighed @ self.data.optics
 
     @property
     def by_line(self) -> Array:
@@ -165,65 +202,98 @@ class EdgeRows:
     @property
     def by_breathing(self) -> Array:
         """By their station's focal breathing, (B or 1, K, G, 2g, 1)."""
-        return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ self.data.breathing)
+        return self.data.weighed @ self.data.breathing
 
     @property
-    def by_machine(self) -> list[tuple[Integers, Array]]:
-        """By parameters at positions (K, G, n): (B, K, G, 2g, n) of both ends and of the radius."""
-        legs, k = self.blocks.leg, self._row
-        by_a, by_b = self.ends.a_by[:, k, legs], self.ends.b_by[:, k, legs]
-        return [
-            (self.ends.a_index[legs], self._by_a @ (self.rot @ by_a)),
-            (self.ends.b_index[legs], self._by_b @ (self.rot @ by_b)),
-            (self.blocks.radius[..., None], self._whitened(self.normals.dn_dradius[..., None])),
-        ]
+    def by_machine(self) -> tuple[Array, Array, Array]:
+        """By the parameters of both ends and by the radius, (n, 2g, ...) each."""
+        ends = self.closure.ends
+        radius = np.sum(self._pulls[0] + self._pulls[1], axis=0)[None]
+        return self._by_a(self._along(ends.a_by)), self._by_b(self._along(ends.b_by)), radius
 
     @property
     def by_station(self) -> Array:
-        """By their station's (omega, tau), (B, K, G, 2g, 6)."""
-        a, b = self.a - self.origin, self.b - self.origin
-        by_turn = -self._by_a @ skew(a) - self._by_b @ skew(b)
-        return np.concatenate([by_turn, self._by_a + self._by_b], axis=-1)
+        """By their station's (omega, tau), (6, 2g, ...)."""
+        n, origin = self.normals.n, self.T_camera_base[:, 3]
+        a, b = (np.concatenate([_moments(p - origin, n), n], axis=1) for p in (self.a, self.b))
+        return self._by_a(a) + self._by_b(b)
 
-    def by_own(self, ends_by_own: Array) -> Array:
-        """By the configuration's own unknowns, (B, K, G, 2g, d), from those of the limbs' ends on
-        the platform (B, K, L, 3, d).
+    def by_own(self, freedoms: slice) -> Array:
+        """By the configuration's own unknowns (d, 2g, ...): the platform's freedoms of its six, and
+        what is internal.
         """
-        return self._by_b @ (self.rot @ ends_by_own[:, self._row, self.blocks.leg])
+        platform = self.closure.platform
+        arm = _at(platform.arm, 1, self._place)
+        by = np.concatenate([_moments(arm, self._n_base), self._n_base], axis=1)[:, freedoms]
+        if platform.by_internal.shape[-1]:
+            by = np.concatenate([by, self._along(platform.by_internal)], axis=1)
+        return self._by_b(by)
+
+    @cached_property
+    def _n_base(self) -> Array:
+        """The normals in the base frame, (g, 3, ...)."""
+        return np.einsum("ij...,ei...->ej...", self.T_camera_base[:, :3], self.normals.n)
+
+    def _along(self, by: Array) -> Array:
+        """Derivatives of the limbs' ends (B, K, L, 3, n), along the blocks' normals (g, n, ...)."""
+        own = _at(by, 2, self._place)
+        return np.einsum("ej...,jc...->ec...", self._n_base, own)
 
     @property
-    def _row(self) -> Integers:
-        return np.arange(len(self.blocks.leg))[:, None]
+    def _place(self) -> Integers:
+        return self.blocks.place(self.closure.layout.n_legs)
 
     @cached_property
-    def _by_a(self) -> Array:
-        return self._whitened(self.normals.dn_da)
+    def _pulls(self) -> tuple[Array, Array]:
+        """Rows by n.a and by n.b, (g, 2g, ...) each: all derivatives are multiples of these."""
+        return self._whitened_each(self.normals.by_a), self._whitened_each(self.normals.by_b)
 
-    @cached_property
-    def _by_b(self) -> Array:
-        return self._whitened(self.normals.dn_db)
+    def _by_a(self, along: Array) -> Array:
+        """Rows (n, 2g, ...) from changes of n.a (g, n, ...)."""
+        return np.einsum("er...,ec...->cr...", self._pulls[0], along)
+
+    def _by_b(self, along: Array) -> Array:
+        """Rows (n, 2g, ...) from changes of n.b (g, n, ...)."""
+        return np.einsum("er...,ec...->cr...", self._pulls[1], along)
 
     def _whitened(self, vectors: Array) -> Array:
-        """basis^T v, whitened and weighted: (B, K, G, g, 3, n) -> (B, K, G, 2g, n)."""
-        flat = self.data.basis.mT @ vectors
-        flat = flat.reshape(*flat.shape[:3], 2 * flat.shape[3], flat.shape[-1])
-        return np.sqrt(self.data.weight)[..., None, None] * (self.data.whiten @ flat)
+        """basis^T v, whitened and weighted: (g, 3, ...) -> (2g, ...)."""
+        return np.einsum("eir...,ei...->r...", self.data.of_normals, vectors)
+
+    def _whitened_each(self, vectors: Array) -> Array:
+        """The same of each edge's vector alone, (g, 2g, ...)."""
+        return np.einsum("eir...,ei...->er...", self.data.of_normals, vectors)
+
+
+def _at(array: Array, components: int, place: Integers) -> Array:
+    """Vectors or matrices of a row of legs or stations (B, ..., n, c) at the blocks' places among
+    them, (K, G): components first, blocks last.
+    """
+    first = np.moveaxis(array, range(-components, 0), range(components))
+    return np.take(first.reshape(*first.shape[: components + 1], -1), place, axis=-1)
+
+
+def _moments(arm: Array, n: Array) -> Array:
+    """Moments ``arm x n`` of arms (3, ...) and the blocks' normals (g, 3, ...)."""
+    return np.moveaxis(cross(np.moveaxis(arm, 0, -1), np.moveaxis(n, 1, -1)), -1, 1)
 
 
 def edge_rows(
-    blocks: EdgeBlocks, data: EdgeData, ends: LimbEnds, radius: Array, T_camera_base: Array
+    blocks: EdgeBlocks, data: EdgeData, c: Closure, radius: Array, T_camera_base: Array
 ) -> EdgeRows:
-    """Rows of the edges from both ends of the limbs, the blocks' radii (B, K, G) and the stations
-    (B, S, 4, 4).
+    """Rows of the edges from the machine's closure (B, K), the blocks' radii (B, K, G) and the
+    stations (B, S, 4, 4).
     """
-    k = np.arange(len(blocks.leg))[:, None]
-    station = T_camera_base[:, blocks.station]
-    rot, origin = station[..., :3, :3], station[..., :3, 3]
-    a, b = ((rot @ end[:, k, blocks.leg, :, None])[..., 0] + origin for end in (ends.a, ends.b))
-    normals = edge_normal_jacobians(
-        a[..., None, :], b[..., None, :], radius[..., None], blocks.side
+    place, ends = blocks.place(c.layout.n_legs), np.broadcast_arrays(c.base.a, c.platform.b)
+    station = _at(T_camera_base[..., :3, :], 2, blocks.station)
+    a, b = (
+        np.einsum("ij...,j...->i...", station[:, :3], _at(end, 1, place)) + station[:, 3]
+        for end in ends
     )
-    return EdgeRows(blocks, data, ends, rot, origin, a, b, normals)
+    side = np.moveaxis(blocks.side, -1, 0)[:, None]
+    found = edge_normal_jacobians(np.moveaxis(a, 0, -1), np.moveaxis(b, 0, -1), radius, side)
+    normals = EdgeNormals(*(np.ascontiguousarray(np.moveaxis(x, -1, 1)) for x in found))
+    return EdgeRows(blocks, data, c, station, a, b, normals)
 
 
 def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Array) -> Array:
@@ -283,6 +353,10 @@ class PoseBlocks:
     on_platform: Booleans
     camera: Integers
 
+    def among(self, configurations: slice) -> PoseBlocks:
+        """Those of some configurations."""
+        return replace(_among(self, configurations, 0), on_platform=self.on_platform)
+
 
 @dataclass(frozen=True)
 class PoseData:
@@ -298,6 +372,10 @@ class PoseData:
     weight: Array
     optics: Array
     breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 6, 0)))
+
+    def among(self, configurations: slice) -> PoseData:
+        """Those of some configurations."""
+        return _among(self, configurations, 1)
 
 
 class PoseRows(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -180,7 +180,7 @@ def _base_alone(estimate: Estimate) -> str:
     machine, table = estimate.machine, estimate.machine.parameters
     drawing = machine.with_values(table.drawing)
     root = table.free_matrix() * table.tolerances_free()
-    drawn = free_of_gauge(replace(estimate, covariance=root @ root.T))
+    drawn = free_of_gauge(estimate, root @ root.T)
     together, before = (
         joint_centres(drawing, machine, covariance)[0].covariance
         for covariance in (free_of_gauge(estimate), drawn)

@@ -16,7 +16,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.identify.gauge import centre_index
-from pkmcal.judge.held import RATIO
+from pkmcal.judge.held import MOVED, RATIO, Evidence
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.wording import split_name
@@ -31,10 +31,12 @@ FOCAL = ("focal.x", "focal.y")
 class Cause:
     """A change that is looked for.
 
-    part : of a leg (:class:`~pkmcal.mechanisms.ParameterTable`), or ``all``, ``scale``, ``camera``.
-    columns : (P, k), the change of the machine's parameters (m, rad) by k numbers; or (P + C, k),
-    then of the cameras' magnification. sizes : (k,) usual ones: a drawing's tolerance, or RATIO.
-    legs : from 0. unit : of the k numbers: m, rad, or nothing for a ratio.
+    part : of a leg (:class:`~pkmcal.mechanisms.ParameterTable`), or ``all``, ``scale``, ``camera``,
+    ``station``. columns : (P, k), the change of the machine's parameters (m, rad) by k numbers; or
+    (P + C, k), then of the cameras' magnification; or of all columns of
+    :class:`~pkmcal.judge.held.Evidence`. sizes : (k,) usual ones: a drawing's tolerance, RATIO, or
+    MOVED. legs : from 0. unit : of the k numbers: m, rad, or nothing for a ratio. camera, station :
+    numbers in the session.
     """
 
     part: str
@@ -43,6 +45,7 @@ class Cause:
     sizes: Array
     unit: str
     camera: int = -1
+    station: int = -1
 
 
 def arms(machine: Machine) -> tuple[tuple[int, ...], ...]:
@@ -90,8 +93,19 @@ def magnification(machine: Machine, camera: int) -> Cause:
     return Cause("camera", (), column, np.array([RATIO]), "", camera)
 
 
-def single_causes(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
-    """All that one mishap may change: a part of a leg, neighbouring joints, scale, a lens."""
+def stations_moved(found: Evidence) -> tuple[Cause, ...]:
+    """Each camera that is said to have been left in place turned and moved, (phi, s)."""
+    columns = np.eye(found.by.shape[1])[:, found.by.shape[1] - 6 * len(found.kept) :]
+    return tuple(
+        Cause("station", (), columns[:, 6 * k : 6 * k + 6], np.full(6, MOVED), "m", station=station)
+        for k, station in enumerate(found.kept)
+    )
+
+
+def single_causes(machine: Machine, found: Evidence | None = None) -> tuple[Cause, ...]:
+    """All that one mishap may change: a part of a leg, neighbouring joints, scale; and, as far as
+    the evidence has columns for them, a lens, or a camera's place.
+    """
     out = [
         cause
         for legs in arms(machine)
@@ -102,8 +116,12 @@ def single_causes(machine: Machine, n_cameras: int = 0) -> tuple[Cause, ...]:
         for pair in _neighbours(machine, side):  # a mount that both share
             one, other = (joint_of(machine, side, leg) for leg in pair)
             out.append(Cause(side, pair, one.columns + other.columns, one.sizes, "m"))
-    cameras = [magnification(machine, c) for c in range(n_cameras)]
-    return (*out, common_scale(machine), *cameras)
+    out.append(common_scale(machine))
+    if found is None:
+        return tuple(out)
+    n_cameras = found.by.shape[1] - len(machine.parameters) - 6 * len(found.kept)
+    out += [magnification(machine, c) for c in range(n_cameras)]
+    return (*out, *stations_moved(found))
 
 
 def joined(causes: Sequence[Cause]) -> Cause:

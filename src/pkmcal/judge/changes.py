@@ -23,6 +23,7 @@ from pkmcal.judge.causes import (
     joined,
     joint_of,
     single_causes,
+    stations_moved,
     whole_legs,
     whole_machine,
     zeros,
@@ -244,6 +245,17 @@ class LegTest:
 
 
 @dataclass(frozen=True)
+class StationTest:
+    """Whether a camera that is said to have been left in place was moved, by its number in the
+    session; change : (phi, s) in its own axes, if nothing else changed.
+    """
+
+    station: int
+    test: ChiSquare
+    change: Change
+
+
+@dataclass(frozen=True)
 class Suspect:
     """A cause with the change that it would have made; chi2 : what it explains."""
 
@@ -256,10 +268,12 @@ class Suspect:
         columns = self.cause.columns
         names = (*machine.parameters.names, *("magnification",) * len(columns))
         numbers = [names[int(abs(column).argmax())] for column in columns.T]
+        place = [f"{number}.{axis}" for number in ("turn", "shift") for axis in "xyz"]
+        own = {"scale": ["scale"], "station": place}
         return {
             "part": self.cause.part,
             "legs": [j + 1 for j in self.cause.legs],
-            "numbers": ["scale"] if self.cause.part == "scale" else numbers,
+            "numbers": own.get(self.cause.part, numbers),
             **self.change.document(),
             "chi2": self.chi2,
         }
@@ -280,6 +294,7 @@ class Explanation:
 @dataclass(frozen=True)
 class ChangeTests:
     """All tests. machine : of all legs' numbers together. scale : of all lengths by one factor.
+    stations : of each camera that is said to have been left in place.
 
     alpha : share of machines that did not change that may be flagged. level : of a single test, so
     that all together keep alpha. left : what the findings leave unexplained of ``machine``.
@@ -293,6 +308,7 @@ class ChangeTests:
     left: ChiSquare
     alpha: float
     level: float
+    stations: tuple[StationTest, ...] = ()
 
     @property
     def changed(self) -> bool:
@@ -300,10 +316,23 @@ class ChangeTests:
         return min((t.adjusted for t in self.tests), default=1.0) < self.alpha
 
     @property
+    def moved(self) -> tuple[int, ...]:
+        """Numbers of the cameras that are said to have been left in place, and were moved rather
+        than that the machine has changed: those that explain the data best; where no single cause
+        does, those whose own test fails.
+        """
+        if self.findings:
+            named = [f.suspect.cause.station for f in self.findings]
+            return tuple(station for station in named if station >= 0)
+        return tuple(s.station for s in self.stations if s.test.adjusted < self.alpha)
+
+    @property
     def tests(self) -> tuple[ChiSquare, ...]:
         """All tests that see anything."""
         legs = [t for leg in self.legs for t in (leg.whole, leg.zero)]
-        return tuple(t for t in (self.machine, self.scale, *legs) if t is not None and t.dof)
+        kept = [station.test for station in self.stations]
+        every = (self.machine, self.scale, *legs, *kept)
+        return tuple(t for t in every if t is not None and t.dof)
 
     def document(self, machine: Machine) -> dict[str, Any]:
         """All tests and findings for programs: m, rad and ratios, legs from 1."""
@@ -332,10 +361,11 @@ def made_tests(
 ) -> tuple[tuple[ChiSquare, ...], tuple[ChiSquare | None, ...], CommonLevel]:
     """Every test on new data, chances adjusted for their number, and what they are worth together.
 
-    First of all legs, of all lengths by one factor, and of each arm's legs; then of each arm's
-    zero, None for one without a reading.
+    First of all legs, of all lengths by one factor, of each arm's legs, and of each camera that was
+    left in place; then of each arm's zero, None for one without a reading.
     """
     causes = [whole_machine(machine), common_scale(machine), *whole_legs(machine)]
+    causes += stations_moved(found)
     zero = zeros(machine)
     level = together(found, [*causes, *(cause for cause in zero if cause)])
 
@@ -351,8 +381,9 @@ def look_for_changes(found: Evidence, machine: Machine, alpha: float) -> ChangeT
 
     alpha : share of machines that did not change that may be flagged.
     """
-    (every, scale, *wholes), own, level = made_tests(found, machine)
+    (every, scale, *each), own, level = made_tests(found, machine)
     single = level.single(alpha)
+    wholes, kept = each[: len(own)], each[len(own) :]
     rows = zip(whole_legs(machine), zeros(machine), wholes, own, strict=True)
     out = ChangeTests(
         legs=tuple(_leg(found, machine, *row, single) for row in rows),
@@ -363,11 +394,14 @@ def look_for_changes(found: Evidence, machine: Machine, alpha: float) -> ChangeT
         left=every,
         alpha=alpha,
         level=single,
+        stations=tuple(
+            StationTest(cause.station, test, change(found, cause))
+            for cause, test in zip(stations_moved(found), kept, strict=True)
+        ),
     )
     if not out.changed:
         return out
-    cameras = found.by.shape[1] - len(machine.parameters)
-    findings = explained(found, single_causes(machine, cameras), alpha)
+    findings = explained(found, single_causes(machine, found), alpha)
     left = _beside(found, [f.suspect.cause for f in findings])
     left = chi_square(left, whole_machine(machine))
     return replace(out, findings=findings, left=left)

@@ -14,12 +14,14 @@ Two things are read from that: what all else predicts of a configuration's readi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import ResultError
+from pkmcal.geometry.rigid import pose_difference, skew
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import reduced_rows
@@ -30,10 +32,12 @@ from pkmcal.identify.rows import Kinds
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.solver import RANK_TOLERANCE, RESTART_DAMPING, Stop, minimise
+from pkmcal.solver import RANK_TOLERANCE, Stop, column_space, minimise
 
 RATIO = 1e-3
 """Of a magnification, or another ratio: the size against which it counts as seen."""
+MOVED = 1e-2
+"""m and rad: the same of a camera's place, what a tripod makes that somebody ran into."""
 UNSCALED = Kinds(1.0, 1.0)
 
 
@@ -153,7 +157,7 @@ def hold(
         problem, found = result.problem, result.solution
     else:
         problem = assembled.trusting(trust.weights)
-        found = minimise(problem, begin, damping=RESTART_DAMPING)
+        found = minimise(problem, begin)
     if found.stop[0] in (Stop.NOT_FINITE, Stop.STALLED):
         raise ResultError(
             "the platform's poses were not found with the calibrated machine:"
@@ -190,27 +194,74 @@ def too_little() -> ResultError:
 class Evidence:
     """New data as a linear regression on a change of the machine, ``w = X c + noise``.
 
-    w : (n,) of unit variance. by : X (n, P + C), by the parameters' changes in m and rad, and by
-    the magnification of C cameras where that was asked for; an axis' own length has no part in it.
+    w : (n,) of unit variance. by : X (n, P + C + 6 k), by the parameters' changes in m and rad, by
+    the magnification of C cameras where that was asked for, and by how k cameras that were left in
+    place turned and moved, (phi, s) in their own axes, rad and m. An axis' own length has no part
+    in it. kept : (k,) numbers of these stations in the session.
     Every test of a change is one on w and X: a score test, no machine is estimated.
     """
 
     w: Array
     by: Array
+    kept: tuple[int, ...] = ()
 
     def along(self, columns: Array) -> Array:
-        """X D of changes (P, k) of the parameters, or (P + C, k) with cameras' magnifications."""
+        """X D of changes (P, k) of the parameters, (P + C, k) with cameras' magnifications, or of
+        all columns.
+        """
         return self.by[:, : len(columns)] @ columns
 
 
-def evidence(held: Held, covariance: Array) -> Evidence:
-    """What the data tell of a change from the held values, whose covariance (P, P) is the
-    calibration's: whitened by V = 1 + A C A^T.
+@dataclass(frozen=True)
+class Kept:
+    """What a calibration knows, with the places of cameras that are said to stand where it had
+    them.
+
+    stations : (k,) their numbers in the session. T_camera_base : (k, 4, 4). covariance :
+    (P + 6 k, P + 6 k) of the parameters and of these poses, left perturbation.
+    """
+
+    stations: tuple[int, ...]
+    T_camera_base: Array
+    covariance: Array
+
+    def without(self, stations: Sequence[int]) -> Kept:
+        """What it knows where some of them do not."""
+        n = len(self.covariance) - 6 * len(self.stations)
+        left = np.array([k for k, s in enumerate(self.stations) if s not in stations], dtype=int)
+        rows = np.r_[:n, (n + 6 * left[:, None] + np.arange(6)).ravel()]
+        return Kept(
+            tuple(self.stations[k] for k in left),
+            self.T_camera_base[left],
+            self.covariance[np.ix_(rows, rows)],
+        )
+
+
+def evidence(held: Held, known: Array | Kept) -> Evidence:
+    """What the data tell of a change from the held values: whitened by V = 1 + A C A^T with the
+    calibration's covariance C.
+
+    known : (P, P) of the parameters, or with stations that were kept. All others are found anew and
+    take up what they can. Of the kept ones the residuals are told at the calibration's places, by
+    the derivatives at those found.
     """
     machine, n = held.machine, len(held.machine.parameters)
+    if not isinstance(known, Kept):
+        known = Kept((), np.zeros((0, 4, 4)), known)
+    covariance, stations = known.covariance, known.stations
     problem, state = held.problem.opened(held.state)
-    rows, left = reduced_rows(problem, state, held.asked)
-    size = np.append(machine.parameters.tolerance, np.full(rows.shape[1] - n, RATIO))
+    names = (*held.asked, "stations") if stations else held.asked
+    rows, left = reduced_rows(problem, state, names)
+    if stations:
+        rows, left = _at_kept(rows, left, state.T_camera_base[0], n, known)
+    n_cameras = rows.shape[1] - n - 6 * len(stations)
+    size = np.concatenate(
+        [
+            machine.parameters.tolerance,
+            np.full(n_cameras, RATIO),
+            np.full(6 * len(stations), MOVED),
+        ]
+    )
     by = rows * size
     by[:, :n] = rows[:, :n] @ _across_axes(machine) * size[:n]
     u, s, vt = np.linalg.svd(by, full_matrices=False)
@@ -219,10 +270,36 @@ def evidence(held: Held, covariance: Array) -> Evidence:
     sign = np.sign(vt[np.arange(len(vt)), np.abs(vt).argmax(axis=1)])[seen]
     by = (sign * s[seen])[:, None] * vt[seen] / size
     told = -sign * (u[:, seen].T @ left)
-    known = by[:, : len(covariance)]
-    spread = np.eye(len(told)) + known @ covariance @ known.T
+    errors = np.delete(by, n + np.arange(n_cameras), axis=1)
+    spread = np.eye(len(told)) + errors @ covariance @ errors.T
     lower = np.linalg.cholesky(0.5 * (spread + spread.T))
-    return Evidence(np.linalg.solve(lower, told), np.linalg.solve(lower, by))
+    for k, station in enumerate(stations):
+        at = n + n_cameras + 6 * k
+        by[:, at : at + 6] = by[:, at : at + 6] @ _by_camera(state.T_camera_base[0, station])
+    return Evidence(np.linalg.solve(lower, told), np.linalg.solve(lower, by), stations)
+
+
+def _at_kept(rows: Array, left: Array, found: Array, n: int, kept: Kept) -> tuple[Array, Array]:
+    """Rows by n parameters, all stations' places (S, 4, 4) and cameras, as rows by parameters,
+    cameras and the kept stations; and the residuals with these at the calibration's places.
+    """
+    six = np.arange(6)
+    all_stations = n + np.arange(6 * len(found))
+    own = (n + 6 * np.array(kept.stations)[:, None] + six).ravel()
+    q = column_space(rows[:, np.setdiff1d(all_stations, own)])
+    rows, left = rows - q @ (q.T @ rows), left - q @ (q.T @ left)
+    off = pose_difference(kept.T_camera_base, found[list(kept.stations)]).ravel()
+    left = left + rows[:, own] @ off
+    return np.concatenate([np.delete(rows, all_stations, axis=1), rows[:, own]], axis=1), left
+
+
+def _by_camera(T_camera_base: Array) -> Array:
+    """Changes (omega, tau) of T_camera_base (4, 4) as the camera turns by phi and moves by s in its
+    own axes, (6, 6): points become Exp(-phi) (p - s) there.
+    """
+    out = -np.eye(6)
+    out[3:, :3] = skew(T_camera_base[:3, 3])
+    return out
 
 
 def _across_axes(machine: Machine) -> Array:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.calibration.aside import Region, by_region, select
+from pkmcal.calibration.aside import Neighbours, by_region, select
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
@@ -24,7 +24,7 @@ class HoldOut:
     estimate : from the rest.
     """
 
-    region: Region
+    region: Neighbours
     estimate: Estimate
     left_out: BesideDrawing
     used: BesideDrawing
@@ -48,7 +48,7 @@ def holdout_of(calibration: Calibration) -> HoldOut | None:
 
 
 def hold_out(
-    drawing: Machine, measurements: Measurements, whole: Estimate, region: Region
+    drawing: Machine, measurements: Measurements, whole: Estimate, region: Neighbours
 ) -> HoldOut:
     """Calibrate without a region's configurations, then predict them.
 
@@ -62,7 +62,7 @@ def hold_out(
 
 
 def judged_without(
-    drawing: Machine, measurements: Measurements, estimate: Estimate, region: Region
+    drawing: Machine, measurements: Measurements, estimate: Estimate, region: Neighbours
 ) -> HoldOut:
     """An estimate that did not see a region's configurations, on them and on those that it saw."""
     measurements = estimate.as_found(measurements)

@@ -8,6 +8,7 @@ is tested for a change of each leg. Nothing is calibrated anew.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,15 +21,17 @@ from pkmcal.calibration.calibrate import Calibration, Progress
 from pkmcal.calibration.results import SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import plain
+from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.assembly import seen_configurations
 from pkmcal.identify.rows import Kinds
 from pkmcal.judge.causes import magnified
-from pkmcal.judge.changes import ChangeTests, look_for_changes
-from pkmcal.judge.held import Held, Trust, evidence, hold
+from pkmcal.judge.changes import ChangeTests, StationTest, look_for_changes
+from pkmcal.judge.held import Held, Kept, Trust, evidence, hold
 from pkmcal.judge.new_data import known_rows, look, read
-from pkmcal.judge.words import LookedAt, watch_verdict
+from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.outcome import Verdict
 from pkmcal.session.load import Session
+from pkmcal.wording import listed
 
 FORMAT = 1
 ALPHA = 0.01
@@ -43,7 +46,8 @@ class Watch:
     calibration : as read back. judged : the tests. residuals : (K,) root mean squares of each
     configuration's residuals with the machine held, in standard deviations. known : (K,)
     configurations that the calibration had used, left out. seen : (K,) those that were looked at.
-    noise_scale, pose_scale : factors on the stated noise that were used.
+    noise_scale, pose_scale : factors on the stated noise that were used. same_place : stations that
+    were taken to stand where the calibration had them. moved : those that were said to, and do not.
     """
 
     calibration: SavedCalibration
@@ -55,6 +59,8 @@ class Watch:
     seen: Booleans
     noise_scale: float
     pose_scale: float
+    same_place: tuple[str, ...] = ()
+    moved: tuple[StationTest, ...] = ()
     timings: dict[str, float] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
@@ -71,6 +77,17 @@ class Watch:
                 ],
                 "noise_scale": self.noise_scale,
                 "pose_scale": self.pose_scale,
+                "same_place": self.same_place,
+                "moved_stations": [
+                    {
+                        "name": self.session.station_names[s.station],
+                        **asdict(s.test),
+                        "turn": s.change.value[:3],
+                        "shift": s.change.value[3:],
+                        "sigma": s.change.sigma,
+                    }
+                    for s in self.moved
+                ],
                 "timings": self.timings,
             }
         )
@@ -82,13 +99,16 @@ def watch(
     *,
     alpha: float = ALPHA,
     seed: int = 0,
+    same_place: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Watch:
     """Test a calibrated machine on new data; nothing is written.
 
     calibration : its folder, or as read back. session : a loaded session, or its folder; a few
     configurations are enough. alpha : share of unchanged machines that may be flagged. seed : of
-    the search for the stations. Raises InputError where the two do not belong together.
+    the search for the stations. same_place : names of stations whose camera was not touched since
+    the calibration; one that evidently was is found anew, and told. Raises InputError where the two
+    do not belong together.
     """
     from threadpoolctl import threadpool_limits
 
@@ -98,6 +118,7 @@ def watch(
         began = time.perf_counter()
         saved, session = read(calibration, session)
         _check_usable(saved)
+        session = _placed(saved, session, same_place)
         known = known_rows(saved, session)
         _check_new(known, np.ones_like(known))
         looked = look(saved, session, seed, told, 0.9)
@@ -109,13 +130,14 @@ def watch(
         before = Kinds(float(old.get("noise_scale", 1.0)), float(old.get("pose_scale", 1.0)))
         trust = Trust.of(looked.estimate, before, _readings(saved, session))
         held = _hold_new(saved, session, looked, trust, ~known)
-        judged = look_for_changes(evidence(held, saved.covariance), saved.machine, alpha)
+        judged, kept, moved = tests_with_kept(held, _kept(saved, session, same_place), alpha)
         around = LookedAt(
             session.configurations,
             known,
             seen,
             trust.scale.edges / before.edges,
-            cameras_of(session),
+            names_of(session),
+            moved,
         )
         return Watch(
             calibration=saved,
@@ -127,6 +149,8 @@ def watch(
             seen=seen & ~known,
             noise_scale=trust.scale.edges,
             pose_scale=trust.scale.poses,
+            same_place=tuple(session.station_names[k] for k in kept.stations),
+            moved=moved,
             timings={**looked.timings, "all": time.perf_counter() - began},
         )
 
@@ -152,9 +176,60 @@ def check_alpha(alpha: float) -> None:
         )
 
 
-def cameras_of(session: Session) -> tuple[str, ...]:
-    """Camera files of a session, in the order of their numbers."""
-    return tuple(dict.fromkeys(station.camera_file for station in session.stations))
+def names_of(session: Session) -> Names:
+    """Names of a session's cameras and stations, in the order of their numbers."""
+    cameras = dict.fromkeys(station.camera_file for station in session.stations)
+    return Names(tuple(cameras), session.station_names)
+
+
+def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]) -> Session:
+    """The session with the kept stations' poses as the calibration has them.
+
+    Raises `InputError` for a station that the session, or the calibration, does not have.
+    """
+    for name in same_place:
+        if name not in session.station_names:
+            raise InputError(
+                "the session has no station of this name",
+                where="--same-place",
+                found=name,
+                expected=listed(session.station_names, 8),
+                next_step="A camera that was left in place has the same name in both sessions",
+            )
+    saved.with_stations(same_place)
+    places = {s.name: inverse(s.T_base_camera) for s in saved.stations if s.name in same_place}
+    stations = tuple(
+        replace(station, T_camera_base=places.get(station.name, station.T_camera_base))
+        for station in session.stations
+    )
+    return replace(session, stations=stations)
+
+
+def _kept(saved: SavedCalibration, session: Session, same_place: Sequence[str]) -> Kept:
+    """What the calibration knows of its machine and of these stations."""
+    places = {station.name: inverse(station.T_base_camera) for station in saved.stations}
+    return Kept(
+        tuple(session.station_names.index(name) for name in same_place),
+        np.array([places[name] for name in same_place]).reshape(-1, 4, 4),
+        saved.with_stations(same_place),
+    )
+
+
+def tests_with_kept(
+    held: Held, kept: Kept, alpha: float
+) -> tuple[ChangeTests, Kept, tuple[StationTest, ...]]:
+    """All tests, the stations that were kept for them, and those that evidently were moved.
+
+    Where moved cameras explain the data better than any change of the machine, these are found anew
+    and the tests made once more; so no more unchanged machines are flagged than alpha.
+    """
+    moved: list[StationTest] = []
+    while True:
+        judged = look_for_changes(evidence(held, kept), held.machine, alpha)
+        if not judged.moved:
+            return judged, kept, tuple(moved)
+        moved += [s for s in judged.stations if s.station in judged.moved]
+        kept = kept.without(judged.moved)
 
 
 def _hold_new(

@@ -10,7 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
-from pkmcal.judge.changes import POWER, ChangeTests, Explanation, LegTest, Suspect
+from pkmcal.judge.changes import (
+    POWER,
+    Change,
+    ChangeTests,
+    Explanation,
+    LegTest,
+    StationTest,
+    Suspect,
+)
 from pkmcal.judge.comparison import BesideDrawing, Ratio, finite_rms, ratio
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.mechanisms import Machine
@@ -169,18 +177,28 @@ def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[str]:
 
 
 @dataclass(frozen=True)
+class Names:
+    """What cameras and stations are called, by their numbers."""
+
+    cameras: tuple[str, ...] = ()
+    stations: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class LookedAt:
     """What a verdict says besides the tests.
 
     configurations : K names. known, seen : (K,) used by the calibration, and looked at. noisier :
-    times the calibration's factor on the stated noise of edges. cameras : names.
+    times the calibration's factor on the stated noise of edges. moved : cameras that were said to
+    have been left in place.
     """
 
     configurations: tuple[str, ...]
     known: Booleans
     seen: Booleans
     noisier: float
-    cameras: tuple[str, ...] = ()
+    names: Names = Names()
+    moved: tuple[StationTest, ...] = ()
 
 
 def watch_verdict(judged: ChangeTests, around: LookedAt) -> Verdict:
@@ -214,7 +232,7 @@ def is_blind(leg: LegTest) -> bool:
     return not leg.detects_zero <= leg.tolerance
 
 
-def said(suspect: Suspect, cameras: Sequence[str] = (), short: bool = False) -> str:
+def said(suspect: Suspect, names: Names = Names(), short: bool = False) -> str:
     """A cause with the change it would have made, as a part of a sentence.
 
     short : how far a joint moved, but not along what.
@@ -224,14 +242,17 @@ def said(suspect: Suspect, cameras: Sequence[str] = (), short: bool = False) -> 
     if cause.part == "scale":
         return f"all lengths against the readings by {_ratio(value[0], sigma[0])}"
     if cause.part == "camera":
-        name = cameras[cause.camera] if cause.camera < len(cameras) else "a camera"
+        known = cause.camera < len(names.cameras)
+        name = names.cameras[cause.camera] if known else "a camera"
         return f"the focal length of {name} by {_ratio(value[0], sigma[0])}"
+    if cause.part == "station":
+        return f"the place of the camera {names.stations[cause.station]}{_place(suspect.change)}"
     if cause.part in ("base", "platform"):
         joint = f"the {cause.part} joint{'s' if len(cause.legs) > 1 else ''} of {who}"
         together = " together" if len(cause.legs) > 1 else ""
         return f"{joint}{together}{_vector(suspect, short)}"
-    names = {"zero": f"the zero of {who}'s reading", "rod": f"the rod length of {who}"}
-    what = names.get(cause.part, f"the {cause.part} of {who}")
+    parts = {"zero": f"the zero of {who}'s reading", "rod": f"the rod length of {who}"}
+    what = parts.get(cause.part, f"the {cause.part} of {who}")
     if len(value) > 1:
         return f"{what}{_vector(suspect, short)}"
     return f"{what} by {signed(value[0], sigma[0], cause.unit)}"
@@ -269,8 +290,23 @@ def _vector(suspect: Suspect, short: bool) -> str:
     return f"{text}, ({parts}) mm in the {cause.part} frame"
 
 
+def _place(change: Change) -> str:
+    """How far a camera moved and turned, as far as that is told."""
+    out: list[str] = []
+    for part, unit, factor in ((slice(3, 6), "mm", 1e3), (slice(0, 3), "°", 180 / np.pi)):
+        value, covariance = change.value[part], change.covariance[part, part]
+        size = float(np.linalg.norm(value))
+        if size == 0 or not np.isfinite(change.sigma[part]).all():
+            continue
+        sigma = float(np.sqrt(value @ covariance @ value)) / size * factor
+        places = decimals(sigma)
+        text = with_unit(number(size * factor, places), unit)
+        out.append(f"{text} (±{number(sigma, places)})")
+    return f" by {' and '.join(out)}" if out else ""
+
+
 def _changed(judged: ChangeTests, around: LookedAt, warnings: tuple[str, ...]) -> Verdict:
-    cameras = around.cameras
+    names = around.names
     findings = judged.findings
     if not findings:
         return Verdict(False, "The machine is not as calibrated.", (_unnamed(judged),), warnings)
@@ -282,7 +318,7 @@ def _changed(judged: ChangeTests, around: LookedAt, warnings: tuple[str, ...]) -
         )
     else:
         headline = f"The machine is not as calibrated: {_changes_headline(findings)}."
-    reasons = [_reason(f, k, cameras) for k, f in enumerate(findings)]
+    reasons = [_reason(f, k, names) for k, f in enumerate(findings)]
     if judged.left.dof and judged.left.chance < UNEXPLAINED:
         reasons.append(
             "That does not explain all: what is left of the machine's test is more than noise"
@@ -302,13 +338,13 @@ def _changes_headline(findings: Sequence[Explanation]) -> str:
     return f"{named(legs)} {verb} changed" + (", or another that looks the same" if rivals else "")
 
 
-def _reason(finding: Explanation, place: int, cameras: Sequence[str]) -> str:
+def _reason(finding: Explanation, place: int, names: Names) -> str:
     """One finding: what, how much, as after what, and what it may be instead."""
     begin = "Most likely it is" if place == 0 else "Besides,"
-    text = f"{begin} {said(finding.suspect, cameras)}{_cause_in_words(finding.suspect)}."
+    text = f"{begin} {said(finding.suspect, names)}{_cause_in_words(finding.suspect)}."
     if not finding.others:
         return text
-    named_others = [said(o, cameras, short=True) for o in finding.others[:MOST_OTHERS]]
+    named_others = [said(o, names, short=True) for o in finding.others[:MOST_OTHERS]]
     more = len(finding.others) - len(named_others)
     tail = f"; or {count(more, 'other cause')}" if more else ""
     return f"{text} These data cannot tell that from {'; or '.join(named_others)}{tail}."
@@ -398,7 +434,11 @@ def _blind(legs: Sequence[LegTest]) -> tuple[str, ...]:
 
 
 def _warnings(around: LookedAt) -> tuple[str, ...]:
-    out: list[str] = []
+    out = [
+        f"The camera {around.names.stations[s.station]} does not stand where the calibration"
+        f" had it: it was moved{_place(s.change)}. Its place was found anew."
+        for s in around.moved
+    ]
     both = around.known & around.seen
     if both.any():
         names = [n for n, k in zip(around.configurations, both, strict=True) if k]

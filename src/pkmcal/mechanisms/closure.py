@@ -153,6 +153,23 @@ class LimbLayout:
         return self.n_equations > self.own_motion.shape[1]
 
     @cached_property
+    def a_index(self) -> Integers:
+        """(L, n) parameters that each limb's end A depends on, P where there are fewer."""
+        return self._ends_index(self.base)
+
+    @cached_property
+    def b_index(self) -> Integers:
+        """(L, n) the same of B."""
+        return self._ends_index(self.platform)
+
+    def _ends_index(self, groups: tuple[CarrierGroup, ...]) -> Integers:
+        width = max(g.index.shape[1] for g in groups)
+        index = np.full((self.n_legs, width), self.n_parameters)
+        for group in groups:
+            index[group.legs, : group.index.shape[1]] = group.index
+        return index
+
+    @cached_property
     def free(self) -> Booleans:
         """(6,) which of (omega, tau) the motion has."""
         return np.asarray(self.motion.any(axis=1))
@@ -511,22 +528,82 @@ class LimbEnds:
 class Closure:
     """The closure's rows, (..., E): lengths of the legs that close, then the axes' equations.
 
-    value : m. u : (..., L, 3) unit directions from A to B of all legs. distance : (..., L) m.
-    by_pose : (..., E, 6). by_internal : (..., E, n), n = 0 for a rigid platform.
-    by_reading : (..., E) by the leg's own reading, zero where it has none.
-    index, by_theta : (E, n) parameters that each row depends on, P where there is none, and the
-    derivatives (..., E, n) by them.
+    Made from the machine (layout, theta), readings, poses and internal coordinates: what the
+    readings decide (base), what the pose decides (platform), and the rows between them. Derivatives
+    by the parameters are found when they are asked for: a search that only tries a step does not.
     """
 
-    value: Array
-    u: Array
-    distance: Array
-    by_pose: Array
-    by_internal: Array
-    by_reading: Array
-    index: Integers
-    by_theta: Array
-    ends: LimbEnds
+    layout: LimbLayout
+    theta: Array
+    readings: Array
+    poses: Array
+    internal: Array | None
+    base: BaseEnds
+    platform: PlatformEnds
+    rows: Rows
+
+    @property
+    def value(self) -> Array:
+        """(..., E) m."""
+        return self.rows.value
+
+    @property
+    def u(self) -> Array:
+        """(..., L, 3) unit directions from A to B of all legs."""
+        return self.rows.u
+
+    @property
+    def distance(self) -> Array:
+        """(..., L) m."""
+        return self.rows.distance
+
+    @property
+    def by_pose(self) -> Array:
+        """(..., E, 6)."""
+        return self.rows.by_pose
+
+    @property
+    def by_internal(self) -> Array:
+        """(..., E, n), n = 0 for a rigid platform."""
+        return self.rows.by_internal
+
+    @cached_property
+    def by_reading(self) -> Array:
+        """(..., E) by the leg's own reading, zero where it has none."""
+        return by_readings(self.layout, self.base, self.rows)
+
+    @cached_property
+    def ends(self) -> LimbEnds:
+        """The limbs' ends with their derivatives."""
+        return _with_parameters(
+            self.layout,
+            self.theta,
+            self.readings,
+            self.poses,
+            self.internal,
+            self.base,
+            self.platform,
+        )
+
+    @property
+    def index(self) -> Integers:
+        """(E, n) parameters that each row depends on, P where there is none."""
+        return self._by_parameters[0]
+
+    @property
+    def by_theta(self) -> Array:
+        """(..., E, n) derivatives by them."""
+        return self._by_parameters[1]
+
+    @cached_property
+    def _by_parameters(self) -> tuple[Integers, Array]:
+        layout = self.layout
+        lengths = _length_parameters(layout, self.rows.u, self.ends)
+        if not len(layout.angles):
+            return lengths
+        line = (self.ends.b - self.ends.a)[..., layout.angles.leg, :]
+        angles = _angle_parameters(layout, self.theta, self.poses, line, self.ends)
+        return _padded(layout, lengths, angles)
 
 
 def limb_ends(
@@ -558,8 +635,6 @@ def _with_parameters(
         g.carrier.by_parameters(g.of(theta), at_legs, own_internal(layout, g, internal))
         for g in layout.platform
     ]
-    all_a_by, a_index = _gather(layout, layout.base, a_by)
-    all_b_by, b_index = _gather(layout, layout.platform, b_by)
     shape = np.broadcast_shapes(theta.shape[:-1], readings.shape[:-1])
     a, by_reading = (
         np.broadcast_to(x, (*shape, layout.n_legs, 3)) for x in (base.a, base.by_reading)
@@ -567,10 +642,10 @@ def _with_parameters(
     return LimbEnds(
         a,
         platform.b,
-        a_index,
-        b_index,
-        all_a_by,
-        all_b_by,
+        layout.a_index,
+        layout.b_index,
+        _padded_to(layout.a_index.shape, layout.base, a_by),
+        _padded_to(layout.b_index.shape, layout.platform, b_by),
         by_reading,
         platform.arm,
         layout.n_parameters,
@@ -578,21 +653,17 @@ def _with_parameters(
     )
 
 
-def _gather(
-    layout: LimbLayout, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]
-) -> tuple[Array, Integers]:
-    """Carriers' derivatives put in the order of the legs, parameters padded to a common count."""
+def _padded_to(
+    shape: tuple[int, ...], groups: tuple[CarrierGroup, ...], by_parameters: list[Array]
+) -> Array:
+    """Carriers' derivatives in the order of the legs, for n parameters each; shape is (L, n)."""
     if len(groups) == 1:
-        return by_parameters[0], groups[0].index
-    width = max(g.index.shape[1] for g in groups)
-    index = np.full((layout.n_legs, width), layout.n_parameters)
-    shape = np.broadcast_shapes(*(by.shape[:-3] for by in by_parameters))
-    out = np.zeros((*shape, layout.n_legs, 3, width))
+        return by_parameters[0]
+    lead = np.broadcast_shapes(*(by.shape[:-3] for by in by_parameters))
+    out = np.zeros((*lead, shape[0], 3, shape[1]))
     for group, by in zip(groups, by_parameters, strict=True):
-        n = group.index.shape[1]
-        index[group.legs, :n] = group.index
-        out[..., group.legs, :, :n] = by
-    return out, index
+        out[..., group.legs, :, : by.shape[-1]] = by
+    return out
 
 
 def closure(
@@ -606,23 +677,7 @@ def closure(
     base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
     rows = rows_between(layout, theta, base, platform, poses)
-    ends = _with_parameters(layout, theta, readings, poses, internal, base, platform)
-    index, by_theta = _length_parameters(layout, rows.u, ends)
-    if len(layout.angles):
-        line = (ends.b - ends.a)[..., layout.angles.leg, :]
-        angles = _angle_parameters(layout, theta, poses, line, ends)
-        index, by_theta = _padded(layout, (index, by_theta), angles)
-    return Closure(
-        value=rows.value,
-        u=rows.u,
-        distance=rows.distance,
-        by_pose=rows.by_pose,
-        by_internal=rows.by_internal,
-        by_reading=by_readings(layout, base, rows),
-        index=index,
-        by_theta=by_theta,
-        ends=ends,
-    )
+    return Closure(layout, theta, readings, poses, internal, base, platform, rows)
 
 
 def _length_parameters(layout: LimbLayout, u: Array, ends: LimbEnds) -> tuple[Integers, Array]:

@@ -77,6 +77,15 @@ class Machine:
         return motor_units(self.document)
 
     @property
+    def joint_names(self) -> tuple[str, ...]:
+        """What a table of readings calls them where nobody says otherwise: by legs, or by motors
+        where legs share these.
+        """
+        if self.layout.shares_motors:
+            return tuple(f"motor{k + 1}" for k in range(self.n_joints))
+        return tuple(f"leg{j + 1}" for j in np.flatnonzero(self.layout.actuated >= 0))
+
+    @property
     def joint_ranges(self) -> Array:
         """Smallest and largest reading by the file, (m, 2) m or rad; NaN where it is silent.
 

@@ -301,9 +301,7 @@ def grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
     one of the directions without turning.
     """
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    signs = np.array([s for s in itertools.product((-1, 0, 1), repeat=len(unit)) if any(s)])
-    far = extents(limits, signs @ unit, middle).poses[:, :3, 3] - middle[:3, 3]
-    low, high = 1.1 * (far @ unit.T).min(axis=0), 1.1 * (far @ unit.T).max(axis=0)
+    low, high = spans(limits, middle, unit)
     _refuse_flat(limits, unit, high - low)
     cell = float((high - low).max()) / count
     # the middle pose is one of the points
@@ -321,9 +319,23 @@ def grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
     return Grid(axes, connected, singular.reshape(shape), size)
 
 
+def spans(limits: Limits, middle: Array, unit: Array) -> tuple[Array, Array]:
+    """How far down and up (k,) along unit vectors (k, 3) straight ways from ``middle`` (4, 4) come,
+    along them and between them, and a tenth more, m.
+    """
+    signs = np.array([s for s in itertools.product((-1, 0, 1), repeat=len(unit)) if any(s)])
+    far = (extents(limits, signs @ unit, middle).poses[:, :3, 3] - middle[:3, 3]) @ unit.T
+    return 1.1 * far.min(axis=0), 1.1 * far.max(axis=0)
+
+
+def is_flat(limits: Limits, sides: Array) -> Booleans:
+    """Which extents (k,), m, are no way that a machine moves without turning."""
+    return sides < 1e-4 * _reach(limits)
+
+
 def _refuse_flat(limits: Limits, unit: Array, sides: Array) -> None:
     """A grid needs some way along each of its directions."""
-    flat = np.flatnonzero(sides < 1e-4 * _reach(limits))
+    flat = np.flatnonzero(is_flat(limits, sides))
     if flat.size:
         raise InputError(
             what="the workspace has no extent along one of the directions at this orientation",

@@ -36,7 +36,6 @@ from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.measured_platform import SeenPlatform, Taken, seen_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames
 from pkmcal.solver import (
-    RESTART_DAMPING,
     Linear,
     Solution,
     Stop,
@@ -381,7 +380,7 @@ def fit_poses(
         for _ in range(ROUNDS):
             state, steps = solution.state, solution.steps
             problem = replace(problem, weigh=problem.whitening(state, noise, joint_noise))
-            solution = minimise(problem, state, MOST_STEPS, RESTART_DAMPING)
+            solution = minimise(problem, state, MOST_STEPS)
             solution = replace(solution, steps=steps + solution.steps)
     names = np.array(unknown_names(machine, problem), dtype=object)
     return PoseFit(problem, solution, tuple(names[~keep]), rank)

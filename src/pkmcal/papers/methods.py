@@ -18,9 +18,8 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import data_share, told_in_gauge
-from pkmcal.identify.estimate import Estimate, State, Statistics
-from pkmcal.identify.gauge import apply, default_gauge, told_unknowns
-from pkmcal.identify.unknowns import own_blocks
+from pkmcal.identify.estimate import Estimate, State, Statistics, told_unknowns
+from pkmcal.identify.gauge import apply, default_gauge
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.four_step import four_step
@@ -58,10 +57,12 @@ def by_paper(
             failed.append(error)
     if len(failed) > len(repeats):
         raise failed[0]
-    theta = np.cov(np.stack([r.theta for r in repeats]), rowvar=False)
+    theta = np.stack([r.theta for r in repeats])
     turns = np.stack([pose_difference(r.T_camera_base, state.T_camera_base) for r in repeats])
-    stations = np.stack([np.cov(turns[:, s], rowvar=False) for s in range(turns.shape[1])])
-    return _estimate(machine.with_values(state.theta), measurements, state, theta, stations)
+    mounts = np.zeros((len(repeats), 6 * len(state.T_mount)))
+    scatter = np.concatenate([theta, turns.reshape(len(repeats), -1), mounts], axis=1)
+    spread = np.cov(scatter, rowvar=False)
+    return _estimate(machine.with_values(state.theta), measurements, state, spread)
 
 
 def _solve(method: Repeated, machine: Machine, measurements: Measurements, guess: Array) -> State:
@@ -95,8 +96,7 @@ def linear_estimate(machine: Machine, measurements: Measurements) -> Estimate:
             machine.with_values(state.theta),
             measurements,
             state,
-            full[told.machine, told.machine],
-            own_blocks(full, told.stations, 6),
+            full,
             (base.weights, base.scale),
         ),
         edge_shift_sigma=base.edge_shift_sigma,
@@ -126,14 +126,14 @@ def _estimate(
     machine: Machine,
     measurements: Measurements,
     state: State,
-    theta: Array,
-    stations: Array,
+    joint: Array,
     trust: tuple[Array, float] | None = None,
 ) -> Estimate:
     """The method's result with its residuals.
 
-    theta : (P, P) and stations (S, 6, 6) covariances. trust : weights (N,) of the edges and the
-    factor on their noise, where the method has its own; else edges far off the rest have weight 0.
+    joint : covariance as :class:`~pkmcal.identify.estimate.Estimate` has it. trust : weights (N,)
+    of the edges and the factor on their noise, where the method has its own; else edges far off the
+    rest have weight 0.
     """
     gauge = default_gauge(machine)
     assembled = assemble(machine, measurements, gauge, use_drawing=False)
@@ -155,16 +155,14 @@ def _estimate(
     return Estimate(
         machine=machine,
         state=state,
-        covariance=theta,
-        station_covariance=stations,
+        joint_covariance=joint,
         edge_shift_sigma=np.zeros(len(state.edge_shift)),
         edge_residuals=edges / scale,
         pose_residuals=poses / pose_scale,
         pose_weights=np.ones(len(poses)),
-        mount_covariance=np.zeros((len(state.T_mount), 6, 6)),
         edge_weights=weight,
         joint_residuals=joints / measurements.joint_noise,
-        data_share=data_share(machine, state.theta, theta, gauge),
+        data_share=data_share(machine, state.theta, joint, gauge),
         configurations=assembled.seen,
         statistics=Statistics(
             chi2=chi2,

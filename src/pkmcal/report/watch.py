@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.judge.changes import POWER, ChiSquare, LegTest
-from pkmcal.judge.watch import Watch, cameras_of
+from pkmcal.judge.watch import Watch, names_of
 from pkmcal.judge.words import found_from, said, signed
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
 from pkmcal.report import charts
-from pkmcal.wording import SCALES, amount, brief, count, named, number
+from pkmcal.wording import SCALES, amount, brief, count, listed, named, number
 
 NONE = "–"
 LARGE = 2.0
@@ -21,10 +21,17 @@ HOW = (
     " poses, stations, edge shifts and shading cannot take it up. Each leg is then tested for a"
     " change of its numbers: a score test, chi-square of as many degrees of freedom as these data"
     " see.",
-    "A camera's place costs six freedoms, also where it was left in place: what moves all of the"
-    " machine against its camera is not seen, and is no change of the machine. Directions in which"
+    "A camera's place costs six freedoms, unless it is said to have been left in place: what moves"
+    " all of the machine against its camera is not seen then. Directions in which"
     " a change by the drawing's whole tolerance would make less than one standard deviation are"
     " left out.",
+)
+
+
+KEPT = (
+    "Where the calibration had a camera is known as well as its covariance with the machine tells,"
+    " most of which the photographs of both share. Whether such a camera was moved is tested as"
+    " well; a base that moved against its camera looks the same."
 )
 
 
@@ -68,7 +75,9 @@ def _how(w: Watch) -> Part:
     )
     known = [n for n, k in zip(w.session.configurations, w.known, strict=True) if k]
     left_out = f"Left out, for the calibration had seen them: {', '.join(known)}."
-    return Part("how", "How it was computed", (*HOW, allowed), notes=(left_out,) if known else ())
+    stayed = f"Left in place: {listed(w.same_place, 8)}. {KEPT}"
+    said = (*HOW, stayed, allowed) if w.same_place else (*HOW, allowed)
+    return Part("how", "How it was computed", said, notes=(left_out,) if known else ())
 
 
 def stamp(w: Watch) -> str:
@@ -176,10 +185,10 @@ def _findings_table(w: Watch) -> Table | None:
     """What explains a change, best first, with what these data cannot tell from it."""
     if not w.judged.findings:
         return None
-    cameras = cameras_of(w.session)
+    names = names_of(w.session)
     rows = [
         Row(
-            f"{mark} {said(suspect, cameras)}",
+            f"{mark} {said(suspect, names)}",
             (number(suspect.chi2, 1), str(len(suspect.cause.sizes))),
         )
         for place, finding in enumerate(w.judged.findings, start=1)

@@ -20,6 +20,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import CsvTable, Document, Keys, read_csv, read_yaml, shown, validate, wanted_file
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.mechanisms.region import Region
 from pkmcal.session.exif import EXIF, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
@@ -87,6 +88,7 @@ class Session:
     trackers : what measured without photographs; in numbers of stations they follow these.
     model : the machine's model by its name in the mechanism file, None for the file's own.
     mechanism : where the machine came from, for other models of it.
+    workspace : where the tool is to be right, None where the file does not say.
     """
 
     folder: Path
@@ -102,6 +104,7 @@ class Session:
     trackers: tuple[PoseTable, ...] = ()
     model: str | None = None
     mechanism: Path | str = ""
+    workspace: Region | None = None
 
     @property
     def station_names(self) -> tuple[str, ...]:
@@ -120,38 +123,46 @@ class Session:
         return load_mechanism(self.mechanism, model=name)
 
 
-def load_session(folder: Path | str, model: str | None = None) -> Session:
+def load_session(folder: Path | str, model: str | None = None, *, measured: bool = True) -> Session:
     """Read and check the session in `folder` (session.yaml itself may be named instead).
 
-    model : one of the models that the mechanism file names.
+    model : one of the models that the mechanism file names. measured : whether there have to be
+    photographs, or poses, of two configurations at least; a plan is made before.
     """
     folder, document = _read(Path(folder))
     schema = validate(document, SessionDocument)
     machine, source = _machine(folder, document, schema.mechanism, model)
-    joints_file = _existing(folder, document, schema.joints.file, ("joints", "file"))
-    table = read_csv(joints_file, label=schema.joints.file)
-    warnings = check_readings(table, machine.joint_ranges, schema.joints.noise, machine.joint_units)
-    if not schema.stations:
-        _check_redundant(document, machine)
-        table, repeated = without_repeats(table, schema.joints.noise)
-        warnings += repeated
+    if measured or (folder / schema.joints.file).exists():
+        path = _existing(folder, document, schema.joints.file, ("joints", "file"))
+        table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
+        warnings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
+        if measured and not schema.stations:
+            _check_redundant(document, machine)
+            table, repeated = without_repeats(table, noise)
+            warnings += repeated
+    else:
+        none, columns = np.zeros((0, machine.n_joints)), machine.joint_names
+        table, warnings = CsvTable(schema.joints.file, columns, (), none, ()), []
     board = _board(folder, document, schema)
     warnings += _of_little_use(document, schema)
     stations = tuple(
         made
         for name, station in schema.cameras.items()
-        for made in _stations(folder, document, name, station, table.names)
+        for made in _stations(folder, document, name, station, table.names, measured)
     )
     warnings += _turned(folder, stations)
     trackers: list[PoseTable] = []
     for name, station in schema.trackers.items():
         given, keys = station.tracker, ("stations", name, "tracker", "poses")
-        path, noise = _existing(folder, document, given.poses, keys), given.noise
-        measured = read_poses(path, given.poses, table.names, noise.position, noise.rotation, name)
-        trackers.append(measured)
+        noise = given.noise.position, given.noise.rotation
+        if measured or (folder / given.poses).exists():
+            path = _existing(folder, document, given.poses, keys)
+            trackers.append(read_poses(path, given.poses, table.names, *noise, name))
+        else:
+            trackers.append(PoseTable.to_come(name, given.poses, *noise))
     _check_distinct(document, stations)
     _check_names(document, (*stations, *trackers))
-    if schema.stations:
+    if measured and schema.stations:
         warnings += _unphotographed(table, stations, tuple(trackers))
     return Session(
         folder=folder,
@@ -167,6 +178,7 @@ def load_session(folder: Path | str, model: str | None = None) -> Session:
         trackers=tuple(trackers),
         model=model,
         mechanism=source,
+        workspace=_workspace(document, schema),
     )
 
 
@@ -301,6 +313,15 @@ def _check_base_board(document: Document, schema: SessionDocument, users: list[s
     )
 
 
+def _workspace(document: Document, schema: SessionDocument) -> Region | None:
+    if schema.workspace is None:
+        return None
+    try:
+        return Region(**schema.workspace.model_dump())
+    except InputError as error:
+        raise error.located(document.where("workspace")) from None
+
+
 def _of_little_use(document: Document, schema: SessionDocument) -> list[str]:
     """A board that is described, and serves nothing."""
     users = schema.observers("board")
@@ -317,12 +338,17 @@ def _of_little_use(document: Document, schema: SessionDocument) -> list[str]:
 
 
 def _stations(
-    folder: Path, document: Document, name: str, station: StationDocument, names: tuple[str, ...]
+    folder: Path,
+    document: Document,
+    name: str,
+    station: StationDocument,
+    names: tuple[str, ...],
+    measured: bool,
 ) -> list[Station]:
     """An entry's station; where the camera was held by hand, one for each photograph."""
     keys: Keys = ("stations", name)
     where = document.where(*keys, "images")
-    photographs = find_photographs(folder, station.images, names, where)
+    photographs = find_photographs(folder, station.images, names, where, needed=measured)
     from_exif = station.camera == EXIF
     if from_exif:
         label = document.where(*keys, "camera")

@@ -37,14 +37,14 @@ class Photograph:
 
 
 def find_photographs(
-    folder: Path, pattern: str, names: Sequence[str], where: str
+    folder: Path, pattern: str, names: Sequence[str], where: str, *, needed: bool = True
 ) -> tuple[Photograph, ...]:
     """Find the files that a pattern such as ``images/front/{configuration}.png`` stands for.
 
     pattern : relative to `folder`, or absolute.
     names : configurations in joints.csv; a file is paired with its row by name alone, never by
         order, so that one missing photograph cannot shift the others.
-    where : place of the pattern in session.yaml, for messages.
+    where : place of the pattern in session.yaml, for messages. needed : whether none is a fault.
     Returns photographs by configuration and repeat. A configuration without one is no fault.
     """
     parts = _parts(pattern, where)
@@ -54,6 +54,8 @@ def find_photographs(
         for name in glob.glob(wildcard, root_dir=folder)
         if (folder / name).is_file()
     ]
+    if not files and not needed:
+        return ()
     if not files:
         raise _none_found(folder, wildcard, pattern, where)
     known = re.compile(_regex(parts, "|".join(map(re.escape, sorted(names, key=len)[::-1]))))

@@ -55,18 +55,33 @@ class PoseTable:
     position: float
     rotation: float | None
 
+    @classmethod
+    def to_come(cls, name: str, label: str, position: float, rotation: float | None) -> PoseTable:
+        """Of a tracker that has not measured yet: poses, or points where it tells no turn."""
+        kind: Kind = "points" if rotation is None else "poses"
+        none = np.zeros(0, dtype=int)
+        return cls(name, label, kind, none, np.zeros((0, 4, 4)), position, rotation)
+
+    @property
+    def known(self) -> tuple[int, ...]:
+        """Which of (omega, tau) it measures."""
+        return {"poses": (0, 1, 2, 3, 4, 5), "points": (3, 4, 5), "heights": (5,)}[self.kind]
+
+    @property
+    def whiten(self) -> Array:
+        """(6, 6) of one measurement, as of :class:`~pkmcal.measurements.PoseSet`."""
+        sigma = np.repeat([self.rotation or 1.0, self.position], 3)
+        return np.diag(np.where(np.isin(np.arange(6), self.known), 1 / sigma, 0.0))
+
     def poses(self, station: int, mount: int) -> PoseSet:
         """The measurements; what is not measured has rows of zeros."""
         n = len(self.configuration)
-        known = {"poses": (0, 1, 2, 3, 4, 5), "points": (3, 4, 5), "heights": (5,)}[self.kind]
-        sigma = np.repeat([self.rotation or 1.0, self.position], 3)
-        whiten = np.diag(np.where(np.isin(np.arange(6), known), 1 / sigma, 0.0))
         return PoseSet(
             station=np.full(n, station),
             configuration=self.configuration,
             mount=np.full(n, mount),
             T_station_target=self.T,
-            whiten=np.broadcast_to(whiten, (n, 6, 6)).copy(),
+            whiten=np.broadcast_to(self.whiten, (n, 6, 6)).copy(),
         )
 
     def start(self, T_base_platform: Array) -> Array | None:

@@ -108,6 +108,17 @@ def _board(value: Any) -> Any:
     return {"file": value} if isinstance(value, str) else value
 
 
+class WorkspaceDocument(Schema):
+    """``workspace``: where the tool is to be right."""
+
+    x: tuple[float, float] | None = Field(default=None, description="[lowest, highest] x in m")
+    y: tuple[float, float] | None = Field(default=None, description="[lowest, highest] y in m")
+    z: tuple[float, float] | None = Field(default=None, description="[lowest, highest] z in m")
+    turn: float | None = Field(
+        default=None, description="how far the platform turns from home in rad, such as 0.26"
+    )
+
+
 class SessionDocument(Schema):
     """The whole of session.yaml."""
 
@@ -121,6 +132,7 @@ class SessionDocument(Schema):
     paths: dict[str, list[str]] | None = Field(
         default=None, description="straight paths by configurations, paths: {line: [c01, c02, c03]}"
     )
+    workspace: WorkspaceDocument | None = None
 
     def observers(self, word: str) -> list[str]:
         """Names of the stations that observe legs, or the board."""

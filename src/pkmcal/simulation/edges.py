@@ -29,6 +29,8 @@ from pkmcal.simulation.placement import one_a_station
 
 PLACES = 48
 """Places looked at along each tube: a hidden stretch is found to a fiftieth of the tube."""
+FITTED = 13
+"""Of these, by which an edge's turns are told: how a plane follows is as smooth as the lens."""
 JOINT_HOUSING = 0.005
 """Metres at both ends of a tube that are never measured."""
 CLEARANCE = 2.0
@@ -113,7 +115,7 @@ def _exact_edges(
     with np.errstate(invalid="ignore"):
         seen = camera.in_image(camera.project(points))
         seen &= (leg_is_seen(a_e, b_e, radius) & (last > first))[..., None]
-    seen &= ~_hidden(points, tubes, radius, a, b, _pixel_angle(camera))
+    seen &= ~hidden(points, tubes.leg, tubes.tube, tubes, radius, a, b, pixel_angle(camera))
     begin, count = _longest_run(seen)
     photo, edge = np.nonzero(count >= LEAST_SEEN)
     begin, count = begin[photo, edge], count[photo, edge]
@@ -133,17 +135,20 @@ def _exact_edges(
     return edges, rays
 
 
-def _hidden(
-    points: Array, tubes: TubeList, radius: Array, a: Array, b: Array, pixel: float
-) -> Booleans:
-    """(M, E, n) True where a tube of another leg, or of the own one, is in front of a point.
+def hidden(
+    points: Array, leg: Integers, tube: Integers, tubes: TubeList, radius: Array,
+    a: Array, b: Array, pixel: float,
+) -> Booleans:  # fmt: skip
+    """(M, G, n) True where a tube of another leg, or of the own one, is in front of a point.
 
-    pixel : angle of a pixel, rad; another leg hides what comes within CLEARANCE of it, too.
+    points : (M, G, n, 3), camera frame, m. leg, tube : (G,) what they lie on, -1 for nothing of the
+    machine. radius : (E,) of the tubes. a, b : (M, L, 3) the legs' ends. pixel : angle of a pixel,
+    rad; another leg hides what comes within CLEARANCE of it, too.
     """
     distance = np.sqrt(dot(points, points))
     margin = CLEARANCE * pixel * distance
     d = points / distance[..., None]
-    hidden = np.zeros(distance.shape, dtype=bool)
+    out = np.zeros(distance.shape, dtype=bool)
     for e in range(0, len(tubes.leg), 2):  # both sides of a tube are one cylinder
         j = tubes.leg[e]
         start, end = a[:, None, None, j], b[:, None, None, j]
@@ -153,18 +158,18 @@ def _hidden(
         # |t d - start|^2 across u, as a quadratic in t
         qa = np.maximum(1 - du**2, 1e-12)
         qb = dot(d, start) - du * au
-        other = (tubes.leg != j)[:, None]
+        other = (leg != j)[:, None]
         qc = dot(start, start) - au**2 - (radius[e] + other * margin) ** 2
         disc = qb**2 - qa * qc
         t = (qb - np.sqrt(np.maximum(disc, 0.0))) / qa
         s = t * du - au
         inside = (s > tubes.start[e]) & (s < np.minimum(tubes.stop[e], length))
         meets = (disc > 0) & inside & (t > 0) & (t < distance)
-        hidden |= meets & (other | (tubes.tube != tubes.tube[e])[:, None])
-    return hidden
+        out |= meets & (other | (tube != tubes.tube[e])[:, None])
+    return out
 
 
-def _pixel_angle(camera: Camera) -> float:
+def pixel_angle(camera: Camera) -> float:
     """Angle (rad) between neighbouring pixels in the middle of the image."""
     middle = (np.array(camera.image_size) - 1) / 2
     rays = camera.ray(middle + np.array([[0.0, 0.0], [1.0, 0.0]]))
@@ -190,10 +195,11 @@ def _with_errors(
     A point at ray s that moves outward by e px turns by e c, c = |J^T n| with J = d ray/d pixel,
     and the plane follows where s . dn = -c e.
     """
-    pixels = camera.project(rays)
+    few = rays[:, np.linspace(0, PLACES - 1, FITTED).astype(int)]
+    pixels = camera.project(few)
     by_pixel, _ = camera.ray_jacobians(pixels)
     gradient = np.einsum("nkij,ni->nkj", by_pixel, edges.normal)
-    by_turn = -np.einsum("nki,nij->nkj", rays, edges.basis)
+    by_turn = -np.einsum("nki,nij->nkj", few, edges.basis)
     by_shift, by_tilt = responses(by_turn / np.sqrt(dot(gradient, gradient))[..., None], pixels)
     normal = disturbed(edges.normal, edges.basis, by_shift, by_tilt, noise, rng)
     parts = np.stack([by_shift * noise.shift, by_tilt * noise.tilt], axis=-1)

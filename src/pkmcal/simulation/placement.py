@@ -219,16 +219,16 @@ def default_stations(
     board : what a board is fixed to that all see: they stand to one side of a machine that stands,
     round one that lies flat, and with room beside the machine for a board on the base.
     """
-    space = np.concatenate(_space(machine))
+    space = legs_space(machine)
     start = rng.uniform(0, 2 * np.pi)
     poses: list[StationPlace] = []
     arc = board is not None and not _is_flat(space)
     for k, camera in enumerate(cameras):
         half = view_angle(camera)
-        away = _distance(machine, min(half, NEAREST), board)
+        away = fitting_distance(machine, camera, board)
         if half > PANORAMIC:
             poses.append(_inside(*_space(machine), rng))
-        elif len(cameras) == 1 and board != "base":
+        elif len(cameras) == 1 and board != "base" and len(tubes_of(machine)):
             poses.append(_clearest(machine, camera, away, start, rng))
         else:
             turn = (
@@ -243,7 +243,7 @@ def places_by_hand(
     machine: Machine, cameras: tuple[Camera, ...], rng: np.random.Generator
 ) -> tuple[StationPlace, ...]:
     """A place for each photograph of someone who walks round the machine, evenly but for a step."""
-    space = np.concatenate(_space(machine))
+    space = legs_space(machine)
     centre = (space.min(axis=0) + space.max(axis=0)) / 2
     radius = float(np.linalg.norm(space - centre, axis=1).max())
     start, out = rng.uniform(0, 2 * np.pi), []
@@ -252,7 +252,7 @@ def places_by_hand(
     for k, camera in enumerate(cameras):
         azimuth = start + turn * (k + rng.uniform(-0.3, 0.3))
         elevation = rng.uniform(*BY_HAND)
-        away = _distance(machine, min(view_angle(camera), NEAREST), None) * rng.uniform(*STEPS)
+        away = fitting_distance(machine, camera) * rng.uniform(*STEPS)
         level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         way = np.cos(elevation) * level + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
         position = centre + away * radius * way
@@ -269,6 +269,16 @@ def places_by_hand(
     return tuple(out)
 
 
+def legs_space(machine: Machine) -> Array:
+    """Points (n, 3) that a picture of the machine has to hold, base frame, m."""
+    return np.concatenate(_space(machine))
+
+
+def fitting_distance(machine: Machine, camera: Camera, board: Body | None = None) -> float:
+    """From which the machine, and the board, fill the camera's picture, in the machine's radius."""
+    return _distance(machine, min(view_angle(camera), NEAREST), board)
+
+
 def _space(machine: Machine) -> tuple[Array, Array]:
     """Legs' ends A and B (n, 3), base frame, m, that a picture of the machine has to hold."""
     a, b = reaches(machine)
@@ -281,7 +291,7 @@ def _clearest(
     """The place on the ring, ``away`` from the machine in its own radius, from which the leg that
     is seen least is seen best.
     """
-    space = np.concatenate(_space(machine))
+    space = legs_space(machine)
     azimuths = start + 2 * np.pi * np.arange(TRIED) / TRIED
     poses = [_outside(space, away, azimuth, rng) for azimuth in azimuths]
     tubes, home = tubes_of(machine), machine.home()[None]
@@ -343,7 +353,7 @@ def _distance(machine: Machine, half: float, board: Body | None) -> float:
     if len(reaches(machine)[0]) > 1 and board != "base":
         share = FULL
     else:
-        share = SPARE if board is None else WITH_BOARD[_is_flat(np.concatenate(_space(machine)))]
+        share = SPARE if board is None else WITH_BOARD[_is_flat(legs_space(machine))]
     return float(share / np.sin(half))
 
 

@@ -199,14 +199,10 @@ def _write_texts(
     files = {
         name: "cameras/camera.yaml" if same else f"cameras/{name}.yaml" for name in truth.stations
     }
-    driven = np.flatnonzero(drawing.layout.actuated >= 0)
-    columns = [f"leg{j + 1}" for j in driven]
-    if drawing.layout.shares_motors:
-        columns = [f"motor{k + 1}" for k in range(drawing.n_joints)]
     texts = {
         "mechanism.yaml": mechanism_text(drawing),
         "session.yaml": yaml_text(_session_document(settings, truth, files)),
-        "joints.csv": csv_text(columns, truth.configurations, truth.readings),
+        "joints.csv": csv_text(drawing.joint_names, truth.configurations, truth.readings),
         FILE: json.dumps(truth_document(truth), indent=1) + "\n",
     }
     if settings.board is not None:

@@ -44,6 +44,17 @@ HANDHELD = "phone"
 
 
 @dataclass(frozen=True)
+class Asked:
+    """Configurations that somebody asks for, as a plan does.
+
+    joints : (n, m) readings. pairs : (M, 2) stations and the configurations that they photograph.
+    """
+
+    joints: Array
+    pairs: Integers
+
+
+@dataclass(frozen=True)
 class Settings:
     """What a simulated session is like.
 
@@ -57,7 +68,7 @@ class Settings:
     photographs of each configuration from each station, with sensor noise of their own. shake :
     standard deviations (m, rad) by which the camera moves between them. finish, light : of the
     legs and of the room. as_built : motors, rings and cables, which no drawing shows, on the legs.
-    handheld : each photograph
+    asked : these configurations, in place of drawn ones. handheld : each photograph
     from a place of its own about the machine, ``repeats`` of each configuration, with focal lengths
     that differ by ``breathing``, one standard deviation; ``stations`` then says nothing.
     """
@@ -81,6 +92,7 @@ class Settings:
     as_built: bool = False
     handheld: bool = False
     breathing: float = BREATHING_SIGMA
+    asked: Asked | None = None
 
     @property
     def n_stations(self) -> int:
@@ -214,6 +226,8 @@ def _configurations(
 
     A controller that moves the machine by its drawing only goes where that closes.
     """
+    if settings.asked is not None:
+        return _as_asked(drawing, machine, settings.asked)
     n, repeats = settings.configurations, settings.repeats
     wanted = n if settings.shared or settings.handheld else n * len(cameras)
     poses, joints = draw_configurations(machine, 2 * wanted + 10, settings.extreme, rng)
@@ -253,6 +267,20 @@ def _configurations(
         pairs = [(s, s * n + k) for s in stations for k in range(n)]
     rows = np.concatenate(chosen)
     return poses[rows], joints[rows], np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def _as_asked(drawing: Machine, machine: Machine, asked: Asked) -> tuple[Array, Array, Integers]:
+    """Poses that the true machine takes at the readings that are asked for."""
+    by_drawing = drawing.forward_result(asked.joints)
+    found = machine.forward_result(asked.joints, by_drawing.T_base_platform)
+    bad = np.flatnonzero(~(found.converged & by_drawing.converged))
+    if bad.size:
+        raise GeometryError(
+            what="the machine cannot take a configuration that was asked for",
+            found=", ".join(f"{q:.4g}" for q in asked.joints[bad[0]]),
+            expected="readings at which all legs reach the platform",
+        )
+    return found.T_base_platform, asked.joints, asked.pairs
 
 
 def truth_document(truth: Truth) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.papers.hand_eye import Pair, PairProblem
-from pkmcal.solver import FIRST_DAMPING, directions, eliminate, minimise
+from pkmcal.solver import directions, eliminate, minimise
 from pkmcal.studies.simulated import SimulatedRuns
 
 LOOSE = 1e-9
@@ -47,9 +47,9 @@ def drawing(machine: Machine, runs: int) -> Fitted:
     return Fitted(np.broadcast_to(values, (runs, len(values))))
 
 
-def joint(problem: Problem, start: BatchState, damping: float = FIRST_DAMPING) -> BatchResult:
+def joint(problem: Problem, start: BatchState) -> BatchResult:
     """The joint maximum-likelihood estimate with the noise as it is, which a simulation knows."""
-    return solve_batch(problem, start, robust=False, scale_noise=False, damping=damping)
+    return solve_batch(problem, start, robust=False, scale_noise=False)
 
 
 def freedom(data: SimulatedRuns, layout: LimbLayout, known: int) -> int:

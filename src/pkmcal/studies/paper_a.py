@@ -26,7 +26,6 @@ from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
 from pkmcal.papers.four_step import Form, FourSteps, solve
 from pkmcal.papers.leg_axes import Axes, centres_from_axes
-from pkmcal.solver import RESTART_DAMPING
 from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, StudyResult
 from pkmcal.studies.estimates import Fitted, drawing, freedom, joint
 from pkmcal.studies.simulated import (
@@ -319,8 +318,7 @@ def joint_estimate(data: SimulatedRuns, start: Start) -> Fitted:
     poses = forward(machine.layout, start.theta[:, None], data.joints, home).T_base_platform
     z = machine.parameters.to_free(start.theta)
     state = BatchState(z, start.T_camera_base, poses, np.zeros((len(z), 1, 1)))
-    # the four steps end near the minimum
-    found = joint(problem, state, RESTART_DAMPING)
+    found = joint(problem, state)
     theta, nz = problem.theta(found.solution.state), z.shape[1]
     dof = freedom(data, machine.layout, known=nz - 12 + 6 * STATIONS)  # the gauge fixes twelve
     spread = in_frames(machine, problem, theta)

@@ -1,0 +1,270 @@
+"""``pkmcal plan``: the next configurations worth measuring, and where to put the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pkmcal.commands import console
+from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.errors import InputError
+
+if TYPE_CHECKING:
+    from pkmcal.mechanisms.region import Region
+    from pkmcal.planning.subject import Subject
+
+
+class Wanted(StrEnum):
+    """What is to be small."""
+
+    tool = "tool"
+    D = "D"
+    E = "E"
+    O1 = "O1"
+
+
+FILES = {
+    "plan.html": PAGE,
+    "plan.csv": "the readings, in the order to be measured",
+    "plan.json": NUMBERS,
+}
+STATIONS = {"stations.yaml": "the places, for session.yaml"}
+LAST = "calibration"
+"""Where calibrate writes, inside a session."""
+
+
+def plan(
+    subject: Annotated[
+        str,
+        typer.Argument(
+            metavar="SESSION|MACHINE", help="A session, or a built-in machine or its file."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="SESSION/plan, or plan, unless given."),
+    ] = None,
+    configurations: Annotated[
+        int,
+        typer.Option("-n", "--configurations", metavar="N", help="Configurations from each place."),
+    ] = 15,
+    index: Annotated[
+        Wanted, typer.Option(help="What is to be small: the tool's variance, or D, E, O1.")
+    ] = Wanted.tool,
+    places: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, max=12, help="Choose N places of the camera as well."),
+    ] = None,
+    best_of: Annotated[
+        int | None,
+        typer.Option("--best-of", metavar="N", min=1, help="Choose N of the session's stations."),
+    ] = None,
+    after: Annotated[
+        Path | None,
+        typer.Option(metavar="CALIBRATION", help="What is known already: a calibrated machine."),
+    ] = None,
+    from_drawing: Annotated[
+        bool, typer.Option("--from-drawing", help="As if nothing had been calibrated.")
+    ] = False,
+    same_place: Annotated[
+        bool,
+        typer.Option("--same-place", help="The cameras stand as they stood in the calibration."),
+    ] = False,
+    together: Annotated[
+        bool | None,
+        typer.Option(
+            "--together/--apart", help="All stations measure each configuration, or each its own."
+        ),
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of a MACHINE: its camera's file.")
+    ] = None,
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="Of a MACHINE: pixels, without a camera file.")
+    ] = "1280x960",
+    board: Annotated[
+        bool, typer.Option("--board", help="Of a MACHINE: a board on its platform is seen.")
+    ] = False,
+    tracker: Annotated[
+        str | None,
+        typer.Option(
+            metavar="M[,RAD]", help="Of a MACHINE: a tracker, or probe, of this noise instead."
+        ),
+    ] = None,
+    edge_noise: Annotated[
+        float, typer.Option(metavar="PX", help="Of an edge, where no photograph tells.")
+    ] = 0.05,
+    corner_noise: Annotated[
+        float, typer.Option(metavar="PX", help="Of a board's corner, where no photograph tells.")
+    ] = 0.05,
+    joint_noise: Annotated[
+        float, typer.Option(metavar="M", help="Of a MACHINE: noise of a reading, m or rad.")
+    ] = 3e-6,
+    seed: console.Seed = 0,
+    as_json: console.Json = False,
+) -> int:
+    """The next configurations worth measuring."""
+    from threadpoolctl import threadpool_limits
+
+    from pkmcal.files import check_own_folder
+    from pkmcal.planning.plan import plan as run
+    from pkmcal.report.plan import outcome_of
+
+    for name, value in (
+        ("--edge-noise", edge_noise), ("--corner-noise", corner_noise),
+        ("--joint-noise", joint_noise),
+    ):  # fmt: skip
+        if not 0 < value < 100:
+            raise InputError(
+                "a noise cannot be this", where=name, found=f"{value:g}", expected="more than 0"
+            )
+    is_session = _is_session(subject)
+    folder = out or (Path(subject) / "plan" if is_session else Path("plan"))
+    files = {**FILES, **(STATIONS if places or best_of else {})}
+    check_own_folder(folder, {**FILES, **STATIONS}, "what plan writes", "an earlier plan")
+    with console.progress(as_json) as told, threadpool_limits(1, "blas"):
+        told("Looking at what there is", 0.0)
+        region = None
+        if is_session:
+            _only_of("a machine", {"--camera": camera, "--board": board, "--tracker": tracker})
+            source, region = _of_session(
+                Path(subject), after, from_drawing, same_place, edge_noise, corner_noise, seed
+            )
+        else:
+            given = {"--after": after, "--same-place": same_place, "--best-of": best_of}
+            _only_of("a session", given)
+            source = _of_machine(
+                subject,
+                camera,
+                size,
+                board,
+                tracker,
+                places,
+                joint_noise,
+                edge_noise,
+                corner_noise,
+                seed,
+            )
+        found = run(
+            source,
+            count=configurations,
+            index=index.value,
+            region=region,
+            together=together,
+            free_places=places,
+            best_of=best_of,
+            seed=seed,
+            told=lambda share: told("Choosing configurations", 0.1 + 0.85 * share),
+        )
+    return finish(outcome_of(found), folder, files, as_json=as_json)
+
+
+def _only_of(owner: str, given: Mapping[str, object]) -> None:
+    """Raise `InputError` for options that mean nothing here."""
+    for name, value in given.items():
+        if value:
+            raise InputError(f"this option is for {owner}", where=name, next_step="Leave it out")
+
+
+def _is_session(subject: str) -> bool:
+    """Whether a subject is a session's folder, or its file."""
+    path = Path(subject)
+    return path.is_dir() or path.name == "session.yaml"
+
+
+def _of_session(
+    folder: Path,
+    after: Path | None,
+    from_drawing: bool,
+    same_place: bool,
+    edge_noise: float,
+    corner_noise: float,
+    seed: int,
+) -> tuple[Subject, Region | None]:
+    """The session as it stands, and its workspace."""
+    from pkmcal.calibration.results import EVERYTHING, load
+    from pkmcal.judge.new_data import read
+    from pkmcal.planning.subject import of_session
+    from pkmcal.session.load import load_session
+
+    session, saved = load_session(folder, measured=False), None
+    if after is None and not from_drawing and (session.folder / LAST / EVERYTHING).is_file():
+        after = session.folder / LAST
+        if not load(after).verdict.usable:  # it says of itself not to be used
+            after = None
+    if after is not None:
+        saved, session = read(after, session)
+        if not saved.verdict.usable:
+            raise InputError(
+                "this calibration should not be used, so no plan is made from it",
+                where=str(saved.path),
+                found=saved.verdict.headline,
+                next_step="Plan without it: --from-drawing",
+            )
+    if same_place and saved is None:
+        raise InputError(
+            "there is no calibration in which the cameras stood anywhere",
+            where="--same-place",
+            expected="--after CALIBRATION, or a session with its calibration",
+        )
+    subject = of_session(
+        session, saved, same_place=same_place, edge=edge_noise, corner=corner_noise, seed=seed
+    )
+    return subject, session.workspace
+
+
+def _of_machine(
+    name: str,
+    camera: Path | None,
+    size: str,
+    board: bool,
+    tracker: str | None,
+    places: int | None,
+    joint_noise: float,
+    edge_noise: float,
+    corner_noise: float,
+    seed: int,
+) -> Subject:
+    """A machine, and the camera that somebody thinks of."""
+    from pkmcal.cameras import load_camera
+    from pkmcal.commands.simulate import parsed_size
+    from pkmcal.mechanisms import load_mechanism
+    from pkmcal.planning.subject import of_machine
+    from pkmcal.simulation import board_for
+    from pkmcal.simulation.demo import camera_of_size
+    from pkmcal.simulation.placement import PANORAMIC, view_angle
+
+    machine = load_mechanism(name, label=None)
+    eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
+    number = 1 if board or places or view_angle(eye) > PANORAMIC else 3
+    return of_machine(
+        machine,
+        [eye] * number,
+        machine.joint_names,
+        board=board_for(machine, "platform") if board else None,
+        tracker=None if tracker is None else _tracker(tracker),
+        joint_noise=joint_noise,
+        edge=edge_noise,
+        corner=corner_noise,
+        seed=seed,
+    )
+
+
+def _tracker(text: str) -> tuple[float, float | None]:
+    """A tracker's noise, m and rad, of a text such as 2e-5 or 2e-5,1e-4."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 2) or not all(0 < x < 1 for x in numbers):
+        raise InputError(
+            "a tracker's noise cannot be this",
+            where="--tracker",
+            found=text,
+            expected="metres, and radians where it measures turns: 2e-5 or 2e-5,1e-4",
+        )
+    return numbers[0], numbers[1] if len(numbers) == 2 else None

@@ -1,0 +1,183 @@
+"""The part of a workspace that somebody cares for, and poses spread evenly over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import perturb, pose_difference
+from pkmcal.mechanisms.kinematics import on_manifold
+from pkmcal.mechanisms.workspace import ALLOWED, Limits, extents, is_flat, reachable, spans
+
+Side = tuple[float, float]
+AXES = ("x", "y", "z")
+SPARSE = 200
+"""Poses tried for each one wanted, at most: where the machine can take fewer than one in so many,
+fewer are found."""
+AT_LEAST = 5000
+"""Poses tried before a region counts as out of reach."""
+AT_ONCE = 4096
+"""Poses at a time, at most."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A box of positions of the platform's origin, and how far it turns there.
+
+    x, y, z : lowest and highest coordinate in the base frame, m; None for as far as the machine
+    comes. turn : largest turn from home's orientation about any axis that the motion has, rad. None
+    for no turn; but where constant rods or axes let the platform not move in all of its motion's
+    directions without turning (a 3-RPS), for as far as it comes.
+    Raises InputError for sides that are no intervals and a turn that is none.
+    """
+
+    x: Side | None = None
+    y: Side | None = None
+    z: Side | None = None
+    turn: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, side in zip(AXES, self.sides, strict=True):
+            if side is not None and not (np.isfinite(side).all() and side[0] <= side[1]):
+                raise InputError(
+                    what=f"the workspace's {name} is no interval",
+                    found=f"[{side[0]:g}, {side[1]:g}]",
+                    expected="[lowest, highest] in metres",
+                )
+        if self.turn is not None and not 0 <= self.turn <= np.pi:
+            raise InputError(
+                what="the workspace's turn is no angle that a platform turns to either side by",
+                found=f"{self.turn:g}",
+                expected="radians from 0 to 3.14; 15 degrees are 0.262",
+            )
+
+    @property
+    def sides(self) -> tuple[Side | None, Side | None, Side | None]:
+        """x, y and z."""
+        return self.x, self.y, self.z
+
+    def holds(self, limits: Limits, poses: Array) -> Booleans:
+        """Which of the poses (..., 4, 4) are in the region, to a micrometre and a microradian;
+        whether the machine can take them is not asked.
+        """
+        out = np.ones(poses.shape[:-2], dtype=bool)
+        for k, side in enumerate(self.sides):
+            if side is not None:
+                place = poses[..., k, 3]
+                out &= (place >= side[0] - ALLOWED) & (place <= side[1] + ALLOWED)
+        if self.turn is not None:
+            turned = np.linalg.norm(pose_difference(poses, limits.home)[..., :3], axis=-1)
+            out &= turned <= self.turn + ALLOWED
+        return out
+
+    def __str__(self) -> str:
+        boxed = [
+            f"{name} {side[0] * 1e3:.4g} to {side[1] * 1e3:.4g} mm"
+            for name, side in zip(AXES, self.sides, strict=True)
+            if side is not None
+        ]
+        turned = [f"turned by up to {np.rad2deg(self.turn):.3g}°"] if self.turn else []
+        return ", ".join([*(boxed or ["the whole reach"]), *turned])
+
+
+@dataclass(frozen=True)
+class Within:
+    """What of a region a machine comes near to, from home: low, high (3,) corners of a box, m, and
+    the largest turn, rad.
+    """
+
+    low: Array
+    high: Array
+    turn: float
+
+
+def within_reach(limits: Limits, region: Region) -> Within:
+    """The box and the turn within which poses of the region are looked for.
+
+    Sides that the region names, as far as straight ways from home come near them without turning.
+    Raises InputError where the region lies beyond them, or home is no pose of the machine.
+    """
+    free = np.eye(3)[limits.layout.free[3:]]
+    low = high = limits.home[:3, 3]
+    moves = 0
+    if len(free):
+        near, far = spans(limits, limits.home, free)
+        low, high = low + near @ free, high + far @ free
+        moves = int(np.count_nonzero(~is_flat(limits, far - near)))
+    for k, (name, side) in enumerate(zip(AXES, region.sides, strict=True)):
+        if side is not None and (side[1] < low[k] - ALLOWED or side[0] > high[k] + ALLOWED):
+            raise InputError(
+                what="the machine does not come to the workspace that was asked for",
+                found=f"{name} from {side[0]:g} to {side[1]:g} m",
+                expected=f"a part of {low[k]:.3g} to {high[k]:.3g} m, where its platform's origin"
+                " comes from home without turning",
+            )
+        if side is not None:
+            low[k], high[k] = np.clip((low[k], high[k]), *side)
+    if region.turn is not None:
+        return Within(low, high, region.turn)
+    return Within(low, high, _turn(limits) if moves < len(free) else 0.0)
+
+
+def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array:
+    """Poses T_base_platform (n, 4, 4) spread evenly over what the machine can take of a region.
+
+    n is ``count``, or less where the machine can take fewer than one in two hundred of the poses
+    about home. seed : shifts the sequence; the same gives the same poses. Of machines whose rods
+    and axes hold some freedoms, the nearest poses that they allow.
+    Raises InputError where the machine can take none of them.
+    """
+    within = within_reach(limits, region)
+    kept: list[Array] = []
+    found = tried = 0
+    most = max(SPARSE * count, AT_LEAST)
+    while found < count and tried < most:
+        more = min(max(count, tried), AT_ONCE)
+        poses = _candidates(limits, within, np.arange(tried, tried + more), seed)
+        closed = on_manifold(limits.layout, limits.theta, poses)
+        poses = closed.T_base_platform[closed.converged]
+        poses = poses[region.holds(limits, poses)]
+        poses = poses[reachable(limits, poses).inside]
+        kept.append(poses)
+        found, tried = found + len(poses), tried + more
+    if not found:
+        home = ", ".join(f"{x:.0f}" for x in np.round(1e3 * limits.home[:3, 3]) + 0.0)
+        raise InputError(
+            what="the machine can take no pose of the workspace that was asked for",
+            found=f"{region}; {tried} poses tried",
+            expected=f"a part of the machine's own, which is about home, [{home}] mm",
+            next_step="widen the workspace, or check the ranges in the mechanism file",
+        )
+    return np.concatenate(kept)[:count]
+
+
+def _turn(limits: Limits) -> float:
+    """How far the platform turns at home about any axis of its motion, rad."""
+    axes = np.eye(6)[:3][limits.layout.free[:3]]
+    return float(extents(limits, np.concatenate([axes, -axes]), limits.home).distance.max())
+
+
+def _candidates(limits: Limits, within: Within, numbers: Integers, seed: int) -> Array:
+    """Members of an evenly spread sequence of poses in the box, (n, 4, 4), by their numbers.
+
+    Additive recurrence with the powers of the generalised golden ratio, the root of
+    phi^(d + 1) = phi + 1 (Roberts 2018).
+    """
+    axes = np.flatnonzero(limits.layout.free[:3]) if within.turn else np.zeros(0, dtype=int)
+    d = 3 + len(axes)
+    golden = max(np.roots([1.0, *np.zeros(d - 1), -1.0, -1.0]).real)
+    start = np.random.default_rng(seed).random(d)
+    unit = (start + np.outer(numbers + 1, golden ** -np.arange(1.0, d + 1))) % 1
+    delta = np.zeros((len(unit), 6))
+    delta[:, 3:] = within.low + unit[:, :3] * (within.high - within.low) - limits.home[:3, 3]
+    if len(axes) == 1:
+        delta[:, axes[0]] = within.turn * (2 * unit[:, 3] - 1)
+    elif len(axes):  # evenly in a ball of rotation vectors
+        height, angle = 2 * unit[:, 3] - 1, 2 * np.pi * unit[:, 4]
+        flat = np.sqrt(1 - height**2)
+        direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=-1)
+        delta[:, :3] = within.turn * np.cbrt(unit[:, 5:]) * direction
+    return perturb(limits.home, delta)

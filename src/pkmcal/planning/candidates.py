@@ -1,0 +1,118 @@
+"""Where machine and cameras could stand: configurations and places among which a plan chooses."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import perturb
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.kinematics import on_manifold
+from pkmcal.session.schema import Body
+from pkmcal.simulation.placement import (
+    INSIDE,
+    PANORAMIC,
+    StationPlace,
+    draw_configurations,
+    fitting_distance,
+    legs_space,
+    usable,
+    view_angle,
+)
+
+AROUND = 12
+"""Places of a camera on a ring round the machine."""
+RINGS = np.deg2rad([5.0, 22.0, 40.0, 60.0])
+"""Heights of the rings, of the line of sight above the ground."""
+NEAR = 0.12
+"""Part of a motor's range by which a configuration is moved when it is bettered."""
+NEIGHBOURS = 6
+"""Configurations that are tried about each chosen one."""
+DRAWN = 3
+"""Configurations drawn for each one wanted: others are singular, folded, or legs touch."""
+
+
+class Configurations(NamedTuple):
+    """joints : (K, m) readings. T_base_platform : (K, 4, 4)."""
+
+    joints: Array
+    T_base_platform: Array
+
+
+def configurations(machine: Machine, count: int, rng: np.random.Generator) -> Configurations:
+    """About ``count`` configurations that the machine can take, spread over its joints' ranges.
+
+    Half of them have every motor near an end of its range, where offsets and centres tell most;
+    the others lie between. All are in range, closed, in home's assembly, away from singular poses,
+    their legs clear of each other. Raises InputError where there are too few.
+    """
+    parts = [
+        draw_configurations(machine, max(count // 2, 1), extreme, rng)[0][: max(count // 2, 1)]
+        for extreme in (1.0, 0.0)
+    ]
+    poses = np.concatenate(parts)
+    return Configurations(machine.inverse(poses), poses)
+
+
+def neighbours(
+    machine: Machine, chosen: Configurations, rng: np.random.Generator
+) -> Configurations:
+    """Configurations about chosen ones, as many as the machine can take of some about each."""
+    joints = np.repeat(chosen.joints, NEIGHBOURS, axis=0)
+    poses = np.repeat(chosen.T_base_platform, NEIGHBOURS, axis=0)
+    low, high = machine.joint_ranges.T
+    if np.isfinite(machine.joint_ranges).all():
+        step = NEAR * (high - low)
+        ends = low + INSIDE[0] * (high - low), low + INSIDE[1] * (high - low)
+        wanted = np.clip(joints + rng.uniform(-1, 1, joints.shape) * step, *ends)
+        found = machine.forward_result(wanted, poses)
+        poses = found.T_base_platform[found.converged]
+    else:
+        size = float(np.ptp(chosen.T_base_platform[:, :3, 3], axis=0).max())
+        unit = np.array([NEAR] * 3 + [NEAR * size] * 3)
+        motion = machine.layout.motion
+        delta = rng.uniform(-1, 1, (len(poses), 6)) * unit @ motion @ motion.T
+        moved = on_manifold(machine.layout, machine.values, perturb(poses, delta))
+        poses = moved.T_base_platform[moved.converged]
+    joints = machine.inverse(poses)
+    finite = np.isfinite(joints).all(axis=-1)
+    poses, joints = poses[finite], joints[finite]
+    good = usable(machine, poses, joints)
+    return Configurations(joints[good], poses[good])
+
+
+def places(machine: Machine, camera: Camera, board: Body | None = None) -> tuple[StationPlace, ...]:
+    """Places of a camera on a sphere about the machine, from which it just fills the picture.
+
+    board : whether there has to be room for one. Raises InputError for a camera that looks all
+    round: it sees the legs best from their middle.
+    """
+    half = view_angle(camera)
+    if half > PANORAMIC:
+        raise InputError(
+            what="a camera that looks all round sees the legs best from their middle, so no place"
+            " round the machine is looked for",
+            where="--places",
+            next_step="give its pose in session.yaml, between the legs",
+        )
+    space = legs_space(machine)
+    centre = (space.min(axis=0) + space.max(axis=0)) / 2
+    radius = float(np.linalg.norm(space - centre, axis=1).max())
+    away = fitting_distance(machine, camera, board) * radius
+    out: list[StationPlace] = []
+    for k, height in enumerate(RINGS):
+        for azimuth in 2 * np.pi * (np.arange(AROUND) + 0.5 * (k % 2)) / AROUND:
+            level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+            way = np.cos(height) * level + np.array([0.0, 0.0, np.sin(height)])
+            position, target = centre + away * way, centre
+            out.append(StationPlace(_tuple(position), _tuple(target)))
+    return tuple(out)
+
+
+def _tuple(v: Array) -> tuple[float, float, float]:
+    x, y, z = (round(float(c), 3) for c in v)
+    return x, y, z

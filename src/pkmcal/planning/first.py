@@ -1,0 +1,258 @@
+"""What the first photographs tell of the edges in all that follow.
+
+A station's first photographs are measured as `calibrate` measures them. How much each edge tells
+there, in pixels, and lost edges nothing, is what such edges will tell elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.calibration.gather import refinement_of
+from pkmcal.errors import ResultError
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.start import start_state
+from pkmcal.measurements import EdgeSet, Measurements, concatenate
+from pkmcal.mechanisms import Machine
+from pkmcal.observe import legs
+from pkmcal.observe.predict import tubes_of
+from pkmcal.session.load import Session
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+
+FIRST = 3
+"""Photographs of a station that are looked at closely: what people take before the long capture."""
+MEASURED = 6
+"""Photographs of all stations together whose edges are measured: a hexapod shows forty edges of
+each kind in them, enough for their scatter to be known to a tenth."""
+FEWEST_EDGES = 24
+"""Edges without which nothing is told: one photograph of a hexapod shows as many."""
+OWN = 2.0
+"""Edges that all of a kind at a station count for beside the leg's own, so that chance among three
+photographs does not make a leg."""
+MOSTLY = 0.5
+"""Part of an edge that has to be free for it to be expected: its place is fitted to as much."""
+EXACT = EdgeNoise(1e-3, 1e-3)
+"""px; errors of edges that are simulated for where they lie, and how they turn by a pixel."""
+SEED = 7
+
+
+class EdgePool(NamedTuple):
+    """What one edge may tell: informations (n, 2, 2), px^-2 of shift and tilt, and chances (n,)."""
+
+    told: Array
+    chance: Array
+
+    @property
+    def mean(self) -> Array:
+        """What it tells on average, (2, 2)."""
+        return np.einsum("n,nij->ij", self.chance, self.told)
+
+
+Pools = tuple[EdgePool, ...]
+"""Of a station's edges, in the order of :func:`~pkmcal.observe.predict.tubes_of`."""
+
+
+@dataclass(frozen=True)
+class EdgesOf:
+    """Edges (k, E) of a station's first photographs, in the order of ``tubes_of``.
+
+    photographs : (k,) their numbers. expected : of which nothing hides the most. found : that were
+    measured and agree with all others.
+    """
+
+    photographs: Integers
+    expected: Booleans
+    found: Booleans
+
+
+@dataclass(frozen=True)
+class FirstEdges:
+    """What the first photographs gave.
+
+    estimate : from them alone. pools, edges : by station. sigma : (S, L) px across, median.
+    """
+
+    estimate: Estimate
+    pools: tuple[Pools, ...]
+    sigma: Array
+    edges: tuple[EdgesOf, ...]
+
+
+def spread_over(configuration: Integers, n_stations: int = 1) -> Integers:
+    """Numbers of the few of a station's photographs that are measured, of different configurations
+    and spread over all. configuration : (n,) of its photographs.
+    """
+    most = min(FIRST, -(-MEASURED // n_stations))
+    first = np.sort(np.unique(configuration, return_index=True)[1])
+    return first[np.unique(np.linspace(0, len(first) - 1, min(most, len(first))).astype(int))]
+
+
+def camera_numbers(session: Session, stations: Sequence[int]) -> Integers:
+    """Number of each station's camera file among theirs, (S,)."""
+    files = [session.stations[s].camera_file for s in stations]
+    return np.array([list(dict.fromkeys(files)).index(file) for file in files], dtype=int)
+
+
+def first_edges(
+    session: Session,
+    photographs: Sequence[legs.Photographs],
+    rows: Sequence[Integers],
+    T_camera_base: Array,
+    poses: Array,
+) -> FirstEdges:
+    """The first photographs' edges, by a look for the legs and one at the edges.
+
+    photographs : of S stations. rows : numbers of those to be measured, by station. T_camera_base :
+    (S, 4, 4) where the stations were found. poses : T_base_platform (K, 4, 4) by the drawing.
+    Raises PkmcalError where they do not carry an estimate.
+    """
+    machine, numbers = session.machine, camera_numbers(session, [p.station for p in photographs])
+    few = [
+        replace(
+            p,
+            station=number,
+            configuration=p.configuration[own],
+            joints=p.joints[own],
+            images=[p.images[k] for k in own],
+        )
+        for number, (p, own) in enumerate(zip(photographs, rows, strict=True))
+    ]
+
+    def measurements(edges: EdgeSet) -> Measurements:
+        if len(edges) < FEWEST_EDGES:
+            raise ResultError("too few edges to tell what others will give", found=len(edges))
+        return Measurements(
+            edges, session.joints, session.joint_noise, len(few), numbers, shaded=True
+        )
+
+    looks = [
+        legs.search(p, machine, T, poses[p.configuration])
+        for p, T in zip(few, T_camera_base, strict=True)
+    ]
+    coarse = replace(measurements(concatenate([one.edges for one in looks])), shaded=False)
+    # a pixel is what the search is good to, so there is no noise to be estimated
+    start = start_state(machine, coarse, T_camera_base)
+    estimate = bundle(machine, coarse, start, scale_noise=False)
+    state = estimate.state
+    looks = [
+        legs.measure(
+            p, estimate.machine, state.T_camera_base[k], state.T_base_platform[p.configuration]
+        )
+        for k, p in enumerate(few)
+    ]
+    fine = measurements(concatenate([one.edges for one in looks]))
+    held = refinement_of(session, refine=False)
+    fine = replace(fine, intrinsics_factor=held.factor, intrinsics_at=held.at)
+    start = replace(state, intrinsics=np.zeros_like(held.at))
+    estimate = bundle(machine, fine, start)
+    return _told(few, rows, estimate, fine.edges)
+
+
+def _told(
+    few: Sequence[legs.Photographs], rows: Sequence[Integers], estimate: Estimate, edges: EdgeSet
+) -> FirstEdges:
+    """What an edge that ought to be seen tells on average, lost ones with nothing."""
+    machine, state = estimate.machine, estimate.state
+    tubes = tubes_of(machine)
+    n_edges, n_legs = len(tubes), machine.n_legs
+    number = np.full((n_legs, int(tubes.tube.max()) + 1, 2), -1)
+    number[tubes.leg, tubes.tube, tubes.side] = np.arange(n_edges)
+    pairs = np.array([(p.station, k) for p in few for k in p.configuration])
+    ideal, _ = simulate_edges(
+        machine,
+        state.T_camera_base,
+        tuple(p.camera for p in few),
+        state.T_base_platform,
+        EXACT,
+        np.random.default_rng(SEED),
+        photographs=pairs,
+    )
+
+    shape = (len(few), len(state.T_base_platform), n_edges)
+
+    def place(some: EdgeSet) -> tuple[Integers, Integers, Integers]:
+        return some.station, some.configuration, number[some.leg, some.tube, some.side]
+
+    expected, kept, whole = (np.zeros(shape, dtype=bool) for _ in range(3))
+    expected[place(ideal)] = True
+    # of a tube that is hidden for the most part nobody asks why its edges are lost
+    length = np.ptp(ideal.span, axis=1)
+    longest = np.zeros(n_edges)
+    np.maximum.at(longest, place(ideal)[2], length)
+    whole[place(ideal)] = length > MOSTLY * longest[place(ideal)[2]]
+    kept[place(edges.select(estimate.edge_weights > 0.5))] = True
+    kept &= expected
+    unit = np.zeros((*shape, 2, 2))
+    unit[place(ideal)] = pixel_turns(ideal)
+    weight = estimate.edge_weights / estimate.statistics.noise_scale**2
+    own = unit[place(edges)]
+    told = np.zeros((*shape, 2, 2))  # lost edges stay zero
+    told[place(edges)] = own.mT @ (np.linalg.inv(edges.covariance) * weight[:, None, None]) @ own
+    kind = np.stack([tubes.tube, tubes.side], axis=1)
+    pools = tuple(_pools(told[s], expected[s], kind) for s in range(len(few)))
+    sigma = np.full((len(few), n_legs), np.nan)
+    pixel = np.linalg.norm(edges.shift, axis=-1)
+    across = np.sqrt(edges.covariance[:, 0, 0]) / pixel * estimate.statistics.noise_scale
+    for s, j in np.ndindex(len(few), n_legs):
+        mine = (edges.station == s) & (edges.leg == j) & (estimate.edge_weights > 0.5)
+        sigma[s, j] = np.median(across[mine]) if mine.any() else np.nan
+    by_station = tuple(
+        EdgesOf(own, whole[s, p.configuration], (kept & whole)[s, p.configuration])
+        for s, (own, p) in enumerate(zip(rows, few, strict=True))
+    )
+    return FirstEdges(estimate, pools, sigma, by_station)
+
+
+def _pools(told: Array, expected: Booleans, kind: Integers) -> Pools:
+    """What edges of a station may tell, by edge (E,): its tube's own, and that of all of its kind.
+
+    told : (K, E, 2, 2), zero where lost; expected : (K, E). kind : (E, 2) tube and side. Edges
+    differ: a mean would promise more than edges of which some tell much and others nothing.
+    """
+    out: list[EdgePool] = []
+    for e in range(told.shape[1]):
+        alike = np.all(kind == kind[e], axis=1)
+        own = told[expected[:, e], e]
+        like = told[:, alike][expected[:, alike]]
+        chance = np.concatenate([np.ones(len(own)), np.full(len(like), OWN / max(len(like), 1))])
+        out.append(EdgePool(np.concatenate([own, like]), chance / max(chance.sum(), 1.0)))
+    return tuple(out)
+
+
+def drawn_edges(
+    machine: Machine, edges: EdgeSet, pools: Sequence[Pools], rng: np.random.Generator | None
+) -> EdgeSet:
+    """Edges with :data:`EXACT` errors that tell as much as such edges did, drawn at random; those
+    that tell nothing go. Without ``rng`` each tells what such an edge does on average.
+    """
+    tubes = tubes_of(machine)
+    own = np.zeros((len(edges), 2, 2))
+    for e in range(len(tubes)):
+        alike = (edges.leg == tubes.leg[e]) & (edges.tube == tubes.tube[e])
+        alike &= edges.side == tubes.side[e]
+        for s, station in enumerate(pools):
+            mine, pool = np.flatnonzero(alike & (edges.station == s)), station[e]
+            if not len(pool.told):
+                continue
+            if rng is None:
+                own[mine] = pool.mean
+            else:
+                own[mine] = pool.told[rng.choice(len(pool.told), len(mine), p=pool.chance)]
+    told = np.linalg.eigvalsh(own)[:, 0] > 0
+    edges, own = edges.select(told), own[told]
+    unit = pixel_turns(edges)
+    return replace(edges, covariance=unit @ np.linalg.inv(own) @ unit.mT)
+
+
+def pixel_turns(edges: EdgeSet) -> Array:
+    """Turns (N, 2, 2) of simulated edges' normals by a pixel of shift and of tilt, in columns.
+
+    The Cholesky factor of their covariance: their bases have the shift first.
+    """
+    return np.linalg.cholesky(edges.covariance) / EXACT.shift

@@ -1,0 +1,92 @@
+"""The shortest way through configurations, by readings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+
+MOST = 50
+"""Changes a point at most; they end before, when none shortens the way."""
+LEAST = 1e-12
+LONGEST = 3
+"""Points that are moved together."""
+
+
+def distances(joints: Array, ranges: Array) -> Array:
+    """(n, n) how long the slowest motor needs from each of the readings (n, m) to each, in parts of
+    its range (m, 2), or of what the readings span where the file gives none.
+    """
+    span = ranges[:, 1] - ranges[:, 0]
+    own = np.ptp(joints, axis=0)
+    span = np.where(np.isfinite(span) & (span > 0), span, np.where(own > 0, own, 1.0))
+    return np.abs((joints[:, None] - joints) / span).max(axis=-1)
+
+
+def shortest_way(
+    apart: Array, first: Array | None = None, barred: Booleans | None = None
+) -> Integers:
+    """An order (n,) that makes the way through all n points short, open at its end.
+
+    apart : (n, n) distances. first : (n,) distances from where the way begins; anywhere if absent.
+    barred : (n, n) steps to be avoided where others serve.
+
+    The nearest point next, then stretches turned round (2-opt, Croes 1958) and moved elsewhere
+    (Or 1976), each time what shortens the way most, until neither does.
+    """
+    n = len(apart)
+    # one more point stands for the beginning and the open end
+    cost = np.zeros((n + 1, n + 1))
+    cost[:n, :n] = apart + (0.0 if barred is None else barred * (apart.max() * n + 1.0))
+    cost[n, :n] = 0.0 if first is None else first
+    order, left = [n], np.ones(n, dtype=bool)
+    while left.any():
+        rest = np.flatnonzero(left)
+        order.append(int(rest[np.argmin(cost[order[-1], rest])]))
+        left[order[-1]] = False
+    way = np.array([*order, n])
+    for _ in range(MOST * n):
+        gain, better = max((_turned(way, cost), _moved(way, cost)), key=lambda found: found[0])
+        if gain < LEAST * cost.max():
+            break
+        way = better
+    return way[1:-1]
+
+
+def length(way: Integers, apart: Array, first: Array | None = None) -> float:
+    """Of a way, with that to its beginning."""
+    begin = 0.0 if first is None else float(first[way[0]])
+    return begin + float(apart[way[:-1], way[1:]].sum())
+
+
+def _turned(way: Integers, cost: Array) -> tuple[float, Integers]:
+    """The best gain by turning round the stretch from i to j, and the way after it."""
+    before, here, after = way[:-2], way[1:-1], way[2:]
+    now = cost[before, here][:, None] + cost[here, after]
+    gain = now - cost[before[:, None], here] - cost[here[:, None], after]
+    gain = np.triu(gain, 1)
+    i, j = np.unravel_index(int(np.argmax(gain)), gain.shape)
+    better = np.concatenate([way[: i + 1], way[i + 1 : j + 2][::-1], way[j + 2 :]])
+    return float(gain[i, j]), better
+
+
+def _moved(way: Integers, cost: Array) -> tuple[float, Integers]:
+    """The best gain by moving a stretch of up to three points between two others."""
+    found: list[tuple[float, int, int, int]] = []
+    step = cost[way[:-1], way[1:]]
+    for size in range(1, min(LONGEST, len(way) - 3) + 1):
+        i = np.arange(1, len(way) - size)
+        first, last = way[i], way[i + size - 1]
+        without = step[i - 1] + step[i + size - 1] - cost[way[i - 1], way[i + size]]
+        j = np.arange(len(way) - 1)
+        with_ = cost[way[j], first[:, None]] + cost[last[:, None], way[j + 1]] - step
+        gain = without[:, None] - with_
+        gain[(j >= i[:, None] - 1) & (j <= i[:, None] + size - 1)] = -np.inf
+        a, b = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        found.append((float(gain[a, b]), int(i[a]), size, int(b)))
+    if not found:
+        return -np.inf, way
+    gain, i, size, j = max(found)
+    part, rest = way[i : i + size], np.delete(way, np.s_[i : i + size])
+    j = j if j < i else j - size
+    return gain, np.concatenate([rest[: j + 1], part, rest[j + 1 :]])

@@ -1,0 +1,402 @@
+"""Rigs: of a session as it stands, or of a machine and a camera that somebody thinks of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.boards.board import Board, load_board
+from pkmcal.boards.views import Boards
+from pkmcal.calibration.gather import measurements_of
+from pkmcal.calibration.recognise import (
+    boards_of,
+    platform_poses,
+    read_photographs,
+    station_poses,
+)
+from pkmcal.calibration.results import SavedCalibration
+from pkmcal.cameras import Camera
+from pkmcal.errors import GeometryError, InputError, PkmcalError
+from pkmcal.geometry.rigid import inverse
+from pkmcal.identify.start import start_mounts
+from pkmcal.measurements import SHADING_SIGMA, Mount
+from pkmcal.mechanisms import Machine
+from pkmcal.observe.predict import tubes_of
+from pkmcal.planning.first import Pools, first_edges, spread_over
+from pkmcal.planning.information import Known
+from pkmcal.planning.rig import (
+    CORNER,
+    EDGE,
+    BoardFrom,
+    Instrument,
+    LegsFrom,
+    Rig,
+    TargetFrom,
+    nominal_pools,
+)
+from pkmcal.session.load import Session
+from pkmcal.simulation.board import place_board
+from pkmcal.simulation.placement import default_stations, draw_configurations
+from pkmcal.wording import brief, listed
+
+READING = 3e-6
+"""m or rad; noise of a reading where nobody tells: of a good encoder."""
+BOARD = "board"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What a plan is made for.
+
+    rig : what measures. known : what an earlier calibration knows. columns : of joints.csv.
+    measured : how many configurations there are already, and names : how those are called. words :
+    where its numbers come from, in sentences. board : fields of the board's file, if one is seen.
+    """
+
+    rig: Rig
+    known: Known | None
+    columns: tuple[str, ...]
+    measured: int
+    names: tuple[str, ...]
+    words: tuple[str, ...]
+    board: dict[str, Any] | None = None
+
+
+class _Noise(NamedTuple):
+    """px, as assumed."""
+
+    edge: float
+    corner: float
+
+
+def of_machine(
+    machine: Machine,
+    cameras: Sequence[Camera],
+    columns: Sequence[str],
+    *,
+    board: Board | None = None,
+    tracker: tuple[float, float | None] | None = None,
+    joint_noise: float = READING,
+    edge: float = EDGE,
+    corner: float = CORNER,
+    seed: int = 0,
+) -> Subject:
+    """Of a machine and the camera, or tracker, that somebody thinks of.
+
+    cameras : one a place. board : on the platform, instead of the legs. tracker : standard
+    deviations of its positions (m) and turns (rad; None where it measures points), instead of
+    cameras. edge, corner : px, how far edges and corners are off.
+    """
+    rng = np.random.default_rng(seed)
+    noise = f"Readings are taken to be good to {_length(joint_noise)}"
+    if tracker is not None:
+        rig = _tracked(machine, tracker, joint_noise)
+        return Subject(rig, None, tuple(columns), 0, (), (noise + ", as told.",))
+    cameras = tuple(cameras)
+    stations = default_stations(machine, cameras, rng, "platform" if board else None)
+    T_camera_base = np.stack([place.T_camera_base() for place in stations])
+    names = tuple(f"station{k + 1}" for k in range(len(cameras)))
+    T_platform_board = None
+    if board is not None:
+        T_platform_board = _bracket(machine, board, cameras, T_camera_base, rng)
+    rig = _seen(
+        machine, names, cameras, T_camera_base, joint_noise, _Noise(edge, corner), board,
+        T_platform_board,
+    )  # fmt: skip
+    what = f"corners of the board to {corner:g} px" if board else f"edges of legs to {edge:g} px"
+    return Subject(
+        rig,
+        None,
+        tuple(columns),
+        0,
+        (),
+        (f"{noise}, {what}: an assumption.",),
+        board.document if board else None,
+    )
+
+
+def _length(sigma: float) -> str:
+    return f"{brief(sigma * 1e6)} µm (or µrad)"
+
+
+def _bracket(
+    machine: Machine, board: Board, cameras: tuple[Camera, ...], T: Array, rng: np.random.Generator
+) -> Array:
+    """Where a board on the platform is seen best."""
+    poses, joints = draw_configurations(machine, 12, 0.5, rng)
+    return place_board(machine, board, "platform", cameras, T, poses, joints, rng)
+
+
+def _seen(
+    machine: Machine,
+    names: tuple[str, ...],
+    cameras: tuple[Camera, ...],
+    T_camera_base: Array,
+    joint_noise: float,
+    noise: _Noise,
+    board: Board | None,
+    T_platform_board: Array | None,
+) -> Rig:
+    """Cameras that all see the legs, or all a board."""
+    pools = nominal_pools(machine, noise.edge)
+    instruments: list[Instrument] = []
+    for s, (camera, T) in enumerate(zip(cameras, T_camera_base, strict=True)):
+        if board is not None and T_platform_board is not None:
+            instruments.append(
+                BoardFrom(s, camera, T, board.points, T_platform_board, noise.corner)
+            )
+        else:
+            instruments.append(LegsFrom(s, camera, T, pools))
+    mounts = (Mount(BOARD, "platform"),) if board is not None else ()
+    if board is None:
+        check_tubes(machine)
+    numbers = np.array([list(dict.fromkeys(map(id, cameras))).index(id(c)) for c in cameras])
+    T_mount = None if T_platform_board is None else T_platform_board[None]
+    return Rig(
+        machine, names, T_camera_base, numbers, joint_noise, tuple(instruments), mounts, T_mount
+    )
+
+
+def check_tubes(machine: Machine) -> None:
+    """Raise `InputError` for a machine whose legs have no edges."""
+    if len(tubes_of(machine)):
+        return
+    raise InputError(
+        "no leg of the drawing has visible cylinders, so a camera sees none",
+        where="mechanism.yaml, legs",
+        expected="tubes: [{radius: 0.014, from: 0.05, to: 0.25}] on the legs",
+        next_step="Measure the legs' radii with calipers, or plan with --board or --tracker",
+    )
+
+
+def _tracked(machine: Machine, noise: tuple[float, float | None], joint_noise: float) -> Rig:
+    """A tracker in the base frame, with its target at the platform's origin."""
+    position, turn = noise
+    whiten = np.diag([0.0 if turn is None else 1 / turn] * 3 + [1 / position] * 3)
+    target = TargetFrom(0, np.eye(4), np.eye(4), whiten)
+    one = np.eye(4)[None]
+    mounts = (Mount("target", "platform"),)
+    return Rig(machine, ("tracker",), one, np.zeros(1, int), joint_noise, (target,), mounts, one)
+
+
+# ------------------------------------------------------------------ of a session
+
+
+def of_session(
+    session: Session,
+    saved: SavedCalibration | None = None,
+    *,
+    same_place: bool = False,
+    edge: float = EDGE,
+    corner: float = CORNER,
+    seed: int = 0,
+) -> Subject:
+    """Of a session: from its drawing, its first photographs, or an earlier calibration.
+
+    saved : of this machine; its values, its stations' places and what it knows are used.
+    same_place : whether its cameras still stand where they stood. edge, corner : px, where no
+    photograph tells how good edges and corners are.
+    Raises InputError where nothing tells where a station stands.
+    """
+    by_hand = [station.name for station in session.stations if station.handheld]
+    if by_hand:
+        raise InputError(
+            "a camera that is held by hand has no place to come back to, so none is planned for",
+            where="session.yaml, stations",
+            found=listed(by_hand, 3),
+            next_step="Plan the places of a camera on a tripod: --places 3",
+        )
+    words: list[str] = []
+    if saved is not None:
+        session = replace(session, machine=saved.machine)
+        words.append(f"The machine, and what is known of it, as calibrated in {saved.path.parent}.")
+    seen = _Photographed.of(session, saved, np.random.default_rng(seed))
+    T_camera_base = _places(session, saved, seen)
+    noise = _Noise(edge, corner)
+    instruments: list[Instrument] = []
+    mounts: list[Mount] = []
+    T_mount: list[Array] = []
+    has_board = any("board" in s.observe for s in session.stations)
+    board: Board | None = None
+    if has_board and session.board is not None and session.board_body == "platform":
+        board = load_board(session.board)
+        mounts.append(Mount(BOARD, "platform"))
+        T_mount.append(_board_place(session, board, saved, seen, T_camera_base, seed))
+        sigma, told = _corner_noise(seen.boards, noise.corner)
+        words.append(told)
+        for s, station in enumerate(session.stations):
+            if "board" in station.observe:
+                place = T_mount[0]
+                instruments.append(
+                    BoardFrom(s, station.camera, T_camera_base[s], board.points, place, sigma)
+                )
+    shading = SHADING_SIGMA
+    legs = [s for s, station in enumerate(session.stations) if "legs" in station.observe]
+    if legs:
+        check_tubes(session.machine)
+        pools, shading, told = _edge_noise(session, legs, seen, T_camera_base, noise.edge)
+        words.append(told)
+        for s, pool in zip(legs, pools, strict=True):
+            instruments.append(LegsFrom(s, session.stations[s].camera, T_camera_base[s], pool))
+    for s, table in enumerate(session.trackers, start=len(session.stations)):
+        place = _saved_target(saved, table.name)
+        mounts.append(Mount(table.name, "platform"))
+        T_mount.append(np.eye(4) if place is None else place)
+        target = TargetFrom(s, T_camera_base[s], T_mount[-1], table.whiten, len(mounts) - 1)
+        instruments.append(target)
+    files = [station.camera_file for station in session.stations]
+    numbers = [list(dict.fromkeys(files)).index(f) for f in files] + [0] * len(session.trackers)
+    rig = Rig(
+        session.machine,
+        session.station_names,
+        T_camera_base,
+        np.array(numbers, dtype=int),
+        session.joint_noise,
+        tuple(instruments),
+        tuple(mounts),
+        np.array(T_mount).reshape(-1, 4, 4),
+        shading,
+    )
+    known = None if saved is None else _known(saved, session, same_place)
+    columns = tuple(session.document["joints"]["columns"])
+    measured = int(saved.used.sum()) if saved is not None else 0
+    names = session.configurations
+    fields = board.document if board else None
+    return Subject(rig, known, columns, measured, names, tuple(words), fields)
+
+
+class _Photographed(NamedTuple):
+    """What photographs a session has: of legs, and the boards in them; where stations were found
+    (S, 4, 4), None where nothing was.
+    """
+
+    photographs: list[Any]
+    boards: Boards
+    T_camera_base: Array | None
+
+    @classmethod
+    def of(
+        cls, session: Session, saved: SavedCalibration | None, rng: np.random.Generator
+    ) -> _Photographed:
+        if not any(station.photographs for station in session.stations):
+            return cls([], Boards(), None)
+        photographs = read_photographs(session)
+        boards = boards_of(session, photographs)
+        if saved is not None and _saved_places(session, saved) is not None:
+            return cls(photographs, boards, None)
+        return cls(photographs, boards, station_poses(session, photographs, boards, rng))
+
+
+def _saved_places(session: Session, saved: SavedCalibration) -> Array | None:
+    """(S, 4, 4) of all stations in a calibration; None where one is not in it."""
+    there = {station.name: inverse(station.T_base_camera) for station in saved.stations}
+    if not all(name in there for name in session.station_names):
+        return None
+    return np.stack([there[name] for name in session.station_names])
+
+
+def _places(session: Session, saved: SavedCalibration | None, seen: _Photographed) -> Array:
+    """Where all stations stand, (S, 4, 4), by the first that tells: the calibration, the
+    photographs, a pose by hand; a tracker in the base frame.
+    """
+    known = None if saved is None else _saved_places(session, saved)
+    if known is None:
+        known = seen.T_camera_base
+    if known is not None:
+        return known
+    out: list[Array] = []
+    for station in session.stations:
+        if station.T_camera_base is None:
+            raise InputError(
+                f"nothing tells where station {station.name} stands",
+                where=f"session.yaml, stations.{station.name}",
+                expected="pose: {position: [...], look_at: [...]}, three photographs, or a"
+                " calibration",
+                next_step="Give its pose, or let places be chosen: --places 3",
+            )
+        out.append(station.T_camera_base)
+    return np.stack([*out, *(np.eye(4) for _ in session.trackers)])
+
+
+def _edge_noise(
+    session: Session, legs: list[int], seen: _Photographed, T_camera_base: Array, edge: float
+) -> tuple[tuple[Pools, ...], float, str]:
+    """What each station's edges tell, the shading, and where that comes from."""
+    try:
+        if len(seen.photographs) == len(legs) and all(len(p.images) for p in seen.photographs):
+            rows = [spread_over(p.configuration, len(legs)) for p in seen.photographs]
+            poses = platform_poses(session)
+            first = first_edges(session, seen.photographs, rows, T_camera_base[legs], poses)
+            count = sum(len(row) for row in rows)
+            words = f"How good edges are is told by {count} of the photographs that there are."
+            return first.pools, first.estimate.statistics.shading, words
+    except (PkmcalError, np.linalg.LinAlgError):
+        pass  # `check` and `calibrate` tell what is wrong with them; here they serve nothing
+    pools = (nominal_pools(session.machine, edge),) * len(legs)
+    words = f"Edges are taken to be good to {edge:g} px: no photograph tells it yet."
+    return pools, SHADING_SIGMA, words
+
+
+def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:
+    """Px of a board's corner, and where that comes from."""
+    sigma = [
+        float(np.hypot(np.median(s.seen.views.sigma[s.seen.views.seen]), s.seen.poses.noise))
+        for s in boards.stations.values()
+        if s.seen.views.seen.any()
+    ]
+    if not sigma:
+        return corner, f"Corners are taken to be good to {corner:g} px: no photograph tells it yet."
+    found = float(np.median(sigma))
+    return found, f"Corners of the board are good to {brief(found)} px in the photographs."
+
+
+def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:
+    """T_platform_target (4, 4) of a calibration."""
+    targets: list[dict[str, Any]] = [] if saved is None else saved.document.get("targets", [])
+    for target in targets:
+        if target["name"] == name and "T_platform_target" in target:
+            return np.array(target["T_platform_target"])
+    return None
+
+
+def _board_place(
+    session: Session,
+    board: Board,
+    saved: SavedCalibration | None,
+    seen: _Photographed,
+    T_camera_base: Array,
+    seed: int,
+) -> Array:
+    """T_platform_board (4, 4): as calibrated, as photographed, or where it would be seen best."""
+    known = _saved_target(saved, BOARD)
+    if known is not None:
+        return known
+    if seen.boards.stations:
+        measurements = measurements_of(session, seen.boards)
+        return start_mounts(measurements, T_camera_base, platform_poses(session, most=True))[0]
+    users = [s for s, station in enumerate(session.stations) if "board" in station.observe]
+    cameras = tuple(session.stations[s].camera for s in users)
+    rng = np.random.default_rng(seed)
+    try:
+        return _bracket(session.machine, board, cameras, T_camera_base[users], rng)
+    except GeometryError as error:
+        raise InputError(
+            error.what,
+            where="session.yaml, stations",
+            found=error.found,
+            expected=error.expected,
+            next_step=error.next_step,
+        ) from None
+
+
+def _known(saved: SavedCalibration, session: Session, same_place: bool) -> Known:
+    """What a calibration knows: of the machine, and of the stations that stand as they stood."""
+    if not same_place:
+        return Known(saved.covariance, np.zeros(0, dtype=int))
+    kept = [k for k, name in enumerate(session.station_names) if name in saved.placed]
+    names = [session.station_names[k] for k in kept]
+    return Known(saved.with_stations(names), np.array(kept, dtype=int))

@@ -1,0 +1,453 @@
+"""A plan as an outcome: what to measure next, in which order, from where, and what it will give."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.cameras import Camera
+from pkmcal.files import csv_text, plain, yaml_text
+from pkmcal.geometry.rigid import apply, inverse
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.outcome import (
+    AXIS,
+    LOOKS,
+    Figure,
+    Finding,
+    Level,
+    Outcome,
+    Part,
+    Plot,
+    Row,
+    Table,
+    Verdict,
+)
+from pkmcal.planning.plan import PAYS, MeasurementPlan, TriedPlace
+from pkmcal.planning.rig import BoardFrom, LegsFrom
+from pkmcal.report.scene import line, markers, space_layout
+from pkmcal.simulation.placement import StationPlace
+from pkmcal.wording import SCALES, amount, brief, count, listed, number
+
+TABLE, DOCUMENT, PAGE_FILE, PLACES = "plan.csv", "plan.json", "plan.html", "stations.yaml"
+FORMAT = 1
+FINEST = 6
+"""Decimals of a reading in metres or radians."""
+INDEX_NAMES = {
+    "tool": "the variance of the tool's position over the workspace",
+    "D": "the determinant of the machine's covariance (D)",
+    "E": "the largest eigenvalue of the machine's covariance (E)",
+    "O1": "the noise amplification index O1",
+}
+FRUSTUM = 0.35
+"""Length of a drawn camera's view, in the distance from the camera to the machine."""
+HOW = (
+    "Each candidate's rows are those of the joint estimate: the exact derivatives of its edges,"
+    " corners, poses and readings, with the platform's pose of that configuration eliminated."
+    " Stations, edge shifts, shading and boards stay unknown, so what is promised is what calibrate"
+    " then states, as far as the photographs turn out as good as assumed.",
+    "Configurations are taken greedily, then each is exchanged for the best of all others until"
+    " nothing gains (Fedorov), then moved by a part of the motors' ranges and exchanged again. They"
+    " are within the joints' ranges, in home's assembly, away from singular poses, with legs clear"
+    " of each other; what lies outside the picture or behind a leg tells nothing.",
+)
+
+
+def outcome_of(found: MeasurementPlan) -> Outcome:
+    """Everything that ``pkmcal plan`` tells and writes."""
+    texts = {TABLE: csv_text(found.subject.columns, found.names, found.joints.round(FINEST))}
+    parts = [_order(found), _curve(found)]
+    if found.tried:
+        texts[PLACES] = yaml_text(stations_document(found))
+        parts.append(_places(found))
+    if _cameras(found):
+        parts.append(_where(found))
+    parts.append(Part("how", "How it was computed", (*HOW, *found.subject.words)))
+    machine = found.subject.rig.machine
+    gain = found.by_chance.position / found.promised.position
+    return Outcome(
+        command="plan",
+        title=f"What to measure next on {machine.name}",
+        subject=_asked(found),
+        verdict=Verdict(
+            usable=True,
+            headline=f"These {count(len(found.names), 'configuration')} will tell the tool's"
+            f" position to {amount(found.promised.position, 'm')} and its orientation to"
+            f" {amount(found.promised.orientation, 'rad')}, standard deviations, mean over the"
+            " workspace.",
+            advice=(_paying(found), *_carefully(found)),
+        ),
+        stamp="Plan",
+        figures=(
+            Figure(
+                "How well will the tool be known?",
+                (
+                    (brief(found.promised.position * 1e3), "mm"),
+                    (brief(np.rad2deg(found.promised.orientation)), "°"),
+                ),
+                f"now {amount(found.now.position, 'm')} and {amount(found.now.orientation, 'rad')}",
+            ),
+            Figure(
+                "How much better than by chance?",
+                ((number(gain, 1), "×"),),
+                "configurations spread evenly over the joints' ranges, as many, would tell it to"
+                f" {amount(found.by_chance.position, 'm')}",
+            ),
+            Figure(
+                "How long is the way?",
+                ((number(found.travel[0], 1), "ranges"),),
+                "moved by the slowest motor in this order, from home; in an order by chance"
+                f" {number(found.travel[1], 1)}",
+            ),
+        ),
+        parts=tuple(parts),
+        findings=tuple(Finding(Level.NOTE, text) for text in found.subject.words),
+        document=document_of(found),
+        texts=texts,
+    )
+
+
+def _asked(found: MeasurementPlan) -> str:
+    """What the plan is for, in a sentence."""
+    where = ""
+    if len(_names(found)) > 1:
+        where = " seen by all stations" if found.together else " from each place"
+    each = count(found.promised.count, "configuration") + where
+    return f"{each}, chosen for {INDEX_NAMES[found.index]}; workspace: {found.region}."
+
+
+def _names(found: MeasurementPlan) -> list[str]:
+    """Names of the stations, each once."""
+    return list(dict.fromkeys(name for names in found.stations for name in names))
+
+
+def _paying(found: MeasurementPlan) -> str:
+    """Where more photographs stop paying."""
+    last, until = found.promised, found.pays_until
+    twice = next(a for a in found.curve if a.count > last.count)
+    more = (
+        f"twice as many would tell the tool's position to {amount(twice.position, 'm')},"
+        f" {1 - twice.position / last.position:.0%} better"
+    )
+    if until is not None:
+        return (
+            f"From {count(until, 'configuration')} a place on, one more betters it by less than"
+            f" {PAYS:.0%}; {more}."
+        )
+    return f"All of them pay: each betters the tool by {PAYS:.0%} at least; {more}."
+
+
+def _carefully(found: MeasurementPlan) -> tuple[str, ...]:
+    """Configurations to which the straight way is blocked."""
+    names = [name for name, bad in zip(found.names, found.blocked, strict=True) if bad]
+    if not names:
+        return ()
+    return (
+        f"Go to {listed(names)} by way of home: on the straight way legs would touch, or the"
+        " machine would leave its reach.",
+    )
+
+
+def _order(found: MeasurementPlan) -> Part:
+    """The configurations, in their order."""
+    units = found.subject.rig.machine.joint_units
+    columns = [
+        f"{name}, {SCALES[unit][1]}"
+        for name, unit in zip(found.subject.columns, units, strict=True)
+    ]
+    rows = [
+        Row(
+            name,
+            (
+                listed(who, 3),
+                str(int(rank)),
+                *(number(q * SCALES[u][0], 2) for q, u in zip(joints, units, strict=True)),
+            ),
+        )
+        for name, who, rank, joints in zip(
+            found.names, found.stations, found.rank, found.joints.tolist(), strict=True
+        )
+    ]
+    table = Table(
+        "In this order",
+        ("Configuration", "from", "rank", *columns),
+        tuple(rows),
+        f"The way from home is the shortest that was found. Rank: if fewer are wanted, those up to"
+        f" a rank are the best so many from each place. {TABLE} holds the readings in metres and"
+        " radians; measured readings replace them.",
+        brief=False,
+        words=(1,),
+    )
+    return Part("order", "Configurations", tables=(table,))
+
+
+def _curve(found: MeasurementPlan) -> Part:
+    """How the tool's deviation falls with the number of configurations."""
+    x = [a.count for a in found.curve]
+    y = [a.position * 1e3 for a in found.curve]
+    here, axis = found.promised, {**AXIS, "type": "log"}
+    figure = {
+        "data": [
+            {
+                "type": "scatter",
+                "mode": "lines+markers",
+                "name": "the best of the plan; beyond it, each again",
+                "x": x,
+                "y": y,
+                "line": {"color": "--calibrated"},
+                "marker": {"color": "--calibrated", "size": 5},
+                "hovertemplate": "%{x} from each place: %{y:.3g} mm<extra></extra>",
+            },
+            {
+                "type": "scatter",
+                "mode": "markers",
+                "name": "by chance",
+                "x": [here.count],
+                "y": [found.by_chance.position * 1e3],
+                "marker": {"color": "--drawing", "size": 9, "symbol": "x"},
+                "hovertemplate": "%{x} by chance: %{y:.3g} mm<extra></extra>",
+            },
+        ],
+        "layout": {
+            **LOOKS,
+            "margin": {"l": 60, "r": 10, "t": 10, "b": 45},
+            "xaxis": {**axis, **_ticks(x), "title": {"text": "configurations from each place"}},
+            "yaxis": {**axis, **_ticks(y), "title": {"text": "σ of the tool's position (mm)"}},
+            "legend": {
+                "orientation": "h", "y": 1.02, "yanchor": "bottom", "bgcolor": "rgba(0,0,0,0)",
+            },
+        },
+        "config": {"displayModeBar": False},
+    }  # fmt: skip
+    plot = Plot(
+        "curve",
+        "How σ falls with the number of configurations",
+        "Mean over the workspace, both axes logarithmic: by chance alone, four times as many halve"
+        " it.",
+        "The tool's standard deviation against the number of configurations from each place",
+        figure,
+        height=340,
+    )
+    wanted = {3, 5, 8, 10, 15, 20, 30, 50}
+    few = [a for a in found.curve if a.count in wanted or a.count >= here.count]
+    rows = [
+        Row(
+            f"{a.count:g}",
+            (amount(a.position, "m"), amount(a.orientation, "rad")),
+            mark="good" if a.count == here.count else None,
+        )
+        for a in few
+    ]
+    table = Table(
+        "What so many from each place tell",
+        ("Configurations", "position", "orientation"),
+        tuple(rows),
+        "Standard deviations of the tool, mean over the workspace. Fewer: those of the lowest"
+        " ranks. More: these again, as often.",
+    )
+    return Part("curve", "How many", plots=(plot,), tables=(table,))
+
+
+def _ticks(values: Sequence[float]) -> dict[str, Any]:
+    """Round places along a logarithmic axis, written out."""
+    low, high = min(values), max(values)
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    places = [m * 10.0**k for k in decades for m in (1, 2, 5)]
+    places = [p for p in places if 0.5 * low <= p <= 2 * high]
+    return {"tickvals": places, "ticktext": [f"{p:g}" for p in places]}
+
+
+def _cameras(found: MeasurementPlan) -> list[tuple[str, Camera, Array]]:
+    """Cameras of the plan: station, camera and T_camera_base."""
+    out: dict[str, tuple[str, Camera, Array]] = {}
+    rig = found.subject.rig
+    for one in rig.instruments:
+        if isinstance(one, LegsFrom | BoardFrom):
+            name = rig.names[one.station]
+            out[name] = (name, one.camera, one.T_camera_base)
+    return list(out.values())
+
+
+def _places(found: MeasurementPlan) -> Part:
+    """Where to put the camera, and what the best places would do alone."""
+    order = sorted(found.tried, key=lambda tried: (not tried.chosen, tried.alone))[:12]
+    rows = [
+        Row(
+            "[" + ", ".join(f"{x:.3g}" for x in tried.place.position) + "]",
+            (
+                "[" + ", ".join(f"{x:.3g}" for x in tried.place.look_at) + "]",
+                amount(tried.alone, "m"),
+            ),
+            mark="good" if tried.chosen else None,
+        )
+        for tried in order
+    ]
+    table = Table(
+        "Places of the camera",
+        ("position, m", "looks at, m", "tool from there alone"),
+        tuple(rows),
+        "Base frame. Chosen as a set: two places that see the same badly do not help each other."
+        f" {PLACES} holds them as session.yaml wants them; to a few centimetres is enough.",
+        words=(0, 1),
+    )
+    return Part("places", "Where to put the camera", tables=(table,))
+
+
+def _where(found: MeasurementPlan) -> Part:
+    """The drawing: the machine, its configurations, the cameras, and the places tried."""
+    rig, home = found.subject.rig, found.subject.rig.machine.home()[None]
+    machine = rig.machine
+    ends = limb_ends(machine.layout, machine.values, machine.inverse(home), home)
+    middle = np.concatenate([ends.a[0], ends.b[0]]).mean(axis=0)
+    legs = [np.stack([a, b]) for a, b in zip(ends.a[0], ends.b[0], strict=True)]
+    places = found.T_base_platform[:, :3, 3]
+    hover = [f"{n} (from {listed(s, 3)})" for n, s in zip(found.names, found.stations, strict=True)]
+    data = [
+        line("The machine at home", "--drawing", 5, legs),
+        markers(
+            "Platform in the plan", places, {"size": 3, "color": "--calibrated"},
+            hovertext=hover, hoverinfo="text",
+        ),
+    ]  # fmt: skip
+    for name, camera, T_camera_base in _cameras(found):
+        eye, frame = _frustum(camera, T_camera_base, middle)
+        look = {"size": 4, "color": "--ink", "symbol": "square"}
+        data += [
+            line(name, "--ink", 3, frame, showlegend=False),
+            markers(
+                name, eye[None], look, mode="markers+text", text=[name],
+                textposition="top center", textfont={"color": "--ink"}, showlegend=False,
+                hoverinfo="skip",
+            ),
+        ]  # fmt: skip
+    if found.tried:
+        data.append(_tried(found.tried))
+    layout = space_layout({"x": 1.3, "y": -1.3, "z": 0.8})
+    layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
+    plot = Plot(
+        "where",
+        "Cameras and configurations",
+        "Drag to turn, wheel or pinch to come nearer."
+        + (" Dots: places that were tried, the darker the better alone." if found.tried else ""),
+        "The machine, the platform's places in the plan, and the cameras, in three dimensions",
+        {"data": data, "layout": layout, "config": {"scrollZoom": True}},
+        height=520,
+    )
+    return Part("where", "In space", plots=(plot,))
+
+
+def _frustum(camera: Camera, T_camera_base: Array, middle: Array) -> tuple[Array, list[Array]]:
+    """A camera's place (3,), and the lines of its view towards the machine, base frame, m."""
+    T = inverse(T_camera_base)
+    eye = T[:3, 3]
+    width, height = camera.image_size
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
+    rays = camera.ray(corners)
+    size = FRUSTUM * float(np.linalg.norm(middle - eye))
+    if not np.isfinite(rays).all() or np.any(rays[:, 2] < 0.2):  # it looks all round
+        ahead = apply(T, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, size]]))
+        return eye, [ahead]
+    rim = apply(T, rays / rays[:, 2:] * size)
+    return eye, [rim, *(np.stack([eye, point]) for point in rim[:-1])]
+
+
+def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:
+    """Dots at the places that were tried, by what each tells alone."""
+    at = np.array([one.place.position for one in tried])
+    value = np.array([one.alone for one in tried]) * 1e3
+    look = {
+        "size": 4,
+        "color": np.log10(value).round(3).tolist(),
+        "colorscale": "Blues",
+        "opacity": 0.7,
+    }
+    hover = [f"alone {brief(v)} mm" for v in value]
+    return markers("Places tried", at, look, hovertext=hover, hoverinfo="text")
+
+
+def stations_document(found: MeasurementPlan) -> dict[str, Any]:
+    """The chosen places as entries of session.yaml."""
+    rig, out = found.subject.rig, dict[str, Any]()
+    for name, _, T_camera_base in _cameras(found):
+        place = StationPlace.of(T_camera_base)
+        observe = [
+            word
+            for word, kind in (("legs", LegsFrom), ("board", BoardFrom))
+            if any(isinstance(x, kind) and rig.names[x.station] == name for x in rig.instruments)
+        ]
+        out[name] = {
+            "camera": "cameras/camera.yaml",
+            "images": f"images/{name}/{{configuration}}.png",
+            "observe": observe[0] if len(observe) == 1 else observe,
+            "pose": {
+                "position": [round(x, 3) + 0.0 for x in place.position],
+                "look_at": [round(x, 3) + 0.0 for x in place.look_at],
+                "up": [round(x, 3) + 0.0 for x in place.up],
+            },
+        }
+    return {"stations": out}
+
+
+def document_of(found: MeasurementPlan) -> dict[str, Any]:
+    """Plain data for JSON: m and rad."""
+    rig = found.subject.rig
+    joined = zip(
+        found.names, found.stations, found.rank, found.joints, found.T_base_platform,
+        found.blocked, strict=True,
+    )  # fmt: skip
+    return plain(
+        {
+            "pkmcal_plan": FORMAT,
+            "machine": rig.machine.name,
+            "index": {"name": found.index, "value": found.value, "by_chance": found.at_random},
+            "workspace": {
+                "x": found.region.x, "y": found.region.y, "z": found.region.z,
+                "turn": found.region.turn,
+            },
+            "together": found.together,
+            "now": _told(found.now),
+            "promised": _told(found.promised),
+            "by_chance": _told(found.by_chance),
+            "pays_until": found.pays_until,
+            "curve": [_told(a) for a in found.curve],
+            "columns": list(found.subject.columns),
+            "configurations": [
+                {
+                    "name": name,
+                    "stations": list(stations),
+                    "rank": int(rank),
+                    "joints": joints,
+                    "T_base_platform": T,
+                    "go_by_home": bool(blocked),
+                }
+                for name, stations, rank, joints, T, blocked in joined
+            ],
+            "stations": [
+                {"name": name, "T_base_camera": inverse(T), "camera": camera.document()}
+                for name, camera, T in _cameras(found)
+            ],
+            "places_tried": [
+                {
+                    "position": list(one.place.position),
+                    "look_at": list(one.place.look_at),
+                    "tool_alone": one.alone,
+                    "chosen": one.chosen,
+                }
+                for one in found.tried
+            ],
+            "assumptions": list(found.subject.words),
+            "board": found.subject.board,
+            "mechanism": rig.machine.to_document(),
+        }
+    )  # fmt: skip
+
+
+def _told(accuracy: Any) -> dict[str, float]:
+    return {
+        "configurations": accuracy.count,
+        "position": accuracy.position,
+        "orientation": accuracy.orientation,
+    }

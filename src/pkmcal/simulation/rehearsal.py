@@ -1,0 +1,95 @@
+"""A plan rehearsed: what a simulated session needs to be what ``pkmcal plan`` asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import ConfigDict, Field
+
+from pkmcal.boards.board import Board, board_from_document
+from pkmcal.cameras import Camera
+from pkmcal.cameras.files import camera_from_document
+from pkmcal.errors import InputError
+from pkmcal.files import Document, Schema, read_json, validate
+from pkmcal.geometry.rigid import inverse
+from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document
+from pkmcal.simulation.placement import StationPlace
+from pkmcal.simulation.truth import Asked
+
+PLAN = "plan.json"
+
+
+class _Part(Schema):
+    """Fields that are needed here."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class _Configuration(_Part):
+    stations: tuple[str, ...]
+    joints: tuple[float, ...]
+
+
+class _Station(_Part):
+    name: str
+    T_base_camera: tuple[tuple[float, ...], ...]
+    camera: dict[str, Any]
+
+
+class _Plan(_Part):
+    pkmcal_plan: Literal[1] = Field(description="the file's version, 1")
+    mechanism: MechanismDocument
+    configurations: tuple[_Configuration, ...]
+    stations: tuple[_Station, ...] = Field(min_length=1, description="the plan's cameras")
+    board: dict[str, Any] | None = None
+
+
+class Rehearsal(NamedTuple):
+    """The planned machine, cameras and their places, configurations, and the board, if any."""
+
+    machine: Machine
+    cameras: tuple[Camera, ...]
+    places: tuple[StationPlace, ...]
+    asked: Asked
+    board: Board | None
+
+
+def rehearsal_of(plan: Path | str) -> Rehearsal:
+    """What a plan asked for; plan : its folder, or its plan.json. Raises InputError for others."""
+    path = Path(plan) / PLAN if Path(plan).is_dir() else Path(plan)
+    if not path.is_file():
+        raise InputError(
+            "there is no plan here",
+            where=str(plan),
+            expected=f"a folder that pkmcal plan wrote, or its {PLAN}",
+        )
+    document = read_json(path, label=str(path))
+    found = validate(document, _Plan)
+    number = {station.name: k for k, station in enumerate(found.stations)}
+    pairs = [
+        (number[name], k)
+        for k, one in enumerate(found.configurations)
+        for name in one.stations
+        if name in number
+    ]
+    machine = machine_from_document(found.mechanism)
+    if any(len(one.joints) != machine.n_joints for one in found.configurations):
+        raise InputError(
+            "the plan's readings are not those of its machine",
+            where=f"{path}, configurations",
+            expected=f"{machine.n_joints} a configuration",
+        )
+    joints = np.array([one.joints for one in found.configurations])
+    return Rehearsal(
+        machine,
+        tuple(camera_from_document(_inside(document, s.camera)) for s in found.stations),
+        tuple(StationPlace.of(inverse(np.array(s.T_base_camera))) for s in found.stations),
+        Asked(joints, np.array(pairs, dtype=int).reshape(-1, 2)),
+        None if found.board is None else board_from_document(_inside(document, found.board)),
+    )
+
+
+def _inside(document: Document, data: dict[str, Any]) -> Document:
+    return Document(document.path, document.label, data, {})

@@ -1,0 +1,106 @@
+"""Regions of a workspace: poses spread over what a machine can take of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import pose_difference
+from pkmcal.mechanisms import catalogue, load_mechanism
+from pkmcal.mechanisms.region import Region, poses_in
+from test_session import change, fault, folder  # noqa: F401 - a fixture
+from test_workspace import cube
+
+
+@pytest.mark.parametrize("name", sorted(catalogue()))
+def test_every_machine_takes_what_it_is_given(name):
+    limits = load_mechanism(name).limits()
+    z = float(limits.home[2, 3])
+    for region in (Region(), Region(x=(-0.02, 0.03), z=(z - 0.01, z + 0.01), turn=0.1)):
+        poses = poses_in(limits, region, 30)
+        assert poses.shape == (30, 4, 4)
+        assert load_mechanism(name).reachable(poses).inside.all()
+        assert region.holds(limits, poses).all()
+
+
+def test_poses_fill_the_box_evenly():
+    """Of every cell of a box about as many; of what lies beyond a machine's reach, none."""
+    limits = cube().limits()
+    poses = poses_in(limits, Region(x=(0.0, 0.5), y=(-0.05, 0.05)), 512)
+    low, high = np.array([0.0, -0.05, -0.1]), np.array([0.1, 0.05, 0.1])
+    cells = np.floor(4 * (poses[:, :3, 3] - low) / (high - low)).astype(int)
+    count = np.bincount(cells @ [16, 4, 1], minlength=64)
+    assert count.sum() == 512
+    assert count.min() >= 4  # of 8; points drawn at random leave some cell with 1 or none
+    assert count.max() <= 12
+
+
+def test_the_seed_decides():
+    limits = load_mechanism("gough-stewart").limits()
+    region = Region(turn=0.2)
+    first = poses_in(limits, region, 20, seed=3)
+    np.testing.assert_array_equal(first, poses_in(limits, region, 40, seed=3)[:20])
+    assert np.abs(first - poses_in(limits, region, 20, seed=4)).max() > 1e-3
+
+
+def test_turns_are_those_of_the_motion_and_fill_the_ball():
+    hexapod, h4 = (load_mechanism(name).limits() for name in ("gough-stewart", "h4"))
+    turns = pose_difference(poses_in(hexapod, Region(turn=0.2), 400), hexapod.home)[:, :3]
+    size = np.linalg.norm(turns, axis=1)
+    assert 0.19 < size.max() <= 0.2 + 1e-9
+    # half of a ball's volume lies beyond 0.794 of its radius; 0.13 is five deviations of chance
+    assert abs(np.mean(size > 0.2 * 0.5 ** (1 / 3)) - 0.5) < 0.13
+    turns = pose_difference(poses_in(h4, Region(turn=0.2), 50), h4.home)[:, :3]
+    assert np.abs(turns[:, :2]).max() == 0
+    assert np.ptp(turns[:, 2]) > 0.3
+
+
+def test_a_machine_that_moves_aside_by_turning_only_turns_unless_told_not_to():
+    limits = load_mechanism("3-rps").limits()
+    turned = [
+        np.linalg.norm(pose_difference(poses_in(limits, region, 30), limits.home)[:, :3], axis=1)
+        for region in (Region(), Region(turn=0.0))
+    ]
+    assert turned[0].max() > 0.2
+    assert turned[1].max() < 1e-6
+
+
+def test_a_region_out_of_reach_is_told():
+    limits = load_mechanism("gough-stewart").limits()
+    with pytest.raises(InputError, match=r"does not come to the workspace .* z from 1 to 2 m"):
+        poses_in(limits, Region(z=(1.0, 2.0)), 5)
+    corner = Region(x=(0.12, 0.13), y=(0.12, 0.13), z=(0.42, 0.43))
+    with pytest.raises(
+        InputError,
+        match=r"can take no pose of the workspace .* 5120 poses tried.*home, .0, 0, 359. mm",
+    ):
+        poses_in(limits, corner, 5)
+
+
+def test_a_session_says_where_the_tool_is_to_be_right(folder):  # noqa: F811
+    from pkmcal.session.load import load_session
+
+    assert load_session(folder).workspace is None
+    change(folder, "session.yaml", "stations:", "workspace: {x: [-0.1, 0.1], turn: 0.2}\nstations:")
+    session = load_session(folder)
+    assert session.workspace == Region(x=(-0.1, 0.1), turn=0.2)
+    assert session.document["workspace"]["x"] == [-0.1, 0.1]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("{x: [0.1, -0.1]}", "x is no interval; found .0.1, -0.1., expected .lowest, highest."),
+        ("{z: [0.1]}", r"workspace.z: this has too few|expected \[lowest, highest\] z in m"),
+        ("{turn: 15}", "turn is no angle .*; found 15, expected radians from 0 to 3.14"),
+        ("{w: [0, 1]}", "this key is not known"),
+    ],
+)
+def test_a_workspace_that_is_none_is_told(folder, line, said):  # noqa: F811
+    import re
+
+    change(folder, "session.yaml", "stations:", f"workspace: {line}\nstations:")
+    message = fault(folder)
+    assert re.search(said, message), message
+    assert "session.yaml, line 4, workspace" in message

@@ -1,0 +1,210 @@
+"""Watching with a camera that was left in place: sharper, no quicker to blame, and not fooled by a
+camera that was moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.geometry.rigid import perturb, pose_difference
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.gauge import freedoms, generators, station_generators
+from pkmcal.identify.start import start_state
+from pkmcal.judge.causes import stations_moved, whole_machine, zeros
+from pkmcal.judge.changes import change, chi_square, detectable, look_for_changes
+from pkmcal.judge.held import Kept, Trust, evidence, hold
+from pkmcal.judge.watch import tests_with_kept as judged_with_kept
+from pkmcal.judge.words import LookedAt, Names, watch_verdict
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.simulation import Settings
+from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from pkmcal.simulation.truth import draw_truth
+from test_watch import ALPHA, CAMERA, moved
+
+SESSIONS = 30
+FEW = 5
+"""Configurations of a session that watches."""
+
+
+class Left:
+    """A hexapod calibrated from three stations, and watched from the first of them.
+
+    Calibrations are drawn about one that was made, which then is the truth, by its joint covariance
+    of machine and stations.
+    """
+
+    def __init__(self):
+        drawing = load_mechanism("gough-stewart")
+        truth = draw_truth(drawing, (CAMERA,) * 3, Settings(stations=3, configurations=8), 1)
+        edges, readings = simulate_edges(
+            truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
+            np.random.default_rng(1), photographs=truth.photographs,
+        )  # fmt: skip
+        data = Measurements(edges, readings, 3e-6, 3, np.zeros(3, dtype=int))
+        start = start_state(drawing, data, truth.T_camera_base)
+        made = bundle(drawing, data, start, robust=False, scale_noise=False)
+        self.true, self.T_camera_base = made.machine, made.state.T_camera_base
+        self.n = len(made.covariance)
+        self.joint = made.joint_covariance
+        values, vectors = np.linalg.eigh(self.joint)
+        self.half = vectors * np.sqrt(np.maximum(values, 0.0))
+        settings = Settings(stations=1, configurations=30, tolerance=0.0)
+        self.poses = draw_truth(self.true, (CAMERA,), settings, 5).T_base_platform
+
+    def looked(self, machine, rng, by=None, few=FEW):
+        """A calibration with errors, held on what the first camera sees of a machine; by : how the
+        camera turned and moved before, (6,) of T_camera_base.
+        """
+        errors = self.half @ rng.standard_normal(len(self.half))
+        calibrated = self.true.with_values(self.true.values + errors[: self.n])
+        there = perturb(self.T_camera_base, errors[self.n :].reshape(3, 6))[:1]
+        now = self.T_camera_base[:1] if by is None else perturb(self.T_camera_base[:1], by)
+        edges, readings = simulate_edges(
+            machine, now, CAMERA, self.poses[rng.choice(30, few, replace=False)], EdgeNoise(), rng
+        )
+        data = Measurements(edges, readings, 3e-6, 1, np.zeros(1, dtype=int))
+        held = hold(calibrated, data, start_state(calibrated, data, now), Trust.full(data))
+        return held, Kept((0,), there, self.joint[: self.n + 6, : self.n + 6])
+
+    def evidence(self, machine, rng, **more):
+        return evidence(*self.looked(machine, rng, **more))
+
+
+@pytest.fixture(scope="module")
+def left():
+    return Left()
+
+
+@pytest.fixture(scope="module")
+def unchanged(left):
+    """Sessions of a machine that did not change: held, and what the calibration knows."""
+    return [left.looked(left.true, np.random.default_rng([k, 7])) for k in range(SESSIONS)]
+
+
+def test_an_unchanged_machine_gives_unit_noise(left, unchanged):
+    """With the calibration's errors of machine and place in the noise, and not without."""
+    every = whole_machine(left.true)
+    tests = [chi_square(evidence(*looked), every) for looked in unchanged]
+    dof = sum(t.dof for t in tests)
+    assert dof > SESSIONS * 30
+    assert abs(sum(t.chi2 for t in tests) - dof) < 4 * np.sqrt(2 * dof)
+    exact = [evidence(h, replace(k, covariance=0 * k.covariance)) for h, k in unchanged[:8]]
+    sharp = [chi_square(found, every) for found in exact]
+    assert sum(t.chi2 for t in sharp) > 1.3 * sum(t.dof for t in sharp)
+
+
+def test_the_place_knows_smaller_changes_of_a_leg(left, unchanged):
+    """The same photographs find half as large a slip of an encoder. It is what the place and the
+    machine have in common that tells: known apart, both as well as they are, they tell no more than
+    the machine alone.
+    """
+    held, kept = unchanged[0]
+    apart, n = kept.covariance.copy(), left.n
+    apart[n:, :n] = apart[:n, n:] = 0.0
+    sizes = [
+        np.mean([detectable(found, z, z.columns[:, 0], ALPHA / 14) for z in zeros(left.true)])
+        for known in (kept, replace(kept, covariance=apart), kept.without([0]))
+        for found in (evidence(held, known),)
+    ]
+    assert sizes[0] < 0.55 * sizes[2]
+    assert sizes[1] > 0.85 * sizes[2]
+
+
+def test_without_its_stations_it_is_the_evidence_of_a_machine_alone(left, unchanged):
+    held, kept = unchanged[1]
+    alone = evidence(held, left.joint[: left.n, : left.n])
+    none = evidence(held, kept.without([0]))
+    np.testing.assert_array_equal(none.w, alone.w)
+    assert none.kept == ()
+
+
+def test_frames_of_machine_and_camera_together_change_nothing(left, unchanged):
+    """A turn of the base frame moves the base joints and the camera, and shows in no residual; of
+    the joints alone it is seen now.
+    """
+    held, kept = unchanged[2]
+    found, basis = evidence(held, kept), freedoms(left.true)
+    joints = generators(left.true.layout, held.machine.values) @ basis
+    camera = station_generators(kept.T_camera_base)[0] @ basis
+    columns = stations_moved(found)[0].columns
+    by_camera = np.linalg.inv(_by_twist(kept.T_camera_base[0])) @ camera
+    both = found.along(np.concatenate([joints, by_camera]))
+    assert np.abs(both).max() < 1e-3 * np.abs(found.along(joints)).max()
+    assert columns.shape == (left.n + 6, 6)
+
+
+def _by_twist(T_camera_base):
+    """(omega, tau) of T_camera_base as the camera turns by phi and moves by s, by differences."""
+    step = 1e-7
+    out = []
+    for k in range(6):
+        phi, s = np.split(step * np.eye(6)[k], 2)
+        moved_back = perturb(np.eye(4), np.r_[-phi, 0, 0, 0])
+        shifted = T_camera_base.copy()
+        shifted[:3, 3] -= s
+        out.append(pose_difference(moved_back @ shifted, T_camera_base) / step)
+    return np.stack(out, axis=-1)
+
+
+def test_a_camera_that_was_moved_is_told_and_no_leg_is_blamed(left):
+    """By 5 mm and half a degree: its shift is told within its deviations."""
+    by = np.array([0.0, 8e-3, 0.0, 3e-3, 0.0, 4e-3])
+    for k in range(4):
+        held, kept = left.looked(left.true, np.random.default_rng([k, 9]), by=by)
+        judged, rest, gone = judged_with_kept(held, kept, ALPHA)
+        assert [s.station for s in gone] == [0]
+        assert rest.stations == ()
+        assert not judged.changed
+        expected = np.linalg.solve(_by_twist(left.T_camera_base[0]), by)
+        off = gone[0].change.value - expected
+        assert off @ np.linalg.solve(gone[0].change.covariance, off) < 25  # of 6 degrees: 3e-4
+        names = Names(("camera",), ("front",))
+        around = LookedAt(tuple("abcde"), np.zeros(5, bool), np.ones(5, bool), 1.0, names, gone)
+        verdict = watch_verdict(judged, around)
+        assert verdict.usable
+        assert "camera front does not stand where the calibration had it" in verdict.warnings[0]
+
+
+def test_a_leg_that_changed_is_not_taken_for_the_camera(left):
+    """0.5 mm, which without the camera's place is found every other time."""
+    found = 0
+    for k in range(6):
+        now = moved(left.true, leg3_length__offset=5e-4)
+        held, kept = left.looked(now, np.random.default_rng([k, 11]))
+        judged, rest, gone = judged_with_kept(held, kept, ALPHA)
+        assert gone == ()
+        assert rest.stations == (0,)
+        named = {(f.suspect.cause.part, f.suspect.cause.legs) for f in judged.findings}
+        found += ("zero", (2,)) in named
+    assert found >= 5
+
+
+def test_a_change_moves_the_evidence_as_the_regression_says(left):
+    """The same noise, seen by a camera that was moved: w moves by X times the move."""
+    by = np.array([1e-4, -2e-4, 1e-4, 2e-4, 1e-4, -3e-4])
+    here, there = (
+        left.evidence(left.true, np.random.default_rng(3), by=move) for move in (np.zeros(6), by)
+    )
+    cause = stations_moved(here)[0]
+    off = change(there, cause).value - change(here, cause).value
+    expected = np.linalg.solve(_by_twist(left.T_camera_base[0]), by)
+    sigma = np.sqrt(np.diag(change(here, cause).covariance))
+    assert (np.abs(off - expected) < 0.05 * sigma + 0.02 * np.abs(expected).max()).all()
+
+
+@pytest.mark.slow
+def test_false_alarms_of_200_sessions(left):
+    """At 0.01, 0.05 and 0.1."""
+    chances = []
+    for k in range(200):
+        judged = look_for_changes(
+            left.evidence(left.true, np.random.default_rng([k, 13])), left.true, ALPHA
+        )
+        chances.append(min(t.adjusted for t in judged.tests))
+    for share in (0.01, 0.05, 0.1):
+        flagged = np.mean(np.array(chances) < share)
+        assert abs(flagged - share) < 4 * np.sqrt(share * (1 - share) / 200)
