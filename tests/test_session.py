@@ -225,7 +225,7 @@ EDITS = [
      ["line 10, stations.front.pose.position: this has too few entries",
       "found [0.0, -1.0], expected the camera's place"]),
     ("session.yaml", SESSION[SESSION.index("stations:"):], "stations: {}\n",
-     ["line 4, stations: this has too few entries"]),
+     ["line 4, stations: nothing was measured but the readings", "6 readings for 6 freedoms"]),
     # files that it names
     ("session.yaml", "joints.csv", "joint.csv",
      ["line 3, joints.file: there is no such file; found joint.csv", "(there is joints.csv)"]),

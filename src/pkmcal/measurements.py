@@ -237,7 +237,7 @@ class Measurements:
     @property
     def n_cameras(self) -> int:
         """Number of cameras, C."""
-        return int(self.camera_of_station.max()) + 1
+        return int(self.camera_of_station.max(initial=-1)) + 1
 
     @property
     def on_platform(self) -> Booleans:

@@ -295,20 +295,25 @@ def _left_of(by_shared: Array, q: Array, along: Array, damped: bool, memory: Mem
     return out
 
 
+def _flat(rows: Array) -> Array:
+    """Rows (B, K, r, n) of all configurations, (B, K r, n); n may be none."""
+    return rows.reshape(rows.shape[0], rows.shape[1] * rows.shape[2], rows.shape[3])
+
+
 def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
     """All rows on the shared unknowns, the own ones eliminated without damping: Jacobian (B, n, na)
     and residuals (B, n). The configurations' rows come first, those on shared unknowns only last.
     """
-    n_runs, na = reduced.rows.shape[0], reduced.rows.shape[-1]
+    n_runs = len(reduced.rows)
     shared = np.broadcast_to(linear.shared_by, (n_runs, *linear.shared_by.shape))
-    rows = np.concatenate([reduced.rows.reshape(n_runs, -1, na), shared], axis=1)
+    rows = np.concatenate([_flat(reduced.rows), shared], axis=1)
     value = [reduced.value.reshape(n_runs, -1), linear.shared_value]
     return rows, np.concatenate(value, axis=1)
 
 
 def reduced_normal(linear: Linear, reduced: Reduced) -> Array:
     """Normal matrix of the shared unknowns, (B, na, na)."""
-    rows = reduced.rows.reshape(reduced.rows.shape[0], -1, reduced.rows.shape[-1])
+    rows = _flat(reduced.rows)
     return rows.mT @ rows + linear.shared_by.T @ linear.shared_by
 
 

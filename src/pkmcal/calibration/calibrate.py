@@ -13,7 +13,7 @@ from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.byhand import misplaced, place_by_hand, without_misplaced
-from pkmcal.calibration.doubts import check_poses, richer_models, scale_doubt
+from pkmcal.calibration.doubts import check_poses, noise_told, richer_models, scale_doubt
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.recognise import (
     boards_of,
@@ -215,6 +215,7 @@ def _judge(
         richer=found.richer,
         held_out=len(found.out.region.rows) if found.out else 0,
         doubts=scale_doubt(session, found.estimate),
+        cautions=noise_told(session, found.estimate),
     )
     clock.lap("identify")
     return Calibration(
@@ -241,7 +242,7 @@ def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
         measurements.n_stations,
         estimate.machine.n_legs,
     )
-    if not len(measurements.edges):  # boards alone: of no leg can be said that it was not seen
+    if not len(measurements.edges):  # of no leg can be said that it was not seen
         seen = np.ones_like(seen)
     told = what_data_tell(measurements, estimate)
     counted = conditions(estimate.machine, seen) if len(measurements.edges) else ()

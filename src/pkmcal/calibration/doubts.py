@@ -30,6 +30,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.rotation_axis import rotation_axis
 from pkmcal.session.load import Session
+from pkmcal.wording import listed
 
 BAD = 2.0
 """Factor on the poses' noise, from which mistakes are looked for."""
@@ -381,6 +382,47 @@ def scale_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
         f"All of the machine came out {abs(scale - 1):.2%} {more} than its drawing, as if {cause}:"
         " every displacement of the platform is wrong by as much.",
     )
+
+
+def noise_told(session: Session, estimate: Estimate) -> tuple[str, ...]:
+    """Sentences where the data do not allow a noise that session.yaml states."""
+    s, out = estimate.statistics, list[str]()
+    units, file = set(session.machine.joint_units), "session.yaml"
+    if s.reading_scale != 1 and not _within(1.0, s.reading_range):
+        found, stated = (
+            _lengths(session.joint_noise * scale, units) for scale in (s.reading_scale, 1.0)
+        )
+        out.append(
+            f"The readings scatter by {found}; joints.noise in {file} says {stated}. What they"
+            f" scatter by was used (the data allow {_between(s.reading_range)} times the stated"
+            " noise): correct joints.noise, or look for what moves the machine beside its readings."
+        )
+    only_trackers = session.trackers and not any("board" in x.observe for x in session.stations)
+    if only_trackers and s.pose_range[1] is not None and s.pose_range[1] < 1:
+        where = listed([f"stations.{table.name}.tracker.noise" for table in session.trackers])
+        out.append(
+            f"What was measured of the platform scatters by {_between(s.pose_range)} times what"
+            f" {where} in {file} says. The stated noise was used all the same, for errors that all"
+            " measurements share do not scatter; if there are none, state it smaller, and standard"
+            " deviations follow."
+        )
+    return tuple(out)
+
+
+def _within(value: float, limits: tuple[float, float | None]) -> bool:
+    low, high = limits
+    return low <= value and (high is None or value <= high)
+
+
+def _between(limits: tuple[float, float | None]) -> str:
+    low, high = limits
+    return f"more than {low:.2g}" if high is None else f"{low:.2g} to {high:.2g}"
+
+
+def _lengths(value: float, units: set[str]) -> str:
+    """A reading's noise where readings are lengths (m), turns (rad), or both."""
+    each = {"m": f"{value * 1e3:.2g} mm", "rad": f"{np.rad2deg(value):.2g}°"}
+    return " or ".join(each[unit] for unit in ("m", "rad") if unit in units)
 
 
 def _error(session: Session, doubt: Doubt, scale: float) -> InputError:

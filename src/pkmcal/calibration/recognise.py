@@ -84,7 +84,7 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
             next_step=error.next_step,
         ) from None
     # near the ends of its workspace a drawing that is right to its tolerance may not close
-    near = found.converged | (found.error < NEARLY * session.machine.document.tolerance.center)
+    near = found.error < NEARLY * session.machine.document.tolerance.center
     if near.all() or (most and near.mean() > MOST):
         _check_turns(session, found.T_base_platform, near)
         return found.T_base_platform
@@ -305,7 +305,8 @@ def known_stations(session: Session, boards: Boards) -> Array:
     """
     given = [station.T_camera_base for station in session.stations]
     given = boards.joined(given) + _tracker_starts(session)
-    known = np.stack([np.full((4, 4), np.nan) if T is None else T for T in given])
+    known = np.array([np.full((4, 4), np.nan) if T is None else T for T in given])
+    known = known.reshape(-1, 4, 4)
     by_hand = np.array([station.handheld for station in session.stations], dtype=bool)
     lost = np.isnan(known[: len(session.stations), 0, 0]) & ~by_hand
     legs_tell = any(lost[k] and k not in boards.stations for k in legs_stations(session))

@@ -289,7 +289,10 @@ def _kinematics(session: Session, rng: np.random.Generator) -> _Motion:
     try:
         poses = platform_poses(session, most=not legs_stations(session))
         found = session.machine.forward_result(session.joints, poses)
-        modes = session.machine.assembly_modes(session.joints[0], rng)
+        first = session.joints[0]
+        if session.machine.layout.overdetermined:  # with errors they close in no pose
+            first = session.machine.inverse(poses[0])
+        modes = session.machine.assembly_modes(first, rng)
     except PkmcalError as error:
         return _Motion(None, math.nan, 0, (wrong(error),))
     findings: list[Finding] = []

@@ -20,7 +20,7 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.export.limbs import FIXED, SLIDE, TELESCOPE, TURN, Limbs, limbs_of
 from pkmcal.geometry.rigid import cross, dot, inverse, quaternion, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.carriers.contract import platform_carriers
+from pkmcal.mechanisms.carriers.contract import PLANAR, platform_carriers
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.joints import Equation, equations
 from pkmcal.mechanisms.kinematics import forward, inverse_result, on_manifold
@@ -60,6 +60,8 @@ CONVENTIONS = (
 )
 WHY_RESTRICTED = {
     "planar": "The platform stays in the plane by its own two slides and its hinge.",
+    "planar-translation": "The platform stays in the plane and keeps its direction by its own two "
+    "slides.",
     "translation": "The platform keeps its direction by its own three slides, which stand for the "
     "parallelograms or axes that hold it.",
     "schoenflies": "The platform stays upright by its own three slides and its hinge, which stand "
@@ -254,9 +256,9 @@ def _add_platform(world: Element, equality: Element, home: HomeState) -> list[An
         SubElement(platform, "freejoint", name="platform")
     else:
         own = home.rot.T  # joints' axes are told in the body's frame
-        for k, axis in enumerate("xy" if motion == "planar" else "xyz"):
+        for k, axis in enumerate("xy" if motion in PLANAR else "xyz"):
             _joint(platform, f"platform_{axis}", "slide", own[:, k], float(at[k]))
-        if motion != "translation":
+        if "translation" not in motion:
             # its value is a turn about z; another orientation is what the value is counted from
             omega = rotation_vector(home.rot)
             turn = float(omega[2]) if np.abs(omega[:2]).max() < SAME else 0.0
@@ -307,7 +309,7 @@ def _bar(platform: Element, equality: Element, home: HomeState, j: int, name: st
         _joint(bar, f"{name}_turn", "hinge", axis, phi)
         return bar
     _turned(bar, home.rot.T)
-    if home.machine.document.motion != "translation":
+    if "translation" not in home.machine.document.motion:
         _joint(bar, f"{name}_turn", "hinge", UP)
         _comment(
             equality,
@@ -353,7 +355,7 @@ def _words(home: HomeState, j: int) -> str:
         driven = home.limbs.drive[j] == TELESCOPE
         rod = "a rod that its motor moves" if driven else "a passive rod"
     out = f"Leg {j + 1}: {leg.base.joint} on the base, {rod}, {leg.platform.joint} on the platform."
-    if not found and home.machine.document.motion != "planar":
+    if not found and home.machine.document.motion not in PLANAR:
         out += (
             " Two hinges and a ball: its turn about its own line, which moves nothing, is left out."
         )
@@ -417,7 +419,7 @@ def _motor(world: Element, home: HomeState, column: int, at: Array, axis: Array)
 def _base_hinges(home: HomeState, j: int) -> Iterator[tuple[str, Array]]:
     """Names and axes (3,) of a leg's hinges on the base side, in their order."""
     found = home.equations[j]
-    if home.machine.document.motion == "planar":
+    if home.machine.document.motion in PLANAR:
         yield "base", UP
         return
     if "revolute base" in found:

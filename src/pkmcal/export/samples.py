@@ -26,7 +26,7 @@ def samples(machine: Machine, count: int = COUNT, seed: int = SEED) -> tuple[Arr
     """
     rng = np.random.default_rng(seed)
     ranges = machine.joint_ranges
-    if np.isfinite(ranges).all():
+    if np.isfinite(ranges).all() and not machine.layout.overdetermined:  # which few readings close
         wanted = rng.uniform(ranges[:, 0], ranges[:, 1], (4 * count, machine.n_joints))
         found = machine.forward_result(wanted)
     else:

@@ -51,10 +51,10 @@ class Places:
 class Assembled:
     """A problem and where its rows come from.
 
-    seen : (K,) configurations with at least one edge, or pose of a board on the platform; only
-    they are in the problem. places : where each kind's measurements stand among the seen ones.
-    priors : names of the kinds of the prior rows, (c,): drawing, camera, shading, breathing, mount
-    or gauge.
+    seen : (K,) configurations with at least one edge, or pose of a board on the platform, or all
+    without a station; only they are in the problem. places : where each kind's measurements stand
+    among the seen ones. priors : names of the kinds of the prior rows, (c,): drawing, camera,
+    shading, breathing, mount or gauge.
     """
 
     problem: Problem
@@ -92,7 +92,7 @@ def assemble(
     unknowns = Unknowns(
         n_free=machine.parameters.free_matrix().shape[1],
         n_stations=measurements.n_stations,
-        n_cameras=int(measurements.camera_of_station.max()) + 1,
+        n_cameras=measurements.n_cameras,
         n_optics=1 + measurements.intrinsics_factor.shape[-1],
         n_lines=int(line.max(initial=-1)) + 1,
         n_mounts=len(measurements.mounts),
@@ -120,7 +120,7 @@ def assemble(
         unknowns=unknowns,
         blocks=blocks,
         data=data,
-        joint_noise=measurements.joint_noise,
+        joint_noise=np.array([measurements.joint_noise]),
         prior=prior,
         prior_target=target,
         frames=exact_moves(machine),
@@ -131,8 +131,12 @@ def assemble(
 
 
 def seen_configurations(measurements: Measurements) -> Booleans:
-    """(K,) configurations of which something was seen that depends on the platform's pose."""
+    """(K,) configurations of which something was seen that depends on the platform's pose; all
+    where nothing but readings was measured, which then stand against each other.
+    """
     poses, n = measurements.poses, len(measurements.joints)
+    if not measurements.n_stations:
+        return np.ones(n, dtype=bool)
     on_platform = measurements.on_platform[poses.mount]
     rows = np.concatenate([measurements.edges.configuration, poses.configuration[on_platform]])
     return np.bincount(rows, minlength=n) > 0
@@ -140,7 +144,7 @@ def seen_configurations(measurements: Measurements) -> Booleans:
 
 def _check(machine: Machine, measurements: Measurements) -> None:
     edges, joints = measurements.edges, measurements.joints
-    if len(edges) == 0 and len(measurements.poses) == 0:
+    if measurements.n_stations and len(edges) == 0 and len(measurements.poses) == 0:
         raise InputError(
             what="there is neither an edge nor a board's pose to calibrate from",
             next_step="check the photographs, the stations' poses and the tubes of the drawing",

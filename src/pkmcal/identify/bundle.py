@@ -7,24 +7,25 @@ readings and the drawing, each divided by its standard deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import ResultError
 from pkmcal.identify.assembly import SHIFT_SIGMA, Assembled, assemble, batch_of, state_of
 from pkmcal.identify.covariance import (
     Identifiability,
     Information,
     data_share,
-    group_fit,
     identifiability,
     information,
     machine_covariance,
 )
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
+from pkmcal.identify.noise import EDGES, FEWEST, POSES, READINGS, Components, components, counts
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, settled_weights
 from pkmcal.identify.rows import Kinds
@@ -42,6 +43,8 @@ LEAST_SCALE = 1.0
 lens) is partly taken up by the parameters, so residuals come out smaller than errors are: scaling
 down by them would promise too much."""
 ROUNDS = 30
+SCALE_CHANGE = 1e-3
+"""Relative change of a noise scale below which it counts as found."""
 SHADING_CHANGE = 0.02
 """Relative change of the shading's deviation below which it counts as found."""
 FREEDOM = 4.0
@@ -57,13 +60,15 @@ class BatchResult:
 
     problem : with the weights in use, noise scale included. solution : states, cost, stops.
     weight : (B, K, G) robust weights 0..1 of each kind of measurement. scale : (B,) factor on its
-    stated noise. steps : (B,). info : rows and covariance at the solution.
+    stated noise; reading_scale : (B,) on the readings'. steps : (B,). info : rows and
+    covariance at the solution.
     """
 
     problem: Problem
     solution: Solution
     weight: Kinds[Array]
     scale: Kinds[Array]
+    reading_scale: Array
     steps: Integers
     info: Information
 
@@ -74,10 +79,13 @@ def solve_batch(
     *,
     robust: bool = True,
     scale_noise: bool = True,
+    scale_readings: bool = True,
     hopeless: float = np.inf,
 ) -> BatchResult:
     """All runs of a problem from their starts; see :func:`bundle` for the options.
 
+    scale_readings : with ``scale_noise``, the readings' noise too; not where the machine is held,
+    whose changes would be taken for noise.
     hopeless : all runs are left as they are where, after a search, the poses' noise has to be
     larger than stated by more than this factor.
     """
@@ -97,26 +105,16 @@ def solve_batch(
         state, weight, steps = found.state, found.weight, steps + found.steps
         scale = found.scale if scale_noise else ones
     fit = _solved(problem, state, weight, scale, steps)
-    for _ in range(ROUNDS if robust or scale_noise else 0):
-        scale = _noise_scale(fit) if scale_noise else fit.scale
-        if scale.poses.min() > hopeless:
-            fit = fit._replace(scale=scale)
-            break
-        state, weight, shading = fit.info.state, fit.weight, problem.data.shading
-        if robust:
-            weight = settled_weights(problem, state, scale)
-        if estimates_shading:
-            shading = _shading_of(fit, least)
-        found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
-        if found_shading and _settled(scale, fit.scale, weight, fit.weight):
-            break
-        if estimates_shading:
-            units = problem.data.shading / shading  # the same shifts in other units
-            state = replace(state, shading=state.shading * units)
-            problem = problem.shaded(shading)
-        fit = _solved(problem, state, weight, scale, fit.solution.steps)
-    steps = fit.solution.steps
-    return BatchResult(fit.info.problem, fit.solution, fit.weight, fit.scale, steps, fit.info)
+    if robust or scale_noise:
+        settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
+        fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
+        if scale_noise and scale_readings and fit.scale.poses.min() <= hopeless:
+            by_data = _readings_speak(fit)
+            if by_data.any():
+                fit = settle(fit, hopeless=hopeless, by_data=by_data)
+    used, steps = fit.info.problem, fit.solution.steps
+    readings = np.broadcast_to(used.joint_noise / problem.joint_noise, n_runs)
+    return BatchResult(used, fit.solution, fit.weight, fit.scale, readings, steps, fit.info)
 
 
 class _Fit(NamedTuple):
@@ -130,6 +128,57 @@ class _Fit(NamedTuple):
     info: Information
 
 
+def _settle(
+    fit: _Fit,
+    by_data: Booleans,
+    *,
+    robust: bool,
+    scale_noise: bool,
+    least: Array,
+    hopeless: float,
+) -> _Fit:
+    """Weights, noise and solution in turns until none changes any more.
+
+    by_data : (B,) runs whose readings' noise is as the data show it, not as stated. least : px, of
+    the lines' shading.
+    """
+    estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
+    for _ in range(ROUNDS):
+        problem, state, weight = fit.info.problem, fit.info.state, fit.weight
+        scale, factor = fit.scale, np.ones(len(by_data))
+        if scale_noise:
+            found = components(fit.info, weight)
+            scale, factor = _scale(fit, found), np.where(by_data, found.factor(READINGS), 1.0)
+        if scale.poses.min() > hopeless:
+            return fit._replace(scale=scale)
+        shading = problem.data.shading
+        if robust:
+            weight = settled_weights(problem, state, scale)
+        if estimates_shading:
+            shading = _shading_of(fit, least)
+        found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
+        found_readings = np.abs(factor - 1).max() < SCALE_CHANGE
+        if found_shading and found_readings and _settled(scale, fit.scale, weight, fit.weight):
+            break
+        if estimates_shading:
+            units = problem.data.shading / shading  # the same shifts in other units
+            state = replace(state, shading=state.shading * units)
+            problem = problem.shaded(shading)
+        if by_data.any():
+            problem = replace(problem, joint_noise=problem.joint_noise * factor)
+        fit = _solved(problem, state, weight, scale, fit.solution.steps)
+    return fit
+
+
+def _readings_speak(fit: _Fit) -> Booleans:
+    """Runs (B,) whose readings' noise the data tell: where they contradict the stated one, or where
+    nothing else was measured, so that it is only the unit of all deviations.
+    """
+    found = components(fit.info, fit.weight)
+    alone = not any(kind.present.any() for kind in fit.info.problem.kinds)
+    return (found.contradicts(READINGS) | alone) & (found.told[:, READINGS] > FEWEST)
+
+
 def _settled(
     scale: Kinds[Array], old_scale: Kinds[Array], weight: Kinds[Array], old_weight: Kinds[Array]
 ) -> bool:
@@ -139,7 +188,7 @@ def _settled(
         0.1 * np.abs(new - old).max(initial=0.0)
         for new, old in zip(weight, old_weight, strict=True)
     ]
-    return max(change) < 1e-3
+    return max(change) < SCALE_CHANGE
 
 
 def _solved(
@@ -157,21 +206,18 @@ def _solved(
     return _Fit(found, weight, scale, information(used, found.state, found.normal))
 
 
-def _noise_scale(fit: _Fit) -> Kinds[Array]:
+def _scale(fit: _Fit, found: Components) -> Kinds[Array]:
     """Factors on the stated noise of each kind that make its chi2 equal its degrees of freedom,
-    (B,) each.
-
-    The variance component of a group with redundancies as weights; kept as it is where fewer
-    than five degrees of freedom remain to judge it.
+    (B,) each; kept as they are where too few remain to judge it.
     """
-    problem = fit.info.problem
-    used = counts(problem, fit.weight)
-    out: list[Array] = []
-    for kind, number, scale in zip(problem.kinds, used, fit.scale, strict=True):
-        chi2, freedom = group_fit(fit.info.linear, fit.info.reduced, kind.rows, number)
-        new = scale * np.sqrt(chi2 / np.maximum(freedom, 1.0))
-        out.append(np.where(freedom > 5, np.maximum(new, LEAST_SCALE), scale))
-    return Kinds(*out)
+    ratio = np.sqrt(found.chi2 / np.maximum(found.freedom, 1.0))
+    known = found.freedom > FEWEST
+    return Kinds(
+        *(
+            np.where(known[:, k], np.maximum(scale * ratio[:, k], LEAST_SCALE), scale)
+            for k, scale in zip((EDGES, POSES), fit.scale, strict=True)
+        )
+    )
 
 
 def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float) -> Array:
@@ -204,12 +250,6 @@ def _shading_of(fit: _Fit, least: Array) -> Array:
     problem, unit = fit.info.problem, fit.info.problem.data.shading
     variance = np.diagonal(fit.info.covariance, axis1=-2, axis2=-1)[:, problem.unknowns.shading]
     return common_shading(unit * fit.info.state.shading, variance, unit, least)
-
-
-def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:
-    """Residuals of each kind in use, each counted by its robust weight, (B,)."""
-    parts = zip(problem.kinds, weight, strict=True)
-    return Kinds(*(np.sum(part * kind.count, axis=(1, 2)) for kind, part in parts))
 
 
 def bundle(
@@ -259,7 +299,7 @@ def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiab
     For words such as "these two values cannot be told apart": names and weights of what is
     unidentified, and of what the drawing knows better than the data.
     """
-    machine = estimate.machine
+    machine, measurements = estimate.machine, estimate.as_found(measurements)
     shading = estimate.line_shading if len(estimate.line_shading) else SHADING_SIGMA
     assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
     problem = assembled.trusting(
@@ -342,10 +382,8 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
     n_drawing = int(np.sum(drawn))
     unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))
     unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
-    freedom = [
-        float(group_fit(linear, result.info.reduced, part, np.array([float(number)]))[1][0])
-        for part, number in zip(rows, (n_edges, n_joints, n_poses), strict=True)
-    ]
+    found = components(result.info, result.weight)
+    freedom = found.freedom[0].tolist()
     return Statistics(
         chi2=sum(chi2) + chi2_drawing,
         dof=n_edges + n_joints + n_poses + n_drawing - unknowns,
@@ -361,8 +399,17 @@ def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
         chi2_poses=chi2[2],
         n_poses=n_poses,
         pose_scale=float(result.scale.poses[0]),
-        dof_edges=freedom[0],
-        dof_joints=freedom[1],
-        dof_poses=freedom[2],
+        dof_edges=freedom[EDGES],
+        dof_joints=freedom[READINGS],
+        dof_poses=freedom[POSES],
+        reading_scale=float(result.reading_scale[0]),
+        reading_range=_range(found, READINGS, result.reading_scale),
+        pose_range=_range(found, POSES, result.scale.poses),
         shading=float(np.median(result.problem.data.shading[0])),
     )
+
+
+def _range(found: Components, kind: int, scale: Array) -> tuple[float, float | None]:
+    """Factors on a stated noise that the data allow, where ``scale`` (1,) is in use."""
+    low, high = (float((scale * end)[0]) for end in found.interval(kind))
+    return low, high if np.isfinite(high) else None

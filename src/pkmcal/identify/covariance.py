@@ -36,8 +36,6 @@ from pkmcal.solver import (
     eliminate,
     inverse_root,
     normal_inverse,
-    normal_root,
-    reduced_normal,
     stacked,
     take,
 )
@@ -122,20 +120,6 @@ def reduced_rows(
     q = column_space(np.delete(rows, kept, axis=1))
     rows = rows[:, kept]
     return rows - q @ (q.T @ rows), value - q @ (q.T @ value)
-
-
-def group_fit(linear: Linear, reduced: Reduced, group: slice, count: Array) -> tuple[Array, Array]:
-    """A group's chi2 and its degrees of freedom, count - tr(hat), (B,) each.
-
-    group : its rows in a configuration. count : rows in use, (B,). reduced : without damping. The
-    hat matrix splits into the own unknowns' part Q Q^T and the shared unknowns' part
-    tr(N^-1 N_group); directions that nothing fixes have no part in it.
-    """
-    own = np.sum(reduced.q[:, :, group] ** 2, axis=(1, 2, 3))
-    rows = reduced.rows[:, :, group].reshape(len(count), -1, reduced.rows.shape[-1])
-    half = normal_root(reduced_normal(linear, reduced), UNKNOWN, loose=False)
-    shared = np.sum((rows @ half) ** 2, axis=(1, 2))
-    return np.sum(linear.value[:, :, group] ** 2, axis=(1, 2)), count - own - shared
 
 
 def machine_covariance(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.unknowns import Unknowns, own_blocks
-from pkmcal.measurements import SHADING_SIGMA
+from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 
 
@@ -55,6 +55,9 @@ class Statistics:
     pose_scale : the same factor of theirs. dof_edges, dof_joints, dof_poses : degrees of freedom
     that each kind of residual has left; their sum and the drawing's is ``dof``. shading : px,
     standard deviation of what the edges of one side of a tube at one station have in common.
+    reading_scale : factor on the readings' stated noise, 1 where the data do not contradict it.
+    reading_range, pose_range : factors on the stated noise that the data allow, smallest and
+    largest, None for no end (:mod:`pkmcal.identify.noise`).
     """
 
     chi2: float
@@ -75,6 +78,9 @@ class Statistics:
     dof_joints: float = 0.0
     dof_poses: float = 0.0
     shading: float = SHADING_SIGMA
+    reading_scale: float = 1.0
+    reading_range: tuple[float, float | None] = (0.0, None)
+    pose_range: tuple[float, float | None] = (0.0, None)
 
 
 @dataclass(frozen=True)
@@ -114,6 +120,11 @@ class Estimate:
     pose_weights: Array = field(default_factory=lambda: np.zeros(0))
     line_shading: Array = field(default_factory=lambda: np.zeros(0))
     breathing_sigma: Array = field(default_factory=lambda: np.zeros(0))
+
+    def as_found(self, measurements: Measurements) -> Measurements:
+        """The measurements with the readings' noise as the data show it."""
+        scale = self.statistics.reading_scale
+        return replace(measurements, joint_noise=measurements.joint_noise * scale)
 
     @property
     def covariance(self) -> Array:

@@ -56,7 +56,8 @@ class ThreeCentres:
 
     The first leg's centre keeps its drawing value, the second lies in the drawing's direction
     from it, the third in the drawing's plane. Legs from 0; a machine of fewer than five legs
-    uses its first three.
+    uses its first three. Where all legs meet in one point of a platform, that keeps its drawing
+    value, and no turn of it is told from the base's.
     """
 
     legs: tuple[int, int, int] = (0, 2, 4)
@@ -111,8 +112,12 @@ def centre_index(layout: LimbLayout) -> tuple[Integers, Integers]:
 
 
 def _three_rows(drawing: Array, index: Integers) -> Array:
-    """The 3-2-1 constraints of one body, (6, P)."""
+    """The 3-2-1 constraints of one body, (6, P); the first three alone where it is a point."""
     p1, p2, p3 = drawing[index]
+    if (p1 == p2).all() and (p1 == p3).all():
+        rows = np.zeros((6, drawing.size))
+        rows[[0, 1, 2], index[0]] = 1.0
+        return rows
     along = (p2 - p1) / np.linalg.norm(p2 - p1)
     normal = cross(along, p3 - p1)
     normal = normal / np.linalg.norm(normal)
@@ -273,6 +278,8 @@ def respecting_motion(motion: Array) -> Array:
     both = np.concatenate([np.eye(6), np.eye(6)])
     if motion[5].any() and motion[2].any():  # schoenflies: each frame shifted and turned about z
         return np.eye(12)[:, [2, 3, 4, 5, 8, 9, 10, 11]]
+    if not motion[[2, 5]].any():  # shifts in a plane: each frame's, and turns of both together
+        return np.concatenate([np.eye(12)[:, [3, 4, 9, 10]], both[:, [2, 5]]], axis=1)
     if motion[:3].any():  # planar: each frame in the plane, and both together along its normal
         return np.concatenate([np.eye(12)[:, [2, 3, 4, 8, 9, 10]], both[:, [5]]], axis=1)
     # translation: each frame's origin, and both frames turned together
@@ -280,11 +287,16 @@ def respecting_motion(motion: Array) -> Array:
 
 
 def default_gauge(machine: Machine) -> Gauge:
-    """Three centres where three legs' joints make a triangle on both bodies, else the best fit."""
+    """Three centres where three legs' joints make a triangle on both bodies, or meet in one point
+    of a platform that does not turn; else the best fit.
+    """
     legs = (0, 2, 4) if machine.n_legs > 4 else (0, 1, 2)
     if machine.n_legs < 3:
         return BestFit()
-    for index in centre_index(machine.layout):
+    base, platform = centre_index(machine.layout)
+    points = machine.parameters.drawing[platform]
+    meet = not machine.layout.motion[:3].any() and bool((points == points[0]).all())
+    for index in (base,) if meet else (base, platform):
         p1, p2, p3 = machine.parameters.drawing[index[list(legs)]]
         sides = np.linalg.norm([p2 - p1, p3 - p1], axis=1)
         if np.linalg.norm(np.cross(p2 - p1, p3 - p1)) <= FLAT * sides.prod():

@@ -51,7 +51,7 @@ class Problem:
     """The joint estimation of B runs; a :class:`pkmcal.solver.LeastSquares`.
 
     layout, drawing (P,), free (P, nz) : the machine. unknowns : which there are, and their columns.
-    blocks, data : edges and readings. joint_noise : standard deviation of a reading.
+    blocks, data : edges and readings. joint_noise : (B or 1,) standard deviation of a reading.
     prior : (c, na) rows on the shared unknowns and prior_target : (c,).
     frames : (12 + n, g) changes of frames and hinges' beginnings that no measurement knows.
     pose_blocks, pose_data : of boards.
@@ -63,7 +63,7 @@ class Problem:
     unknowns: Unknowns
     blocks: EdgeBlocks
     data: EdgeData
-    joint_noise: float
+    joint_noise: Array
     prior: Array
     prior_target: Array
     frames: Array
@@ -88,7 +88,12 @@ class Problem:
 
     def select(self, runs: Integers) -> Problem:
         """The problem of some runs only."""
-        return replace(self, data=of_runs(self.data, runs), pose_data=of_runs(self.pose_data, runs))
+        return replace(
+            self,
+            data=of_runs(self.data, runs),
+            pose_data=of_runs(self.pose_data, runs),
+            joint_noise=of_runs(self.joint_noise, runs),
+        )
 
     def among(self, configurations: slice) -> Problem:
         """The problem of some configurations only."""
@@ -328,7 +333,7 @@ class Problem:
 
     def _by_noise(self, c: Closure, rows: Array) -> Array:
         """Rows (B, K, E, n) of the closure in standard deviations."""
-        return by_noise(self.layout, self.joint_noise, c.by_reading, rows)
+        return by_noise(self.layout, self.joint_noise[:, None, None], c.by_reading, rows)
 
     def _values(self, state: BatchState, c: Closure, edges: EdgeRows, poses: PoseRows) -> Array:
         """All rows of the configurations, (B, K, r)."""
@@ -372,7 +377,7 @@ class Problem:
             """Steps (B, n, 6) of poses without what the frame change y does to them."""
             return step - (by_frames @ y[:, None])[..., 0]
 
-        camera = shared[:, u.stations].reshape(-1, u.n_stations, 6)
+        camera = shared[:, u.stations].reshape(len(z), u.n_stations, 6)
         mount = shared[:, u.mounts].reshape(*state.T_mount.shape[:2], 6)
         motion = own @ layout.own_motion.T
         on_platform = self.pose_blocks.on_platform

@@ -296,12 +296,13 @@ def edge_rows(
     return EdgeRows(blocks, data, c, station, a, b, normals)
 
 
-def by_noise(layout: LimbLayout, joint_noise: float, by_reading: Array, rows: Array) -> Array:
+def by_noise(layout: LimbLayout, joint_noise: Array, by_reading: Array, rows: Array) -> Array:
     """Rows (..., E, n) of the closure in standard deviations; the noise's own derivative is
     multiplied by c = 0.
 
-    by_reading : (..., E). Rods on one motor share its reading's noise: with slopes g of the
-    motor's rows their covariance is ``sigma^2 g g^T + PERFECT^2``, whitened in closed form.
+    joint_noise : what by_reading (..., E) broadcasts with. Rods on one motor share its reading's
+    noise: with slopes g of the motor's rows their covariance is ``sigma^2 g g^T + PERFECT^2``,
+    whitened in closed form.
     """
     if not layout.shares_motors:
         return rows / closure_sigma(layout, joint_noise, by_reading)[..., None]
@@ -314,7 +315,7 @@ def by_noise(layout: LimbLayout, joint_noise: float, by_reading: Array, rows: Ar
     return rows / PERFECT
 
 
-def closure_sigma(layout: LimbLayout, joint_noise: float, by_reading: Array) -> Array:
+def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> Array:
     """Standard deviation (..., E) of each closure where every motor moves one rod.
 
     A crank in line with its rod does not move it, so no closure is sharper than a perfect one; a

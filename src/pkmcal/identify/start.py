@@ -26,13 +26,12 @@ def start_state(machine: Machine, measurements: Measurements, T_camera_base_gues
     """
     found = machine.forward_result(measurements.joints)
     poses = found.T_base_platform
-    n_cameras = int(np.max(measurements.camera_of_station)) + 1
     stations = np.asarray(T_camera_base_guess)
     return State(
         machine.values,
         stations,
         poses,
-        np.zeros(n_cameras),
+        np.zeros(measurements.n_cameras),
         T_mount=start_mounts(measurements, stations, poses),
         on_platform=measurements.on_platform,
         internal=found.internal,

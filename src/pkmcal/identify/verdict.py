@@ -61,6 +61,7 @@ def judge(
     findings: Findings | None = None,
     richer: tuple[RicherModel, ...] = (),
     doubts: tuple[str, ...] = (),
+    cautions: tuple[str, ...] = (),
     held_out: int = 0,
 ) -> Verdict:
     """The verdict on an estimate of a session by a method.
@@ -68,7 +69,7 @@ def judge(
     told : what the data tell of the machine; findings : the same in words, made from ``told`` and
     the edges where absent. Without both, values that the data do not decide speak for themselves.
     richer : models of the machine that were tried because this one is too poor for the poses.
-    doubts : further reasons against it, found in the session.
+    doubts : further reasons against it, cautions : further warnings, found in the session.
     held_out : configurations that were left out on purpose.
     """
     if findings is None and told is not None:
@@ -89,6 +90,7 @@ def judge(
     warnings = (
         *_warnings(observation, estimate, held_out),
         *_poses_doubted(estimate, richer),
+        *cautions,
         *(f"{s.text} {s.advice}" for s in matter),
     )
     if reasons:

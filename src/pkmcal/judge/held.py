@@ -44,7 +44,7 @@ UNSCALED = Kinds(1.0, 1.0)
 @dataclass(frozen=True)
 class Trust:
     """How far new data are believed: robust weights (N,) 0..1 of each kind, factors on its stated
-    noise, and the standard deviation (px) of shading.
+    noise and on that of readings, and the standard deviation (px) of shading.
 
     Weights come from an estimate whose machine could move: with the machine held, a leg that has
     changed would be taken for an error of its edges, and be let go.
@@ -52,6 +52,7 @@ class Trust:
 
     robust: Kinds[Array]
     scale: Kinds[float] = UNSCALED
+    readings: float = 1.0
     shading: float = SHADING_SIGMA
 
     @property
@@ -65,12 +66,16 @@ class Trust:
         return cls(Kinds(np.ones(len(measurements.edges)), np.ones(len(measurements.poses))))
 
     @classmethod
-    def of(cls, estimate: Estimate, scale: Kinds[float] = UNSCALED) -> Trust:
-        """An estimate's weights, and the larger of its factors and of the calibration's."""
+    def of(cls, estimate: Estimate, scale: Kinds[float] = UNSCALED, readings: float = 1.0) -> Trust:
+        """An estimate's weights, and the larger of its factors and of the calibration's; of the
+        readings its own where its data contradict their stated noise.
+        """
         own = Kinds(estimate.statistics.noise_scale, estimate.statistics.pose_scale)
+        own_readings = estimate.statistics.reading_scale
         return cls(
             Kinds(estimate.edge_weights, estimate.pose_weights),
             Kinds(*(max(pair) for pair in zip(own, scale, strict=True))),
+            readings if own_readings == 1 else own_readings,
             estimate.statistics.shading,
         )
 
@@ -140,11 +145,15 @@ def hold(
     """
     still = held_machine(machine, radii=trust is None)
     shading = SHADING_SIGMA if trust is None else trust.shading
+    if trust is not None:
+        noise = measurements.joint_noise * trust.readings
+        measurements = replace(measurements, joint_noise=noise)
+        magnified = magnified and replace(magnified, joint_noise=noise)
     assembled = assemble(still, measurements, default_gauge(still), shading=shading)
     begin = batch_of(still, assembled, replace(start, theta=still.values))
     if trust is None:
         _check_enough(assembled.problem, begin)
-        result = solve_batch(assembled.problem, begin)
+        result = solve_batch(assembled.problem, begin, scale_readings=False)
         problem, found = result.problem, result.solution
     else:
         problem = assembled.trusting(trust.weights)

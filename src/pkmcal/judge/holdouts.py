@@ -65,6 +65,7 @@ def judged_without(
     drawing: Machine, measurements: Measurements, estimate: Estimate, region: Neighbours
 ) -> HoldOut:
     """An estimate that did not see a region's configurations, on them and on those that it saw."""
+    measurements = estimate.as_found(measurements)
     found = predict(estimate.machine, measurements, estimate.state)
     out = region.rows[found.seen[region.rows]]
     used = np.setdiff1d(np.flatnonzero(found.seen), out)

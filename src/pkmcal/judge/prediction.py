@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import pose_generators
@@ -96,6 +97,12 @@ def predict(machine: Machine, measurements: Measurements, start: State) -> Predi
     start : stations, mounts and poses in frames near the machine's. Raises ResultError where they
     are not found, or where nothing but a configuration's own readings tells its pose.
     """
+    if not measurements.n_stations:
+        raise ResultError(
+            "nothing but readings was measured, and readings are not predicted from themselves",
+            expected="a session with photographs, or with a table of poses",
+            next_step="To see whether the machine is as it was, use pkmcal watch with new readings",
+        )
     held = hold(machine, replace(measurements, joint_noise=SOFT), start)
     linear = held.problem.linearize(held.state)
     reduced = eliminate(linear, np.zeros(1))

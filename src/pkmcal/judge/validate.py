@@ -93,7 +93,8 @@ def validate(
         if not regions:
             _check_independent(known, _photographed(session))
         looked = look(saved, session, seed, told, 0.8)
-        data, estimate = looked.measurements, looked.estimate
+        estimate = looked.estimate
+        data = estimate.as_found(looked.measurements)
 
         told("Predicting the readings", 0.8)
         drawing = drawing_of(saved)
@@ -134,8 +135,10 @@ def drawing_of(saved: SavedCalibration) -> Machine:
 
 
 def _photographed(session: Session) -> Booleans:
-    """(K,) configurations with a photograph; all where a tracker may have seen them."""
-    out = np.full(len(session.configurations), bool(session.trackers))
+    """(K,) configurations with a photograph; all where a tracker may have seen them, or where
+    readings alone were taken.
+    """
+    out = np.full(len(session.configurations), bool(session.trackers or not session.stations))
     for station in session.stations:
         out[[photo.configuration for photo in station.photographs]] = True
     return out

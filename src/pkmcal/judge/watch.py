@@ -128,7 +128,7 @@ def watch(
         told("Testing for changes", 0.9)
         old = saved.document.get("statistics") or {}
         before = Kinds(float(old.get("noise_scale", 1.0)), float(old.get("pose_scale", 1.0)))
-        trust = Trust.of(looked.estimate, before)
+        trust = Trust.of(looked.estimate, before, _readings(saved, session))
         held = _hold_new(saved, session, looked, trust, ~known)
         judged, kept, moved = tests_with_kept(held, _kept(saved, session, same_place), alpha)
         around = LookedAt(
@@ -153,6 +153,16 @@ def watch(
             moved=moved,
             timings={**looked.timings, "all": time.perf_counter() - began},
         )
+
+
+def _readings(saved: SavedCalibration, session: Session) -> float:
+    """The factor on the readings' stated noise that the calibration found, where the session states
+    the same.
+    """
+    joints = (saved.document.get("session") or {}).get("joints") or {}
+    statistics = saved.document.get("statistics") or {}
+    alike = joints.get("noise") == session.joint_noise
+    return float(statistics.get("reading_scale", 1.0)) if alike else 1.0
 
 
 def check_alpha(alpha: float) -> None:

@@ -148,6 +148,11 @@ class LimbLayout:
         return out
 
     @cached_property
+    def overdetermined(self) -> bool:
+        """Whether there are more rows than unknowns, so that readings with errors close none."""
+        return self.n_equations > self.own_motion.shape[1]
+
+    @cached_property
     def a_index(self) -> Integers:
         """(L, n) parameters that each limb's end A depends on, P where there are fewer."""
         return self._ends_index(self.base)

@@ -79,12 +79,13 @@ OFFSET = ParameterKind("offset", "m", "offset", part="zero")
 CONSTANT = ParameterKind("constant", "m", "offset", label="rod length", part="rod")
 
 
-Motion = Literal["spatial", "planar", "translation", "schoenflies"]
+Motion = Literal["spatial", "planar", "translation", "schoenflies", "planar-translation"]
 MOTIONS: dict[str, Array] = {
     "spatial": np.eye(6),
     "planar": np.eye(6)[:, [2, 3, 4]],
     "translation": np.eye(6)[:, 3:],
     "schoenflies": np.eye(6)[:, 2:],
+    "planar-translation": np.eye(6)[:, [3, 4]],
 }
 """Columns: the directions (omega, tau) in which the platform can move, base frame; neighbours."""
 

@@ -14,7 +14,13 @@ import numpy as np
 
 from pkmcal.errors import InputError
 from pkmcal.files.documents import field_path
-from pkmcal.mechanisms.carriers.contract import IN_PLANE, Site, base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.contract import (
+    IN_PLANE,
+    PLANAR,
+    Site,
+    base_carriers,
+    platform_carriers,
+)
 from pkmcal.mechanisms.document import (
     MOTIONS,
     ConstantLength,
@@ -43,9 +49,9 @@ def check_drawing(document: MechanismDocument, where: Where | None = None) -> No
         for side, carrier in (("base", base), ("platform", platform)):
             site = Site(j + 1, side, document.motion, partial(place, "legs", j, side))
             carrier.check(getattr(leg, side), site)
-        if document.motion == "planar":
+        if document.motion in PLANAR:
             _check_plane(document, j, leg, place)
-        if document.motion == "translation":
+        if document.motion in ("translation", "planar-translation"):
             _check_parallel(j, leg, place)
         if base.driven and not isinstance(leg.length, ConstantLength):
             raise InputError(

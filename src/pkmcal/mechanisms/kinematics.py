@@ -45,6 +45,13 @@ SETTLING = 15
 """Steps for a machine's second rods; a pose that they all allow takes four."""
 SETTLED = 1e-15
 """A step of readings (rad) and hinges below which nothing changes any more."""
+SAME_EQUATION = 1e-9
+"""Singular value of the scaled rows below which one of them says what the others do."""
+LEVELLING = 3
+"""Steps to the pose that closes more rows than it has unknowns best; each leaves of the way what
+the closure error is of a rod."""
+GAP = 0.05
+"""Of a rod, the closure error beyond which readings are no machine's with errors, but another's."""
 NEAR_SINGULAR = 0.02
 """Smallest singular value of the scaled inverse Jacobian below which a warning is due: a
 reading's error then moves the platform fifty times as far."""
@@ -191,6 +198,8 @@ class ForwardResult:
     """Poses found from readings, and how far to trust each.
 
     T_base_platform : (..., 4, 4); converged : (...); error : (...) largest closure error, m.
+    A machine with more rows than unknowns is closed as well as its readings allow, by least
+    squares; converged where that leaves errors of readings and of drawings, see GAP.
     internal : (..., n) the hinges' turns of an articulated platform, rad; n = 0 for a rigid one.
     layout, theta, readings : the machine, and what it was closed at.
     """
@@ -321,7 +330,29 @@ def forward(
     )
     poses, inner = found.poses.reshape(*shape, 4, 4), found.internal.reshape(*shape, n)
     error = found.error.reshape(shape)
-    return ForwardResult(poses, error < CONVERGED, error, inner, layout, theta, readings)
+    converged = error < CONVERGED
+    if layout.overdetermined:
+        poses, inner, error = _at_least(layout, theta, readings, poses, inner)
+        rods = np.nanmedian(np.abs(rod_lengths(layout, theta, readings)), axis=-1)
+        converged = error < GAP * rods
+    return ForwardResult(poses, converged, error, inner, layout, theta, readings)
+
+
+def _at_least(
+    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array
+) -> Closed:
+    """Poses (..., 4, 4) near the least of the rows' squares, brought to it.
+
+    Gauss-Newton: near it the squares are level to rounding, and tell a search nothing.
+    """
+    for _ in range(LEVELLING):
+        rows = pose_rows(layout, theta, readings, poses, internal)
+        back = np.linalg.pinv(np.nan_to_num(layout.by_own(rows)))
+        step = (back @ np.nan_to_num(rows.value)[..., None])[..., 0] @ layout.own_motion.T
+        poses, internal = perturb(poses, -step[..., :6]), internal - step[..., 6:]
+    rows = pose_rows(layout, theta, readings, poses, internal)
+    worst = np.abs(rows.value).max(axis=-1)
+    return Closed(poses, internal, np.where(np.isfinite(worst), worst, np.inf))
 
 
 def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:
@@ -376,13 +407,15 @@ def home_candidates(layout: LimbLayout, theta: Array, readings: Array) -> Array:
     a, b = base_ends(layout, theta, readings).a, platform_ends(layout, theta, np.eye(4)).b
     shift = a.mean(axis=-2) - b.mean(axis=-2)
     reach = typical_reach(layout, theta, readings)
+    if not layout.free[5]:  # in its plane: turned a little, or beside the base's middle
+        angles = (0.0, 0.5, -0.5, 1.0, -1.0) if layout.free[2] else (0.0,)
+        beside = (0.0,) if layout.free[2] else (0.0, -reach / 3, reach / 3)
+        places = [shift + np.array([0.0, y, 0.0]) for y in beside]
+        return np.stack([pose(rotation(np.array([0, 0, a])), p) for a in angles for p in places])
     flat = float(np.linalg.norm((b + shift - a)[..., :2], axis=-1).mean())
     height = np.sqrt(max(reach**2 - flat**2, (0.3 * reach) ** 2))
     sides = (-1, 1) if _hangs(layout, theta, a) else (1, -1)
-    starts = [pose(np.eye(3), shift + np.array([0.0, 0.0, s * height])) for s in sides]
-    if layout.motion.shape[1] == 3 and layout.motion[2, 0] == 1:
-        starts = [pose(rotation(np.array([0, 0, a])), shift) for a in (0.0, 0.5, -0.5, 1.0, -1.0)]
-    return np.stack(starts)
+    return np.stack([pose(np.eye(3), shift + np.array([0.0, 0.0, s * height])) for s in sides])
 
 
 def _hangs(layout: LimbLayout, theta: Array, a: Array) -> bool:
@@ -394,6 +427,18 @@ def _hangs(layout: LimbLayout, theta: Array, a: Array) -> bool:
 def typical_reach(layout: LimbLayout, theta: Array, readings: Array) -> float:
     """Mean length of the rods whose length is known, m."""
     return float(np.abs(rod_lengths(layout, theta, readings)[layout.closing]).mean())
+
+
+def mobility(layout: LimbLayout, theta: Array, pose: Array) -> int:
+    """In how many ways the machine moves near a pose (4, 4): unknowns and readings together, less
+    the equations between them that differ. A machine with more readings is redundant.
+    """
+    readings, internal = inverse_result(layout, theta, pose)
+    rows, drives = rows_and_drives(layout, theta, readings, pose, internal)
+    every = np.concatenate(
+        [scaled_rows(layout, theta, rows), drives[..., None] * layout.of_motor], axis=-1
+    )
+    return every.shape[-1] - int(np.linalg.matrix_rank(every, tol=SAME_EQUATION))
 
 
 def on_manifold(layout: LimbLayout, theta: Array, poses: Array) -> ForwardResult:

@@ -65,6 +65,13 @@ class Machine:
         return self.layout.n_readings
 
     @property
+    def redundancy(self) -> int:
+        """Readings that a configuration has beyond its freedoms, at home: what readings alone can
+        be held against.
+        """
+        return self.n_joints - kinematics.mobility(self.layout, self.values, self.home())
+
+    @property
     def joint_units(self) -> tuple[str, ...]:
         """``m`` or ``rad`` of each reading, (m,)."""
         return motor_units(self.document)

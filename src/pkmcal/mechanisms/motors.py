@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.mechanisms.carriers.contract import base_carriers, platform_carriers
+from pkmcal.mechanisms.carriers.contract import PLANAR, base_carriers, platform_carriers
 from pkmcal.mechanisms.document import ActuatedLength, Leg, MechanismDocument
 
 
@@ -100,7 +100,7 @@ def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
         for field in fields
         if all(getattr(getattr(document.legs[j], side), field) is not None for j in legs)
     )
-    if document.motion != "planar":
+    if document.motion not in PLANAR:
         return shared
     numbers = range(1, len(document.legs) + 1)
     heights = ((f"legs[{j}].base.center.z", f"legs[{j}].platform.center.z") for j in numbers)
@@ -109,7 +109,7 @@ def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
 
 def built_in_fixed(document: MechanismDocument) -> tuple[str, ...]:
     """Entries that are no unknowns: what leaves a planar machine's plane."""
-    if document.motion != "planar":
+    if document.motion not in PLANAR:
         return ()
     return tuple(
         f"legs[{j}].{side}.{field}"

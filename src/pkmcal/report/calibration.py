@@ -99,7 +99,7 @@ def report_of(
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     # boards and trackers alone have no edges to show; legs without any do have a question
-    photographed = len(edges) > 0 or not len(observation.poses)
+    photographed = len(edges) > 0 or (not len(observation.poses) and bool(session.station_names))
     parts = (
         scene.section(session, estimate, centres, poses.places(observation, estimate)),
         parameters.section(session.machine, estimate),
@@ -111,7 +111,7 @@ def report_of(
             session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
         ),
         provenance.left_out(session, observation.rejected, estimate, findings),
-        provenance.stations(session, estimate, camera),
+        provenance.stations(session, estimate, camera) if session.station_names else None,
         provenance.how(session, estimate, timings or {}),
     )
     return Outcome(
@@ -184,6 +184,7 @@ def numbers(
         "rejected": len(observation.rejected),
         "chi2_per_freedom": statistics.chi2 / statistics.dof if statistics.dof > 0 else None,
         "edge_noise_scale": statistics.noise_scale,
+        "reading_noise_scale": statistics.reading_scale,
     }
 
 
@@ -223,8 +224,18 @@ def _tool_change(session: Session, tool: ToolPoint) -> Figure | None:
 
 
 def _data(session: Session, observation: Observation, estimate: Estimate) -> Figure:
-    """Photographs and edges, used and not; of a session without any, the trackers' poses."""
+    """Photographs and edges, used and not; of a session without any, the trackers' poses, or the
+    readings alone.
+    """
     taken = sum(len(station.photographs) for station in session.stations)
+    if not session.station_names:
+        return Figure(
+            "What is it based on?",
+            ((str(len(session.configurations)), "poses"),),
+            f"{count(session.machine.n_joints, 'reading')} of each, "
+            f"{session.machine.redundancy} more than the machine has freedoms; nothing else was"
+            " measured",
+        )
     if not taken:
         quiet, n = int(np.sum(estimate.pose_weights < KEPT)), len(observation.poses)
         kinds = sorted({table.kind for table in session.trackers})
@@ -262,7 +273,11 @@ def _fit(estimate: Estimate) -> Figure:
     value = s.chi2 / s.dof if s.dof > 0 else float("nan")
     scaled = [
         f"the {what}' stated noise was multiplied by {number(scale, 2)}"
-        for what, scale in (("edges", s.noise_scale), ("poses", s.pose_scale))
+        for what, scale in (
+            ("edges", s.noise_scale),
+            ("poses", s.pose_scale),
+            ("readings", s.reading_scale),
+        )
         if np.isfinite(scale) and abs(scale - 1) > 0.005
     ]
     return Figure(

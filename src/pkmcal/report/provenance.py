@@ -130,10 +130,24 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
             for name, scale, n in (
                 ("edges", s.noise_scale, s.n_edges),
                 ("poses", s.pose_scale, s.n_poses),
+                ("readings", s.reading_scale, s.n_joints),
+            )
+            if n
+        ),
+        *(
+            (f"What the data allow of the {name}' stated noise", f"{_between(limits)} times")
+            for name, limits, n in (
+                ("poses", s.pose_range, s.n_poses),
+                ("readings", s.reading_range, s.n_joints),
             )
             if n
         ),
     )
+
+
+def _between(limits: tuple[float, float | None]) -> str:
+    low, high = limits
+    return f"{brief(low) if low else '0'} to {'any' if high is None else brief(high)}"
 
 
 @dataclass(frozen=True)

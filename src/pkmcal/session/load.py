@@ -24,7 +24,7 @@ from pkmcal.mechanisms.region import Region
 from pkmcal.session.exif import EXIF, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
-from pkmcal.session.readings import check_readings
+from pkmcal.session.readings import check_readings, without_repeats
 from pkmcal.session.schema import (
     Body,
     SessionDocument,
@@ -136,6 +136,10 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         path = _existing(folder, document, schema.joints.file, ("joints", "file"))
         table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
         warnings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
+        if measured and not schema.stations:
+            _check_redundant(document, machine)
+            table, repeated = without_repeats(table, noise)
+            warnings += repeated
     else:
         none, columns = np.zeros((0, machine.n_joints)), machine.joint_names
         table, warnings = CsvTable(schema.joints.file, columns, (), none, ()), []
@@ -158,7 +162,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
             trackers.append(PoseTable.to_come(name, given.poses, *noise))
     _check_distinct(document, stations)
     _check_names(document, (*stations, *trackers))
-    if measured:
+    if measured and schema.stations:
         warnings += _unphotographed(table, stations, tuple(trackers))
     return Session(
         folder=folder,
@@ -258,6 +262,20 @@ def _machine(
         path = _existing(folder, document, source, ("mechanism",))
         return load_mechanism(path, label=source, model=model), path
     return load_mechanism(source, label=document.where("mechanism"), model=model), source
+
+
+def _check_redundant(document: Document, machine: Machine) -> None:
+    """Without a station, readings have only each other to be held against."""
+    if machine.redundancy > 0:
+        return
+    raise InputError(
+        "nothing was measured but the readings, and these cannot calibrate this machine: it has no"
+        " more of them than freedoms, so any geometry fits them",
+        where=document.where("stations"),
+        found=f"{machine.n_joints} readings for {machine.n_joints - machine.redundancy} freedoms",
+        expected="stations: a camera or a tracker, or a machine with more readings than freedoms",
+        next_step="Photograph the machine, or measure its platform, and name that under stations",
+    )
 
 
 def _board(folder: Path, document: Document, schema: SessionDocument) -> Path | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from math import pi
 
 import numpy as np
@@ -146,6 +147,37 @@ def _check_movement(table: CsvTable, noise: float) -> list[str]:
     return [
         f"{table.label}: {listed(names)} never moves by more than its noise; what depends on"
         " that movement cannot be told apart."
+    ]
+
+
+def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[str]]:
+    """The table with rows of one pose made one, at their mean, and a sentence about them.
+
+    For readings that are calibrated by themselves. What the model leaves out, a belt that sags or a
+    hook that is no point, is alike in all repeats of a pose; as so many measurements they would
+    promise too much. Rows are of one pose where no reading differs by more than noise explains.
+    Over so small a step the closures are straight, so a mean of rows is what the mean pose reads.
+    """
+    owner = np.full(len(table.names), -1)
+    for row in range(len(owner)):
+        if owner[row] < 0:
+            alike = (np.abs(table.values - table.values[row]) <= _ALIKE * noise).all(axis=1)
+            owner[alike & (owner < 0)] = row
+    first, group = np.unique(owner, return_inverse=True)
+    if len(first) == len(owner):
+        return table, []
+    total = np.zeros((len(first), table.values.shape[1]))
+    np.add.at(total, group, table.values)
+    merged = replace(
+        table,
+        names=tuple(table.names[row] for row in first),
+        values=total / np.bincount(group)[:, None],
+        lines=tuple(table.lines[row] for row in first),
+    )
+    return merged, [
+        f"{table.label}: its {len(owner)} rows are of {len(first)} poses, whose readings differ by"
+        f" more than {_ALIKE:g} times joints.noise; each pose counts once, by the mean of its rows,"
+        " for what the model leaves out is the same in all of them."
     ]
 
 

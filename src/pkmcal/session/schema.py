@@ -125,8 +125,8 @@ class SessionDocument(Schema):
     pkmcal: Literal[1] = Field(description="the line pkmcal: 1, the format's version")
     mechanism: str = Field(description="a mechanism's file, or a built-in's name")
     joints: JointsDocument = Field(description="file and noise of the joint readings")
-    stations: Annotated[dict[str, AnyStation], Field(min_length=1)] = Field(
-        description="one entry a camera, or a tracker, in one place"
+    stations: dict[str, AnyStation] = Field(
+        default_factory=dict, description="one entry a camera, or a tracker, in one place"
     )
     board: Annotated[BoardDocument | None, BeforeValidator(_board)] = None
     paths: dict[str, list[str]] | None = Field(

@@ -120,15 +120,20 @@ def _candidates(
     ranges = machine.joint_ranges
     share = rng.uniform(*INSIDE, (n, machine.n_joints))
     ends = np.where(rng.random(share.shape) < 0.5, *INSIDE)
-    share = np.where(rng.random((n, 1)) < extreme, ends, share)
+    if not machine.layout.overdetermined:  # else no pose has every leg near an end
+        share = np.where(rng.random((n, 1)) < extreme, ends, share)
     if ranges.size and np.isfinite(ranges).all():
         wanted = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
         found = machine.forward_result(wanted)
-        poses = found.T_base_platform[found.converged]
+        # no pose has the readings wanted of more than its freedoms: what comes nearest to them
+        near = found.converged | machine.layout.overdetermined
+        poses = found.T_base_platform[near]
     else:
         poses = _around_home(machine, n, rng)
     joints = machine.inverse(poses)
     finite = np.isfinite(joints).all(axis=-1)
+    if machine.layout.overdetermined and ranges.size:
+        finite &= ~((joints < ranges[:, 0]) | (joints > ranges[:, 1])).any(axis=-1)
     return poses[finite], joints[finite]
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, cross, rotation
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.carriers.contract import PLANAR
 from pkmcal.mechanisms.closure import leg_readings, limb_ends, skeletons
 from pkmcal.simulation.drives import Drives, drives_of, reaches, side_bars
 from pkmcal.simulation.render import Scene, ScenePart
@@ -103,7 +104,7 @@ def discs_of(machine: Machine) -> Discs:
         for p in (held[:, :2], b)
     )
     base, platform = held.mean(axis=0), b.mean(axis=0)
-    planar = machine.document.motion == "planar"
+    planar = machine.document.motion in PLANAR
     near, far = (p[0, :, 2].mean() for p in reaches(machine))
     lift, drop = POSTS if planar else (2.2, 2.2)
     over = -side if planar else -1.0 if far - near < -1e-3 else 1.0

@@ -18,6 +18,7 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import Exif, csv_text, staged_folder, with_exif, yaml_text
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
+from pkmcal.mechanisms.carriers.contract import PLANAR
 from pkmcal.simulation.board import board_part, holder_part
 from pkmcal.simulation.placement import one_a_station
 from pkmcal.simulation.render import PixelRays, ScenePart, Sensor, photograph, render
@@ -112,7 +113,7 @@ class Studio:
         fixed: tuple[ScenePart, ...] = ()
         if settings.board is not None and truth.T_base_board is not None:
             fixed = (board_part(settings.board, truth.T_base_board),)
-        flat = truth.machine.document.motion == "planar"
+        flat = truth.machine.document.motion in PLANAR
         finish = Finish.from_noise(noise, flat, settings.finish)
         board, built, eyes = settings.board, settings.as_built, tuple(cameras)
         return cls(truth, discs, finish, room, eyes, views, settings.sensor, fixed, board, built)

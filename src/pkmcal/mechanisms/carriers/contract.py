@@ -37,6 +37,8 @@ CLOSED = 1e-9
 """Of a rod's length, what is left when its reading is found, and what may be at most: where the
 rod stands square to the motion, only half of the digits can be had."""
 TINY = 1e-30
+PLANAR = ("planar", "planar-translation")
+"""Motions in planes z = const of the base frame."""
 IN_PLANE = 1e-6
 """Metres out of a plane, and radians off its normal, that rounding in a file explains."""
 
@@ -124,6 +126,11 @@ class Site(NamedTuple):
     motion: str
     where: Callable[..., str]
 
+    @property
+    def planar(self) -> bool:
+        """Whether the machine moves in planes z = const."""
+        return self.motion in PLANAR
+
 
 class Chain(NamedTuple):
     """The one elementary joint that carries a limb's end, for programs of bodies and joints.
@@ -175,7 +182,7 @@ class Carrier(ABC):
         otherwise.
         """
         axis = getattr(node, "axis", None)
-        if site.motion == "planar" and axis is not None and hypot(axis[0], axis[1]) > IN_PLANE:
+        if site.planar and axis is not None and hypot(axis[0], axis[1]) > IN_PLANE:
             raise InputError(
                 f"leg {site.leg} of a planar machine turns about an axis that is not the plane's",
                 where=site.where("axis"),

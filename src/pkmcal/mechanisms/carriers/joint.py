@@ -29,7 +29,7 @@ def check_joint(node: JointDocument, site: Site) -> None:
             where=site.where("axis"),
             expected="no axis, or joint: universal or revolute",
         )
-    if node.joint == "revolute" and node.axis is None and site.motion != "planar":
+    if node.joint == "revolute" and node.axis is None and not site.planar:
         raise InputError(
             f"leg {site.leg} has a revolute joint without an axis",
             where=site.where(),

@@ -50,7 +50,7 @@ class Slider(BaseCarrier):
     @classmethod
     def check(cls, node: SliderDocument, site: Site) -> None:
         """A planar machine's guides lie in its plane."""
-        if site.motion == "planar" and abs(node.axis[2]) > IN_PLANE:
+        if site.planar and abs(node.axis[2]) > IN_PLANE:
             raise InputError(
                 f"the slider of leg {site.leg} leaves the plane of a planar machine",
                 where=site.where("axis"),

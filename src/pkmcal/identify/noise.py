@@ -1,0 +1,144 @@
+"""How large the noise of each kind of rows is, as the data show it: variance components.
+
+An error that no unknown takes up is left in the residuals. With H the hat matrix of all rows in
+standard deviations and R = 1 - H, the residuals of kind k have the sum of squares c_k, expected as
+
+    E c_k = sum over all kinds l of s_l^2 S_kl,      S_kl = tr(R_kl R_lk),      sum_l S_kl = tr R_kk
+
+where the noise of kind l is s_l times what it counts for (MINQUE; Rao 1971). Solved again and again
+at the noise that it finds, that is restricted maximum likelihood (Patterson and Thompson 1971).
+Where poses follow their readings, S_kk of the readings is small: their residuals are mostly what
+other kinds leave in them, and hardly answer to a noise that is stated wrong; so the interval that
+the data allow is wide.
+
+c_k is nearly a multiple of a chi-square variable (Satterthwaite 1946), of ``tr^2 R_kk / S_kk``
+degrees of freedom, fewer where the s_l of the other kinds are not well known themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.identify.covariance import UNKNOWN, Information
+from pkmcal.identify.problem import Problem
+from pkmcal.identify.rows import Kinds, joint_rows
+from pkmcal.solver import normal_root, reduced_normal
+
+EDGES, POSES, READINGS = range(3)
+"""Kinds of rows in the last axes of :class:`Components`."""
+DOUBT = 0.01 / 3
+"""Probability of contradicting a noise that is stated right: one in a hundred, shared by the three
+kinds of rows."""
+FEWEST = 5.0
+"""Degrees of freedom below which a sum of squares tells no noise."""
+STEP = 10.0
+"""Largest factor on a noise in one step: what follows from it is linear no further."""
+TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Components:
+    """What B solutions leave of each kind of rows, see the module.
+
+    chi2 : (B, 3) c_k. freedom : (B, 3) tr R_kk. square : (B, 3, 3) S_kl.
+    """
+
+    chi2: Array
+    freedom: Array
+    square: Array
+
+    @property
+    def told(self) -> Array:
+        """Degrees of freedom (B, 3) of the chi-square variables that the sums of squares are."""
+        own = np.einsum("bkk->bk", self.square)
+        others = (self.freedom > FEWEST)[:, None, :] & ~np.eye(3, dtype=bool)
+        across = self.square**2 / np.where(others, own[:, None, :], 1.0)
+        spread = own + np.where(others, across, 0.0).sum(axis=-1)
+        return np.where(own > 0, self.freedom**2 / np.where(own > 0, spread, 1.0), 0.0)
+
+    def factor(self, kind: int) -> Array:
+        """By what to multiply a kind's noise next, (B,): to where c_k is as expected, or, where no
+        noise would be too much, by how much less it is.
+        """
+        square = self._variance(kind, self.chi2[:, kind])
+        less = np.minimum(self.chi2 / np.maximum(self.freedom, TINY), 1.0)[:, kind]
+        return np.sqrt(np.clip(np.where(square > less, square, less), STEP**-2, STEP**2))
+
+    def interval(self, kind: int) -> tuple[Array, Array]:
+        """Factors on a kind's noise, smallest and largest (B,) each, that the data allow; 0 and
+        infinity where they say nothing.
+        """
+        from scipy.special import chdtri
+
+        dof = self.told[:, kind]
+        known = dof > FEWEST
+        ends: list[Array] = []
+        for share in (DOUBT / 2, 1 - DOUBT / 2):
+            mean = self.chi2[:, kind] * dof / chdtri(np.where(known, dof, FEWEST), share)
+            ends.append(np.sqrt(np.maximum(self._variance(kind, mean), 0.0)))
+        return np.where(known, ends[0], 0.0), np.where(known, ends[1], np.inf)
+
+    def contradicts(self, kind: int) -> Booleans:
+        """Whether the data do not allow a kind's noise as it is, (B,)."""
+        low, high = self.interval(kind)
+        return (low > 1) | (high < 1)
+
+    def _variance(self, kind: int, chi2: Array) -> Array:
+        """s_k^2 (B,) with which a kind's sum of squares is expected to be ``chi2`` (B,), the other
+        kinds' noise as their own sums of squares have it; what is known beforehand counts as it is.
+        """
+        own = self.square[:, kind, kind]
+        known = self.freedom > FEWEST
+        others = np.where(known, self.chi2 / np.maximum(self.freedom, TINY), 1.0)
+        others[:, kind] = 1.0
+        by_others = np.sum((others - 1) * self.square[:, kind], axis=-1)
+        return 1 + (chi2 - self.freedom[:, kind] - by_others) / np.maximum(own, TINY)
+
+
+def components(info: Information, weight: Kinds[Array]) -> Components:
+    """Those of a solution with weights (B, K, G) in use.
+
+    H is Q Q^T of the own unknowns and S S^T of the shared ones, orthogonal to each other; what
+    nothing fixes has no part in it. With G_k = [Q S]_k^T [Q S]_k, tr(H_kl H_lk) = tr(G_k G_l).
+    """
+    problem, linear, reduced = info.problem, info.linear, info.reduced
+    half = normal_root(reduced_normal(linear, reduced), UNKNOWN, loose=False)
+    by_reading = problem.closure(info.state).by_reading[..., None, :]
+
+    def readings(rows: Array) -> Array:
+        """Of rows (B, K, r, n) those of the readings, (B, K, m, n)."""
+        closures = rows[..., problem.closure_rows, :].mT
+        return joint_rows(problem.layout, by_reading, closures).mT
+
+    edges, poses = (kind.rows for kind in problem.kinds)
+    n_readings = float(linear.value.shape[1] * problem.layout.n_readings)
+    count = np.stack([*counts(problem, weight), np.full(len(half), n_readings)], axis=-1)
+    every = reduced.q, reduced.rows @ half[:, None], linear.value[..., None]
+    kinds = [
+        tuple(rows[..., edges, :] for rows in every),
+        tuple(rows[..., poses, :] for rows in every),
+        tuple(readings(rows) for rows in every),
+    ]
+    own = np.stack([q.mT @ q for q, _, _ in kinds], axis=1)
+    cross = np.stack([q.mT @ s for q, s, _ in kinds], axis=1)
+    shared = np.stack([(s.mT @ s).sum(axis=1) for _, s, _ in kinds], axis=1)
+    flat = [part.reshape(len(half), 3, -1) for part in (own, np.sqrt(2) * cross, shared)]
+    parts = np.concatenate(flat, axis=-1)
+    trace = np.einsum("bkcii->bk", own) + np.einsum("bkii->bk", shared)
+    square = parts @ parts.mT
+    each = np.arange(3)
+    square[:, each, each] += count - 2 * trace
+    return Components(
+        chi2=np.stack([np.sum(value**2, axis=(1, 2, 3)) for _, _, value in kinds], axis=-1),
+        freedom=count - trace,
+        square=np.maximum(square, 0.0),
+    )
+
+
+def counts(problem: Problem, weight: Kinds[Array]) -> Kinds[Array]:
+    """Residuals of each kind in use, each counted by its robust weight, (B,)."""
+    parts = zip(problem.kinds, weight, strict=True)
+    return Kinds(*(np.sum(part * kind.count, axis=(1, 2)) for kind, part in parts))
