@@ -8,7 +8,8 @@ known beforehand of cameras, shading and mounts, the gauge (:mod:`pkmcal.identif
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,6 +45,16 @@ from pkmcal.solver import Compact, Linear, Memory, Values, of_runs
 
 CLOSINGS = 2
 """Newton steps back onto the closures; each squares what is left."""
+
+
+class _Evaluated(NamedTuple):
+    """Residuals at a point, and what they were found from."""
+
+    value: Array
+    shared_value: Array
+    closure: Closure
+    edges: EdgeRows
+    poses: PoseRows
 
 
 @dataclass(frozen=True)
@@ -152,16 +163,15 @@ class Problem:
 
     def residuals(self, state: BatchState) -> Values:
         """Residuals; NaN where a leg passes through the camera."""
-        c = self.closure(state)
-        value = self._values(state, c, self._edges(state, c), self._poses(state))
-        return Values(value, self.prior_values(state) - self.prior_target)
+        found = self._evaluated(state)
+        return Values(found.value, found.shared_value, partial(self._rows, found))
 
     def linearize(self, state: BatchState) -> Linear:
         """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
         rows = self.compact(state)
         by_shared = np.empty((*rows.value.shape, rows.n_shared))
-        for run, out in enumerate(by_shared):
-            out[...] = rows.write(run, slice(None), Memory())
+        for run in range(len(by_shared)):
+            by_shared[run] = rows.write(run, slice(None), Memory())
         return Linear(
             rows.value, by_shared, rows.by_own, rows.usable, rows.shared_value, rows.shared_by
         )
@@ -170,9 +180,17 @@ class Problem:
         """The same, with the derivatives by the shared unknowns of all rows that have few of them
         in few numbers.
         """
+        return self._rows(self._evaluated(state))
+
+    def _evaluated(self, state: BatchState) -> _Evaluated:
         c = self.closure(state)
         edges, poses = self._edges(state, c), self._poses(state)
         value = self._values(state, c, edges, poses)
+        return _Evaluated(value, self.prior_values(state) - self.prior_target, c, edges, poses)
+
+    def _rows(self, found: _Evaluated) -> Compact:
+        """The rows at a point, from what was needed of it for its residuals."""
+        value, shared_value, c, edges, poses = found
         usable = np.isfinite(value) & self._in_use()
         few, own = self._of_edges(edges)
         wide, by_pose = self._of_closures(c)
@@ -190,9 +208,7 @@ class Problem:
         def write(run: int, configurations: slice, memory: Memory) -> Array:
             return self._written(few[:, :, run], wide[run], configurations, memory)
 
-        shared_value = self.prior_values(state) - self.prior_target
-        value = np.where(usable, value, 0.0)
-        count = self.unknowns.count
+        value, count = np.where(usable, value, 0.0), self.unknowns.count
         return Compact(value, by_own, usable, shared_value, self.prior, count, write)
 
     def _written(self, few: Array, wide: Array, some: slice, memory: Memory) -> Array:
@@ -414,12 +430,14 @@ class Problem:
     ) -> BatchState:
         """The trial with its poses moved to where the closures are what the step meant them to be.
 
-        For machines with cranks or sliders, whose readings are far sharper than a board's poses:
-        the closures bend over a step by more than they may be wrong, and the search would creep.
+        For machines with cranks or sliders, whose readings are far sharper than a board's poses, or
+        with equations of joints' axes, which are as good as exact: the closures bend over a step by
+        more than they may be wrong, and the search would creep.
         """
         layout = self.layout
         freedoms = layout.own_motion.shape[1]
-        if layout.n_equations != freedoms or not any(g.carrier.driven for g in layout.base):
+        bends = any(g.carrier.driven for g in layout.base) or len(layout.angles)
+        if layout.n_equations != freedoms or not bends:
             return trial
         c = self.closure(state)
         change = shared[:, self.unknowns.machine] @ self.free.T
