@@ -39,14 +39,17 @@ from pkmcal.arrays import Array, Booleans, Integers
 LEAST_DAMPING = 1e-14
 """Damping that a search begins with, as good as none: near an answer, and starts mostly are, a full
 step is the best, and any damping costs steps along what is known little of."""
+GROWTH = 8.0
+"""Factor on it after a step that was refused, and that factor's after each more in a row: from
+nothing to a hundredth in five."""
 MOST_DAMPING = 1e9
 """Damping beyond which a step is below rounding: nothing downhill was found."""
 STEP_TOLERANCE = 1e-7
 """A step that changes all fitted values together by less, in standard deviations, ends the
 search: a ten-millionth of what the noise does, and above the rounding of 1e-9 or so."""
 REFUSED = 1e-3
-"""The same of a step that is refused, though the linear model promises something of it: that little
-is its rounding, where a direction is a millionth as well known as the others."""
+"""The same of a step that the residuals refuse, though the linear model promises something: so little
+is their rounding, where a direction is a millionth as well known as the others."""
 
 EPSILON = float(np.finfo(float).eps)
 ROUNDING = 1e-13
@@ -495,16 +498,16 @@ def _minimised(problem: _Divided, start: Any, values: Values, max_steps: int) ->
     cost = _cost(values, np.isfinite(values.value))
     steps = np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
-    dampings, sizes = np.full(n_runs, LEAST_DAMPING), np.full(n_runs, np.inf)
+    search = _Search.begun(n_runs)
     state, active = start, np.arange(n_runs)
     part, here, at = problem, start, values
     normal: Array | None = None
     for _ in range(max_steps):
-        new, gain = _try(part, here, at, dampings[active], sizes[active])
+        new, gain = _try(part, here, at, take(search, active))
         steps[active] += 1
         here, at = _kept(here, new, gain)
         state = put(state, active, here)
-        cost[active], dampings[active], sizes[active] = gain.cost, gain.damping, gain.size
+        cost[active], search = gain.cost, put(search, active, gain.search)
         normal = gain.normal if normal is None else put(normal, active, gain.normal)
         for run, reason in zip(active, gain.stop, strict=True):
             stop[run] = reason
@@ -526,29 +529,65 @@ def _kept(here: Any, new: Any, gain: _Gain) -> tuple[Any, Values | None]:
     return put(here, runs, take(new, runs)), None
 
 
-class _Gain(NamedTuple):
-    """What came of a step. values : the first part's residuals after it. size : of its change of
-    all residuals, infinite where it was refused.
+class _Search(NamedTuple):
+    """Where a search stands, (B,) each.
+
+    damping : of the next step. growth : by how much more of it, should that be refused. size : of
+    the last step's change of all residuals; infinite where it was damped or refused.
     """
+
+    damping: Array
+    growth: Array
+    size: Array
+
+    @classmethod
+    def begun(cls, n_runs: int) -> _Search:
+        """Before the first step."""
+        return cls(*(np.full(n_runs, x) for x in (LEAST_DAMPING, GROWTH, np.inf)))
+
+    def after(self, accepted: Booleans, ratio: Array, size: Array) -> _Search:
+        """After a step of a size that kept a ratio of what it promised."""
+        less = np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2.0))
+        damping = self.damping * np.where(accepted, less, self.growth)
+        return _Search(
+            np.clip(damping, LEAST_DAMPING, MOST_DAMPING),
+            np.where(accepted, GROWTH, GROWTH * self.growth),
+            np.where(accepted & self.undamped, size, np.inf),
+        )
+
+    @property
+    def undamped(self) -> Booleans:
+        """Whether the next step is a full one."""
+        return self.damping <= LEAST_DAMPING
+
+    def left(self, size: Array) -> Array:
+        """How much is left to go after a full step of this size. Steps that shrink by a factor q
+        each leave ``q / (1 - q)`` of the last (Hairer and Wanner, Solving Ordinary Differential
+        Equations II, IV.8).
+        """
+        told = self.undamped & np.isfinite(self.size) & (size < self.size)
+        return np.where(told, size, np.inf) * (size / np.where(told, self.size - size, 1.0))
+
+
+class _Gain(NamedTuple):
+    """What came of a step. values : the first part's residuals after it."""
 
     accepted: Booleans
     values: Values
     cost: Array
-    damping: Array
-    size: Array
+    search: _Search
     normal: Array
     stop: list[Stop]
 
 
 def _try(
-    problem: _Divided, state: Any, values: Values | None, damping: Array, before: Array
+    problem: _Divided, state: Any, values: Values | None, search: _Search
 ) -> tuple[Any, _Gain]:
     """One damped step of every run; returns the states after it and what came of it.
 
-    values : the residuals at the state, where they are known. before : size of the last step,
-    infinite where there is none. Steps that shrink by a factor q each leave ``q / (1 - q)`` of the
-    last one to go (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.8).
+    values : the residuals at the state, where they are known.
     """
+    damping = search.damping
     normal = _normal(problem.rows(state, values), damping, problem.memory)
     shared, own = normal.step(damping)
     trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
@@ -565,17 +604,14 @@ def _try(
     # a step near the end changes the cost by less than its rounding, and then it cannot be judged
     small |= np.abs(descent - size2) < ROUNDING * cost
     accepted = cost_trial <= cost * (1 + ROUNDING)
-    shrinks = accepted & np.isfinite(before) & (size < before)
-    small |= shrinks & (size**2 < STEP_TOLERANCE * tolerance * (before - size))
-    small |= ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2)
-    next_damping = np.where(
-        accepted, damping * np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2)), damping * 8
-    )
-    next_damping = np.clip(next_damping, LEAST_DAMPING, MOST_DAMPING)
+    small |= accepted & (search.left(size) < STEP_TOLERANCE * tolerance)
+    # a step that is refused for its rounding is better taken: all that is known of it is good
+    little = ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2)
+    small, accepted = small | little, accepted | (little & (cost_trial - cost < REFUSED**2))
     any_usable = _total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
-    cost, size = np.where(accepted, cost_trial, cost), np.where(accepted, size, np.inf)
-    return trial, _Gain(accepted, values, cost, next_damping, size, normal.matrix, stop)
+    cost, search = np.where(accepted, cost_trial, cost), search.after(accepted, ratio, size)
+    return trial, _Gain(accepted, values, cost, search, normal.matrix, stop)
 
 
 def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
