@@ -71,7 +71,9 @@ def result(case: Case) -> Shot:
     """README's first picture: a photograph with fitted edges beside the geometry's change."""
     session, estimate = case.session, case.result.estimate
     edges = case.result.observation.edges
-    centres = joint_centres(session.machine, estimate.machine, free_of_gauge(estimate))
+    centres = joint_centres(
+        session.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
+    )
     drawn = scene.scene_of(session, estimate, centres)
     taken = pictures.pictures(session, edges, estimate, outward(case), centres)
     shots = {(p.station, p.configuration): p for p in taken}
@@ -192,7 +194,9 @@ def _edge_scores(case: Case, seed: int) -> Array:
     drawing = case.session.machine
     start = start_state(drawing, measured, truth.T_camera_base)
     estimate = bundle(drawing, measured, start, use_drawing=False, scale_noise=False)
-    centres = joint_centres(truth.machine, estimate.machine, free_of_gauge(estimate))
+    centres = joint_centres(
+        truth.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
+    )
     return np.concatenate([normalised(body) for body in centres])
 
 
@@ -201,7 +205,7 @@ def _photograph_scores(case: Case, seed: int) -> dict[str, Array]:
     folder = simulated(case.work / f"repeat{seed}", seed)
     estimate = pkmcal.calibrate(folder).estimate
     truth = load_truth(folder, case.session.machine)
-    covariance = free_of_gauge(estimate)
+    covariance = free_of_gauge(estimate.machine, estimate.covariance)
     centres = joint_centres(truth.machine, estimate.machine, covariance)
     error = estimate.machine.values - truth.machine.values
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
