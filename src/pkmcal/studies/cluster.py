@@ -8,7 +8,7 @@ from typing import Any
 
 from pkmcal import __version__
 from pkmcal.errors import InputError, ResultError
-from pkmcal.studies.engine import Finished, Runner, Task, work
+from pkmcal.studies.engine import Done, Finished, Runner, Task, work
 
 TIMEOUT = 20
 """Seconds for a scheduler to answer, and for its first worker to be there."""
@@ -17,6 +17,16 @@ TIMEOUT = 20
 def _version() -> str:
     """On a worker: the program's version there."""
     return __version__
+
+
+def _worked(task: Task) -> Done:
+    """On a worker, which keeps to one thread in its linear algebra from then on: its tasks may
+    overlap, and each would give the others' threads back when it ends.
+    """
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1, "blas")
+    return work(task)
 
 
 def on_cluster(address: str) -> Runner:
@@ -84,9 +94,9 @@ def _done(client: Any, tasks: Sequence[Task], finished: Finished) -> None:
     """All tasks; what a worker had in hand when it died is done again by another."""
     from distributed import KilledWorker, as_completed
 
-    futures = {client.submit(work, task, pure=False): k for k, task in enumerate(tasks)}
+    futures = {client.submit(_worked, task, pure=False): k for k, task in enumerate(tasks)}
     try:
-        for future in as_completed(list(futures)):
+        for future in as_completed(list(futures), loop=client.loop):
             number = futures.pop(future)
             finished(number, future.result())
             future.release()
