@@ -69,7 +69,8 @@ class Store:
     def load(self, cell: int, number: int, batch: Batch) -> Done | None:
         """A finished batch; None where it is still to be done, or has another number of runs."""
         try:
-            with np.load(self._path(cell, number), allow_pickle=False) as file:
+            content = io.BytesIO(self._path(cell, number).read_bytes())
+            with np.load(content, allow_pickle=False) as file:
                 runs, wall, cpu = file["done"].tolist()
                 arrays = {name: file[name] for name in file.files if name != "done"}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
