@@ -317,7 +317,8 @@ def test_parquet(tmp_path, alone, monkeypatch):
 
 # ------------------------------------------------------------------ stopped and resumed
 
-COMMAND = ("3-rpr", *SMALL, "--runs", "40")
+COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "600")
+BATCHES = 18
 
 
 def started(out: Path, *more: str) -> subprocess.Popen[bytes]:
@@ -341,14 +342,14 @@ def test_a_study_that_is_stopped_goes_on(tmp_path, how):
     process.send_signal(getattr(signal, how))
     process.wait()
     finished = {p.name: p.stat().st_mtime_ns for p in stopped.glob("batches/*.npz")}
-    assert 2 <= len(finished) < 8
+    assert 2 <= len(finished) < BATCHES
     assert not (stopped / "study.csv").exists()
     assert run("study", *COMMAND, "-o", stopped).code == 0
     assert run("study", *COMMAND, "-o", whole).code == 0
     for name in ("study.csv", "study.json", "study.html"):
         assert (stopped / name).read_bytes() == (whole / name).read_bytes()
     kept = {p.name: p.stat().st_mtime_ns for p in stopped.glob("batches/*.npz")}
-    assert len(kept) == 8
+    assert len(kept) == BATCHES
     assert finished.items() <= kept.items()
     assert not list(stopped.glob("batches/.*"))
 
@@ -474,10 +475,10 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, alone):
                 killed.append(next(iter(local.workers.values())).pid)
                 os.kill(killed[0], signal.SIGKILL)
 
-        many = study("3-rpr", SMALL[1:2], runs=60, scheduler=local.scheduler_address,
+        many = study("a", ["configurations=5"], runs=600, scheduler=local.scheduler_address,
                      out=tmp_path / "cluster", progress=told)  # fmt: skip
     assert killed
-    one = study("3-rpr", SMALL[1:2], runs=60)
+    one = study("a", ["configurations=5"], runs=600)
     from pkmcal.report.study import document_of, runs_bytes
 
     assert runs_bytes(many, "study.csv") == runs_bytes(one, "study.csv")
