@@ -190,7 +190,7 @@ def test_the_tool_of_the_truth_is_not_off():
         ("3-rpr", ["stations=1", "configurations=10"]),
         ("h4", ["observe=board", "stations=1", "configurations=12"]),
         ("gough-stewart", ["camera=mirror", "stations=1", "configurations=10"]),
-        ("3-rpr", ["observe=legs+board", "stations=1", "configurations=5"]),
+        ("gough-stewart", ["observe=legs+board", "stations=1", "configurations=5"]),
         ("a", []),
     ],
 )

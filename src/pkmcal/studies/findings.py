@@ -37,7 +37,8 @@ class CellFindings:
     runs, failed : how many, and the share that did not converge, or had to be refused. freedom : of
     what standard errors are told from. position (m)
     and orientation (rad) : the tool's errors over the workspace, root mean square; ``_95`` : that
-    95 % of them stay below; ``_sigma`` : what calibrations state. covered, covered_tool : share of
+    95 % of them stay below; ``_sigma`` : what
+    calibrations state, their mean. covered, covered_tool : share of
     95 % intervals that hold the truth, of all parameters and of the tool's pose. held, held_tool :
     (n,) the same of the intervals of SHARES. chi2 : per degree of freedom. by_parameter : (P,)
     share of each parameter's 95 % intervals, NaN of what has none.
@@ -195,9 +196,6 @@ def found_of(cell: Cell, result: StudyResult[Setting]) -> CellFindings:
         root = float(np.sqrt(square.value))
         return Summary(root, square.error / (2 * max(root, 1e-300)))
 
-    def quadratic(name: str) -> float:
-        return float(np.sqrt(clustered(values[name][good] ** 2, batch[good]).value))
-
     tool = values["tool"][good].reshape(int(good.sum()), -1, 2, 3)
     size = np.sqrt(np.where(np.isfinite(tool).any(-1), np.nansum(tool**2, axis=-1), np.nan))
     e, s = values["parameters"][good], sigma["parameters"][good]
@@ -211,8 +209,8 @@ def found_of(cell: Cell, result: StudyResult[Setting]) -> CellFindings:
         orientation=rooted("orientation"),
         position_95=_percentile(size[:, :, 1]),
         orientation_95=_percentile(size[:, :, 0]),
-        position_sigma=quadratic("position_sigma"),
-        orientation_sigma=quadratic("orientation_sigma"),
+        position_sigma=summed("position_sigma").value,
+        orientation_sigma=summed("orientation_sigma").value,
         covered=summed("covered"),
         covered_tool=summed("covered_tool"),
         held=np.array([_mean(covered(e, s, float(share))) for share in SHARES]),
