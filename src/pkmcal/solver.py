@@ -48,8 +48,8 @@ STEP_TOLERANCE = 1e-7
 """A step that changes all fitted values together by less, in standard deviations, ends the
 search: a ten-millionth of what the noise does, and above the rounding of 1e-9 or so."""
 REFUSED = 1e-3
-"""The same of a step that the residuals refuse, though the linear model promises something: so little
-is their rounding, where a direction is a millionth as well known as the others."""
+"""The same of a step that the residuals refuse, though the linear model promises something: so
+little is their rounding, where a direction is a millionth as well known as the others."""
 
 EPSILON = float(np.finfo(float).eps)
 ROUNDING = 1e-13

@@ -58,7 +58,9 @@ HOW = (
 
 def outcome_of(found: MeasurementPlan) -> Outcome:
     """Everything that ``pkmcal plan`` tells and writes."""
-    texts = {TABLE: csv_text(found.subject.columns, found.names, found.joints.round(FINEST))}
+    texts: dict[str, str | bytes] = {
+        TABLE: csv_text(found.subject.columns, found.names, found.joints.round(FINEST))
+    }
     parts = [_order(found), _curve(found)]
     if found.tried:
         texts[PLACES] = yaml_text(stations_document(found))

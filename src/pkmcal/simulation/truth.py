@@ -242,7 +242,7 @@ def _configurations(
     )
     groups = [seen.all(axis=0)] if settings.shared else list(seen)
     if settings.handheld:  # each configuration by its own photographs
-        n, groups = 1, list(seen.reshape(n, repeats, -1).all(axis=1))
+        n, groups = 1, list(np.all(seen.reshape(n, repeats, -1), axis=1, keepdims=True)[:, 0])
     taken = np.zeros(len(poses), dtype=bool)
     chosen: list[Integers] = []
     for k, good in enumerate(groups):
