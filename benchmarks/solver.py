@@ -1,18 +1,30 @@
-"""Our joint solve against SciPy's on the same residuals, from the same start, in one run.
+"""How fast the joint solve is: beside SciPy's, by size, in studies, and beside another version.
 
-    python benchmarks/solver.py [--configurations 30]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/solver.py [--configurations 30 300 3000]
+        [--against ../other/src]
 
-SciPy's trust-region method gets the residual as one dense vector, once with finite
-differences and once with our Jacobian, columns scaled. Prints seconds, evaluations, final
-cost and the ratio of times; exits with 1 where the answers differ.
+First our solve against SciPy's trust-region method on the same residuals, from the same start: as
+one dense vector, once with our Jacobian and once with finite differences, columns scaled.
+
+Then, each in a process of its own: the solve and the whole robust estimate of a hexapod seen by
+three cameras, and the joint estimates of [A] 4.3 as a study makes them. Processor seconds, as other
+programs disturb these least, with wall-clock seconds beside them, and the greatest memory. With
+``--against`` the same is done with another version's ``src``, the two in turns, and ratios are
+printed. Times are the best of several repeats. Exits with 1 where answers differ.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import resource
+import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -20,12 +32,24 @@ from scipy.optimize import least_squares
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState
+from pkmcal.papers.four_step import solve
+from pkmcal.papers.leg_axes import centres_from_axes
 from pkmcal.solver import minimise
+from pkmcal.studies import paper_a
+from pkmcal.studies.engine import batches
 from test_identify_scene import guess, make_scene
+
+RUNS = 25
+"""Runs of a study that are solved at once, as its own batches."""
+REPEATS = 3
+SAME = 1e-6
+"""Relative difference of costs, and of stated deviations: what is left of a search, and half of the
+digits of a normal matrix."""
 
 
 class Flat:
@@ -59,42 +83,137 @@ class Flat:
         return out
 
 
-def timed(run):  # noqa: ANN001, ANN201
-    """Result and seconds, best of two."""
-    best = np.inf
-    for _ in range(2):
-        begin = time.perf_counter()
-        result = run()
-        best = min(best, time.perf_counter() - begin)
-    return result, best
+def timed(work: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
+    """Result, processor seconds and wall-clock seconds, the best of several."""
+    result, best = None, np.full(2, np.inf)
+    for _ in range(repeats):
+        begin = time.process_time(), time.perf_counter()
+        result = work()
+        best = np.minimum(best, np.subtract((time.process_time(), time.perf_counter()), begin))
+    return result, float(best[0]), float(best[1])
 
 
-def main() -> int:
-    """Run the comparison; 0 where all three find the same minimum."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--configurations", type=int, default=30)
-    count = parser.parse_args().configurations
+def session(count: int) -> tuple[Any, Any, Any, Problem, BatchState]:
+    """A hexapod's machine, measurements and start, and the problem that they make."""
     rng = np.random.default_rng(0)
     scene = make_scene(rng, configurations=count)
     measurements = scene.measurements(rng)
     assembled = assemble(scene.machine, measurements, ThreeCentres())
-    stations = guess(rng, scene.T_camera_base)
-    start = batch_of(scene.machine, assembled, start_state(scene.machine, measurements, stations))
-    flat = Flat(assembled.problem, start)
-    x0 = np.zeros(assembled.problem.unknowns.count + flat.n_own)
+    state = start_state(scene.machine, measurements, guess(rng, scene.T_camera_base))
+    start = batch_of(scene.machine, assembled, state)
+    return scene.machine, measurements, state, assembled.problem, start
+
+
+def against_scipy(count: int) -> bool:
+    """Print the comparison; False where the three do not find the same minimum."""
+    _, measurements, _, problem, start = session(count)
+    flat = Flat(problem, start)
+    x0 = np.zeros(problem.unknowns.count + flat.n_own)
     options = {"x_scale": "jac", "xtol": 1e-10, "ftol": 1e-12, "gtol": 1e-10}
-    ours, our_time = timed(lambda: minimise(assembled.problem, start))
+    ours, our_time, _ = timed(lambda: minimise(problem, start), REPEATS)
     rows = [("pkmcal", our_time, int(ours.steps[0]), float(ours.cost[0]))]
     for name, jac in (("scipy, our Jacobian", flat.jacobian), ("scipy, 2-point", "2-point")):
-        found, seconds = timed(lambda j=jac: least_squares(flat.residuals, x0, j, **options))
+        found, seconds, _ = timed(lambda j=jac: least_squares(flat.residuals, x0, j, **options), 1)
         rows.append((name, seconds, found.nfev, 2 * found.cost))
-    lines = [f"{count} configurations, {len(measurements.edges)} edges, {x0.size} unknowns"]
-    lines += [
-        f"{name:22s}{seconds:9.3f} s{n:6d} steps  cost {cost:.6f}  x {seconds / our_time:.1f}"
-        for name, seconds, n, cost in rows
-    ]
-    sys.stdout.write("\n".join(lines) + "\n")
-    same = np.allclose([r[3] for r in rows], rows[0][3], rtol=1e-4)
+    say(f"{count} configurations, {len(measurements.edges)} edges, {x0.size} unknowns")
+    for name, seconds, n, cost in rows:
+        say(f"{name:22s}{seconds:9.3f} s{n:6d} steps  cost {cost:.6f}  x {seconds / our_time:.1f}")
+    return bool(np.allclose([r[3] for r in rows], rows[0][3], rtol=1e-4))
+
+
+def measured(what: str, count: int) -> dict[str, float]:
+    """One measurement in this process: seconds, steps, an answer to compare, megabytes."""
+    if what == "study":
+        work, answer, per = study(count)
+    else:
+        machine, measurements, state, problem, start = session(count)
+        per = 1
+        if what == "solve":
+
+            def work() -> Any:
+                return minimise(problem, start)
+
+            def answer(found: Any) -> tuple[float, float]:
+                return found.steps[0], found.cost[0]
+        else:
+
+            def work() -> Any:
+                return bundle(machine, measurements, state)
+
+            def answer(found: Any) -> tuple[float, float]:
+                return found.statistics.steps, float(np.sum(np.diag(found.covariance)))
+
+    found, cpu, wall = timed(work, REPEATS if count < 1000 else 1)
+    steps, value = answer(found)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return {
+        "cpu": cpu / per,
+        "wall": wall / per,
+        "steps": float(steps),
+        "answer": float(value),
+        "MB": memory,
+    }
+
+
+def study(runs: int) -> tuple[Callable[[], Any], Callable[[Any], tuple[float, float]], int]:
+    """The joint estimates of [A] 4.3 from the four steps' answers."""
+    setting = paper_a.HexapodByAxes(batch=runs)
+    data = setting.draw(batches(setting, runs, seed=0)[0])
+    axes = paper_a.measured_axes(data)
+    steps = solve(data.machine, axes, *centres_from_axes(axes, paper_a.STATIONS), "corrected")
+    start = paper_a.Start(paper_a.parameters_of(data.machine, steps), steps.T_camera_base)
+
+    def answer(found: paper_a.Fitted) -> tuple[float, float]:
+        return found.told["steps"].mean(), found.sigma["parameters"].mean()
+
+    return lambda: paper_a.joint_estimate(data, start), answer, runs
+
+
+def in_turns(what: str, count: int, sources: list[Path]) -> list[dict[str, float]]:
+    """The best of several measurements with each version's source, in turns."""
+    best: list[dict[str, float]] = [{} for _ in sources]
+    for _ in range(REPEATS):
+        for k, source in enumerate(sources):
+            command = [sys.executable, __file__, "--one", what, str(count)]
+            environment = {**os.environ, "PYTHONPATH": str(source)}
+            done = subprocess.run(  # noqa: S603
+                command, env=environment, capture_output=True, text=True, check=True
+            )
+            found = json.loads(done.stdout)
+            best[k] = {key: min(found[key], best[k].get(key, np.inf)) for key in found}
+    return best
+
+
+def say(line: str) -> None:
+    """Print a line at once: the next may take minutes."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    """Run all comparisons; 0 where answers agree."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--configurations", type=int, nargs="+", default=[30])
+    parser.add_argument("--against", type=Path)
+    parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.one:
+        sys.stdout.write(json.dumps(measured(options.one[0], int(options.one[1]))))
+        return 0
+    same = against_scipy(options.configurations[0])
+    sources = [Path(__file__).resolve().parents[1] / "src"]
+    sources += [options.against.resolve()] if options.against else []
+    work = [(what, n) for n in options.configurations for what in ("solve", "bundle")]
+    for what, count in [*work, ("study", RUNS)]:
+        found = in_turns(what, count, sources)
+        for name, m in zip(("this", "other"), found, strict=False):
+            say(
+                f"{what:7s}{count:6d} {name:6s}{m['cpu']:10.4f} s of the processor"
+                f"{m['wall']:10.4f} s{m['steps']:7.2f} steps{m['MB']:7.0f} MB"
+            )
+        if len(found) > 1:
+            say(f"{'':20s}x {found[1]['cpu'] / found[0]['cpu']:.2f}")
+            same &= bool(np.isclose(found[0]["answer"], found[1]["answer"], rtol=SAME))
     return 0 if same else 1
 
 
