@@ -176,7 +176,7 @@ def in_turns(what: str, count: int, sources: list[Path]) -> list[dict[str, float
         for k, source in enumerate(sources):
             command = [sys.executable, __file__, "--one", what, str(count)]
             environment = {**os.environ, "PYTHONPATH": str(source)}
-            done = subprocess.run(  # noqa: S603
+            done = subprocess.run(
                 command, env=environment, capture_output=True, text=True, check=True
             )
             found = json.loads(done.stdout)

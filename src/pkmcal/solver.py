@@ -571,7 +571,7 @@ class _Search(NamedTuple):
         Equations II, IV.8).
         """
         told = self.undamped & np.isfinite(self.size) & (size < self.size)
-        return np.where(told, size, np.inf) * (size / np.where(told, self.size - size, 1.0))
+        return np.where(told, size**2 / np.where(told, self.size - size, 1.0), np.inf)
 
 
 class _Gain(NamedTuple):
