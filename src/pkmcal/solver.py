@@ -42,6 +42,8 @@ step is the best, and any damping costs steps along what is known little of."""
 GROWTH = 8.0
 """Factor on it after a step that was refused, and that factor's after each more in a row: from
 nothing to a hundredth in five."""
+STRONG = 1e-2
+"""Damping from which on a step is small anywhere, so that its size tells nothing."""
 MOST_DAMPING = 1e9
 """Damping beyond which a step is below rounding: nothing downhill was found."""
 STEP_TOLERANCE = 1e-7
@@ -611,7 +613,7 @@ def _try(
     accepted = cost_trial <= cost * (1 + ROUNDING)
     small |= accepted & (search.left(size) < STEP_TOLERANCE * tolerance)
     # a step that is refused for its rounding is better taken: all that is known of it is good
-    little = ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2)
+    little = ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2) & (damping < STRONG)
     small, accepted = small | little, accepted | (little & (cost_trial - cost < REFUSED**2))
     any_usable = _total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
@@ -622,7 +624,7 @@ def _try(
 def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
     if not usable:
         return Stop.NOT_FINITE
-    if small and damping < 1e-2:  # a strongly damped step is small anywhere
+    if small and damping < STRONG:
         return Stop.CONVERGED
     return Stop.STALLED if not accepted and damping >= MOST_DAMPING else Stop.RUNNING
 
