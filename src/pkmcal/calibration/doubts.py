@@ -364,9 +364,9 @@ def noise_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
     if s.reading_scale <= 1 or noise <= most:
         return ()
     return (
-        f"The readings scatter by {_lengths(noise, units)} about what else was measured, more than"
-        f" the drawing's tolerance of {_lengths(most, units)}: they may belong to other"
-        " configurations, or to another machine.",
+        f"The readings scatter by {_lengths(noise, units)}, more than the drawing's tolerance of"
+        f" {_lengths(most, units)}: they may belong to other configurations, or to another"
+        " machine.",
     )
 
 
