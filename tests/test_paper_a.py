@@ -132,13 +132,13 @@ def test_standard_errors_are_the_scatter_of_studies():
     assert np.all((ratio > 0.29) & (ratio < 1.87)), ratio
 
 
-def test_the_result_does_not_depend_on_threads(monkeypatch):
+def test_the_result_does_not_depend_on_workers(monkeypatch):
     results, told = [], []
     for count in (1, 3):
-        monkeypatch.setattr("os.cpu_count", lambda count=count: count)
+        monkeypatch.setattr("pkmcal.studies.workers.cores", lambda count=count: count)
         setting = HexapodByAxes(batch=4)
         results.append(engine.run(setting, 10, 3, told=lambda _text, share: told.append(share)))
-    assert [r.threads for r in results] == [1, 3]
+    assert [r.workers for r in results] == [1, 3]
     assert told == pytest.approx(2 * [1 / 3, 2 / 3, 1])
     for name in METHODS:
         assert results[0].of(name) == results[1].of(name)

@@ -10,7 +10,7 @@ from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
-from pkmcal.identify.tool import pose_by_parameters, tool_point
+from pkmcal.identify.tool import pose_by_parameters, tool_error
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.charts import ticks_between
@@ -115,7 +115,7 @@ def test_uncertainty_does_not_depend_on_the_frame(case):
     shift = np.zeros(len(machine.values))
     shift[index[:, 0]] = 1e-3  # a common shift of the base along x: a frame change
     moved = with_covariance(case.estimate, case.estimate.covariance + np.outer(shift, shift))
-    once, twice = free_of_gauge(case.estimate), free_of_gauge(moved)
+    once, twice = (free_of_gauge(e.machine, e.covariance) for e in (case.estimate, moved))
     np.testing.assert_allclose(once, twice, atol=1e-6 * once.max())
 
 
@@ -128,10 +128,8 @@ def test_drawing_is_laid_over_before_the_change_is_told(case):
     base, platform = joint_centres(drawing, drawing.with_values(values), estimate.covariance)
     assert np.abs(base.change).max() < 1e-12
     assert np.abs(platform.change).max() < 1e-12
-    used = np.array([1, 3])
-    centres = joint_centres(drawing, estimate.machine, estimate.covariance)
-    tool = tool_point(drawing, estimate.machine, estimate.covariance, session.joints,
-                      estimate.state.T_base_platform, used, centres)  # fmt: skip
+    tool = tool_error(drawing, estimate.machine, estimate.covariance,
+                      estimate.state.T_base_platform[[1, 3]], session.joints[[1, 3]])  # fmt: skip
     assert (tool.position > 1e-5).all()
     assert (tool.off_position > 1e-4).all()
 

@@ -27,9 +27,12 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
+from pkmcal.planning.plan import plan as make_plan
+from pkmcal.planning.subject import of_machine
 from pkmcal.report import page, pictures, scene
 from pkmcal.report import residuals as shown
 from pkmcal.report.calibration import save
+from pkmcal.report.plan import outcome_of
 from pkmcal.simulation import EdgeNoise, load_truth, simulate_edges, simulate_session
 from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera
 
@@ -68,7 +71,9 @@ def result(case: Case) -> Shot:
     """README's first picture: a photograph with fitted edges beside the geometry's change."""
     session, estimate = case.session, case.result.estimate
     edges = case.result.observation.edges
-    centres = joint_centres(session.machine, estimate.machine, free_of_gauge(estimate))
+    centres = joint_centres(
+        session.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
+    )
     drawn = scene.scene_of(session, estimate, centres)
     taken = pictures.pictures(session, edges, estimate, outward(case), centres)
     shots = {(p.station, p.configuration): p for p in taken}
@@ -189,7 +194,9 @@ def _edge_scores(case: Case, seed: int) -> Array:
     drawing = case.session.machine
     start = start_state(drawing, measured, truth.T_camera_base)
     estimate = bundle(drawing, measured, start, use_drawing=False, scale_noise=False)
-    centres = joint_centres(truth.machine, estimate.machine, free_of_gauge(estimate))
+    centres = joint_centres(
+        truth.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
+    )
     return np.concatenate([normalised(body) for body in centres])
 
 
@@ -198,7 +205,7 @@ def _photograph_scores(case: Case, seed: int) -> dict[str, Array]:
     folder = simulated(case.work / f"repeat{seed}", seed)
     estimate = pkmcal.calibrate(folder).estimate
     truth = load_truth(folder, case.session.machine)
-    covariance = free_of_gauge(estimate)
+    covariance = free_of_gauge(estimate.machine, estimate.covariance)
     centres = joint_centres(truth.machine, estimate.machine, covariance)
     error = estimate.machine.values - truth.machine.values
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -256,7 +263,10 @@ def photograph(shot: Shot, path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "page.html", Path(folder) / "page.png"
         source.write_text(shot.html, encoding="utf-8")
-        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        command = [browser, "--headless=new", "--no-sandbox", "--hide-scrollbars"]
+        # drawings in space need WebGL, and a moment
+        command += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        command += ["--virtual-time-budget=8000"]
         command += [f"--window-size={shot.width},{shot.height}", f"--screenshot={target}"]
         subprocess.run([*command, source.as_uri()], check=True, capture_output=True, timeout=120)
         image = cv2.imread(str(target))
@@ -269,9 +279,30 @@ def photograph(shot: Shot, path: Path) -> None:
         sys.exit(f"{path} is larger than {LARGEST / 1e3:.0f} kB")
 
 
+def plan(_case: Case) -> Shot:
+    """Where a plan puts three cameras round a hexapod: the page's drawing in space."""
+    machine = pkmcal.load_mechanism(MECHANISM)
+    subject = of_machine(machine, [demo_camera()], machine.joint_names)
+    found = outcome_of(make_plan(subject, free_places=3))
+    kept = tuple(part for part in found.parts if part.name == "where")
+    html = page.page_html(replace(found, parts=kept, findings=()))
+    return Shot(html, 1000, 1390)
+
+
 PICTURES: dict[str, Callable[[Case], Shot]] = {
     f.__name__.replace("_", "-"): f
-    for f in (result, report, frames, edge_planes, looks, profile, positions, residuals, repeats)
+    for f in (
+        result,
+        report,
+        frames,
+        edge_planes,
+        looks,
+        profile,
+        positions,
+        residuals,
+        repeats,
+        plan,
+    )
 }
 
 

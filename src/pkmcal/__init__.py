@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import Machine, load_mechanism
     from pkmcal.session.load import load_session
+    from pkmcal.studies.findings import study
 
 __version__ = "0.1.0"
 
@@ -31,6 +32,7 @@ __all__ = [
     "load_camera",
     "load_mechanism",
     "load_session",
+    "study",
 ]
 
 _HOMES = {
@@ -39,6 +41,7 @@ _HOMES = {
     "load_camera": "pkmcal.cameras",
     "load_mechanism": "pkmcal.mechanisms",
     "load_session": "pkmcal.session.load",
+    "study": "pkmcal.studies.findings",
 }
 
 

@@ -209,7 +209,7 @@ class Outcome:
     closing: str = ""
     document: dict[str, Any] = field(default_factory=dict[str, Any])
     summary: dict[str, Any] | None = None
-    texts: dict[str, str] = field(default_factory=dict[str, str])
+    texts: dict[str, str | bytes] = field(default_factory=dict[str, str | bytes])
 
     @property
     def mark(self) -> Mark:

@@ -39,16 +39,17 @@ from pkmcal.arrays import Array, Booleans, Integers
 LEAST_DAMPING = 1e-14
 """Damping that a search begins with, as good as none: near an answer, and starts mostly are, a full
 step is the best, and any damping costs steps along what is known little of."""
-USEFUL_DAMPING = 1e-5
-"""Damping after a step that did not keep its promise, at least: much less changes no step."""
+GROWTH = 8.0
+"""Factor on it after a step that was refused, and that factor's after each more in a row: from
+nothing to a hundredth in five."""
 MOST_DAMPING = 1e9
 """Damping beyond which a step is below rounding: nothing downhill was found."""
 STEP_TOLERANCE = 1e-7
 """A step that changes all fitted values together by less, in standard deviations, ends the
 search: a ten-millionth of what the noise does, and above the rounding of 1e-9 or so."""
 REFUSED = 1e-3
-"""The same of a step that is refused, though the linear model promises something of it: that little
-is its rounding, where a direction is a millionth as well known as the others."""
+"""The same of a step that the residuals refuse, though the linear model promises something: so
+little is their rounding, where a direction is a millionth as well known as the others."""
 
 EPSILON = float(np.finfo(float).eps)
 ROUNDING = 1e-13
@@ -102,10 +103,14 @@ class Linear(NamedTuple):
 
 
 class Values(NamedTuple):
-    """Residuals alone: value (B, K, r) with NaN where nothing can be predicted, shared (B, c)."""
+    """Residuals alone: value (B, K, r) with NaN where nothing can be predicted, shared (B, c).
+
+    rows : gives the Jacobian there, where it costs less to go on from what these took.
+    """
 
     value: Array
     shared_value: Array
+    rows: Callable[[], Compact] | None = None
 
 
 class LeastSquares(Protocol):
@@ -433,8 +438,8 @@ def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solutio
     found: list[Solution] = []
     for first in range(0, n_runs, few):
         runs = np.arange(first, min(first + few, n_runs))
-        part, at, here = problem.select(runs), take(start, runs), take(values, runs)
-        found.append(_minimised(_Divided.of(part, here), at, here, max_steps))
+        part, here = problem.select(runs), Values(values.value[runs], values.shared_value[runs])
+        found.append(_minimised(_Divided.of(part, here), take(start, runs), here, max_steps))
     return Solution(
         _each(lambda *states: np.concatenate(states), *(one.state for one in found)),
         np.concatenate([one.cost for one in found]),
@@ -468,24 +473,28 @@ class _Divided(NamedTuple):
         parts = [(cut, part.select(runs)) for cut, part in self.parts]
         return self._replace(problem=self.problem.select(runs), parts=parts)
 
-    def rows(self, state: Any) -> Iterator[Compact]:
-        """Residuals and Jacobian of one part after the other."""
+    def rows(self, state: Any, values: Values | None) -> Iterator[Compact]:
+        """Residuals and Jacobian of one part after the other; values : the residuals there, where
+        they are known.
+        """
+        if len(self.parts) == 1 and values is not None and values.rows is not None:
+            yield values.rows()
+            return
         for cut, part in self.parts:
             if isinstance(part, Divisible):
                 yield part.compact(part.state_among(state, cut))
             else:
                 yield compact(part.linearize(state))
 
-    def cost(self, state: Any, usable: list[Booleans]) -> Array:
-        """Sum of squares (B,) of the rows that were usable."""
-        total: list[Array] = []
-        for (cut, part), use in zip(self.parts, usable, strict=True):
-            here = part.state_among(state, cut) if isinstance(part, Divisible) else state
-            values = part.residuals(here)
-            if total:
-                values = values._replace(shared_value=values.shared_value[:, :0])
-            total.append(_cost(values, use))
-        return _total(total)
+    def residuals(self, state: Any) -> Iterator[Values]:
+        """Residuals of one part after the other; those of shared unknowns only in the first."""
+        for k, (cut, part) in enumerate(self.parts):
+            if len(self.parts) > 1 and isinstance(part, Divisible):
+                state_of_part = part.state_among(state, cut)
+            else:
+                state_of_part = state
+            values = part.residuals(state_of_part)
+            yield values._replace(shared_value=values.shared_value[:, :0]) if k else values
 
 
 def _minimised(problem: _Divided, start: Any, values: Values, max_steps: int) -> Solution:
@@ -494,16 +503,16 @@ def _minimised(problem: _Divided, start: Any, values: Values, max_steps: int) ->
     cost = _cost(values, np.isfinite(values.value))
     steps = np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
-    dampings, sizes = np.full(n_runs, LEAST_DAMPING), np.full(n_runs, np.inf)
+    search = _Search.begun(n_runs)
     state, active = start, np.arange(n_runs)
-    part, here = problem, start
+    part, here, at = problem, start, values
     normal: Array | None = None
     for _ in range(max_steps):
-        new, gain = _try(part, here, dampings[active], sizes[active])
+        new, gain = _try(part, here, at, take(search, active))
         steps[active] += 1
-        here = put(here, np.flatnonzero(gain.accepted), new)
+        here, at = _kept(here, new, gain)
         state = put(state, active, here)
-        cost[active], dampings[active], sizes[active] = gain.cost, gain.damping, gain.size
+        cost[active], search = gain.cost, put(search, active, gain.search)
         normal = gain.normal if normal is None else put(normal, active, gain.normal)
         for run, reason in zip(active, gain.stop, strict=True):
             stop[run] = reason
@@ -512,34 +521,87 @@ def _minimised(problem: _Divided, start: Any, values: Values, max_steps: int) ->
             break
         if keep.size < active.size:
             active = active[keep]
-            part, here = problem.select(active), take(state, active)
+            part, here, at = problem.select(active), take(state, active), None
     final = tuple(Stop.STEPS if s is Stop.RUNNING else s for s in stop)
     return Solution(state, cost, steps, final, cast(Array, normal))
 
 
+def _kept(here: Any, new: Any, gain: _Gain) -> tuple[Any, Values | None]:
+    """The state with the steps that were accepted, and the residuals there where they are known."""
+    if gain.accepted.all():
+        return new, gain.values
+    runs = np.flatnonzero(gain.accepted)
+    return put(here, runs, take(new, runs)), None
+
+
+class _Search(NamedTuple):
+    """Where a search stands, (B,) each.
+
+    damping : of the next step. growth : by how much more of it, should that be refused. size : of
+    the last step's change of all residuals; infinite where it was damped or refused.
+    """
+
+    damping: Array
+    growth: Array
+    size: Array
+
+    @classmethod
+    def begun(cls, n_runs: int) -> _Search:
+        """Before the first step."""
+        return cls(*(np.full(n_runs, x) for x in (LEAST_DAMPING, GROWTH, np.inf)))
+
+    def after(self, accepted: Booleans, ratio: Array, size: Array) -> _Search:
+        """After a step of a size that kept a ratio of what it promised."""
+        less = np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2.0))
+        damping = self.damping * np.where(accepted, less, self.growth)
+        return _Search(
+            np.clip(damping, LEAST_DAMPING, MOST_DAMPING),
+            np.where(accepted, GROWTH, GROWTH * self.growth),
+            np.where(accepted & self.undamped, size, np.inf),
+        )
+
+    @property
+    def undamped(self) -> Booleans:
+        """Whether the next step is a full one."""
+        return self.damping <= LEAST_DAMPING
+
+    def left(self, size: Array) -> Array:
+        """How much is left to go after a full step of this size. Steps that shrink by a factor q
+        each leave ``q / (1 - q)`` of the last (Hairer and Wanner, Solving Ordinary Differential
+        Equations II, IV.8).
+        """
+        told = self.undamped & np.isfinite(self.size) & (size < self.size)
+        return np.where(told, size, np.inf) * (size / np.where(told, self.size - size, 1.0))
+
+
 class _Gain(NamedTuple):
-    """What came of a step. size : of its change of all residuals, infinite where it was refused."""
+    """What came of a step. values : the first part's residuals after it."""
 
     accepted: Booleans
+    values: Values
     cost: Array
-    damping: Array
-    size: Array
+    search: _Search
     normal: Array
     stop: list[Stop]
 
 
-def _try(problem: _Divided, state: Any, damping: Array, before: Array) -> tuple[Any, _Gain]:
-    """One damped step of every run; returns the accepted runs' new states and what came of it.
+def _try(
+    problem: _Divided, state: Any, values: Values | None, search: _Search
+) -> tuple[Any, _Gain]:
+    """One damped step of every run; returns the states after it and what came of it.
 
-    before : size of the last step, infinite where there is none. Steps that shrink by a factor q
-    each leave ``q / (1 - q)`` of the last one to go (Hairer and Wanner, Solving Ordinary
-    Differential Equations II, IV.8).
+    values : the residuals at the state, where they are known.
     """
-    normal = _normal(problem.rows(state), damping, problem.memory)
+    damping = search.damping
+    normal = _normal(problem.rows(state, values), damping, problem.memory)
     shared, own = normal.step(damping)
     trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
     usable = [part.usable for part in normal.parts]
-    cost, cost_trial = normal.cost, problem.cost(trial, usable)
+    after = problem.residuals(trial)
+    values = next(after)
+    cost, cost_trial = normal.cost, _cost(values, usable[0])
+    for part, use in zip(after, usable[1:], strict=True):
+        cost_trial = cost_trial + _cost(part, use)
     descent, size2 = normal.promise(shared, own)
     ratio = (cost - cost_trial) / np.maximum(descent - size2, 1e-300)
     size, tolerance = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
@@ -547,18 +609,14 @@ def _try(problem: _Divided, state: Any, damping: Array, before: Array) -> tuple[
     # a step near the end changes the cost by less than its rounding, and then it cannot be judged
     small |= np.abs(descent - size2) < ROUNDING * cost
     accepted = cost_trial <= cost * (1 + ROUNDING)
-    shrinks = accepted & np.isfinite(before) & (size < before)
-    small |= shrinks & (size**2 < STEP_TOLERANCE * tolerance * (before - size))
-    small |= ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2)
-    less = damping * np.where(ratio > 0.5, 0.05, 0.5)
-    more = np.maximum(damping * np.where(accepted, 2.0, 8.0), USEFUL_DAMPING)
-    next_damping = np.where(accepted & (ratio > 0.2), less, more)
-    next_damping = np.clip(next_damping, LEAST_DAMPING, MOST_DAMPING)
+    small |= accepted & (search.left(size) < STEP_TOLERANCE * tolerance)
+    # a step that is refused for its rounding is better taken: all that is known of it is good
+    little = ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2)
+    small, accepted = small | little, accepted | (little & (cost_trial - cost < REFUSED**2))
     any_usable = _total(np.sum(part, axis=(1, 2)) for part in usable) > 0
     stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
-    new = take(trial, np.flatnonzero(accepted))
-    cost, size = np.where(accepted, cost_trial, cost), np.where(accepted, size, np.inf)
-    return new, _Gain(accepted, cost, next_damping, size, normal.matrix, stop)
+    cost, search = np.where(accepted, cost_trial, cost), search.after(accepted, ratio, size)
+    return trial, _Gain(accepted, values, cost, search, normal.matrix, stop)
 
 
 def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:

@@ -33,7 +33,9 @@ from pkmcal.calibration.recognise import (
 )
 from pkmcal.calibration.turns import Progress, Turns, identify_poses, take_turns
 from pkmcal.identify.bundle import what_data_tell
+from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.identify.unidentified import Findings, explain, joined_by_boards, seen_legs
 from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
@@ -75,6 +77,22 @@ class Calibration:
     def machine(self) -> Machine:
         """The calibrated machine."""
         return self.estimate.machine
+
+    def tool_error(self, T_base_platform: Array) -> ToolError:
+        """How sure poses (n, 4, 4) of the calibrated machine are, and how wrong the drawing's were;
+        see :func:`pkmcal.identify.tool.tool_error`. No frame is favoured: base and platform are
+        laid over the drawing's by all joint centres, or, where only boards or trackers saw the
+        machine, by these poses. NaN where the machine cannot take a pose. Raises InputError for an
+        array that holds no poses.
+        """
+        machine = self.estimate.machine
+        return tool_error(
+            self.session.machine,
+            machine,
+            free_of_gauge(machine, self.estimate.covariance),
+            checked_poses(T_base_platform),
+            legs_seen=self.estimate.edge_weights.size > 0,
+        )
 
 
 def calibrate(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import platform
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -29,7 +29,9 @@ from pkmcal.files import (
     validate,
 )
 from pkmcal.geometry.rigid import inverse, skew
+from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.decided import decided_by
+from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document, mechanism_text
 from pkmcal.outcome import Verdict
@@ -473,6 +475,20 @@ class SavedCalibration:
         """(P, P) of the machine's parameters."""
         n = len(self.machine.parameters)
         return self.joint_covariance[:n, :n]
+
+    def tool_error(self, T_base_platform: Array) -> ToolError:
+        """As :meth:`pkmcal.calibration.calibrate.Calibration.tool_error`, from the file."""
+        edges = (self.document.get("residuals") or {}).get("edges")
+        # what the file's machine calls its drawing are the calibrated values
+        table = replace(self.machine.parameters, drawing=self.drawing)
+        machine = replace(self.machine, parameters=table)
+        return tool_error(
+            machine.with_values(self.drawing),
+            machine,
+            free_of_gauge(machine, self.covariance),
+            checked_poses(T_base_platform),
+            legs_seen=bool(edges),
+        )
 
     def with_stations(self, names: Sequence[str]) -> Array:
         """Joint covariance (P + 6 n, P + 6 n) of the parameters and of n stations in their order,

@@ -28,6 +28,7 @@ from pkmcal.commands import (
     reproduce,
     servo,
     simulate,
+    study,
     validate,
     watch,
 )
@@ -55,6 +56,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "export": export.export,
     "watch": watch.watch,
     "simulate": simulate.simulate,
+    "study": study.study,
     "reproduce": reproduce.reproduce,
 }
 """In the order of the help: the order in which a newcomer needs them."""

@@ -12,7 +12,7 @@ from pkmcal.arrays import Array, rms
 from pkmcal.identify.centres import joint_centres
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.identify.tool import tool_point
+from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import Machine
 from pkmcal.simulation import Truth, load_truth
 
@@ -66,10 +66,7 @@ def _errors(machine: Machine, truth: Truth) -> Errors:
     table = machine.parameters
     nothing = np.zeros((len(table), len(table)))
     centres = joint_centres(machine, truth.machine, nothing)
-    every = np.arange(len(truth.joints))
-    tool = tool_point(
-        machine, truth.machine, nothing, truth.joints, truth.T_base_platform, every, centres
-    )
+    tool = tool_error(machine, truth.machine, nothing, truth.T_base_platform, truth.joints)
     change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres])
     offsets = (machine.values - truth.machine.values)[table.of_kind("offset")]
     return Errors(

@@ -71,8 +71,8 @@ def answer(
     return outcome.exit_code
 
 
-def contents(outcome: Outcome, files: Mapping[str, str]) -> dict[str, str]:
-    """The text of each of the files."""
+def contents(outcome: Outcome, files: Mapping[str, str]) -> dict[str, str | bytes]:
+    """The content of each of the files."""
     from pkmcal.files import json_text
     from pkmcal.report.page import page_html
 

@@ -57,11 +57,12 @@ def check_own_folder(
         )
 
 
-def write_folder(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write texts by their files' names, all of them or none."""
+def write_folder(folder: Path, texts: Mapping[str, str | bytes]) -> None:
+    """Write texts, or bytes, by their files' names, all of them or none."""
     with staged_folder(folder) as stage:
         for name, text in texts.items():
-            (stage / name).write_text(text, encoding="utf-8", newline="\n")
+            content = text.encode("utf-8") if isinstance(text, str) else text
+            (stage / name).write_bytes(content)
 
 
 def write_text(path: Path | str, text: str) -> None:

@@ -13,8 +13,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, register
-from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.gauge import BestFit, transformation
+from pkmcal.identify.gauge import BestFit, generators, projector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import LimbEnds, limb_ends
 
@@ -68,13 +67,12 @@ def joint_centres(drawing: Machine, calibrated: Machine, covariance: Array) -> t
     return tuple(found)
 
 
-def free_of_gauge(estimate: Estimate, covariance: Array | None = None) -> Array:
-    """Covariance (P, P) of the parameters about the best fit of all centres to the drawing; the
-    estimate's, or another in any frames.
+def free_of_gauge(machine: Machine, covariance: Array) -> Array:
+    """The covariance (P, P) of a machine's parameters, told in any frames, about the best fit of
+    all centres to the drawing.
     """
-    covariance = estimate.covariance if covariance is None else covariance
-    n = len(covariance)
-    keep = transformation(estimate.machine, estimate.state, BestFit())[:n, :n]
+    by_frames = generators(machine.layout, machine.values)
+    keep = np.eye(len(covariance)) - by_frames @ projector(machine, machine.values, BestFit())
     return keep @ covariance @ keep.T
 
 

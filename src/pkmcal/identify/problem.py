@@ -8,7 +8,8 @@ known beforehand of cameras, shading and mounts, the gauge (:mod:`pkmcal.identif
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,11 +40,21 @@ from pkmcal.identify.rows import (
     pose_rows,
 )
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, on_tangents
+from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense, on_tangents
 from pkmcal.solver import Compact, Linear, Memory, Values, of_runs
 
 CLOSINGS = 2
 """Newton steps back onto the closures; each squares what is left."""
+
+
+class _Evaluated(NamedTuple):
+    """Residuals at a point, and what they were found from."""
+
+    value: Array
+    shared_value: Array
+    closure: Closure
+    edges: EdgeRows
+    poses: PoseRows
 
 
 @dataclass(frozen=True)
@@ -157,16 +168,15 @@ class Problem:
 
     def residuals(self, state: BatchState) -> Values:
         """Residuals; NaN where a leg passes through the camera."""
-        c = self.closure(state)
-        value = self._values(state, c, self._edges(state, c), self._poses(state))
-        return Values(value, self.prior_values(state) - self.prior_target)
+        found = self._evaluated(state)
+        return Values(found.value, found.shared_value, partial(self._rows, found))
 
     def linearize(self, state: BatchState) -> Linear:
         """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
         rows = self.compact(state)
         by_shared = np.empty((*rows.value.shape, rows.n_shared))
-        for run, out in enumerate(by_shared):
-            out[...] = rows.write(run, slice(None), Memory())
+        for run in range(len(by_shared)):
+            by_shared[run] = rows.write(run, slice(None), Memory())
         return Linear(
             rows.value, by_shared, rows.by_own, rows.usable, rows.shared_value, rows.shared_by
         )
@@ -175,46 +185,54 @@ class Problem:
         """The same, with the derivatives by the shared unknowns of all rows that have few of them
         in few numbers.
         """
+        return self._rows(self._evaluated(state))
+
+    def _evaluated(self, state: BatchState) -> _Evaluated:
         c = self.closure(state)
         edges, poses = self._edges(state, c), self._poses(state)
         value = self._values(state, c, edges, poses)
+        return _Evaluated(value, self.prior_values(state) - self.prior_target, c, edges, poses)
+
+    def _rows(self, found: _Evaluated) -> Compact:
+        """The rows at a point, from what was needed of it for its residuals."""
+        value, shared_value, c, edges, poses = found
         usable = np.isfinite(value) & self._in_use()
-        few, own = self._of_edges(edges)
-        wide, by_pose = self._of_closures(c)
-        if self.pose_blocks.present.size:
-            boards = self._of_boards(poses)
-            wide, by_pose = (
-                np.concatenate(both, axis=2) for both in zip((wide, by_pose), boards, strict=True)
-            )
-        by_own = np.concatenate([own, by_pose], axis=2)
+        by_edges, own = self._of_edges(edges)
+        by_closures, by_pose = self._of_closures(c)
+        by_boards, by_board = self._of_boards(poses)
+        by_own = np.concatenate([own, by_pose, by_board], axis=2)
         # padding may lie anywhere, so its derivatives need not be finite though its row is zero
-        lost = ~np.isfinite(wide.sum(axis=-1) + value[:, :, self.closure_rows.start :])
-        wide[lost] = 0.0
         by_own[~np.isfinite(value + by_own.sum(axis=-1))] = 0.0
 
         def write(run: int, configurations: slice, memory: Memory) -> Array:
-            return self._written(few[:, :, run], wide[run], configurations, memory)
+            some = by_edges[:, :, run], by_closures[run], by_boards[run]
+            return self._written(*some, configurations, memory)
 
-        shared_value = self.prior_values(state) - self.prior_target
-        value = np.where(usable, value, 0.0)
-        count = self.unknowns.count
+        value, count = np.where(usable, value, 0.0), self.unknowns.count
         return Compact(value, by_own, usable, shared_value, self.prior, count, write)
 
-    def _written(self, few: Array, wide: Array, some: slice, memory: Memory) -> Array:
+    def _written(
+        self, edges: Array, closures: Array, boards: Array, some: slice, memory: Memory
+    ) -> Array:
         """Derivatives (k, r, na) of some configurations of one run by the shared unknowns, from
-        those of the edges (n, 2g, K, G) and those of all other rows (K, r', na).
+        those of the edges (n, 2g, K, G), the closures (K, E, n) and the boards (K, 6 G, na).
         """
-        first, count = self.closure_rows.start, self.unknowns.count
-        where, wide = self._edge_places[:, :, some], wide[some]
-        k = len(wide)
-        out = memory.empty("by shared", (k, first + wide.shape[1], self._width))
+        rows, count = self.closure_rows, self.unknowns.count
+        out = memory.empty("by shared", (len(boards[some]), self._rows_each, self._width))
         out.fill(0.0)
-        if where.size:
-            out.reshape(-1)[where - (some.start or 0) * out[0].size] = few[:, :, some]
+        flat, before = out.reshape(-1), (some.start or 0) * self._rows_each * self._width
+        if edges.size:
+            flat[self._edge_places[:, :, some] - before] = edges[:, :, some]
+        flat[self._closure_places[some] - before] = closures[some]
         if self._choice is None:
-            out[:, :first, self.unknowns.machine] = out[:, :first, count:-1] @ self.free
-        out[:, first:, :count] = wide
+            out[:, : rows.stop, self.unknowns.machine] = out[:, : rows.stop, count:-1] @ self.free
+        out[:, rows.stop :, :count] = boards[some]
         return out[..., :count]
+
+    @cached_property
+    def _rows_each(self) -> int:
+        """Rows of a configuration, r."""
+        return self.closure_rows.stop + self.pose_blocks.present.shape[1] * 6
 
     @cached_property
     def _edge_places(self) -> Integers:
@@ -229,9 +247,22 @@ class Problem:
         if u.n_breathing:
             columns.append(_columns(u.breathing, blocks.station, 1))
         (k, g), n = blocks.leg.shape, 2 * blocks.side.shape[-1]
-        rows = self.closure_rows.stop + self.pose_blocks.present.shape[1] * 6
-        row = rows * np.arange(k)[:, None] + n * np.arange(g) + np.arange(n)[:, None, None]
+        row = self._rows_each * np.arange(k)[:, None] + n * np.arange(g)
+        row = row + np.arange(n)[:, None, None]
         return row * self._width + np.moveaxis(np.concatenate(columns, axis=-1), -1, 0)[:, None]
+
+    @cached_property
+    def _closure_places(self) -> Integers:
+        """The same of the closures' derivatives, (K, E, n); rods on one motor share their noise, so
+        each has those of all.
+        """
+        rows, index = self.closure_rows, self.layout.closure_index
+        if self.layout.shares_motors:
+            index = np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
+        row = self._rows_each * np.arange(len(self.blocks.leg))[:, None] + np.arange(
+            rows.start, rows.stop
+        )
+        return row[..., None] * self._width + self._column[index]
 
     def _of_edges(self, edges: EdgeRows) -> tuple[Array, Array]:
         """The edges' derivatives (n, 2g, B, K, G) by what :attr:`_edge_places` says, and by the
@@ -251,17 +282,18 @@ class Problem:
         return out, _in_rows(np.moveaxis(own, (0, 1), (-1, -2)))
 
     def _of_closures(self, c: Closure) -> tuple[Array, Array]:
-        """The closures' derivatives by the shared unknowns (B, K, E, na) and by the own ones."""
-        n = self.drawing.size
-        full = np.zeros((*c.value.shape, n + 1))  # the last column takes what is no parameter's
-        full[:, :, np.arange(c.value.shape[-1])[:, None], c.index] = c.by_theta
-        out = np.zeros((*c.value.shape, self.unknowns.count))
-        free = full[..., :n] @ self.free if self._choice is None else full[..., self._choice]
-        out[..., self.unknowns.machine] = self._by_noise(c, free)
+        """The closures' derivatives (B, K, E, n) by what :attr:`_closure_places` says, and by the
+        own unknowns; zero where they are lost.
+        """
+        by_theta = dense(c, self.drawing.size) if self.layout.shares_motors else c.by_theta
+        out = self._by_noise(c, by_theta)
+        lost = ~np.isfinite(out.sum(axis=-1))
+        if lost.any():
+            out[lost] = 0.0
         return out, self._by_noise(c, self.layout.by_own(c))
 
     def _of_boards(self, poses: PoseRows) -> tuple[Array, Array]:
-        """The same of the boards' poses, (B, K, 6 G, na)."""
+        """The same of the boards' poses by all shared unknowns, (B, K, 6 G, na)."""
         u, boards = self.unknowns, self.pose_blocks
         parts = [
             (_columns(u.stations, boards.station, 6), poses.by_station),
@@ -276,6 +308,7 @@ class Problem:
         own = np.zeros((*poses.value.shape, self.layout.own_motion.shape[1]))
         by_pose = poses.by_platform[..., self.layout.freedoms]
         own[..., : by_pose.shape[-1]] = by_pose
+        out[~np.isfinite(poses.value + out.sum(axis=-1))] = 0.0
         return _in_rows(out), _in_rows(own)
 
     @cached_property
@@ -419,12 +452,14 @@ class Problem:
     ) -> BatchState:
         """The trial with its poses moved to where the closures are what the step meant them to be.
 
-        For machines with cranks or sliders, whose readings are far sharper than a board's poses:
-        the closures bend over a step by more than they may be wrong, and the search would creep.
+        For machines with cranks or sliders, whose readings are far sharper than a board's poses, or
+        with equations of joints' axes, which are as good as exact: the closures bend over a step by
+        more than they may be wrong, and the search would creep.
         """
         layout = self.layout
         freedoms = layout.own_motion.shape[1]
-        if layout.n_equations != freedoms or not any(g.carrier.driven for g in layout.base):
+        bends = any(g.carrier.driven for g in layout.base) or len(layout.angles)
+        if layout.n_equations != freedoms or not bends:
             return trial
         c = self.closure(state)
         change = shared[:, self.unknowns.machine] @ self.free.T

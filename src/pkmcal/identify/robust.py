@@ -45,10 +45,14 @@ class Anneal(NamedTuple):
 
 def clean_norm(share: float, count: Integers) -> Array:
     """The norm beyond which a share of those of ``count`` clean residuals lies."""
-    from scipy.special import chdtri
-
     pair = np.sqrt(-2 * np.log(share))  # the closed form of two residuals: most are edges
-    return np.where(count == 2, pair, np.sqrt(chdtri(np.maximum(count, 1), share)))
+    out = np.full(count.shape, pair)
+    others = count != 2
+    if others.any():
+        from scipy.special import chdtri
+
+        out[others] = np.sqrt(chdtri(np.maximum(count[others], 1), share))
+    return out
 
 
 def as_pairs(kind: Kind) -> Array:

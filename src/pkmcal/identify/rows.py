@@ -406,6 +406,10 @@ def pose_rows(
     T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), optics
     (B, C, w), breathing (B, S) or (B, 0).
     """
+    if not blocks.present.size:
+        none = np.zeros((*poses.shape[:2], 0, 6, 6))
+        optics = np.zeros((*none.shape[:-1], optics.shape[-1]))
+        return PoseRows(none[..., 0], none, none, none, optics, none[..., :1])
     moving = blocks.on_platform[blocks.mount][..., None, None]
     camera = T_camera_base[:, blocks.station]
     body = np.where(moving, poses[:, :, None], np.eye(4))

@@ -5,10 +5,12 @@ the drawing was. A calibration is for this; joints and lengths are the way to it
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
@@ -83,105 +85,161 @@ def _around(machine: Machine, T_base_platform: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class ToolPoint:
-    """Uncertainty and change of the platform's pose at the configurations in use.
+class ToolError:
+    """How sure n poses of the platform are, and how wrong the drawing's were; NaN where the machine
+    cannot take a pose, or the drawing has none.
 
-    configurations : (n,) their numbers. position, orientation : (n,) standard deviations of the
-    platform's origin (m, root of the summed variances) and of its rotation (rad).
-    off_position, off_orientation : (n,) how far the drawing's pose is from the calibrated one at
-    the same readings (m, rad), frames laid over each other; NaN where the drawing has no pose.
+    T_base_platform : (n, 4, 4) as calibrated. by_parameters : (n, 6, P) derivatives of the poses
+    (omega, tau), left perturbation, frames taken out. parameters : (P, P) covariance of these, told
+    in the same way. off : (n, 6) what leads from the calibrated pose to the drawing's at the same
+    readings, frames laid over each other.
     """
 
-    configurations: Integers
-    position: Array
-    orientation: Array
-    off_position: Array
-    off_orientation: Array
+    T_base_platform: Array
+    by_parameters: Array
+    parameters: Array
+    off: Array
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(n, 6, 6) of (omega, tau), rad and m: the geometry's part, not the noise of a reading."""
+        return self.by_parameters @ self.parameters @ self.by_parameters.mT
+
+    @property
+    def position(self) -> Array:
+        """(n,) standard deviations of the platform's origin, m, root of the summed variances."""
+        return np.sqrt(np.maximum(np.trace(self.covariance[:, 3:, 3:], axis1=1, axis2=2), 0.0))
+
+    @property
+    def orientation(self) -> Array:
+        """(n,) the same of its rotation, rad."""
+        return np.sqrt(np.maximum(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2), 0.0))
+
+    @property
+    def off_position(self) -> Array:
+        """(n,) how far the drawing's origin is off, m."""
+        return np.linalg.norm(self.off[:, 3:], axis=-1)
+
+    @property
+    def off_orientation(self) -> Array:
+        """(n,) how far it is turned, rad."""
+        return np.linalg.norm(self.off[:, :3], axis=-1)
+
+
+def checked_poses(poses: Array) -> Array:
+    """The poses (n, 4, 4). Raises InputError for another shape, or numbers that are none."""
+    array = np.asarray(poses, dtype=float)
+    if array.ndim != 3 or array.shape[1:] != (4, 4) or not np.isfinite(array).all():
+        raise InputError(
+            what="the tool's error is asked for at what are no poses",
+            found=f"an array of shape {array.shape}"
+            + ("" if np.isfinite(array).all() else ", with numbers that are none"),
+            expected="T_base_platform, (n, 4, 4)",
+        )
+    return array
 
 
 def centres_and_tool(
     drawing: Machine, estimate: Estimate, joints: Array
-) -> tuple[tuple[Centres, ...], ToolPoint]:
-    """Joint centres and the platform's poses of an estimate, no frame favoured; joints (K, m)."""
-    covariance = free_of_gauge(estimate)
-    centres = joint_centres(drawing, estimate.machine, covariance)
-    tool = tool_point(
-        drawing,
-        estimate.machine,
-        covariance,
-        joints,
-        estimate.state.T_base_platform,
-        np.flatnonzero(estimate.configurations),
-        centres,
-        legs_seen=estimate.edge_weights.size > 0,
-    )
-    return centres, tool
+) -> tuple[tuple[Centres, ...], ToolError]:
+    """Joint centres of an estimate and the platform's poses of the configurations in use, no frame
+    favoured; joints (K, m).
+    """
+    machine, used = estimate.machine, estimate.configurations
+    covariance = free_of_gauge(machine, estimate.covariance)
+    seen = estimate.edge_weights.size > 0
+    poses = estimate.state.T_base_platform[used]
+    tool = tool_error(drawing, machine, covariance, poses, joints[used], legs_seen=seen)
+    return joint_centres(drawing, machine, covariance), tool
 
 
-def tool_point(
+def tool_error(
     drawing: Machine,
     calibrated: Machine,
     covariance: Array,
-    joints: Array,
     poses: Array,
-    used: Integers,
-    centres: tuple[Centres, ...],
+    joints: Array | None = None,
     *,
     legs_seen: bool = True,
-) -> ToolPoint:
-    """How well the poses of the configurations ``used`` (n,) are known, and how wrong they were.
+    fitted: Integers | None = None,
+) -> ToolError:
+    """How well poses T_base_platform (n, 4, 4) of the calibrated machine are known, and how wrong
+    the drawing's were.
 
-    covariance : (P, P) about the best fit of the frames, so that no three joints carry the
-    uncertainty of all. joints (K, m), poses T_base_platform (K, 4, 4). legs_seen : whether legs
-    tell where the joints are, and these the frames. A board leaves open what shifts joints and
-    moves nothing, so without legs frames are by the poses themselves.
+    covariance : (P, P) of the parameters about the best fit of the frames
+    (:func:`~pkmcal.identify.centres.free_of_gauge`), so that no three joints carry the uncertainty
+    of all. joints : (n, m) readings that were taken there; without them the poses are first put
+    where rods and axes allow them, and readings are the calibrated machine's.
+    legs_seen : whether legs tell where the joints are, and these the frames. A board leaves open
+    what shifts joints and moves nothing, so without legs frames are by the poses themselves, all or
+    the ``fitted`` (k,) among them.
     """
-    jacobian = pose_by_parameters(calibrated, joints[used], poses[used])
-    jacobian = without_frames(calibrated, poses[used], jacobian, every=not legs_seen)
-    variance = np.einsum("kip,pq,kiq->ki", jacobian, covariance, jacobian)
-    off = _off(drawing, calibrated, joints[used], poses[used], centres)
-    good = np.isfinite(off).all(axis=1)
-    left = without_frames(calibrated, poses[used][good], off[good][..., None], every=not legs_seen)
-    off[good] = left[..., 0]
-    return ToolPoint(
-        configurations=used,
-        position=np.sqrt(variance[:, 3:].sum(axis=-1)),
-        orientation=np.sqrt(variance[:, :3].sum(axis=-1)),
-        off_position=np.linalg.norm(off[:, 3:], axis=-1),
-        off_orientation=np.linalg.norm(off[:, :3], axis=-1),
+    layout, n, theta = calibrated.layout, len(poses), calibrated.values
+    if joints is None:
+        closed = on_manifold(layout, theta, poses)
+        poses, joints = closed.T_base_platform, calibrated.inverse(closed.T_base_platform)
+        reached: Booleans = closed.converged & np.isfinite(joints).all(axis=-1)
+    else:
+        reached = np.ones(n, dtype=bool)
+    rows = np.flatnonzero(reached)
+    jacobian = np.full((n, 6, theta.size), np.nan)
+    jacobian[rows] = pose_by_parameters(calibrated, joints[rows], poses[rows])
+    off = np.full((n, 6, 1), np.nan)
+    off[rows, :, 0] = _off(drawing, calibrated, joints[rows], poses[rows])
+    by, off = (
+        without_frames(calibrated, poses, change, every=not legs_seen, fitted=fitted)
+        for change in (jacobian, off)
     )
+    return ToolError(poses, by, covariance, off[..., 0])
 
 
-def without_frames(machine: Machine, poses: Array, change: Array, *, every: bool = False) -> Array:
+def without_frames(
+    machine: Machine,
+    poses: Array,
+    change: Array,
+    *,
+    every: bool = False,
+    fitted: Integers | None = None,
+) -> Array:
     """Changes (n, 6, m) of poses less what only turns or shifts base and platform as wholes.
 
-    By least squares. Only frame changes that keep the motion, and, but for ``every`` one, that no
-    parameters follow (some are fixed, or tied): what parameters follow is taken out of their
-    covariance already.
+    By least squares over all poses, or the ``fitted`` (k,) among them, as far as their changes are
+    known; turns count as ways of the platform's joints. Only frame changes that keep the motion,
+    and, but for ``every`` one, that no parameters follow (some are fixed, or tied): what parameters
+    follow is taken out of their covariance already.
     """
     rest = respecting_motion(machine.layout.motion)
     if not every:
         followed = np.linalg.qr(freedoms(machine))[0]
         u, s, _ = np.linalg.svd(rest - followed @ (followed.T @ rest), full_matrices=False)
         rest = u[:, s > 1e-9]
-    if not rest.shape[1] or not len(poses):
+    known = np.asarray(np.isfinite(change).all(axis=(1, 2)))
+    told = np.flatnonzero(known) if fitted is None else fitted[known[fitted]]
+    if not rest.shape[1] or not told.size:
         return change
     size = float(np.linalg.norm(machine.platform_centers(), axis=-1).max())
     unit = np.array([max(size, 1e-3)] * 3 + [1.0] * 3)[:, None]
-    frames = (unit * (pose_generators(poses) @ rest)).reshape(-1, rest.shape[1])
-    flat = (unit * change).reshape(len(frames), -1)
-    left = flat - frames @ np.linalg.lstsq(frames, flat, rcond=1e-9)[0]
-    return left.reshape(change.shape) / unit
+    frames = pose_generators(poses) @ rest
+    rows = (unit * frames[told]).reshape(-1, rest.shape[1])
+    flat = (unit * change[told]).reshape(len(rows), -1)
+    return change - frames @ np.linalg.lstsq(rows, flat, rcond=1e-9)[0]
 
 
-def _off(
-    drawing: Machine, calibrated: Machine, joints: Array, poses: Array, centres: tuple[Centres, ...]
-) -> Array:
-    """Differences (n, 6) of the drawing's poses from the calibrated ones, left perturbation."""
+def _off(drawing: Machine, calibrated: Machine, joints: Array, poses: Array) -> Array:
+    """Differences (n, 6) of the drawing's poses from the calibrated ones, left perturbation; NaN
+    where either machine has none.
+
+    Along the motion's own directions: joints of a planar machine at several heights, or a delta's
+    that are laid over each other, tilt frames against each other, and no platform.
+    """
+    along = calibrated.layout.motion @ calibrated.layout.motion.T
+    nothing = np.zeros((calibrated.values.size, calibrated.values.size))
+    centres = joint_centres(drawing, calibrated, nothing)
     base, platform = (side.T_calibrated_drawing for side in centres)
-    before = drawing.forward_result(joints, inverse(base) @ poses @ platform)
+    start = pose_difference(inverse(base) @ poses @ platform, poses) @ along
+    before = drawing.forward_result(joints, perturb(poses, start))
     after = calibrated.forward_result(joints, poses)
     moved = base @ before.T_base_platform @ inverse(platform)
-    difference = pose_difference(moved, after.T_base_platform)
+    difference = pose_difference(moved, after.T_base_platform) @ along
     good = before.converged & after.converged
     return np.where(good[:, None], difference, np.nan)

@@ -20,6 +20,7 @@ hinges; :attr:`~pkmcal.mechanisms.closure.LimbLayout.own_motion` says how.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -48,38 +49,38 @@ class Unknowns:
     n_mounts: int = 0
     n_breathing: int = 0
 
-    @property
+    @cached_property
     def machine(self) -> slice:
         """The machine's columns."""
         return slice(0, self.n_free)
 
-    @property
+    @cached_property
     def stations(self) -> slice:
         """The stations' columns, six each."""
         return slice(self.n_free, self.n_free + 6 * self.n_stations)
 
-    @property
+    @cached_property
     def optics(self) -> slice:
         """The cameras' columns, ``n_optics`` each."""
         first = self.stations.stop
         return slice(first, first + self.n_cameras * self.n_optics)
 
-    @property
+    @cached_property
     def shading(self) -> slice:
         """The lines' columns."""
         return slice(self.optics.stop, self.optics.stop + self.n_lines)
 
-    @property
+    @cached_property
     def breathing(self) -> slice:
         """The focal lengths' columns, one a station."""
         return slice(self.shading.stop, self.shading.stop + self.n_breathing)
 
-    @property
+    @cached_property
     def mounts(self) -> slice:
         """The mounts' columns, six each."""
         return slice(self.breathing.stop, self.breathing.stop + 6 * self.n_mounts)
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Number of shared unknowns, na."""
         return self.mounts.stop

@@ -112,7 +112,8 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
             f"Calibrated: the platform's joints to {_platform_sigma(estimate) * 1e3:.2g} mm at"
             " given readings (standard deviation)."
         )
-    machine, covariance = estimate.machine, free_of_gauge(estimate)  # medians that favour no frame
+    machine = estimate.machine
+    covariance = free_of_gauge(machine, estimate.covariance)  # medians that favour no frame
     drawing = machine.with_values(machine.parameters.drawing)
     bodies = joint_centres(drawing, machine, covariance)
     centre = float(np.median(np.concatenate([body.sigma for body in bodies])))
@@ -180,10 +181,9 @@ def _base_alone(estimate: Estimate) -> str:
     machine, table = estimate.machine, estimate.machine.parameters
     drawing = machine.with_values(table.drawing)
     root = table.free_matrix() * table.tolerances_free()
-    drawn = free_of_gauge(estimate, root @ root.T)
     together, before = (
-        joint_centres(drawing, machine, covariance)[0].covariance
-        for covariance in (free_of_gauge(estimate), drawn)
+        joint_centres(drawing, machine, free_of_gauge(machine, covariance))[0].covariance
+        for covariance in (estimate.covariance, root @ root.T)
     )
     values, vectors = np.linalg.eigh(before)
     known = values > EXACT_SHARE * values[-1]

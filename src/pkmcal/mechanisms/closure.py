@@ -162,6 +162,30 @@ class LimbLayout:
         """(L, n) the same of B."""
         return self._ends_index(self.platform)
 
+    @cached_property
+    def closure_index(self) -> Integers:
+        """(E, n) parameters that each row of the closure depends on, P where there are fewer."""
+        none, keep, leg = self.n_parameters, self.closing, self.angles.leg
+        rod = np.where(keep, self.rod, none)[:, None]
+        lengths = np.concatenate([self.a_index, self.b_index, rod], axis=1)[keep]
+        angles = np.concatenate(
+            [
+                self.a_index[leg],
+                self.b_index[leg],
+                np.where(self.angles.on_base[:, None], self.angles.base, none),
+                np.where(self.angles.on_platform[:, None], self.angles.platform, none),
+            ],
+            axis=1,
+        )
+        if not len(self.angles):
+            return lengths
+        width = max(lengths.shape[1], angles.shape[1])
+        wide = (
+            np.pad(x, ((0, 0), (0, width - x.shape[1])), constant_values=none)
+            for x in (lengths, angles)
+        )
+        return np.concatenate(list(wide))
+
     def _ends_index(self, groups: tuple[CarrierGroup, ...]) -> Integers:
         width = max(g.index.shape[1] for g in groups)
         index = np.full((self.n_legs, width), self.n_parameters)
@@ -588,22 +612,24 @@ class Closure:
     @property
     def index(self) -> Integers:
         """(E, n) parameters that each row depends on, P where there is none."""
-        return self._by_parameters[0]
-
-    @property
-    def by_theta(self) -> Array:
-        """(..., E, n) derivatives by them."""
-        return self._by_parameters[1]
+        return self.layout.closure_index
 
     @cached_property
-    def _by_parameters(self) -> tuple[Integers, Array]:
+    def by_theta(self) -> Array:
+        """(..., E, n) derivatives by them."""
         layout = self.layout
-        lengths = _length_parameters(layout, self.rows.u, self.ends)
+        lengths = _by_length(layout, self.rows.u, self.ends)
         if not len(layout.angles):
             return lengths
         line = (self.ends.b - self.ends.a)[..., layout.angles.leg, :]
-        angles = _angle_parameters(layout, self.theta, self.poses, line, self.ends)
-        return _padded(layout, lengths, angles)
+        angles = _by_angles(layout, self.theta, self.poses, line, self.ends)
+        width = self.index.shape[1]
+        spares = (
+            [(0, 0)] * (by.ndim - 1) + [(0, width - by.shape[-1])] for by in (lengths, angles)
+        )
+        return stacked(
+            *(np.pad(by, spare) for by, spare in zip((lengths, angles), spares, strict=True))
+        )
 
 
 def limb_ends(
@@ -680,14 +706,11 @@ def closure(
     return Closure(layout, theta, readings, poses, internal, base, platform, rows)
 
 
-def _length_parameters(layout: LimbLayout, u: Array, ends: LimbEnds) -> tuple[Integers, Array]:
-    """Parameters (E, n) of |B - A| - length of the legs that close, and derivatives (..., E, n)."""
-    keep = layout.closing
+def _by_length(layout: LimbLayout, u: Array, ends: LimbEnds) -> Array:
+    """Derivatives (..., E, n) of |B - A| - length of the legs that close, by their parameters."""
     parts = (-along(u, ends.a_by), along(u, ends.b_by), np.full((1, 1), -1.0))
-    rod = np.where(keep, layout.rod, layout.n_parameters)[:, None]
-    index = np.concatenate([ends.a_index, ends.b_index, rod], axis=1)
     by_theta = _side_by_side(parts)
-    return (index, by_theta) if layout.all_close else (index[keep], by_theta[..., keep, :])
+    return by_theta if layout.all_close else by_theta[..., layout.closing, :]
 
 
 def _side_by_side(parts: tuple[Array, ...]) -> Array:
@@ -702,39 +725,18 @@ def along(u: Array, by: Array) -> Array:
     return (u[..., None, :] @ by)[..., 0, :]
 
 
-def _angle_parameters(
+def _by_angles(
     layout: LimbLayout, theta: Array, poses: Array, line: Array, ends: LimbEnds
-) -> tuple[Integers, Array]:
+) -> Array:
     """The same of the axes' equations."""
-    angles, leg = layout.angles, layout.angles.leg
-    rows = angle_rows(angles, theta, poses[..., :3, :3], line)
+    rows, leg = angle_rows(layout.angles, theta, poses[..., :3, :3], line), layout.angles.leg
     parts = (
         -along(rows.by_line, ends.a_by[..., leg, :, :]),
         along(rows.by_line, ends.b_by[..., leg, :, :]),
         rows.by_base_axis,
         rows.by_platform_axis,
     )
-    none = layout.n_parameters
-    index = (
-        ends.a_index[leg],
-        ends.b_index[leg],
-        np.where(angles.on_base[:, None], angles.base, none),
-        np.where(angles.on_platform[:, None], angles.platform, none),
-    )
-    return np.concatenate(index, axis=1), _side_by_side(parts)
-
-
-def _padded(
-    layout: LimbLayout, lengths: tuple[Integers, Array], angles: tuple[Integers, Array]
-) -> tuple[Integers, Array]:
-    """Length rows, then angle rows; parameters padded to a common count."""
-    width = max(lengths[0].shape[1], angles[0].shape[1])
-    index, by_theta = [], []
-    for own, by in (lengths, angles):
-        spare = width - own.shape[1]
-        index.append(np.pad(own, ((0, 0), (0, spare)), constant_values=layout.n_parameters))
-        by_theta.append(np.pad(by, [(0, 0)] * (by.ndim - 1) + [(0, spare)]))
-    return np.concatenate(index), stacked(*by_theta)
+    return _side_by_side(parts)
 
 
 def on_tangents(layout: LimbLayout, theta: Array, drawing: Array) -> Array:

@@ -52,6 +52,8 @@ LEVELLING = 3
 the closure error is of a rod."""
 GAP = 0.05
 """Of a rod, the closure error beyond which readings are no machine's with errors, but another's."""
+GIVEN_UP = 5
+"""Steps in a row out of a limb's reach after which no pose is looked for any more."""
 NEAR_SINGULAR = 0.02
 """Smallest singular value of the scaled inverse Jacobian below which a warning is due: a
 reading's error then moves the platform fifty times as far."""
@@ -441,29 +443,41 @@ def mobility(layout: LimbLayout, theta: Array, pose: Array) -> int:
     return every.shape[-1] - int(np.linalg.matrix_rank(every, tol=SAME_EQUATION))
 
 
-def on_manifold(layout: LimbLayout, theta: Array, poses: Array) -> ForwardResult:
+def on_manifold(
+    layout: LimbLayout, theta: Array, poses: Array, steps: int = MAX_STEPS
+) -> ForwardResult:
     """Poses (..., 4, 4) moved to where everything closes that no drive can change.
 
     Constant rods, joints' axes and second rods of a motor leave a platform only some poses;
     readings follow from these. Gauss-Newton with the shortest step, so a pose that is right stays
-    where it is.
+    where it is; ``steps`` at most.
     """
-    current = np.array(poses)
-    readings, phi = inverse_result(layout, theta, current)
-    c, drives = rows_and_drives(layout, theta, readings, current, phi)
+    shape = np.broadcast_shapes(poses.shape[:-2], theta.shape[:-1])
+    current = np.array(np.broadcast_to(poses, (*shape, 4, 4))).reshape(-1, 4, 4)
+    every = theta if theta.ndim == 1 else np.broadcast_to(theta, (*shape, theta.shape[-1]))
+    every = every if theta.ndim == 1 else every.reshape(-1, theta.shape[-1])
     free = layout.driven_rows.size < layout.n_equations or layout.shares_motors
-    for _ in range(MAX_STEPS if free else 0):
+    left, lost = np.arange(len(current)), np.zeros(len(current), dtype=int)
+    for _ in range(steps if free else 0):
+        own = every if every.ndim == 1 else every[left]
+        readings, phi = inverse_result(layout, own, current[left])
+        c, drives = rows_and_drives(layout, own, readings, current[left], phi)
         value, blind = undriven(layout, c, drives)
         value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.by_pose @ layout.motion)
-        if np.abs(value).max(initial=0.0) < CONVERGED * 1e-2:
+        lost[left] = np.where(np.isfinite(readings).all(axis=-1), 0, lost[left] + 1)
+        more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED * 1e-2
+        more &= lost[left] < GIVEN_UP
+        left = left[more]
+        if not left.size:
             break
-        step = -np.linalg.pinv(by_pose) @ value[..., None]
-        current = perturb(current, (layout.motion @ step)[..., 0])
-        readings, phi = inverse_result(layout, theta, current)
-        c, drives = rows_and_drives(layout, theta, readings, current, phi)
+        step = -np.linalg.pinv(by_pose[more]) @ value[more][..., None]
+        current[left] = perturb(current[left], (layout.motion @ step)[..., 0])
+    current = current.reshape(*shape, 4, 4)
+    readings, phi = inverse_result(layout, theta, current)
+    c, drives = rows_and_drives(layout, theta, readings, current, phi)
     reached = np.isfinite(c.value).all(axis=-1)
-    left = np.abs(undriven(layout, c, drives)[0]).max(axis=-1, initial=0.0)
-    error = np.where(reached, left, np.inf)
+    off = np.abs(undriven(layout, c, drives)[0]).max(axis=-1, initial=0.0)
+    error = np.where(reached, off, np.inf)
     return ForwardResult(current, error < CONVERGED, error, phi, layout, theta, readings)
 
 

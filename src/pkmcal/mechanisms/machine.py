@@ -217,9 +217,16 @@ class Machine:
         return velocities.amplification(self.layout, self.values, poses, point)
 
     def limits(self) -> workspace.Limits:
-        """The machine with its ranges and home's assembly, for the functions of workspaces."""
+        """The machine with its ranges and home's assembly, for the functions of workspaces. Home is
+        put where rods and axes allow it: a file's may be the drawing's.
+        """
+        home = kinematics.on_manifold(self.layout, self.values, self._home)
         return workspace.Limits(
-            self.layout, self.values, self.joint_ranges, self.joint_units, self.home()
+            self.layout,
+            self.values,
+            self.joint_ranges,
+            self.joint_units,
+            home.T_base_platform if home.converged else self.home(),
         )
 
     def reachable(self, T_base_platform: Array) -> workspace.Reach:

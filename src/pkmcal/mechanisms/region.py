@@ -10,7 +10,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.mechanisms.kinematics import on_manifold
-from pkmcal.mechanisms.workspace import ALLOWED, Limits, extents, is_flat, reachable, spans
+from pkmcal.mechanisms.workspace import ALLOWED, ROUGH, Limits, extents, is_flat, reachable, spans
 
 Side = tuple[float, float]
 AXES = ("x", "y", "z")
@@ -137,7 +137,7 @@ def poses_in(limits: Limits, region: Region, count: int, seed: int = 0) -> Array
     while found < count and tried < most:
         more = min(max(count, tried), AT_ONCE)
         poses = _candidates(limits, within, np.arange(tried, tried + more), seed)
-        closed = on_manifold(limits.layout, limits.theta, poses)
+        closed = on_manifold(limits.layout, limits.theta, poses, ROUGH.newton)
         poses = closed.T_base_platform[closed.converged]
         poses = poses[region.holds(limits, poses)]
         poses = poses[reachable(limits, poses).inside]

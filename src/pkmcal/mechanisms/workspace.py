@@ -18,6 +18,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose, pose_difference
 from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import (
+    MAX_STEPS,
     NEAR_SINGULAR,
     inverse_result,
     on_manifold,
@@ -162,12 +163,26 @@ def _elsewhere(limits: Limits, poses: Array) -> Booleans:
     return np.asarray(moved.max(axis=-1) > ALLOWED)
 
 
-STEPS = 100
-"""Poses along a ray before the bisection: what is narrower is not seen."""
-HALVINGS = 30
+@dataclass(frozen=True)
+class Effort:
+    """How finely the ends of ways are looked for. steps : poses along a way before the bisection;
+    what is narrower is not seen. halvings : of the bisection. newton : steps that bring a pose
+    where rods and axes allow it. rounds : how often it is then moved on, as far as it was.
+    """
+
+    steps: int = 100
+    halvings: int = 30
+    newton: int = MAX_STEPS
+    rounds: int = 4
+
+
+FINE = Effort()
+ROUGH = Effort(steps=40, halvings=5, newton=6, rounds=1)
+"""For a box about the workspace: a thousandth of the longest way."""
+AHEAD = 8
+"""Poses of each way at a time."""
 KEPT = 0.99
 """Share of the way asked for that must be left when constant rods and axes had their say."""
-ROUNDS = 4
 AT_ONCE = 20_000
 """Poses of a grid at a time."""
 
@@ -203,7 +218,13 @@ class Grid:
     size: float
 
 
-def extents(limits: Limits, directions: Array, start: Array, most: float | None = None) -> Extents:
+def extents(
+    limits: Limits,
+    directions: Array,
+    start: Array,
+    most: float | None = None,
+    effort: Effort = FINE,
+) -> Extents:
     """How far one comes from ``start`` (4, 4) along straight ways, until something stands against
     it: a range, a limb's reach, a singular pose.
 
@@ -222,19 +243,26 @@ def extents(limits: Limits, directions: Array, start: Array, most: float | None 
         )
     twists = _twists(directions)
     farthest = _farthest(limits, twists) if most is None else np.full(len(twists), most)
-    way = farthest[:, None] * np.linspace(0, 1, STEPS + 1)
-    inside = _along(limits, start, twists[:, None], way)[1].inside
-    still: Booleans = np.logical_and.accumulate(inside, axis=1)
+    way = farthest[:, None] * np.linspace(0, 1, effort.steps + 1)
+    still = np.zeros(way.shape, dtype=bool)
+    ahead: Integers = np.arange(len(way))
+    for first in range(0, effort.steps + 1, AHEAD):  # what comes after the end is not looked at
+        at = slice(first, first + AHEAD)
+        inside = _along(limits, start, twists[ahead, None], way[ahead, at], effort)[1].inside
+        still[ahead, at] = np.logical_and.accumulate(inside, axis=1)
+        ahead = ahead[inside.all(axis=1)]
+        if not ahead.size:
+            break
     last = still.sum(axis=1) - 1
     rows = np.arange(len(twists))
-    low, high = way[rows, last], way[rows, np.minimum(last + 1, STEPS)]
-    for _ in range(HALVINGS):
+    low, high = way[rows, last], way[rows, np.minimum(last + 1, effort.steps)]
+    for _ in range(effort.halvings):
         middle = (low + high) / 2
-        good = _along(limits, start, twists, middle)[1].inside
+        good = _along(limits, start, twists, middle, effort)[1].inside
         low, high = np.where(good, middle, low), np.where(good, high, middle)
-    poses = _along(limits, start, twists, low)[0]
-    beyond = _along(limits, start, twists, high)[1]
-    why = tuple(() if last[k] == STEPS else beyond.why(k) for k in range(len(twists)))
+    poses = _along(limits, start, twists, low, effort)[0]
+    beyond = _along(limits, start, twists, high, effort)[1]
+    why = tuple(() if last[k] == effort.steps else beyond.why(k) for k in range(len(twists)))
     return Extents(low, poses, why)
 
 
@@ -264,28 +292,32 @@ def _twists(directions: Array) -> Array:
     return np.concatenate([np.zeros_like(unit), unit], axis=-1)
 
 
-def _along(limits: Limits, start: Array, twists: Array, way: Array) -> tuple[Array, Reach]:
+def _along(
+    limits: Limits, start: Array, twists: Array, way: Array, effort: Effort
+) -> tuple[Array, Reach]:
     """Poses (..., 4, 4) after ways (...,) along twists (..., 6), and what stands against them."""
     poses = perturb(start, twists * way[..., None])
     if limits.layout.row_motor.min(initial=0) < 0 or limits.layout.shares_motors:
-        poses = _settled(limits, start, twists, way, poses)
+        poses = _settled(limits, start, twists, way, poses, effort)
     return poses, reachable(limits, poses)
 
 
-def _settled(limits: Limits, start: Array, twists: Array, way: Array, poses: Array) -> Array:
+def _settled(
+    limits: Limits, start: Array, twists: Array, way: Array, poses: Array, effort: Effort
+) -> Array:
     """Poses (..., 4, 4) put where rods and axes allow them, as far along the twists as they were.
 
     In turns to the nearest pose that is allowed, and on along the twist by what that took away.
     What is then still behind, keeps its own pose, which is forbidden.
     """
     size = np.sum(twists * twists, axis=-1)
-    settled = on_manifold(limits.layout, limits.theta, poses).T_base_platform
-    for _ in range(ROUNDS):
+    settled = on_manifold(limits.layout, limits.theta, poses, effort.newton).T_base_platform
+    for _ in range(effort.rounds):
         behind = way - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
         if np.all(np.abs(behind) <= (1 - KEPT) * 1e-2 * way):
             break
         ahead = perturb(settled, twists * behind[..., None])
-        settled = on_manifold(limits.layout, limits.theta, ahead).T_base_platform
+        settled = on_manifold(limits.layout, limits.theta, ahead, effort.newton).T_base_platform
     behind = way - np.sum(pose_difference(settled, start) * twists, axis=-1) / size
     kept = np.abs(behind) <= (1 - KEPT) * way
     return np.where(kept[..., None, None], settled, poses)
@@ -324,7 +356,8 @@ def spans(limits: Limits, middle: Array, unit: Array) -> tuple[Array, Array]:
     along them and between them, and a tenth more, m.
     """
     signs = np.array([s for s in itertools.product((-1, 0, 1), repeat=len(unit)) if any(s)])
-    far = (extents(limits, signs @ unit, middle).poses[:, :3, 3] - middle[:3, 3]) @ unit.T
+    ways = extents(limits, signs @ unit, middle, effort=ROUGH)
+    far = (ways.poses[:, :3, 3] - middle[:3, 3]) @ unit.T
     return 1.1 * far.min(axis=0), 1.1 * far.max(axis=0)
 
 
@@ -454,7 +487,7 @@ def _leaving(
     if outside[0] == 0:
         return 0.0, found.why(0)
     low, high = places[outside[0] - 1], places[outside[0]]
-    for _ in range(HALVINGS):
+    for _ in range(FINE.halvings):
         middle = (low + high) / 2
         good = bool(reachable(limits, _at(poses, np.array([middle]))).inside[0])
         low, high = (middle, high) if good else (low, middle)
@@ -467,7 +500,7 @@ def _crossings(limits: Limits, poses: Array, places: Array, found: Reach) -> tup
     changes = np.diff(found.crossed.astype(int)) != 0
     at = np.flatnonzero(changes & reached[1:] & reached[:-1])
     low, high = places[at], places[at + 1]
-    for _ in range(HALVINGS if at.size else 0):
+    for _ in range(FINE.halvings if at.size else 0):
         middle = (low + high) / 2
         same = reachable(limits, _at(poses, middle)).crossed == found.crossed[at]
         low, high = np.where(same, middle, low), np.where(same, high, middle)

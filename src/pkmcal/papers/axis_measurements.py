@@ -78,7 +78,9 @@ def as_edges(axis: Array, sigma: Array, radius: Array) -> tuple[Array, Array]:
         point[..., None, :], other[..., None, :], np.asarray(radius)[..., None], side
     )
     basis = tangent_basis(e.n, np.broadcast_to(point[..., None, :], e.n.shape))
-    by_axis = e.dn_da @ dpoint[..., None, :, :] + e.dn_db @ (dpoint + 0.3 * du)[..., None, :, :]
-    jac = basis.mT @ by_axis
+    # a normal moves by by_a (n . da) + by_b (n . db)
+    by_a, by_b = ((by[..., None, :] @ basis).mT for by in (e.by_a, e.by_b))
+    along_a, along_b = (e.n @ end for end in (dpoint, dpoint + 0.3 * du))
+    jac = by_a * along_a[..., None, :] + by_b * along_b[..., None, :]
     jac = jac.reshape(*u.shape[:-1], 4, 4)
     return basis, np.linalg.inv(jac) / sigma[:, None]

@@ -45,6 +45,10 @@ class Index(Protocol):
         """(...)."""
         ...
 
+    def size(self, value: float, p: int, /) -> float:
+        """A value as what goes like a standard deviation of p directions."""
+        ...
+
     def slope(self, covariance: Array, /) -> Array:
         """F (p, k) at one covariance, with ``d value = tr(F^T dC F)``."""
         ...
@@ -60,6 +64,10 @@ class ToolIndex:
         """tr(W C)."""
         return np.einsum("ij,...ij->...", self.weight, covariance)
 
+    def size(self, value: float, _p: int, /) -> float:
+        """Metres."""
+        return float(np.sqrt(value))
+
     def slope(self, _covariance: Array, /) -> Array:
         """W's root."""
         return _root(self.weight)
@@ -72,6 +80,10 @@ class DIndex:
     def value(self, covariance: Array) -> Array:
         """Log det C."""
         return np.linalg.slogdet(covariance)[1]
+
+    def size(self, value: float, p: int, /) -> float:
+        """In tolerances, of a direction."""
+        return float(np.exp(value / (2 * p)))
 
     def slope(self, covariance: Array) -> Array:
         """The root of C^-1."""
@@ -86,6 +98,10 @@ class EIndex:
         """The largest eigenvalue of C."""
         return np.linalg.eigvalsh(covariance)[..., -1]
 
+    def size(self, value: float, _p: int, /) -> float:
+        """In tolerances, of the worst direction."""
+        return float(np.sqrt(value))
+
     def slope(self, covariance: Array) -> Array:
         """Its eigenvector."""
         return np.linalg.eigh(covariance)[1][:, -1:]
@@ -99,6 +115,10 @@ class O1Index:
         """-log of the geometric mean of the singular values."""
         told = np.linalg.eigvalsh(np.linalg.inv(covariance)) - 1.0
         return -0.5 * np.log(np.maximum(told, UNSEEN)).mean(axis=-1)
+
+    def size(self, value: float, _p: int, /) -> float:
+        """In tolerances."""
+        return float(np.exp(value))
 
     def slope(self, covariance: Array) -> Array:
         """By C, through its inverse."""

@@ -32,8 +32,10 @@ CANDIDATES = 400
 """Configurations among which is chosen."""
 AT_WORK = 60
 """Poses of the workspace at which the tool counts."""
-BETTERED = 2
-"""Rounds in which the chosen configurations are moved."""
+BETTERED = 8
+"""Rounds, at most, in which the chosen configurations are moved."""
+GAINING = 0.01
+"""Part of the deviation that a round has to gain for another one."""
 FOR_PLACES = 24
 """Configurations by which places of a camera are compared."""
 RANDOM = 10
@@ -223,10 +225,16 @@ class _Making:
         index = INDICES[self.index](pool.info)
         first = greedy(pool.info, self.count, index, lambda x: told(0.4 * x)).chosen
         best = pool.candidates.only(np.sort(exchanged(pool.info, first, index)))
+        size = np.inf
         for k in range(BETTERED):
             told(0.5 + 0.5 * k / BETTERED)
             pool, start = self._about(best, rng)
-            best = pool.candidates.only(np.sort(exchanged(pool.info, start, index)))
+            chosen = np.sort(exchanged(pool.info, start, index))
+            best = pool.candidates.only(chosen)
+            covariance = pool.info.covariance(pool.info.of(chosen))
+            before, size = size, index.size(float(index.value(covariance)), len(covariance))
+            if size > (1 - GAINING) * before:
+                break
         return best
 
     def _about(self, best: Candidates, rng: np.random.Generator) -> tuple[_Pool, Integers]:

@@ -14,7 +14,7 @@ from pkmcal.calibration.results import REPORT, check_output, texts_of
 from pkmcal.files import write_folder
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import ToolPoint, centres_and_tool
+from pkmcal.identify.tool import ToolError, centres_and_tool
 from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Verdict
@@ -134,7 +134,7 @@ def cards(
     observation: Observation,
     estimate: Estimate,
     centres: tuple[Centres, ...],
-    tool: ToolPoint,
+    tool: ToolError,
 ) -> tuple[Figure, ...]:
     """The cards in their order; those that have nothing to tell are left out."""
     sigma = np.concatenate([side.sigma for side in centres]) * 1e3
@@ -155,9 +155,9 @@ def cards(
     )
     found = (
         joints if len(observation.edges) else None,
-        _tool_sigma(session, tool),
+        _tool_sigma(session, estimate, tool),
         moved,
-        _tool_change(session, tool),
+        _tool_change(session, estimate, tool),
         _data(session, observation, estimate),
         _fit(estimate),
     )
@@ -165,7 +165,7 @@ def cards(
 
 
 def numbers(
-    observation: Observation, estimate: Estimate, centres: tuple[Centres, ...], tool: ToolPoint
+    observation: Observation, estimate: Estimate, centres: tuple[Centres, ...], tool: ToolError
 ) -> dict[str, Any]:
     """In m and rad; means over joint centres and configurations, sigma of one coordinate."""
     statistics, table = estimate.statistics, estimate.machine.parameters
@@ -194,11 +194,12 @@ def _mean(values: Array) -> float | None:
     return float(values.mean()) if values.size else None
 
 
-def _tool_sigma(session: Session, tool: ToolPoint) -> Figure | None:
+def _tool_sigma(session: Session, estimate: Estimate, tool: ToolError) -> Figure | None:
     """Uncertainty of the platform's pose from that of the geometry."""
-    if not tool.configurations.size:
+    if not tool.position.size:
         return None
-    where = session.configurations[tool.configurations[int(np.argmax(tool.position))]]
+    used = np.flatnonzero(estimate.configurations)
+    where = session.configurations[used[int(np.argmax(tool.position))]]
     return Figure(
         "How well is the platform's pose known?",
         _pose_values(tool.position.mean(), tool.orientation.mean()),
@@ -208,13 +209,14 @@ def _tool_sigma(session: Session, tool: ToolPoint) -> Figure | None:
     )
 
 
-def _tool_change(session: Session, tool: ToolPoint) -> Figure | None:
+def _tool_change(session: Session, estimate: Estimate, tool: ToolError) -> Figure | None:
     """What the drawing's errors did to the platform's pose."""
     good = np.isfinite(tool.off_position)
     if not good.any():
         return None
     off, turn = tool.off_position[good], tool.off_orientation[good]
-    where = session.configurations[tool.configurations[good][int(np.argmax(off))]]
+    used = np.flatnonzero(estimate.configurations)
+    where = session.configurations[used[good][int(np.argmax(off))]]
     return Figure(
         "What did the drawing do to the platform's pose?",
         _pose_values(off.mean(), turn.mean()),

@@ -58,7 +58,9 @@ HOW = (
 
 def outcome_of(found: MeasurementPlan) -> Outcome:
     """Everything that ``pkmcal plan`` tells and writes."""
-    texts = {TABLE: csv_text(found.subject.columns, found.names, found.joints.round(FINEST))}
+    texts: dict[str, str | bytes] = {
+        TABLE: csv_text(found.subject.columns, found.names, found.joints.round(FINEST))
+    }
     parts = [_order(found), _curve(found)]
     if found.tried:
         texts[PLACES] = yaml_text(stations_document(found))
@@ -325,7 +327,7 @@ def _where(found: MeasurementPlan) -> Part:
         ]  # fmt: skip
     if found.tried:
         data.append(_tried(found.tried))
-    layout = space_layout({"x": 1.3, "y": -1.3, "z": 0.8})
+    layout = space_layout({"x": 1.0, "y": -1.0, "z": 0.6})
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     plot = Plot(
         "where",

@@ -82,7 +82,7 @@ def simulate_edges(
         rows = photographs[photographs[:, 0] == station, 1]
         ends = limb_ends(machine.layout, machine.values, joints[rows], T_base_platform[rows])
         a, b = apply(T_camera_base[station], ends.a), apply(T_camera_base[station], ends.b)
-        exact, rays = _exact_edges(one, tubes, machine.values[tubes.radius], a, b)
+        exact, rays = visible_edges(one, tubes, machine.values[tubes.radius], a, b)
         exact = replace(
             exact,
             station=np.full(len(exact), station),
@@ -93,7 +93,7 @@ def simulate_edges(
     return edges, joints + joint_noise * rng.standard_normal(joints.shape)
 
 
-def _exact_edges(
+def visible_edges(
     camera: Camera, tubes: TubeList, radius: Array, a: Array, b: Array
 ) -> tuple[EdgeSet, Array]:
     """All visible edges of a camera's M photographs, and unit rays along each, (N, n, 3).
@@ -190,23 +190,29 @@ def _longest_run(seen: Booleans) -> tuple[Integers, Integers]:
 def _with_errors(
     camera: Camera, edges: EdgeSet, rays: Array, noise: EdgeNoise, rng: np.random.Generator
 ) -> EdgeSet:
-    """Edges with noise, its covariance, and what an outward shift by a pixel does.
-
-    A point at ray s that moves outward by e px turns by e c, c = |J^T n| with J = d ray/d pixel,
-    and the plane follows where s . dn = -c e.
-    """
+    """Edges with noise, its covariance, and what an outward shift by a pixel does."""
     few = rays[:, np.linspace(0, PLACES - 1, FITTED).astype(int)]
-    pixels = camera.project(few)
-    by_pixel, _ = camera.ray_jacobians(pixels)
-    gradient = np.einsum("nkij,ni->nkj", by_pixel, edges.normal)
-    by_turn = -np.einsum("nki,nij->nkj", few, edges.basis)
-    by_shift, by_tilt = responses(by_turn / np.sqrt(dot(gradient, gradient))[..., None], pixels)
+    by_shift, by_tilt = moved_outward(camera, edges.normal, edges.basis, few)
     normal = disturbed(edges.normal, edges.basis, by_shift, by_tilt, noise, rng)
     parts = np.stack([by_shift * noise.shift, by_tilt * noise.tilt], axis=-1)
     return replace(
         edges, normal=normal, basis=tangent_basis(normal, rays[:, PLACES // 2]),
         covariance=parts @ parts.mT, shift=by_shift,
     )  # fmt: skip
+
+
+def moved_outward(camera: Camera, normal: Array, basis: Array, rays: Array) -> tuple[Array, Array]:
+    """:func:`responses` (N, 2) of edges with normals (N, 3) and bases (N, 3, 2) from unit rays
+    (N, n, 3) along each.
+
+    A point at ray s that moves outward by e px turns by e c, c = |J^T n| with J = d ray/d pixel,
+    and the plane follows where s . dn = -c e.
+    """
+    pixels = camera.project(rays)
+    by_pixel, _ = camera.ray_jacobians(pixels)
+    gradient = np.einsum("nkij,ni->nkj", by_pixel, normal)
+    by_turn = -np.einsum("nki,nij->nkj", rays, basis)
+    return responses(by_turn / np.sqrt(dot(gradient, gradient))[..., None], pixels)
 
 
 def responses(by_turn: Array, pixels: Array) -> tuple[Array, Array]:

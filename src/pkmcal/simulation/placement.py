@@ -212,12 +212,17 @@ def default_stations(
     cameras: tuple[Camera, ...],
     rng: np.random.Generator,
     board: Body | None = None,
+    *,
+    distance: float | None = None,
+    elevation: float | None = None,
 ) -> tuple[StationPlace, ...]:
     """One place for each camera: evenly round the machine, not quite regular, as by hand.
 
     A camera that is alone goes where it sees most of every leg, unless it sees a board on the base.
     board : what a board is fixed to that all see: they stand to one side of a machine that stands,
-    round one that lies flat, and with room beside the machine for a board on the base.
+    round one that lies flat, and with room beside the machine for a board on the base. distance :
+    from the machine's middle, m, instead of where it fills the picture. elevation : rad above the
+    level, instead of the usual. Neither moves a camera that stands inside.
     """
     space = legs_space(machine)
     start = rng.uniform(0, 2 * np.pi)
@@ -226,16 +231,18 @@ def default_stations(
     for k, camera in enumerate(cameras):
         half = view_angle(camera)
         away = fitting_distance(machine, camera, board)
+        if distance is not None:
+            away = distance / _radius(space)
         if half > PANORAMIC:
             poses.append(_inside(*_space(machine), rng))
         elif len(cameras) == 1 and board != "base" and len(tubes_of(machine)):
-            poses.append(_clearest(machine, camera, away, start, rng))
+            poses.append(_clearest(machine, camera, away, start, rng, elevation))
         else:
             turn = (
                 ARC * (k / max(len(cameras) - 1, 1) - 0.5) if arc else 2 * np.pi * k / len(cameras)
             )
             azimuth = start + turn + np.deg2rad(rng.uniform(-8, 8))
-            poses.append(_outside(space, away, azimuth, rng))
+            poses.append(_outside(space, away, azimuth, rng, elevation))
     return tuple(poses)
 
 
@@ -286,14 +293,19 @@ def _space(machine: Machine) -> tuple[Array, Array]:
 
 
 def _clearest(
-    machine: Machine, camera: Camera, away: float, start: float, rng: np.random.Generator
+    machine: Machine,
+    camera: Camera,
+    away: float,
+    start: float,
+    rng: np.random.Generator,
+    elevation: float | None,
 ) -> StationPlace:
     """The place on the ring, ``away`` from the machine in its own radius, from which the leg that
     is seen least is seen best.
     """
     space = legs_space(machine)
     azimuths = start + 2 * np.pi * np.arange(TRIED) / TRIED
-    poses = [_outside(space, away, azimuth, rng) for azimuth in azimuths]
+    poses = [_outside(space, away, azimuth, rng, elevation) for azimuth in azimuths]
     tubes, home = tubes_of(machine), machine.home()[None]
     T_camera_base = np.stack([pose.T_camera_base() for pose in poses])
     legs = legs_in_camera(machine, T_camera_base, home, machine.inverse(home))
@@ -358,21 +370,30 @@ def _distance(machine: Machine, half: float, board: Body | None) -> float:
 
 
 def _outside(
-    points: Array, distance: float, azimuth: float, rng: np.random.Generator
+    points: Array,
+    distance: float,
+    azimuth: float,
+    rng: np.random.Generator,
+    elevation: float | None = None,
 ) -> StationPlace:
     """On a ring round the machine's points (n, 3), low, or high for a flat machine."""
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
-    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    centre, radius = (points.min(axis=0) + points.max(axis=0)) / 2, _radius(points)
     flat = _is_flat(points)
-    elevation = np.deg2rad(rng.uniform(42, 55) if flat else rng.uniform(7, 17))
+    usual = np.deg2rad(rng.uniform(42, 55) if flat else rng.uniform(7, 17))
+    above = usual if elevation is None else elevation
     way = np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
-         np.sin(elevation)]
+        [np.cos(azimuth) * np.cos(above), np.sin(azimuth) * np.cos(above), np.sin(above)]
     )  # fmt: skip
     target = centre + rng.uniform(-0.03, 0.03, 3) * radius
     up = np.array([*rng.normal(0, 0.04, 2), 1.0])
     position = centre + distance * radius * way
     return StationPlace(_rounded(position), _rounded(target), _rounded(up))
+
+
+def _radius(points: Array) -> float:
+    """Of the ball about the middle of points (n, 3) that holds them, m."""
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return float(np.linalg.norm(points - centre, axis=1).max())
 
 
 def _inside(a: Array, b: Array, rng: np.random.Generator) -> StationPlace:
@@ -384,6 +405,16 @@ def _inside(a: Array, b: Array, rng: np.random.Generator) -> StationPlace:
     target = position + rise + np.array([*rng.uniform(-0.03, 0.03, 2), 0.0]) * width
     up = (float(np.cos(angle)), float(np.sin(angle)), 0.0)
     return StationPlace(_rounded(position), _rounded(target), _rounded(np.array(up)))
+
+
+def in_picture(
+    machine: Machine, camera: Camera, T_camera_base: Array, T_base_platform: Array, joints: Array
+) -> Booleans:
+    """(K,) whether a photograph of each configuration shows the machine: a leg may lose its end to
+    the border; a picture with half a machine is a bad photograph.
+    """
+    share = share_in_image(machine, camera, T_camera_base, T_base_platform, joints)
+    return (share.mean(axis=-1) > 0.8) & (share.min(axis=-1) > 0.4)
 
 
 def share_in_image(

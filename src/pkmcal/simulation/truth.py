@@ -27,9 +27,9 @@ from pkmcal.simulation.placement import (
     StationPlace,
     default_stations,
     draw_configurations,
+    in_picture,
     places_by_hand,
     rough_pose,
-    share_in_image,
     unfolded,
 )
 from pkmcal.simulation.render import Sensor
@@ -234,17 +234,15 @@ def _configurations(
     by_drawing = drawing.forward_result(joints)
     reached = by_drawing.converged & unfolded(drawing, by_drawing.T_base_platform)
     poses, joints = poses[reached], joints[reached]
-    share = np.stack(
+    seen = np.stack(
         [
-            share_in_image(machine, camera, T, poses, joints)
+            in_picture(machine, camera, T, poses, joints)
             for camera, T in zip(cameras, T_camera_base, strict=True)
         ]
     )
-    # a leg may lose its end to the border; a picture with half a machine is a bad photograph
-    seen = (share.mean(axis=-1) > 0.8) & (share.min(axis=-1) > 0.4)
     groups = [seen.all(axis=0)] if settings.shared else list(seen)
     if settings.handheld:  # each configuration by its own photographs
-        n, groups = 1, list(seen.reshape(n, repeats, -1).all(axis=1))
+        n, groups = 1, list(np.all(seen.reshape(n, repeats, -1), axis=1, keepdims=True)[:, 0])
     taken = np.zeros(len(poses), dtype=bool)
     chosen: list[Integers] = []
     for k, good in enumerate(groups):

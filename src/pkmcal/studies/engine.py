@@ -8,21 +8,17 @@ on the number of workers nor on their order, and a batch may be done anywhere.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.studies.estimates import Fitted
-from pkmcal.studies.simulated import SimulatedRuns
 from pkmcal.studies.statistics import STATISTICS, Statistic, Summary
 
-MOST_THREADS = 4
 Key = tuple[str, ...]
 """What was estimated how: a method's name, after those of the truth and the model where a study has
 several."""
@@ -84,17 +80,15 @@ class Setting(Protocol):
         """What ``runs`` runs of the study are made of."""
         ...
 
-    def draw(self, batch: Batch) -> SimulatedRuns:
-        """True machines and their measurements."""
+    def draw(self, batch: Batch) -> Any:
+        """True machines and their measurements, in the setting's own form."""
         ...
 
-    def solve(self, batch: Batch, data: SimulatedRuns) -> Mapping[Key, Fitted]:
+    def solve(self, batch: Batch, data: Any) -> Mapping[Key, Fitted]:
         """Every estimator's answer."""
         ...
 
-    def judge(
-        self, batch: Batch, data: SimulatedRuns, found: Mapping[Key, Fitted]
-    ) -> Mapping[Key, Sample]:
+    def judge(self, batch: Batch, data: Any, found: Mapping[Key, Fitted]) -> Mapping[Key, Sample]:
         """How far each is from the truth."""
         ...
 
@@ -108,7 +102,7 @@ class StudyResult(Generic[S]):
 
     samples : of every run, by what was estimated how. accuracy : its quantities summed up, each
     with its Monte-Carlo error. wall : seconds of it all. solving : seconds of the estimators alone,
-    on ``threads`` threads. cpu : their processor time.
+    on so many ``workers``. cpu : their processor time.
     """
 
     setting: S
@@ -119,7 +113,7 @@ class StudyResult(Generic[S]):
     wall: float
     solving: float
     cpu: float
-    threads: int
+    workers: int
 
     def of(self, *key: str) -> Mapping[str, Summary]:
         """The quantities of one method, summed up."""
@@ -130,7 +124,14 @@ class StudyResult(Generic[S]):
         return self.samples[key].values[quantity]
 
 
-class _Done(NamedTuple):
+class Task(NamedTuple):
+    """One batch of one setting: all that a worker needs."""
+
+    setting: Setting
+    batch: Batch
+
+
+class Done(NamedTuple):
     """A batch's samples, and seconds of its solving: on the clock and of the processor."""
 
     samples: Mapping[Key, Sample]
@@ -138,31 +139,80 @@ class _Done(NamedTuple):
     cpu: float
 
 
-def run(setting: S, runs: int, seed: int, told: Told | None = None) -> StudyResult[S]:
-    """The whole study. told : called with what is done and the share of it."""
-    from threadpoolctl import threadpool_limits
+Finished = Callable[[int, Done], None]
+"""Called with a task's number as soon as it is done, from one thread at a time."""
+Runner = Callable[[Sequence[Task], Finished], int]
+"""Does all tasks in any order, and returns how many workers it had."""
 
-    work = batches(setting, runs, seed)
-    threads = max(1, min(MOST_THREADS, os.cpu_count() or 1, len(work)))
-    began, done = time.perf_counter(), list[_Done]()
-    # Small matrices: threads inside the linear algebra would only wait for one another.
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(threads) as pool:
-        for part in pool.map(lambda batch: _work(setting, batch), work):
-            done.append(part)
-            if told:
-                told(setting.doing, len(done) / len(work))
-    samples = collected([part.samples for part in done])
-    return StudyResult(
-        setting=setting,
-        runs=runs,
-        seed=seed,
-        samples=samples,
-        accuracy={key: summed_up(setting, sample) for key, sample in samples.items()},
-        wall=time.perf_counter() - began,
-        solving=sum(part.wall for part in done) / threads,
-        cpu=sum(part.cpu for part in done),
-        threads=threads,
-    )
+
+class Kept(Protocol):
+    """Where finished batches are kept, so that a study goes on where it was stopped."""
+
+    def load(self, cell: int, number: int, batch: Batch) -> Done | None:
+        """A finished batch of a setting; None where it is still to be done."""
+        ...
+
+    def save(self, cell: int, number: int, done: Done) -> None:
+        """Keep a batch, whole or not at all."""
+        ...
+
+
+def run(setting: S, runs: int, seed: int, told: Told | None = None) -> StudyResult[S]:
+    """The whole study of one setting. told : called with what is done and the share of it."""
+    return run_all([setting], runs, seed, told)[0]
+
+
+def run_all(
+    settings: Sequence[S],
+    runs: int,
+    seed: int,
+    told: Told | None = None,
+    runner: Runner | None = None,
+    kept: Kept | None = None,
+) -> list[StudyResult[S]]:
+    """Several settings with the same seeds: what they differ by is theirs, and not the draws'.
+
+    runner : all cores of this machine unless given. kept : batches that are finished already are
+    taken from there, and new ones put there at once.
+    """
+    from pkmcal.studies.workers import on_cores
+
+    began = time.perf_counter()
+    parts = [
+        (cell, number, batch)
+        for cell, setting in enumerate(settings)
+        for number, batch in enumerate(batches(setting, runs, seed))
+    ]
+    done: dict[int, Done] = {}
+    for k, part in enumerate(parts):
+        found = kept.load(*part) if kept else None
+        if found is not None:
+            done[k] = found
+    left = [k for k in range(len(parts)) if k not in done]
+    if told and done:
+        told(settings[0].doing, len(done) / len(parts))
+
+    def finished(task: int, result: Done) -> None:
+        k = left[task]
+        cell, number, _ = parts[k]
+        if kept:
+            kept.save(cell, number, result)
+        done[k] = result
+        if told:
+            told(settings[cell].doing, len(done) / len(parts))
+
+    tasks = [Task(settings[parts[k][0]], parts[k][2]) for k in left]
+    workers = (runner or on_cores)(tasks, finished) if tasks else 1
+    wall = time.perf_counter() - began
+    out: list[StudyResult[S]] = []
+    for cell, setting in enumerate(settings):
+        own = [done[k] for k, part in enumerate(parts) if part[0] == cell]
+        samples = collected([part.samples for part in own])
+        accuracy = {key: summed_up(setting, sample) for key, sample in samples.items()}
+        solving = sum(part.wall for part in own) / workers
+        cpu = sum(part.cpu for part in own)
+        out.append(StudyResult(setting, runs, seed, samples, accuracy, wall, solving, cpu, workers))
+    return out
 
 
 def batches(setting: Setting, runs: int, seed: int) -> list[Batch]:
@@ -176,12 +226,18 @@ def batches(setting: Setting, runs: int, seed: int) -> list[Batch]:
     return [Batch(name, count, own) for (name, count), own in zip(parts, seeds, strict=True)]
 
 
-def _work(setting: Setting, batch: Batch) -> _Done:
-    data = setting.draw(batch)
-    began, used = time.perf_counter(), time.thread_time()
-    found = setting.solve(batch, data)
-    wall, cpu = time.perf_counter() - began, time.thread_time() - used
-    return _Done(setting.judge(batch, data, found), wall, cpu)
+def work(task: Task) -> Done:
+    """A batch drawn, solved and judged, on one thread."""
+    from threadpoolctl import threadpool_limits
+
+    setting, batch = task
+    # Small matrices: threads inside the linear algebra would only wait for one another.
+    with threadpool_limits(1, "blas"):
+        data = setting.draw(batch)
+        began, used = time.perf_counter(), time.thread_time()
+        found = setting.solve(batch, data)
+        wall, cpu = time.perf_counter() - began, time.thread_time() - used
+        return Done(setting.judge(batch, data, found), wall, cpu)
 
 
 def collected(parts: Sequence[Mapping[Key, Sample]]) -> dict[Key, Sample]:

@@ -31,7 +31,8 @@ FREE = 1e3
 class Fitted:
     """An estimate of B runs. theta : (B, P). T_camera_base, T_mount : (B, 4, 4) of the only ones.
     told : what the method says of itself, (B,) or (B, n) by name, such as chi2 per degree of
-    freedom. sigma : the standard deviations that it states, by quantity.
+    freedom. sigma : the standard deviations that it states, by quantity. covariance : (B, P, P)
+    that it states of theta, where it does.
     """
 
     theta: Array
@@ -39,6 +40,7 @@ class Fitted:
     T_mount: Array | None = None
     told: dict[str, Array] = field(default_factory=dict[str, Array])
     sigma: dict[str, Array] = field(default_factory=dict[str, Array])
+    covariance: Array | None = None
 
 
 def drawing(machine: Machine, runs: int) -> Fitted:

@@ -333,6 +333,7 @@ def joint_estimate(data: SimulatedRuns, start: Start) -> Fitted:
             "steps": found.steps.astype(float),
         },
         sigma={"parameters": np.sqrt(variance)},
+        covariance=stated,
     )
 
 

@@ -433,7 +433,7 @@ def _numbers(
         "poses_per_station": s.setting.poses,
         "converged": converged(s),
         "chi2_per_dof": s.of(JOINT)["chi2"].value,
-        "seconds": {"wall": s.solving, "cpu": s.cpu, "threads": s.threads},
+        "seconds": {"wall": s.solving, "cpu": s.cpu, "workers": s.workers},
         "paper": {
             "mean_error": MEAN_ERRORS,
             "before": dict(zip(("displacement", "orientation"), BEFORE, strict=True)),

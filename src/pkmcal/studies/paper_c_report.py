@@ -267,7 +267,7 @@ def _numbers(s: Found, start: Before) -> dict[str, Any]:
     return {
         "runs": s.runs,
         "seed": s.seed,
-        "seconds": {"wall": s.wall, "threads": s.threads},
+        "seconds": {"wall": s.wall, "workers": s.workers},
         "before": start._asdict(),
         "paper": {
             "before": BEFORE._asdict(),

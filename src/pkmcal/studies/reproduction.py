@@ -89,7 +89,7 @@ class Words:
             "setting": study.setting,
             "runs": study.runs,
             "seed": study.seed,
-            "threads": study.threads,
+            "workers": study.workers,
         }
         times = {"wall": study.wall, "solving": study.solving, "cpu": study.cpu}
         for name, value in {**times, **values}.items():

@@ -1,0 +1,191 @@
+"""Over the whole workspace: how sure the platform's poses are after a calibration, how sure they
+would be by the drawing's tolerances, and how wrong the drawing was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import pose, pose_difference
+from pkmcal.identify.centres import free_of_gauge
+from pkmcal.identify.tool import ToolError, tool_error
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.kinematics import on_manifold
+from pkmcal.mechanisms.region import Region, poses_in
+from pkmcal.mechanisms.workspace import ROUGH, Limits, reachable
+
+SPREAD = 250
+"""Poses spread over the region, from which figures are told."""
+CELLS = 20
+"""Cells along a slice's longer side."""
+HEIGHTS = (0.15, 0.5, 0.85)
+"""Where slices lie between the lowest and the highest of those poses."""
+LEAST_CELLS = 8
+"""Fewer make no slice."""
+ASIDE = 0.25
+"""Of a cell: how far from its middle a pose may be put by rods and axes."""
+TURNED = np.deg2rad(3.0)
+"""Turns that crooked axes force on a platform that should only shift; a slice is of one
+orientation."""
+
+
+@dataclass(frozen=True)
+class Slice:
+    """Positions in a plane, at home's orientation.
+
+    across, up : axes (0 to 2) of the base frame that the slice lies along. level : its place along
+    the third, m. u (a,), v (b,) : coordinates of the cells' middles, m. rows : (b, a) each cell's
+    pose in the map, -1 where the machine cannot take it.
+    """
+
+    across: int
+    up: int
+    level: float
+    u: Array
+    v: Array
+    rows: Integers
+
+    @property
+    def normal(self) -> int:
+        """The third axis."""
+        return 3 - self.across - self.up
+
+
+@dataclass(frozen=True)
+class ToolMap:
+    """Poses of a region, the first ``spread`` of them evenly over it, the rest in slices.
+
+    after : how sure they are as calibrated, and how far the drawing was off. before : how sure they
+    would be by the drawing's tolerances alone.
+    """
+
+    region: Region
+    spread: int
+    slices: tuple[Slice, ...]
+    after: ToolError
+    before: ToolError
+
+    def document(self) -> dict[str, Any]:
+        """For programs, of the evenly spread poses: m and rad."""
+        even = slice(0, self.spread)
+        after, before = self.after, self.before
+        worst = int(np.nanargmax(after.position[even]))
+        return {
+            "region": {
+                **dict(zip("xyz", self.region.sides, strict=True)),
+                "turn": self.region.turn,
+            },
+            "poses": self.spread,
+            "sigma": _summary(self.after.position[even], self.after.orientation[even]),
+            "drawing_off": _summary(after.off_position[even], after.off_orientation[even]),
+            "sigma_of_drawing": _summary(before.position[even], before.orientation[even]),
+            "worst_at": self.after.T_base_platform[worst, :3, 3],
+        }
+
+
+def _summary(position: Array, orientation: Array) -> dict[str, Any]:
+    """Medians and largest, None where nothing is known."""
+    parts = {"position": position, "orientation": orientation}
+    known = {name: values[np.isfinite(values)] for name, values in parts.items()}
+    return {
+        name: {"median": float(np.median(values)), "worst": float(values.max())}
+        if values.size
+        else None
+        for name, values in known.items()
+    }
+
+
+def map_of(
+    drawing: Machine,
+    calibrated: Machine,
+    covariance: Array,
+    region: Region | None = None,
+    *,
+    legs_seen: bool = True,
+) -> ToolMap:
+    """The map of a region, the whole reach unless given.
+
+    covariance : (P, P) of the calibrated parameters, in any frames. legs_seen : see
+    :func:`~pkmcal.identify.tool.tool_error`; without legs the frames are those that fit the evenly
+    spread poses best. Raises InputError where the machine can take no pose of the region.
+    """
+    region = region or Region()
+    limits = calibrated.limits()
+    even = poses_in(limits, region, SPREAD)
+    slices, more = _slices(limits, region, even)
+    poses = np.concatenate([even, *more])
+    table = calibrated.parameters
+    root = table.free_matrix() * table.tolerances_free()
+    after = tool_error(
+        drawing,
+        calibrated,
+        free_of_gauge(calibrated, covariance),
+        poses,
+        legs_seen=legs_seen,
+        fitted=np.arange(len(even)),
+    )
+    before = replace(after, parameters=free_of_gauge(calibrated, root @ root.T))
+    return ToolMap(region, len(even), slices, after, before)
+
+
+def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, ...], list[Array]]:
+    """Horizontal slices and a vertical one where the machine has a height, and their poses, in the
+    order in which the rows count them, after the evenly spread ones.
+    """
+    places = even[:, :3, 3]
+    low, high = places.min(axis=0), places.max(axis=0)
+    wide = high - low
+    flat = wide < 1e-3 * wide.max()
+    middle = (low + high) / 2
+    middle[flat] = limits.home[:3, 3][flat]
+    if flat[2]:
+        planes = [(0, 1, float(middle[2]))]
+    else:
+        planes = [(0, 1, float(low[2] + share * wide[2])) for share in HEIGHTS]
+        across = int(np.argmax(wide[:2]))
+        planes.append((across, 2, float(middle[1 - across])))
+    out: list[Slice] = []
+    poses: list[Array] = []
+    first = len(even)
+    for across, up, level in planes:
+        if flat[across] or flat[up]:
+            continue
+        made, taken = _slice(limits, region, (across, up, level), (low, high), first)
+        if len(taken) >= LEAST_CELLS:
+            out.append(made)
+            poses.append(taken)
+            first += len(taken)
+    return tuple(out), poses
+
+
+def _slice(
+    limits: Limits,
+    region: Region,
+    plane: tuple[int, int, float],
+    box: tuple[Array, Array],
+    first: int,
+) -> tuple[Slice, Array]:
+    """A slice within a box, its rows counted from ``first``, and its poses."""
+    across, up, level = plane
+    low, high = box
+    cell = max(high[across] - low[across], high[up] - low[up]) / CELLS
+    u, v = (
+        low[k] + cell * (np.arange(max(round((high[k] - low[k]) / cell), 1)) + 0.5)
+        for k in (across, up)
+    )
+    at = np.full((len(v), len(u), 3), level)
+    at[..., across], at[..., up] = u, v[:, None]
+    wanted = pose(limits.home[:3, :3], at.reshape(-1, 3))
+    closed = on_manifold(limits.layout, limits.theta, wanted, ROUGH.newton)
+    there = closed.T_base_platform
+    off = pose_difference(there, wanted)
+    good = closed.converged & (np.linalg.norm(off[:, 3:], axis=1) < ASIDE * cell)
+    good &= np.linalg.norm(off[:, :3], axis=1) < TURNED
+    good &= reachable(limits, there).inside & region.holds(limits, wanted)
+    rows = np.full(len(good), -1)
+    rows[good] = first + np.arange(np.count_nonzero(good))
+    return Slice(across, up, level, u, v, rows.reshape(len(v), len(u))), there[good]

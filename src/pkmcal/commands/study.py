@@ -1,0 +1,84 @@
+"""``pkmcal study``: accuracy before anything is bought, by simulation."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pkmcal.commands import console
+from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.errors import InputError
+
+ROWS = "one row a run"
+
+
+class TableFormat(StrEnum):
+    """Formats of the table of runs."""
+
+    csv = "csv"
+    parquet = "parquet"
+
+
+def study(
+    subject: Annotated[
+        str,
+        typer.Argument(
+            metavar="SUBJECT",
+            help="A session's folder, a mechanism file, a built-in machine, or a: [A] 4.3.",
+        ),
+    ],
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=V1,V2", help="Values to try, every combination; one value sets it."
+        ),
+    ] = None,
+    runs: Annotated[
+        int,
+        typer.Option(metavar="N", min=2, max=1_000_000, help="Simulations of each combination."),
+    ] = 100,
+    seed: console.Seed = 0,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="DIR", help="Results, and what is finished.")
+    ] = Path("study"),
+    table: Annotated[TableFormat, typer.Option(help="Of the table of runs.")] = TableFormat.csv,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A Dask cluster's, to work there.")
+    ] = None,
+    as_json: console.Json = False,
+) -> int:
+    """Simulate calibrations: what accuracy a camera, a place or more photographs would give."""
+    from importlib.util import find_spec
+
+    from pkmcal.files import check_own_folder
+    from pkmcal.report.study import outcome_of
+    from pkmcal.studies.findings import study as simulated
+    from pkmcal.studies.store import FOLDER
+
+    if table is TableFormat.parquet and find_spec("pyarrow") is None:
+        raise InputError(
+            "a Parquet table needs pyarrow, which is not installed",
+            where="--table",
+            next_step="Install it with: pip install 'pkmcal[parquet]', or leave the option out",
+        )
+    name = f"study.{table.value}"
+    files = {"study.html": PAGE, "study.json": NUMBERS, name: ROWS}
+    ours = {"study.html", "study.json", *(f"study.{kind.value}" for kind in TableFormat), FOLDER}
+    check_own_folder(out, ours, "a study", "an earlier study")
+    try:
+        with console.progress(as_json) as told:
+            found = simulated(
+                subject, vary or (), runs=runs, seed=seed, out=out, scheduler=scheduler,
+                progress=told,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        if not as_json:
+            console.print_points(
+                console.err(),
+                [("", f"What is finished lies in {out}; the same command goes on from there.")],
+            )
+        raise
+    return finish(outcome_of(found, table=name), out, files, as_json=as_json)

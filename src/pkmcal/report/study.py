@@ -1,0 +1,446 @@
+"""A study as an outcome: what accuracy each combination gives, whether its stated deviations hold,
+and which of what was varied gains most.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.outcome import (
+    AXIS,
+    LOOKS,
+    Figure,
+    Level,
+    Outcome,
+    Part,
+    Plot,
+    Row,
+    Table,
+    Verdict,
+    note,
+)
+from pkmcal.studies.calibrations import ESTIMATE
+from pkmcal.studies.engine import StudyResult
+from pkmcal.studies.findings import HELD, PROMISE, SHARES, CellFindings, Gain, SweepResult
+from pkmcal.studies.sweep import Setting, Value
+from pkmcal.wording import amount, brief, count, decimals, number
+
+MOST_LINES = 8
+"""Curves in one plot; where there would be more, they are taken together."""
+MANY_FAILED = 0.1
+"""Share of failed runs from which a combination is named."""
+HOW = (
+    "Each run draws a machine from the drawing's tolerances, measures it with the noise that is"
+    " stated, and calibrates it as pkmcal calibrate does: from the drawing, robust, with the scale"
+    " of the noise and the tubes' shading found from the data. Some runs share a plan of stations"
+    " and configurations, which is drawn anew for the next; standard errors take that into account."
+    " All combinations have the same machines, noise and choices of configurations, as far as what"
+    " is varied leaves them.",
+    "The tool's error is that of the platform's pose at readings spread over the workspace, between"
+    " the calibrated and the true machine, frames laid over each other. What a camera sees is"
+    " decided by the drawing. Not simulated are wrong edges, other things in the picture, bending,"
+    " play and errors of the lens: these cost accuracy, and no simulation knows how much.",
+)
+HOW_PAPER = (
+    "Each run draws a hexapod, measures the axes of its legs with the noise of [A] Table 1, and"
+    " calibrates it by the joint estimate from the corrected four steps, without the drawing as"
+    " knowledge. The tool's error is that of the platform's pose at ten random readings, in frames"
+    " by three joint centres.",
+)
+
+
+def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
+    """Everything that ``pkmcal study`` tells and writes. table : the name of the runs' table."""
+    gains, bad = study.gains, [cell for cell in study.found if not cell.honest]
+    failing = [cell for cell in study.found if cell.failed.value > MANY_FAILED]
+    paper = not hasattr(study.subject.design, "observe")
+    runs = count(study.runs, "simulated calibration")
+    cells = "" if len(study.found) == 1 else f" of each of {len(study.found)} combinations"
+    seconds = f"{study.wall:.1f} s on {count(study.workers, 'worker')}"
+    return Outcome(
+        command="study",
+        title=f"Accuracy of {study.subject.name}",
+        kicker="study",
+        subject=f"{study.subject.name}: {runs}{cells}, seed {study.seed}.",
+        verdict=Verdict(
+            usable=not bad and not failing,
+            headline=_headline(study, gains, bad),
+            reasons=tuple(_reason(cell) for cell in bad) + tuple(map(_failing, failing)),
+        ),
+        stamp="Deviations hold" if not bad and not failing else "Look closer",
+        figures=_cards(study),
+        parts=(
+            Part("accuracy", "Accuracy", tables=(_table(study),), plots=_curves(study)),
+            _honesty(study),
+            Part("how", "How it was found", text=HOW_PAPER if paper else HOW),
+        ),
+        findings=tuple(note(text) for text in study.subject.warnings),
+        closing=f"{count(study.runs * len(study.found), 'run')} in {seconds}.",
+        document=document_of(study),
+        texts={table: runs_bytes(study, table)},
+    )
+
+
+# ------------------------------------------------------------------ in words
+
+
+def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) -> str:
+    """The verdict in a sentence or two."""
+    covered = [c.covered.value for c in study.found] + [c.covered_tool.value for c in study.found]
+    if not np.isfinite(covered).all():
+        return "Not every combination has a calibration that may be used."
+    low, high = 100 * min(covered), 100 * max(covered)
+    share = f"{low:.1f} %" if round(high - low, 1) == 0 else f"{low:.1f} to {high:.1f} %"
+    if bad:
+        several = f" in {len(bad)} of {len(study.found)} combinations"
+        which = several if len(study.found) > 1 else ""
+        text = f"The stated deviations are too small{which}: {share} of the 95 % intervals hold."
+    else:
+        text = f"The stated deviations hold: {share} of the 95 % intervals do."
+    if len(study.found) == 1:
+        cell = study.found[0]
+        left = f"{amount(cell.position.value, 'm')} and {amount(cell.orientation.value, 'rad')}"
+        return f"Calibrations leave {left} at the tool. {text}"
+    sure = [gain for gain in gains if gain.sure]
+    if not sure:
+        return f"{text} Nothing of what was varied matters more than chance does."
+    gain = sure[0]
+    return (
+        f"{text} Most is gained by {_name(gain.name)}: from"
+        f" {shown(study, gain.name, gain.worst)} to {shown(study, gain.name, gain.best)} the tool's"
+        f" error falls from {amount(gain.before, 'm')} to {amount(gain.after, 'm')}"
+        f" ({brief(gain.times)} times)."
+    )
+
+
+def _reason(cell: CellFindings) -> str:
+    where = f"{_label(cell)}: " if cell.values else ""
+    tool, own = 100 * cell.covered_tool.value, 100 * cell.covered.value
+    return (
+        f"{where}95 % intervals hold {own:.1f} % of the parameters and {tool:.1f} % of the tool's"
+        f" poses; {100 * (PROMISE - HELD):.0f} % is the least."
+    )
+
+
+def _failing(cell: CellFindings) -> str:
+    where = f"{_label(cell)}: " if cell.values else ""
+    return f"{where}{100 * cell.failed.value:.0f} % of the calibrations fail or do not converge."
+
+
+def _name(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def shown(study: SweepResult, name: str, value: Value) -> str:
+    """A value with its unit."""
+    unit = study.subject.names[name].unit
+    text = value if isinstance(value, str) else f"{value:g}"
+    return f"{text}{unit}" if unit == "°" else f"{text} {unit}".rstrip()
+
+
+def _label(cell: CellFindings) -> str:
+    """A combination in words."""
+    return ", ".join(
+        f"{_name(name)} {value if isinstance(value, str) else f'{value:g}'}"
+        for name, value in cell.values.items()
+    )
+
+
+# ------------------------------------------------------------------ cards and tables
+
+
+def _cards(study: SweepResult) -> tuple[Figure, ...]:
+    """Of the best combination."""
+    best = min(study.found, key=lambda cell: np.nan_to_num(cell.position.value, nan=np.inf))
+    which = f"with {_label(best)}" if len(study.found) > 1 else "root mean square"
+    one = 1e3
+    position, turn = one * best.position.value, one * best.orientation.value
+    return (
+        Figure(
+            "How far off is the tool after a calibration?",
+            ((brief(position), "mm"), (brief(turn), "mrad")),
+            f"{which}; ± {one * best.position.error:.2g} mm by chance",
+        ),
+        Figure(
+            "What stays below in 95 % of the workspace?",
+            ((brief(one * best.position_95), "mm"), (brief(one * best.orientation_95), "mrad")),
+            "over all runs and poses",
+        ),
+        Figure(
+            "Do its 95 % intervals hold?",
+            ((number(100 * best.covered.value, 1), "%"),),
+            f"of all parameters; {100 * best.covered_tool.value:.1f} % of the tool's poses",
+        ),
+        Figure(
+            "Does it always converge?",
+            ((number(100 * best.failed.value, 1), "% fail"),),
+            f"of {best.runs} runs",
+        ),
+    )
+
+
+def _table(study: SweepResult) -> Table:
+    """A row a combination."""
+    rows: list[Row] = []
+    for cell in study.found:
+        cells = (
+            _with_error(1e3 * cell.position.value, 1e3 * cell.position.error),
+            brief(1e3 * cell.position_sigma),
+            f"{100 * cell.covered.value:.1f}",
+            f"{100 * cell.covered_tool.value:.1f}",
+            brief(1e3 * cell.position_95),
+            _with_error(1e3 * cell.orientation.value, 1e3 * cell.orientation.error),
+            brief(1e3 * cell.orientation_sigma),
+            brief(1e3 * cell.orientation_95),
+            f"{100 * cell.failed.value:.1f}",
+        )
+        mark = None if cell.honest else Level.DOUBTFUL
+        rows.append(Row(_label(cell) or study.subject.name, cells, mark=mark))
+    heads = (
+        "", "tool, mm", "stated", "held, %", "tool's, %", "95 % below, mm", "tool, mrad",
+        "stated, mrad", "95 % below, mrad", "failed, %",
+    )  # fmt: skip
+    legend = (
+        "stated: deviation that calibrations tell of themselves; held: share of",
+        "95 % intervals that hold the truth, of all parameters and of the tool's pose",
+    )
+    return Table("Errors after a calibration", heads, tuple(rows), first=5, legend=legend)
+
+
+def _with_error(value: float, error: float) -> str:
+    """A figure with its standard error in the same decimals."""
+    places = decimals(value)
+    return f"{number(value, places)} ± {number(error, places)}" if np.isfinite(value) else "–"
+
+
+def _honesty(study: SweepResult) -> Part:
+    """How often intervals hold, of each size and of each kind of parameter."""
+    kinds: dict[str, list[float]] = {}
+    names = study.cells[0].setting.parameters
+    for cell in study.found:
+        for (name, _), share in zip(names, cell.by_parameter.tolist(), strict=False):
+            if np.isfinite(share):
+                kinds.setdefault(_kind(name), []).append(share)
+    rows = [
+        Row(kind, (f"{100 * np.mean(own):.1f}", f"{100 * min(own):.1f}", f"{100 * max(own):.1f}"))
+        for kind, own in kinds.items()
+    ]
+    table = Table(
+        "95 % intervals of the parameters that hold, %",
+        ("", "mean", "least", "most"),
+        tuple(rows),
+        brief=False,
+        note="Least and most: of single parameters and combinations; chance alone spreads them.",
+    )
+    text = (
+        "Where an interval of 95 % holds the truth in 95 of 100 calibrations, its deviation may be"
+        " believed. Above the line deviations are on the safe side, below it they promise too much."
+    )
+    return Part("honesty", "Do the stated deviations hold?", (text,), plots=(_held(study),),
+                tables=(table,))  # fmt: skip
+
+
+def _kind(name: str) -> str:
+    """What a parameter is, without its leg and coordinate."""
+    if "]" not in name:  # [A]'s: A2 x, q5
+        return {"A": "base centres", "B": "platform centres"}.get(name[:1], "offsets")
+    rest = name.partition("].")[2]
+    rest = rest.removesuffix(".x").removesuffix(".y").removesuffix(".z")
+    return "tubes.radius" if rest.startswith("tubes") else rest
+
+
+# ------------------------------------------------------------------ plots
+
+
+def _plane(x: str, y: str) -> dict[str, Any]:
+    return {
+        **LOOKS,
+        "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
+        "legend": {"orientation": "h", "y": 1.12, "x": 0, "bgcolor": "rgba(0,0,0,0)"},
+        "xaxis": {**AXIS, "title": {"text": x}},
+        "yaxis": {**AXIS, "title": {"text": y}, "rangemode": "tozero"},
+    }
+
+
+def _trace(name: str, x: list[Any], y: list[float], colour: str, **more: Any) -> dict[str, Any]:
+    shape = {"type": "scatter", "mode": "lines+markers", "name": name, "x": x}
+    values = [None if not np.isfinite(v) else round(v, 6) for v in y]
+    return {**shape, "y": values, "line": {"color": colour}, "marker": {"color": colour}, **more}
+
+
+def _groups(study: SweepResult, name: str) -> Iterator[tuple[str, list[CellFindings]]]:
+    """Cells along a name, for every combination of all else."""
+    others: dict[tuple[Any, ...], list[CellFindings]] = {}
+    for cell in study.found:
+        rest = {key: value for key, value in cell.values.items() if key != name}
+        others.setdefault(tuple(rest.items()), []).append(cell)
+    for rest, cells in others.items():
+        told = [f"{_name(k)} {v if isinstance(v, str) else f'{v:g}'}" for k, v in rest
+                if len(study.varied[k]) > 1]  # fmt: skip
+        yield ", ".join(told), cells
+
+
+def _curves(study: SweepResult) -> tuple[Plot, ...]:
+    """The tool's error and what is stated of it, along each name."""
+    out: list[Plot] = []
+    for name, values in study.varied.items():
+        if len(values) < 2:
+            continue
+        groups = list(_groups(study, name))
+        x = [value if isinstance(value, str) else float(value) for value in values]
+        data: list[dict[str, Any]] = []
+        if len(groups) > MOST_LINES:
+            means = [study.at(name, value) for value in values]
+            bars = {"type": "data", "array": [2e3 * s.error for s in means]}
+            y = [1e3 * s.value for s in means]
+            data.append(_trace("error, all else together", x, y, "--calibrated", error_y=bars))
+        else:
+            for k, (label, cells) in enumerate(groups):
+                colour = f"--leg{k % 8 + 1}"
+                bars = {"type": "data", "array": [2e3 * c.position.error for c in cells]}
+                y = [1e3 * c.position.value for c in cells]
+                data.append(_trace(label or "error", x, y, colour, error_y=bars))
+                stated = [1e3 * c.position_sigma for c in cells]
+                dash = {"color": colour, "dash": "dot"}
+                told = f"stated, {label}" if label else "stated"
+                data.append(_trace(told, x, stated, colour, line=dash, mode="lines"))
+        unit = study.subject.names[name].unit
+        layout = _plane(_name(name) + (f", {unit}" if unit else ""), "tool's position, mm")
+        numbers = [v for v in x if not isinstance(v, str)]
+        if numbers and min(numbers) > 0 and max(numbers) / min(numbers) >= 8:
+            layout["xaxis"] |= {"type": "log"}
+        caption = "Bars are two standard errors of the simulation; dotted: what is stated."
+        out.append(
+            Plot(
+                f"by-{name.replace('_', '-')}",
+                f"By {_name(name)}",
+                caption,
+                f"The tool's position error by {_name(name)}, with what calibrations state of it.",
+                {"data": data, "layout": layout, "config": {}},
+                height=380,
+            )
+        )
+    return tuple(out)
+
+
+def _held(study: SweepResult) -> Plot:
+    """Intervals that hold against their promise, all combinations together."""
+    x = (100 * SHARES).tolist()
+    own = 100 * np.nanmean([cell.held for cell in study.found], axis=0)
+    tool = 100 * np.nanmean([cell.held_tool for cell in study.found], axis=0)
+    line = {"color": "--quiet", "dash": "dash"}
+    data = [
+        _trace("as promised", [50, 100], [50, 100], "--quiet", line=line, mode="lines"),
+        _trace("parameters", x, own.tolist(), "--calibrated"),
+        _trace("tool's pose", x, tool.tolist(), "--drawing"),
+    ]
+    layout = _plane("interval, %", "hold the truth, %")
+    layout["yaxis"] |= {"rangemode": "normal"}
+    return Plot(
+        "held",
+        "Intervals that hold",
+        "All combinations together.",
+        "Share of intervals that hold the truth against the share that they promise.",
+        {"data": data, "layout": layout, "config": {}},
+        height=380,
+    )
+
+
+# ------------------------------------------------------------------ for programs
+
+
+def document_of(study: SweepResult) -> dict[str, Any]:
+    """Everything for programs, m and rad; nothing of how long it took, so that the same study is
+    the same file.
+    """
+    names = [name for name, _ in study.cells[0].setting.parameters]
+    return {
+        "pkmcal_study": 1,
+        "subject": study.subject.name,
+        "vary": {name: list(values) for name, values in study.varied.items()},
+        "runs": study.runs,
+        "seed": study.seed,
+        "combinations": [_cell(cell, names) for cell in study.found],
+        "gains": [
+            {
+                "name": g.name, "from": g.worst, "to": g.best,
+                "position_before": g.before, "position_after": g.after, "beyond_chance": g.sure,
+            }
+            for g in study.gains
+        ],
+        "warnings": list(study.subject.warnings),
+    }  # fmt: skip
+
+
+def _cell(cell: CellFindings, names: list[str]) -> dict[str, Any]:
+    summaries = ("position", "orientation", "covered", "covered_tool", "failed")
+    out: dict[str, Any] = {"values": dict(cell.values), "runs": cell.runs}
+    for name in summaries:
+        found = getattr(cell, name)
+        out[name] = {"value": found.value, "standard_error": found.error}
+    for name in ("position_95", "orientation_95", "position_sigma", "orientation_sigma", "chi2"):
+        out[name] = getattr(cell, name)
+    out["intervals"] = {
+        "promised": SHARES, "parameters": cell.held, "tool": cell.held_tool,
+    }  # fmt: skip
+    out["covered_by_parameter"] = dict(zip(names, cell.by_parameter.tolist(), strict=False))
+    return out | {"deviations_hold": cell.honest}
+
+
+COLUMNS = (
+    "position", "orientation", "position_sigma", "orientation_sigma", "worst_parameter",
+    "worst_parameter_error", "worst_parameter_sigma", "covered", "covered_tool", "chi2", "scale",
+    "steps", "failed",
+)  # fmt: skip
+"""Of the table of runs, after what is varied and the run's number; m, rad, and shares."""
+
+
+def runs_table(study: SweepResult) -> dict[str, list[Any]]:
+    """One row a run, by column: what is varied, ``run``, then COLUMNS."""
+    out: dict[str, list[Any]] = {name: [] for name in (*study.varied, "run", *COLUMNS)}
+    for cell, result in zip(study.cells, study.results, strict=True):
+        own = _runs_of(result, [name for name, _ in cell.setting.parameters])
+        for name in study.varied:
+            out[name] += [cell.values[name]] * study.runs
+        out["run"] += list(range(study.runs))
+        for name in COLUMNS:
+            out[name] += own[name]
+    return out
+
+
+def _runs_of(result: StudyResult[Setting], names: list[str]) -> dict[str, list[Any]]:
+    """Columns of one combination. The worst parameter is that with the largest error in stated
+    deviations.
+    """
+    sample = result.samples[ESTIMATE]
+    values: Mapping[str, Array] = sample.values
+    errors, sigma = values["parameters"], sample.sigma["parameters"]
+    worst = np.argmax(np.nan_to_num(np.abs(errors) / sigma), axis=1)
+    row = np.arange(len(worst))
+    out: dict[str, list[Any]] = {name: values[name].tolist() for name in COLUMNS if name in values}
+    out["worst_parameter"] = [names[k] for k in worst]
+    out["worst_parameter_error"] = errors[row, worst].tolist()
+    out["worst_parameter_sigma"] = sigma[row, worst].tolist()
+    return out
+
+
+def runs_bytes(study: SweepResult, name: str) -> str | bytes:
+    """The table of runs as CSV, or as Parquet where its name ends so."""
+    table = runs_table(study)
+    if name.endswith(".parquet"):
+        pyarrow, parquet = (import_module(name) for name in ("pyarrow", "pyarrow.parquet"))
+        sink = io.BytesIO()
+        parquet.write_table(pyarrow.table(table), sink)
+        return sink.getvalue()
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(table)
+    writer.writerows(zip(*table.values(), strict=True))
+    return stream.getvalue()

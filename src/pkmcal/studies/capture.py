@@ -1,0 +1,234 @@
+"""What a session would photograph, told by the drawing: stations, configurations, what is seen.
+
+Axes: S stations, K configurations, N edges, V views of a board with n corners each. A plan is made
+with the drawing, as people make it; the true machines of a study, which differ from it by its
+tolerances, then take the same readings. What is seen of them is what the plan sees: an edge that
+a true machine shows by a millimetre less counts as long as planned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.boards.board import Board
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import apply, dot
+from pkmcal.measurements import EdgeSet, Measurements, Mount, PoseSet, concatenate
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.observe.predict import tubes_of
+from pkmcal.simulation.board import board_for, place_board
+from pkmcal.simulation.drives import with_forearms
+from pkmcal.simulation.edges import visible_edges
+from pkmcal.simulation.placement import default_stations, draw_configurations, in_picture
+from pkmcal.simulation.truth import Settings
+
+LEAST_CORNERS = 0.5
+"""Share of a board's corners that a photograph has to show."""
+LEAST_FACING = 0.2
+"""Cosine of the angle between a board's normal and the line of sight below which it shows nothing:
+detectors give up at some eighty degrees."""
+MARGIN = 10.0
+"""px between a corner and the image's border."""
+SPARE = 10
+"""Configurations drawn beyond those wanted, of which a station takes what it sees."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """What is to be built and bought; lengths in m, angles in rad.
+
+    machine : the drawing. cameras : one for all stations, or one each. stations : how many.
+    T_camera_base : (S, 4, 4) where they stand, None for places of their own in every batch.
+    observe : legs, board or both; the board is on the platform. board : None for one in proportion
+    to the machine. configurations : photographed by each station, its own or, ``shared``, the same
+    by all. distance, elevation : of the cameras, None for the usual. reading_noise : m or rad.
+    edge_noise : px, of an edge's place and of its ends. corner_noise : px, of a coordinate.
+    shading : px, of the shift that all edges of a tube's side have at a station. tolerance : true
+    machines differ from the drawing by so many of its tolerances. extreme : share of
+    configurations with legs near the ends of their ranges.
+    """
+
+    machine: Machine
+    cameras: tuple[Camera, ...]
+    stations: int = 3
+    T_camera_base: Array | None = None
+    observe: tuple[str, ...] = ("legs",)
+    board: Board | None = None
+    configurations: int = 15
+    shared: bool = False
+    distance: float | None = None
+    elevation: float | None = None
+    reading_noise: float = 3e-6
+    edge_noise: float = 0.1
+    corner_noise: float = 0.05
+    shading: float = 0.03
+    tolerance: float = 1.0
+    extreme: float = field(default=Settings.extreme)
+
+    @property
+    def seen_machine(self) -> Machine:
+        """The drawing with a cylinder a rod where legs are observed and it gives them none."""
+        return with_forearms(self.machine) if "legs" in self.observe else self.machine
+
+    @property
+    def camera_of_station(self) -> tuple[Camera, ...]:
+        """One a station."""
+        return self.cameras if len(self.cameras) > 1 else self.cameras * self.stations
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A plan of photographs.
+
+    machine : the drawing. cameras : one a station. T_camera_base : (S, 4, 4). T_base_platform
+    (K, 4, 4), joints (K, m) : by the drawing, exact. edges : exact, by the drawing; empty where
+    legs are not observed. views : (V, 2) station and configuration of the photographs that show
+    the board; corners : (V, n) which of its corners. board, T_platform_board : None without one.
+    """
+
+    machine: Machine
+    cameras: tuple[Camera, ...]
+    T_camera_base: Array
+    T_base_platform: Array
+    joints: Array
+    edges: EdgeSet
+    views: Integers
+    corners: Booleans
+    board: Board | None = None
+    T_platform_board: Array | None = None
+
+    def measurements(self, joint_noise: float) -> Measurements:
+        """The plan as measurements: where each stands; numbers by the drawing, of boards none."""
+        n = len(self.views)
+        none = np.zeros(n, dtype=int)
+        unit = np.broadcast_to(np.eye(4), (n, 4, 4))
+        white = np.broadcast_to(np.eye(6), (n, 6, 6))
+        kinds = {camera: k for k, camera in enumerate(dict.fromkeys(map(id, self.cameras)))}
+        return Measurements(
+            replace(self.edges, covariance=np.broadcast_to(np.eye(2), (len(self.edges), 2, 2))),
+            self.joints,
+            joint_noise,
+            len(self.cameras),
+            np.array([kinds[id(camera)] for camera in self.cameras]),
+            poses=PoseSet(self.views[:, 0], self.views[:, 1], none, unit, white),
+            mounts=(Mount("board", "platform"),) if n else (),
+            shaded=len(self.edges) > 0,
+        )
+
+
+def captured(design: Design, rng: np.random.Generator) -> Capture:
+    """A plan: stations and board where people put them, configurations drawn until all are seen.
+
+    Raises InputError where a station does not see enough.
+    """
+    machine, cameras = design.seen_machine, design.camera_of_station
+    by_board = "board" in design.observe
+    T_camera_base = design.T_camera_base
+    if T_camera_base is None:
+        places = default_stations(
+            with_forearms(machine), cameras, rng, "platform" if by_board else None,
+            distance=design.distance, elevation=design.elevation,
+        )  # fmt: skip
+        T_camera_base = np.stack([place.T_camera_base() for place in places])
+    n = design.configurations
+    wanted = n if design.shared else n * design.stations
+    poses, joints = draw_configurations(machine, 2 * wanted + SPARE, design.extreme, rng)
+    board = T_platform_board = None
+    seen = np.ones((design.stations, len(joints)), dtype=bool)
+    if by_board:
+        whole = with_forearms(machine)
+        board = design.board or board_for(whole, "platform")
+        T_platform_board = place_board(
+            whole, board, "platform", cameras, T_camera_base, poses, whole.inverse(poses), rng
+        )
+        shown = _corners(board, T_platform_board, cameras, T_camera_base, poses)
+        seen &= shown.mean(axis=-1) >= LEAST_CORNERS
+    if "legs" in design.observe:
+        seen &= np.stack(
+            [
+                in_picture(machine, camera, T, poses, joints)
+                for camera, T in zip(cameras, T_camera_base, strict=True)
+            ]
+        )
+    rows, photographs = _chosen(seen, n, shared=design.shared)
+    poses, joints = poses[rows], joints[rows]
+    edges = EdgeSet.empty()
+    if "legs" in design.observe:
+        edges = _edges(machine, cameras, T_camera_base, poses, joints, photographs)
+    views, corners = np.zeros((0, 2), dtype=int), np.zeros((0, 0), dtype=bool)
+    if board is not None and T_platform_board is not None:
+        views = photographs
+        shown = _corners(board, T_platform_board, cameras, T_camera_base, poses)
+        corners = shown[views[:, 0], views[:, 1]]
+    return Capture(
+        machine, cameras, T_camera_base, poses, joints, edges, views, corners, board,
+        T_platform_board,
+    )  # fmt: skip
+
+
+def _chosen(seen: Booleans, n: int, *, shared: bool) -> tuple[Integers, Integers]:
+    """Candidates (K,) that are taken, and pairs (M, 2) of station and configuration.
+
+    seen : (S, candidates).
+    """
+    taken, rows, pairs = np.zeros(seen.shape[1], dtype=bool), list[Integers](), list[Integers]()
+    for number, good in enumerate([np.asarray(seen.all(axis=0))] if shared else list(seen)):
+        own = np.flatnonzero(good & ~taken)[:n]
+        if len(own) < n:
+            raise InputError(
+                "a camera does not see the machine, or its board, in enough configurations",
+                found=f"{len(own)} at "
+                + ("all stations at once" if shared else f"station {number + 1}"),
+                expected=str(n),
+                next_step="Move the camera back, use a wider lens, or fewer configurations",
+            )
+        first = sum(map(len, rows))
+        taken[own] = True
+        rows.append(own)
+        for station in range(len(seen)) if shared else (number,):
+            pairs.append(np.stack([np.full(n, station), first + np.arange(n)], axis=1))
+    return np.concatenate(rows), np.concatenate(pairs)
+
+
+def _edges(
+    machine: Machine,
+    cameras: tuple[Camera, ...],
+    T_camera_base: Array,
+    poses: Array,
+    joints: Array,
+    photographs: Integers,
+) -> EdgeSet:
+    """All edges that the photographs show, exact."""
+    tubes, sets = tubes_of(machine), list[EdgeSet]()
+    for station, (camera, T) in enumerate(zip(cameras, T_camera_base, strict=True)):
+        rows = photographs[photographs[:, 0] == station, 1]
+        ends = limb_ends(machine.layout, machine.values, joints[rows], poses[rows])
+        radius = machine.values[tubes.radius]
+        exact, _ = visible_edges(camera, tubes, radius, apply(T, ends.a), apply(T, ends.b))
+        place = np.full(len(exact), station)
+        sets.append(replace(exact, station=place, configuration=rows[exact.configuration]))
+    return concatenate(sets)
+
+
+def _corners(
+    board: Board,
+    T_platform_board: Array,
+    cameras: tuple[Camera, ...],
+    T_camera_base: Array,
+    poses: Array,
+) -> Booleans:
+    """(S, K, n) which corners each station sees; the machine's own parts hide none."""
+    out: list[Booleans] = []
+    for camera, T in zip(cameras, T_camera_base, strict=True):
+        there = T @ poses @ T_platform_board
+        points = apply(there[:, None], board.points)
+        facing = dot(there[:, None, :3, 2], points) / np.sqrt(dot(points, points))
+        with np.errstate(invalid="ignore"):
+            pixels = camera.project(points)
+        out.append(camera.in_image(pixels, margin=MARGIN) & (facing > LEAST_FACING))
+    return np.stack(out)

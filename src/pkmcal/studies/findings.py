@@ -1,0 +1,250 @@
+"""What a study's runs come to, combination by combination, and what was varied with most gain.
+
+Runs of a batch share a plan of photographs, so standard errors are those of a mean over batches
+that differ: the squares of the batches' sums of deviations, not of each run's alone. Runs that
+failed are counted, and left out of all else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import InputError
+from pkmcal.studies.calibrations import ESTIMATE, covered
+from pkmcal.studies.cluster import on_cluster
+from pkmcal.studies.engine import Runner, StudyResult, Told, batches, run_all
+from pkmcal.studies.statistics import Summary
+from pkmcal.studies.store import Store
+from pkmcal.studies.sweep import Cell, Setting, Subject, Value, cells_of, parsed, subject_of
+
+PROMISE = 0.95
+HELD = 0.02
+"""Coverage may be off its promise by this, as asked of a calibration: 93 to 97 %."""
+SHARES = np.array([0.5, 0.68, 0.8, 0.9, 0.95, 0.99])
+"""Intervals of which it is told how often they hold."""
+
+
+@dataclass(frozen=True)
+class CellFindings:
+    """One combination.
+
+    runs, failed : how many, and the share that did not converge, or had to be refused. freedom : of
+    what standard errors are told from. position (m)
+    and orientation (rad) : the tool's errors over the workspace, root mean square; ``_95`` : that
+    95 % of them stay below; ``_sigma`` : what
+    calibrations state, their mean. covered, covered_tool : share of
+    95 % intervals that hold the truth, of all parameters and of the tool's pose. held, held_tool :
+    (n,) the same of the intervals of SHARES. chi2 : per degree of freedom. by_parameter : (P,)
+    share of each parameter's 95 % intervals, NaN of what has none.
+    """
+
+    values: Mapping[str, Value]
+    runs: int
+    freedom: int
+    failed: Summary
+    position: Summary
+    orientation: Summary
+    position_95: float
+    orientation_95: float
+    position_sigma: float
+    orientation_sigma: float
+    covered: Summary
+    covered_tool: Summary
+    held: Array
+    held_tool: Array
+    chi2: float
+    by_parameter: Array
+
+    @property
+    def honest(self) -> bool:
+        """Whether 95 % intervals hold often enough, chance aside (Student's, both ways)."""
+        from scipy.special import stdtrit
+
+        few = float(stdtrit(max(self.freedom, 1), 0.975))
+        return all(
+            s.value + few * s.error >= PROMISE - HELD for s in (self.covered, self.covered_tool)
+        )
+
+
+class Gain(NamedTuple):
+    """What a varied name does to the tool's position: from its worst to its best value, root mean
+    squares over all else that was varied (m), how many times that is, and whether chance could do
+    it.
+    """
+
+    name: str
+    worst: Value
+    best: Value
+    before: float
+    after: float
+    sure: bool
+
+    @property
+    def times(self) -> float:
+        """Before over after."""
+        return self.before / self.after
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """A whole study.
+
+    subject, varied : what was asked. cells, results : combinations and all their runs. found : what
+    they come to. runs, seed : of each. wall : seconds. workers : how many worked.
+    """
+
+    subject: Subject
+    varied: Mapping[str, tuple[Value, ...]]
+    cells: tuple[Cell, ...]
+    results: tuple[StudyResult[Setting], ...]
+    found: tuple[CellFindings, ...]
+    runs: int
+    seed: int
+
+    @property
+    def wall(self) -> float:
+        """Seconds that this took."""
+        return self.results[0].wall
+
+    @property
+    def workers(self) -> int:
+        """How many worked."""
+        return self.results[0].workers
+
+    @property
+    def gains(self) -> list[Gain]:
+        """Names with more than one value, the one with most gain first."""
+        several = [name for name, values in self.varied.items() if len(values) > 1]
+        return sorted((self._gain(name) for name in several), key=lambda g: -g.times)
+
+    def _gain(self, name: str) -> Gain:
+        """Of one name."""
+        means = [self.at(name, value) for value in self.varied[name]]
+        order = np.argsort([mean.value for mean in means])
+        best, worst = int(order[0]), int(order[-1])
+        apart = means[worst].value - means[best].value
+        return Gain(
+            name,
+            self.varied[name][worst],
+            self.varied[name][best],
+            means[worst].value,
+            means[best].value,
+            bool(apart > 2 * np.hypot(means[worst].error, means[best].error)),
+        )
+
+    def at(self, name: str, value: Value) -> Summary:
+        """The tool's position error where a name has a value, root mean square over all else."""
+        own = [cell.position for cell in self.found if cell.values[name] == value]
+        square = float(np.mean([s.value**2 for s in own]))
+        error = np.sqrt(np.sum([(s.value * s.error) ** 2 for s in own])) / len(own)
+        return Summary(float(np.sqrt(square)), float(error / max(np.sqrt(square), 1e-300)))
+
+
+def study(
+    subject: str,
+    vary: Mapping[str, Sequence[Value]] | Sequence[str] = (),
+    *,
+    runs: int = 100,
+    seed: int = 0,
+    out: Path | str | None = None,
+    scheduler: str | None = None,
+    progress: Told | None = None,
+) -> SweepResult:
+    """How accurate calibrations would be, by simulation; the same as the command.
+
+    subject : a session's folder, a mechanism file, a built-in machine or ``a``, [A] 4.3. vary :
+    values by name, every combination of which is tried. runs : simulated calibrations of each. out
+    : a folder in which finished batches are kept, and from which a study goes on. scheduler : the
+    address of a Dask cluster. progress : called with what is done and the share of it.
+    Raises InputError for what cannot be studied, and where ``out`` holds another study.
+    """
+    if isinstance(vary, Mapping):
+        vary = [f"{name}={','.join(map(str, values))}" for name, values in vary.items()]
+    if runs < 2:
+        raise InputError("a study needs two runs at least", found=str(runs))
+    runner: Runner | None = on_cluster(scheduler) if scheduler else None
+    begun = subject_of(subject)
+    varied = parsed(begun, vary)
+    cells = cells_of(begun, varied)
+    settings = [cell.setting for cell in cells]
+    told = " ".join([subject, *vary])
+    store = Store.opened(Path(out), told, settings, seed) if out is not None else None
+    results = run_all(settings, runs, seed, progress, runner, store)
+    found = tuple(found_of(cell, result) for cell, result in zip(cells, results, strict=True))
+    return SweepResult(begun, varied, tuple(cells), tuple(results), found, runs, seed)
+
+
+def found_of(cell: Cell, result: StudyResult[Setting]) -> CellFindings:
+    """One combination's runs summed up; NaN where all of them failed."""
+    sample = result.samples[ESTIMATE]
+    values, sigma = sample.values, sample.sigma
+    sizes = [batch.runs for batch in batches(result.setting, result.runs, result.seed)]
+    batch = np.repeat(np.arange(len(sizes)), sizes)
+    good = values["failed"] == 0
+
+    def summed(name: str) -> Summary:
+        return clustered(values[name][good], batch[good])
+
+    def rooted(name: str) -> Summary:
+        square = clustered(values[name][good] ** 2, batch[good])
+        root = float(np.sqrt(square.value))
+        return Summary(root, square.error / (2 * max(root, 1e-300)))
+
+    tool = values["tool"][good].reshape(int(good.sum()), -1, 2, 3)
+    size = np.sqrt(np.where(np.isfinite(tool).any(-1), np.nansum(tool**2, axis=-1), np.nan))
+    e, s = values["parameters"][good], sigma["parameters"][good]
+    t, st = values["tool"][good], sigma["tool"][good]
+    return CellFindings(
+        values=cell.values,
+        runs=result.runs,
+        freedom=(len(sizes) if len(sizes) > 1 else result.runs) - 1,
+        failed=clustered(values["failed"], batch),
+        position=rooted("position"),
+        orientation=rooted("orientation"),
+        position_95=_percentile(size[:, :, 1]),
+        orientation_95=_percentile(size[:, :, 0]),
+        position_sigma=summed("position_sigma").value,
+        orientation_sigma=summed("orientation_sigma").value,
+        covered=summed("covered"),
+        covered_tool=summed("covered_tool"),
+        held=np.array([_mean(covered(e, s, float(share))) for share in SHARES]),
+        held_tool=np.array([_mean(covered(t, st, float(share))) for share in SHARES]),
+        chi2=_mean(values["chi2"][good]),
+        by_parameter=_by_parameter(e, s),
+    )
+
+
+def clustered(values: Array, batch: Integers) -> Summary:
+    """Mean of values (B,) and its standard error where runs of a batch (B,) go together; of one
+    batch alone, that of its runs.
+    """
+    if not len(values):
+        return Summary(np.nan, np.nan)
+    mean, groups = float(values.mean()), len(np.unique(batch))
+    if groups == 1:
+        batch, groups = np.arange(len(values)), len(values)
+    sums = np.bincount(batch, weights=values - mean)
+    spread = float(np.sqrt(np.sum(sums**2))) / len(values)
+    return Summary(mean, spread * float(np.sqrt(groups / max(groups - 1, 1))))
+
+
+def _by_parameter(errors: Array, sigma: Array) -> Array:
+    known: Booleans = np.isfinite(sigma)
+    inside = np.sum(known & (np.abs(errors) <= 1.959964 * sigma), axis=0)
+    count = np.sum(known, axis=0)
+    return np.where(count > 0, inside / np.maximum(count, 1), np.nan)
+
+
+def _percentile(values: Array) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.percentile(values, 95)) if values.size else float("nan")
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean()) if values.size else float("nan")

@@ -1,0 +1,142 @@
+"""Finished batches of a study on disk, so that it goes on where it was stopped.
+
+A folder ``batches`` beside the results holds one file a batch, written whole or not at all, and
+``study.json``, which says of what study they are. A batch depends on its own seed alone, so a study
+that was stopped and goes on, on any number of workers, ends at the same numbers as one that was
+not. More runs of the same study take the finished ones in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal import __version__
+from pkmcal.arrays import Array
+from pkmcal.boards.board import Board
+from pkmcal.cameras import Camera
+from pkmcal.errors import InputError
+from pkmcal.files import json_text, plain, write_bytes, write_text
+from pkmcal.mechanisms import Machine
+from pkmcal.studies.engine import Batch, Done, Key, Sample, Setting
+
+FOLDER = "batches"
+DESCRIPTION = "study.json"
+SEPARATOR = "/"
+"""Between what names an array in a batch's file."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """The batches of one study. folder : theirs."""
+
+    folder: Path
+
+    @classmethod
+    def opened(cls, out: Path, told: str, settings: Sequence[Setting], seed: int) -> Store:
+        """The store in a results folder, made or found there.
+
+        told : the study in words. Raises InputError where it holds another study.
+        """
+        folder = out / FOLDER
+        path = folder / DESCRIPTION
+        own = {"study": told, "seed": seed, "pkmcal": __version__}
+        own |= {"digest": digest([plainly(setting) for setting in settings], seed)}
+        if path.is_file():
+            before = _description(path)
+            if before.get("digest") != own["digest"]:
+                raise InputError(
+                    "the folder holds the batches of another study",
+                    where=str(folder),
+                    found=_in_words(before),
+                    expected=_in_words(own),
+                    next_step="Name another folder with -o, or remove this one",
+                )
+        else:
+            write_text(path, json_text(own))
+        for left in folder.glob(".*.part"):  # of a process that was killed while it wrote
+            left.unlink(missing_ok=True)
+        return cls(folder)
+
+    def load(self, cell: int, number: int, batch: Batch) -> Done | None:
+        """A finished batch; None where it is still to be done, or has another number of runs."""
+        try:
+            content = io.BytesIO(self._path(cell, number).read_bytes())
+            with np.load(content, allow_pickle=False) as file:
+                runs, wall, cpu = file["done"].tolist()
+                arrays = {name: file[name] for name in file.files if name != "done"}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        if runs != batch.runs:
+            return None
+        parts: dict[Key, dict[str, dict[str, Array]]] = {}
+        for name, array in arrays.items():
+            *key, kind, quantity = name.split(SEPARATOR)
+            own = parts.setdefault(tuple(key), {"values": {}, "sigma": {}})
+            own[kind][quantity] = array
+        return Done({key: Sample(p["values"], p["sigma"]) for key, p in parts.items()}, wall, cpu)
+
+    def save(self, cell: int, number: int, done: Done) -> None:
+        """Keep a batch."""
+        arrays = {
+            SEPARATOR.join((*key, kind, quantity)): array
+            for key, sample in done.samples.items()
+            for kind, those in (("values", sample.values), ("sigma", sample.sigma))
+            for quantity, array in those.items()
+        }
+        runs = len(next(iter(arrays.values())))
+        stream = io.BytesIO()
+        np.savez(stream, allow_pickle=False, done=np.array([runs, done.wall, done.cpu]), **arrays)
+        write_bytes(self._path(cell, number), stream.getvalue())
+
+    def _path(self, cell: int, number: int) -> Path:
+        return self.folder / f"{cell:03d}-{number:05d}.npz"
+
+
+def digest(settings: Any, seed: int) -> str:
+    """What tells studies apart: the program, what is studied, and the seed; not how many runs."""
+    text = json.dumps([__version__, settings, seed], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def plainly(value: Any) -> Any:
+    """A setting as plain data: all that its numbers depend on."""
+    if isinstance(value, Machine):
+        return {"machine": plain(value.to_document()), "model": list(value.parameters.fixed)}
+    if isinstance(value, Camera | Board):
+        return plain(value.document() if isinstance(value, Camera) else value.document)
+    if is_dataclass(value):
+        own = {field.name: plainly(getattr(value, field.name)) for field in fields(value)}
+        return {"kind": type(value).__name__, **own}
+    if isinstance(value, Mapping):
+        return {str(key): plainly(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plainly(item) for item in value]
+    return plain(value)
+
+
+def _description(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        found = None
+    if isinstance(found, dict):
+        return found
+    raise InputError(
+        "this does not describe a study",
+        where=str(path),
+        next_step="Name another folder with -o, or remove this one",
+    )
+
+
+def _in_words(description: Mapping[str, Any]) -> str:
+    parts = [f"{description.get('study')}", f"seed {description.get('seed')}"]
+    return ", ".join([*parts, f"pkmcal {description.get('pkmcal')}"])

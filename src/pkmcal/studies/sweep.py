@@ -1,0 +1,368 @@
+"""What a study varies: names, values and what each changes in a design; and where designs begin.
+
+A study begins with a machine, a session or a paper's setting, and tries every combination of the
+values that are given (a full grid). All combinations get the same seeds: their machines, noise and
+choices of configurations differ by nothing but what is varied.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.boards.board import load_board
+from pkmcal.cameras import Camera, camera_models, load_camera
+from pkmcal.errors import InputError
+from pkmcal.files import closest
+from pkmcal.mechanisms import Machine, MechanismDocument, catalogue, load_mechanism
+from pkmcal.mechanisms.machine import machine_from_document
+from pkmcal.session.load import FILE, Session, load_session
+from pkmcal.simulation.demo import camera_of_size
+from pkmcal.studies.calibrations import SimulatedCalibrations
+from pkmcal.studies.capture import Design
+from pkmcal.studies.paper_a import HexapodByAxes
+from pkmcal.studies.paper_a_joint import JointByAxes
+from pkmcal.wording import listed
+
+PAPER = "a"
+MOST_CELLS = 500
+SIZE = (1024, 768)
+"""Pixels of the built-in cameras."""
+MIRROR_FOCAL, MIRROR_XI = 0.35, 1.0
+"""Focal length of the built-in mirror, in the image's height: a parabola shows all to 110 degrees
+from its axis."""
+Value = float | int | str
+Setting = SimulatedCalibrations | JointByAxes
+
+
+@dataclass(frozen=True)
+class Varied:
+    """A name that can be varied. least, most : its numbers. whole : no fractions. unit : of its
+    numbers. told : what it is. words : its values where they are no numbers.
+    """
+
+    told: str
+    unit: str = ""
+    least: float = 0.0
+    most: float = math.inf
+    whole: bool = False
+    words: tuple[str, ...] = ()
+
+
+NAMES: Mapping[str, Varied] = {
+    "resolution": Varied("width of the photographs", "px", 64, 20000, whole=True),
+    "focal": Varied("focal length", "px", 10, 1e6),
+    "distance": Varied("from the camera to the machine's middle", "m", 1e-3, 1e3),
+    "elevation": Varied("of the camera above the machine's level", "°", -85, 85),
+    "stations": Varied("places of the camera", "", 1, 100, whole=True),
+    "configurations": Varied("photographs from each place", "", 2, 1000, whole=True),
+    "edge_noise": Varied("deviation of an edge's place and of its ends", "px", 1e-4, 100),
+    "corner_noise": Varied("deviation of a board's corner", "px", 1e-4, 100),
+    "shading": Varied("deviation of a tube's side by its shading", "px", 0, 100),
+    "reading_noise": Varied("deviation of a reading", "m or rad", 1e-12, 1),
+    "radius": Varied("tubes' radii, times the drawing's", "", 0.01, 100),
+    "size": Varied("the machine's size, times the drawing's", "", 0.001, 1000),
+    "tolerance": Varied("deviation of true machines, in tolerances", "", 0, 100),
+    "extreme": Varied("share of configurations with legs near their ends", "", 0, 1),
+    "observe": Varied("what is seen", words=("legs", "board", "legs+board")),
+    "camera": Varied("pinhole, mirror, or a camera's file", words=("pinhole", "mirror")),
+}
+OF_PAPER: Mapping[str, Varied] = {
+    "configurations": Varied("photographs from each place", "", 5, 1000, whole=True),
+    "legs": Varied("legs that each camera sees", "", 3, 6, whole=True),
+    "axis_noise": Varied("noise of an axis, times Table 1", "", 1e-3, 1e3),
+    "reading_noise": Varied("deviation of a reading", "m", 1e-12, 1),
+    "drawing_error": Varied("deviation of true machines from the drawing", "m", 0, 1),
+    "distance": Varied("from the camera to the machine's middle", "m", 0.1, 100),
+    "height": Varied("of the cameras above the base", "m", -10, 10),
+}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is studied: a design, or [A] 4.3. name : in words. warnings : what to know of it."""
+
+    name: str
+    design: Design | HexapodByAxes
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> Mapping[str, Varied]:
+        """What can be varied."""
+        return OF_PAPER if isinstance(self.design, HexapodByAxes) else NAMES
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One combination. values : of what is varied, by name. setting : what is simulated."""
+
+    values: Mapping[str, Value]
+    setting: Setting
+
+
+def subject_of(origin: str) -> Subject:
+    """A paper's letter, a session's folder, a mechanism file or a built-in machine by its name.
+
+    Raises InputError where it is none of these.
+    """
+    if origin == PAPER:
+        return Subject("the joint calibration of [A] 4.3", HexapodByAxes())
+    path = Path(origin)
+    if path.is_dir() or path.name == FILE:
+        return _of_session(load_session(path))
+    if origin not in catalogue() and path.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            "there is nothing of this name to study",
+            found=origin,
+            expected=f"a session's folder, a mechanism file, the paper {PAPER}, or"
+            f" {listed(sorted(catalogue()), 20)}",
+        )
+    machine = load_mechanism(origin, label=None)
+    return Subject(machine.name, Design(machine, (camera_of_size(SIZE),)))
+
+
+def _of_session(session: Session) -> Subject:
+    """A session's machine, cameras, stations and noise, and as many configurations."""
+    if not session.stations or any(station.handheld for station in session.stations):
+        raise InputError(
+            "a study needs cameras that stand still",
+            where=str(session.folder),
+            found="photographs by hand" if session.stations else "trackers alone",
+            next_step="Study the machine itself: pkmcal study with its mechanism file",
+        )
+    on_base = session.board is not None and session.board_body == "base"
+    warnings: list[str] = []
+    if on_base:
+        warnings.append("The board on the base is left out: what it adds is not simulated.")
+    if session.trackers:
+        warnings.append("Trackers are left out: only what cameras see is simulated.")
+    words = [{w for w in s.observe if not (on_base and w == "board")} for s in session.stations]
+    if any(own != words[0] for own in words) or not words[0]:
+        raise InputError(
+            "a study needs stations that all observe the same, legs or a board on the platform",
+            where=str(session.folder),
+            found=listed([" and ".join(sorted(own)) or "the base's board" for own in words], 4),
+        )
+    places = [station.T_camera_base for station in session.stations]
+    known = [place for place in places if place is not None]
+    if len(known) < len(places):
+        warnings.append("Stations without a pose stand where a camera sees the machine well.")
+    seen = [{p.configuration for p in station.photographs} for station in session.stations]
+    board = None if session.board is None or on_base else load_board(session.board)
+    design = Design(
+        session.machine,
+        tuple(station.camera for station in session.stations),
+        stations=len(places),
+        T_camera_base=np.stack(known) if len(known) == len(places) else None,
+        observe=tuple(word for word in ("legs", "board") if word in words[0]),
+        board=board,
+        configurations=max(2, round(float(np.median([len(own) for own in seen])))),
+        shared=len(seen) > 1 and all(own == seen[0] for own in seen),
+        reading_noise=session.joint_noise,
+    )
+    return Subject(f"the session {session.folder}", design, tuple(warnings))
+
+
+def parsed(subject: Subject, texts: Sequence[str]) -> dict[str, tuple[Value, ...]]:
+    """``NAME=V1,V2,…`` each; raises InputError for what cannot be varied so."""
+    out: dict[str, tuple[Value, ...]] = {}
+    for text in texts:
+        name, equals, rest = text.partition("=")
+        name = name.strip().replace("-", "_")
+        if name not in subject.names:
+            guess = closest(name, subject.names)
+            raise InputError(
+                "this cannot be varied",
+                where="--vary",
+                found=text,
+                expected=guess or f"NAME=V1,V2 with a name of {listed(list(subject.names), 20)}",
+            )
+        if name in out:
+            raise InputError("a name is varied twice", where="--vary", found=name)
+        values = [_value(name, subject.names[name], part.strip()) for part in rest.split(",")]
+        if not equals or len(set(values)) < len(values):
+            raise InputError(
+                "values are missing, or stand twice",
+                where="--vary",
+                found=text,
+                expected=f"{name}=V1,V2",
+            )
+        out[name] = tuple(values)
+    return out
+
+
+def _value(name: str, varied: Varied, text: str) -> Value:
+    """One value, checked."""
+    if varied.words:
+        if text in varied.words or (name == "camera" and Path(text).is_file()):
+            return text
+        expected = listed(varied.words) + (" or a camera's file" if name == "camera" else "")
+        raise InputError(f"no such {name}", where="--vary", found=text, expected=expected)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    good = varied.least <= value <= varied.most and not (varied.whole and value % 1)
+    if not good:
+        most = f" to {varied.most:g}" if math.isfinite(varied.most) else " or more"
+        raise InputError(
+            f"{name} cannot be this ({varied.told})",
+            where="--vary",
+            found=text,
+            expected=("a whole number of " if varied.whole else "")
+            + f"{varied.least:g}{most} {varied.unit}".rstrip(),
+        )
+    return int(value) if varied.whole else value
+
+
+def cells_of(subject: Subject, varied: Mapping[str, Sequence[Value]]) -> list[Cell]:
+    """Every combination of the values."""
+    count = math.prod(map(len, varied.values()))
+    if count > MOST_CELLS:
+        raise InputError(
+            "too many combinations", where="--vary", found=str(count),
+            expected=f"at most {MOST_CELLS}", next_step="Give fewer values",
+        )  # fmt: skip
+    out: list[Cell] = []
+    for values in product(*varied.values()):
+        chosen = dict(zip(varied, values, strict=True))
+        if isinstance(subject.design, HexapodByAxes):
+            out.append(Cell(chosen, JointByAxes(_paper(subject.design, chosen))))
+        else:
+            out.append(Cell(chosen, SimulatedCalibrations(_design(subject.design, chosen))))
+    return out
+
+
+def _paper(setting: HexapodByAxes, values: Mapping[str, Value]) -> HexapodByAxes:
+    """[A] 4.3 with other values."""
+    own = {
+        {"configurations": "poses", "legs": "legs_seen", "reading_noise": "joint_noise"}.get(
+            name, name
+        ): value
+        for name, value in values.items()
+        if name != "axis_noise"
+    }
+    factor = float(values.get("axis_noise", 1.0))
+    noise = setting.noise
+    sizes = {f.name: factor * getattr(noise, f.name) for f in fields(noise) if f.name != "images"}
+    return replace(setting, noise=replace(noise, **sizes), **own)
+
+
+def _design(design: Design, values: Mapping[str, Value]) -> Design:
+    """A design with other values; where stations have moved, places are drawn anew."""
+    moved = {"stations", "distance", "elevation", "size", "camera"} & values.keys()
+    if moved:
+        design = replace(design, T_camera_base=None)
+    if "stations" in values and len(design.cameras) > 1:
+        design = replace(design, cameras=design.cameras[:1])
+    cameras = design.cameras
+    if "camera" in values:
+        cameras = (_camera(str(values["camera"])),)
+    if "resolution" in values:
+        cameras = tuple(_resized(camera, int(values["resolution"])) for camera in cameras)
+    if "focal" in values:
+        cameras = tuple(_refocused(camera, float(values["focal"])) for camera in cameras)
+    machine = design.machine
+    if "size" in values:
+        machine = scaled(machine, float(values["size"]))
+    plain: dict[str, Any] = {
+        name: value
+        for name, value in values.items()
+        if name not in ("camera", "resolution", "focal", "size", "radius", "observe", "elevation")
+    }
+    if "observe" in values:
+        plain["observe"] = tuple(str(values["observe"]).split("+"))
+    if "elevation" in values:
+        plain["elevation"] = math.radians(float(values["elevation"]))
+    design = replace(design, machine=machine, cameras=cameras, **plain)
+    if "radius" in values:
+        design = replace(design, machine=_with_radii(design.seen_machine, float(values["radius"])))
+    return design
+
+
+def _camera(name: str) -> Camera:
+    """A built-in camera, or one of a file."""
+    if name == "pinhole":
+        return camera_of_size(SIZE)
+    if name == "mirror":
+        width, height = SIZE
+        focal = MIRROR_FOCAL * height
+        centre = [(width - 1) / 2, (height - 1) / 2]
+        parameters = np.array([focal, focal, *centre, MIRROR_XI, 0.0, 0.0, 0.0, 0.0])
+        return camera_models()["unified"](SIZE, parameters)
+    return load_camera(Path(name))
+
+
+def _resized(camera: Camera, width: int) -> Camera:
+    """The same lens on a sensor of the same size with other pixels."""
+    factor = width / camera.image_size[0]
+    size = (width, max(1, round(factor * camera.image_size[1])))
+    parameters = _scaled_pixels(camera, factor)
+    # pixel centres are at integers, so the image's corner is at -0.5
+    parameters[2:4] = factor * (camera.parameters[2:4] + 0.5) - 0.5
+    return replace(camera, image_size=size, parameters=parameters, covariance=None)
+
+
+def _refocused(camera: Camera, focal: float) -> Camera:
+    """Another focal length before the same sensor."""
+    parameters = _scaled_pixels(camera, focal / float(camera.parameters[0]))
+    return replace(camera, parameters=parameters, covariance=None)
+
+
+def _scaled_pixels(camera: Camera, factor: float) -> Array:
+    parameters = camera.parameters.copy()
+    parameters[:2] *= factor
+    return parameters
+
+
+def _with_radii(machine: Machine, factor: float) -> Machine:
+    """The machine with other tubes."""
+    document = machine.to_document()
+    for leg in document["legs"]:
+        for tube in leg.get("tubes", ()):
+            tube["radius"] *= factor
+    return _rebuilt(document)
+
+
+def scaled(machine: Machine, factor: float) -> Machine:
+    """The machine with all lengths of its drawing times a factor; tolerances stay as they are, as
+    those of a workshop do.
+    """
+    values = machine.values.copy()
+    lengths = np.array(machine.parameters.units) == "m"
+    values[lengths] *= factor
+    document = machine.with_values(values).to_document()
+    for leg, unit in zip(document["legs"], _units(machine), strict=True):
+        _scale(leg["length"], "range", factor)
+        if unit == "m":
+            _scale(leg["base"], "range", factor)
+        for tube in leg.get("tubes", ()):
+            tube["from"] *= factor
+            tube["to"] *= factor
+    if document.get("home"):
+        _scale(document["home"], "position", factor)
+    return _rebuilt(document)
+
+
+def _units(machine: Machine) -> list[str]:
+    """The unit of each leg's reading, empty without one."""
+    motors = machine.layout.actuated
+    return [machine.joint_units[k] if k >= 0 else "" for k in motors.tolist()]
+
+
+def _scale(node: dict[str, Any], key: str, factor: float) -> None:
+    if node.get(key) is not None:
+        node[key] = [factor * value for value in node[key]]
+
+
+def _rebuilt(document: dict[str, Any]) -> Machine:
+    import json
+
+    return machine_from_document(MechanismDocument.model_validate_json(json.dumps(document)))

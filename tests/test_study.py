@@ -1,0 +1,485 @@
+"""pkmcal study: simulated calibrations, stopped and resumed, on processes and clusters."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.errors import InputError, ResultError
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.studies import cluster, engine, workers
+from pkmcal.studies.calibrations import (
+    ESTIMATE,
+    SimulatedCalibrations,
+    covered,
+    judged,
+    tool_difference,
+)
+from pkmcal.studies.capture import captured
+from pkmcal.studies.engine import Batch, Population, Sample, Task
+from pkmcal.studies.estimates import Fitted
+from pkmcal.studies.findings import clustered, study
+from pkmcal.studies.paper_a_joint import JointByAxes
+from pkmcal.studies.store import Store
+from pkmcal.studies.sweep import cells_of, parsed, scaled, subject_of
+
+SMALL = ("--vary", "configurations=6", "--vary", "stations=1,2")
+"""Of 3-rpr: two combinations in a second or two."""
+
+
+@pytest.fixture
+def alone(monkeypatch):
+    """This process alone: other ones take a second to start."""
+    monkeypatch.setattr(workers, "cores", lambda: 1)
+
+
+def design_of(name, *vary):
+    subject = subject_of(name)
+    return cells_of(subject, parsed(subject, vary))[0].setting.design
+
+
+def batch_of(setting, runs=4, seed=0):
+    return engine.batches(setting, runs, seed)[0]
+
+
+# ------------------------------------------------------------------ what is studied
+
+
+def test_a_grid_has_every_combination():
+    subject = subject_of("gough-stewart")
+    cells = cells_of(subject, parsed(subject, ["stations=1,2,3", "edge_noise=0.1,0.2"]))
+    assert [tuple(cell.values.values()) for cell in cells] == [
+        (s, e) for s in (1, 2, 3) for e in (0.1, 0.2)
+    ]
+    assert cells[3].setting.design.stations == 2
+    assert cells[3].setting.design.edge_noise == 0.2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["station=1"], "this cannot be varied.*expected stations"),
+        (["colour=1"], "this cannot be varied.*NAME=V1,V2"),
+        (["stations"], "stations cannot be this"),
+        (["stations=1,x"], "stations cannot be this.*a whole number of 1 to 100"),
+        (["stations=1.5"], "stations cannot be this"),
+        (["edge_noise=-1"], "edge_noise cannot be this.*px"),
+        (["stations=1,1"], "stand twice"),
+        (["stations=1", "stations=2"], "varied twice"),
+        (["camera=telescope"], "no such camera.*a camera's file"),
+        (["observe=arms"], "no such observe.*legs, board and legs\\+board"),
+    ],
+)
+def test_what_cannot_be_varied_is_told(words, message):
+    with pytest.raises(InputError) as caught:
+        parsed(subject_of("3-rpr"), words)
+    assert re.search(message, str(caught.value))
+
+
+def test_too_many_combinations_are_refused():
+    subject = subject_of("3-rpr")
+    values = ",".join(str(k) for k in range(11, 41))
+    with pytest.raises(InputError, match=r"too many combinations.*900"):
+        cells_of(subject, parsed(subject, [f"stations={values}", f"focal={values}"]))
+
+
+def test_an_unknown_subject_is_told():
+    with pytest.raises(InputError, match=r"there is nothing of this name to study.*gough-stewart"):
+        subject_of("gough")
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "h4", "hexaglide", "delta", "3-rpr"])
+def test_a_machine_of_another_size_is_the_same_machine(name):
+    """Twice as large, it reaches twice as far with the same angles and twice the lengths."""
+    one = load_mechanism(name)
+    two = scaled(one, 2.0)
+    lengths = np.array(one.joint_units) == "m"
+    readings = one.inverse(one.home()[None])
+    expected = one.forward(readings)
+    expected[..., :3, 3] *= 2
+    found = two.forward(np.where(lengths, 2.0, 1.0) * readings)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    factor = np.where(lengths, 2.0, 1.0)[:, None]
+    np.testing.assert_allclose(two.joint_ranges, factor * one.joint_ranges)
+    np.testing.assert_array_equal(two.parameters.tolerance, one.parameters.tolerance)
+
+
+def test_cameras_change_as_told():
+    usual = design_of("gough-stewart").cameras[0]
+    fine = design_of("gough-stewart", "resolution=2048").cameras[0]
+    assert fine.image_size == (2048, 1536)
+    points = np.random.default_rng(0).normal(0, 0.2, (20, 3)) + np.eye(3)[2]
+    there = usual.project(points)
+    np.testing.assert_allclose(fine.project(points) + 0.5, 2 * (there + 0.5), atol=1e-9)
+    long = design_of("gough-stewart", "focal=2000").cameras[0]
+    assert long.image_size == usual.image_size
+    assert long.parameters[0] == 2000
+    assert design_of("gough-stewart", "camera=mirror").cameras[0].model == "unified"
+
+
+def test_places_are_where_they_are_asked_for():
+    design = design_of("gough-stewart", "distance=1.6", "elevation=30", "configurations=3")
+    plan = captured(design, np.random.default_rng(0))
+    eyes = np.linalg.inv(plan.T_camera_base)[:, :3, 3]
+    machine = design.machine
+    ends = np.concatenate([machine.base_centers(), machine.platform_centers()])
+    middle = np.array([0.0, 0.0, (machine.home()[2, 3] + ends[0, 2]) / 2])
+    away = np.linalg.norm(eyes - middle, axis=1)
+    np.testing.assert_allclose(away, 1.6, atol=0.05)
+    above = np.degrees(np.arcsin((eyes - middle)[:, 2] / away))
+    np.testing.assert_allclose(above, 30, atol=2)
+
+
+def test_a_camera_that_sees_too_little_is_told():
+    design = design_of("gough-stewart", "distance=0.4", "focal=3000")
+    with pytest.raises(InputError, match="does not see the machine"):
+        captured(design, np.random.default_rng(0))
+
+
+def test_a_session_gives_its_cameras_stations_and_noise(demo):
+    subject = subject_of(str(demo.session))
+    design = subject.design
+    assert (design.stations, design.configurations, design.observe) == (3, 4, ("legs",))
+    assert design.reading_noise == 3e-6
+    assert design.T_camera_base.shape == (3, 4, 4)
+    plan = captured(design, np.random.default_rng(0))
+    np.testing.assert_array_equal(plan.T_camera_base, design.T_camera_base)
+    moved = cells_of(subject, parsed(subject, ["stations=2"]))[0].setting.design
+    assert moved.T_camera_base is None
+
+
+# ------------------------------------------------------------------ what is simulated
+
+
+def test_the_tool_of_the_truth_is_not_off():
+    """Whatever frames the truth is told in: only what moves the tool counts."""
+    design = design_of("gough-stewart", "configurations=5")
+    setting = SimulatedCalibrations(design)
+    data = setting.draw(batch_of(setting, 2))
+    from pkmcal.identify.gauge import changed_frames
+    from pkmcal.studies.calibrations import _truth
+
+    machine, true = data.capture.machine, _truth(data, 0)
+    turn = np.eye(4)
+    turn[:3, 3] = 0.01, -0.02, 0.005
+    other = changed_frames(machine.layout, true, turn, np.linalg.inv(turn))
+    covariance = 1e-8 * np.eye(len(true.theta))
+    joints = data.capture.joints[:4]
+    off, sigma = tool_difference(machine, true.theta, covariance, other, joints, every=False)
+    assert np.abs(off).max() < 1e-9
+    assert np.isfinite(sigma).all()
+    worse = replace(true, theta=true.theta + 1e-4 * np.eye(len(true.theta))[20])
+    off, _ = tool_difference(machine, true.theta, covariance, worse, joints, every=False)
+    assert np.abs(off).max() > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("subject", "vary"),
+    [
+        ("3-rpr", ["stations=1", "configurations=10"]),
+        ("h4", ["observe=board", "stations=1", "configurations=12"]),
+        ("gough-stewart", ["camera=mirror", "stations=1", "configurations=10"]),
+        ("gough-stewart", ["observe=legs+board", "stations=1", "configurations=5"]),
+        ("a", []),
+    ],
+)
+def test_stated_deviations_hold(subject, vary, alone):
+    """A few runs: errors over stated deviations are about one, for parameters and tool."""
+    found = study(subject, vary, runs=10)
+    cell, sample = found.found[0], found.results[0].samples[ESTIMATE]
+    assert cell.failed.value == 0
+    assert 0.7 < cell.chi2 < 1.1
+    for name in ("parameters", "tool"):
+        ratio = sample.values[name] / sample.sigma[name]
+        assert 0.7 < np.sqrt(np.nanmean(ratio**2)) < 1.4, name
+    assert cell.honest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("subject", "vary"),
+    [
+        ("3-rpr", ["stations=1", "configurations=20"]),
+        ("h4", ["observe=board", "stations=1", "configurations=20"]),
+        ("gough-stewart", ["camera=mirror", "stations=1", "configurations=20"]),
+        ("gough-stewart", ["stations=3", "configurations=15"]),
+    ],
+)
+def test_coverage(subject, vary):
+    """95 % intervals of all parameters and of the tool's pose cover 93 to 97 %."""
+    cell = study(subject, vary, runs=500).found[0]
+    for found in (cell.covered, cell.covered_tool):
+        assert 0.93 <= found.value <= 0.97
+
+
+def test_wrong_deviations_are_told():
+    """Half of the true deviations: the study says so, and exit code and page with it."""
+    rng = np.random.default_rng(0)
+    sigma = np.ones((40, 30))
+    error = rng.normal(size=sigma.shape)
+    assert abs(covered(error, sigma).mean() - 0.95) < 0.02
+    assert covered(error, 0.5 * sigma).mean() < 0.75
+    tool = rng.normal(size=(40, 5, 6))
+    sample = judged(np.stack([error, 0.5 * sigma]), np.stack([tool, np.ones_like(tool)]),
+                    Fitted(error, told={"chi2": np.ones(40), "failed": np.zeros(40)}))  # fmt: skip
+    assert sample.values["covered"].mean() < 0.75
+    assert sample.values["covered_tool"].mean() > 0.9
+
+
+def test_standard_errors_know_of_batches():
+    """Runs of a batch that are alike count as one."""
+    rng = np.random.default_rng(1)
+    means = rng.normal(size=(400, 25))
+    batch = np.repeat(np.arange(25), 8)
+    errors = [clustered(np.repeat(row, 8), batch).error for row in means]
+    assert np.mean(np.square(errors)) == pytest.approx(1 / 25, rel=0.05)
+
+
+# ------------------------------------------------------------------ the command
+
+
+def test_the_command_tells_and_writes(tmp_path, alone):
+    out = tmp_path / "study"
+    done = run("study", "3-rpr", *SMALL, "--runs", 12, "-o", out)
+    assert done.code == 0, done.err
+    assert "The stated deviations hold" in done.out
+    assert "stations 1" in done.out
+    with (out / "study.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 24
+    assert [row["run"] for row in rows[:12]] == [str(k) for k in range(12)]
+    assert {row["stations"] for row in rows} == {"1", "2"}
+    assert all(float(row["position"]) > 0 for row in rows)
+    assert all(row["worst_parameter"].startswith("legs[") for row in rows)
+    page = (out / "study.html").read_text()
+    assert "By stations" in page
+    again = run("study", "3-rpr", *SMALL, "--runs", 12, "-o", out, "--json").json
+    assert again["exit_code"] == 0
+    assert len(again["combinations"]) == 2
+    assert again["combinations"][0]["covered"]["value"] > 0.85
+    assert [gain["name"] for gain in again["gains"]] == ["stations"]
+
+
+def test_more_runs_go_on_from_the_finished_ones(tmp_path, alone):
+    few = study("3-rpr", SMALL[1:2], runs=10, out=tmp_path)
+    before = sorted(p.stat().st_mtime_ns for p in tmp_path.glob("batches/*.npz"))
+    more = study("3-rpr", SMALL[1:2], runs=20, out=tmp_path)
+    after = sorted(p.stat().st_mtime_ns for p in tmp_path.glob("batches/*.npz"))
+    assert after[:1] == before
+    first, both = (r.results[0].values("position", *ESTIMATE) for r in (few, more))
+    np.testing.assert_array_equal(both[:10], first)
+
+
+def test_another_study_in_the_same_folder_is_refused(tmp_path, alone):
+    study("a", (), runs=4, out=tmp_path)
+    done = run("study", "a", "--vary", "legs=5", "--runs", 4, "-o", tmp_path)
+    assert done.code == 2
+    assert "the batches of another study" in done.err
+    assert "found a, seed 0" in done.err
+    (tmp_path / "batches" / "study.json").write_text("nonsense")
+    done = run("study", "a", "--runs", 4, "-o", tmp_path)
+    assert done.code == 2
+    assert "does not describe a study" in done.err
+
+
+def test_a_file_that_is_spoilt_is_done_again(tmp_path, alone):
+    one = study("a", (), runs=4, out=tmp_path)
+    (path,) = tmp_path.glob("batches/*.npz")
+    path.write_bytes(path.read_bytes()[:500])
+    two = study("a", (), runs=4, out=tmp_path)
+    np.testing.assert_array_equal(*(r.results[0].values("position", *ESTIMATE) for r in (one, two)))
+
+
+def test_parquet(tmp_path, alone, monkeypatch):
+    words = ("study", "a", "--runs", 4, "-o", tmp_path / "out", "--table", "parquet")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    done = run(*words)
+    assert done.code == 2
+    assert "pip install 'pkmcal[parquet]'" in done.err
+    monkeypatch.undo()
+    parquet = pytest.importorskip("pyarrow.parquet")
+    assert run(*words).code == 0
+    table = parquet.read_table(tmp_path / "out" / "study.parquet").to_pydict()
+    assert table["run"] == [0, 1, 2, 3]
+    assert all(np.array(table["position"]) > 0)
+
+
+# ------------------------------------------------------------------ stopped and resumed
+
+COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "600")
+BATCHES = 18
+
+
+def started(out: Path, *more: str) -> subprocess.Popen[bytes]:
+    words = [sys.executable, "-m", "pkmcal", "study", *COMMAND, "-o", str(out), *more]
+    quiet = subprocess.DEVNULL
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    return subprocess.Popen(words, stdout=quiet, stderr=quiet, env=environment)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no kill -9 here")
+@pytest.mark.parametrize("how", ["SIGKILL", "SIGINT"])
+def test_a_study_that_is_stopped_goes_on(tmp_path, how):
+    """The same numbers to the byte, no finished batch lost and none done twice."""
+    stopped, whole = tmp_path / "stopped", tmp_path / "whole"
+    process = started(stopped)
+    deadline = time.monotonic() + 120
+    while len(list(stopped.glob("batches/*.npz"))) < 2:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(getattr(signal, how))
+    process.wait()
+    finished = {p.name: p.stat().st_mtime_ns for p in stopped.glob("batches/*.npz")}
+    assert 2 <= len(finished) < BATCHES
+    assert not (stopped / "study.csv").exists()
+    assert run("study", *COMMAND, "-o", stopped).code == 0
+    assert run("study", *COMMAND, "-o", whole).code == 0
+    for name in ("study.csv", "study.json", "study.html"):
+        assert (stopped / name).read_bytes() == (whole / name).read_bytes()
+    kept = {p.name: p.stat().st_mtime_ns for p in stopped.glob("batches/*.npz")}
+    assert len(kept) == BATCHES
+    assert finished.items() <= kept.items()
+    assert not list(stopped.glob("batches/.*"))
+
+
+class Counting:
+    """A setting whose runs are their own random numbers."""
+
+    doing = "Counting"
+    quantities = {"x": engine.Quantity("mean")}  # noqa: RUF012 - a test's
+
+    def __init__(self, fails: str = "") -> None:
+        self.fails = fails
+
+    def populations(self, runs):
+        return [Population("numbers", runs, 5)]
+
+    def draw(self, batch: Batch):
+        if self.fails == "input":
+            raise InputError("nothing to count")
+        if self.fails == "dies" and os.environ.get("PKMCAL_TEST_PARENT") != str(os.getpid()):
+            os._exit(9)
+        return batch.generator(0).random(batch.runs)
+
+    def solve(self, batch, data):
+        return {ESTIMATE: data}
+
+    def judge(self, batch, data, found):
+        time.sleep(0.02)
+        return {ESTIMATE: Sample({"x": found[ESTIMATE]})}
+
+
+def test_workers_that_die_are_replaced(monkeypatch):
+    """One is killed in the middle: the same numbers, and no batch twice."""
+    begun: list[subprocess.Popen[bytes]] = []
+    real = subprocess.Popen
+
+    def recorded(*words, **options):
+        begun.append(real(*words, **options))
+        return begun[-1]
+
+    monkeypatch.setattr(workers.subprocess, "Popen", recorded)
+    monkeypatch.setattr(workers, "cores", lambda: 3)
+    done: list[float] = []
+
+    def told(_text, share):
+        done.append(share)
+        if len(done) == 100:
+            begun[0].kill()
+
+    setting = JointByAxes(replace(JointByAxes().axes, poses=4, batch=2))
+    counting = Counting()
+    many = engine.run(counting, 3000, 1, told)
+    assert len(done) == 600
+    assert len(begun) >= 3
+    monkeypatch.setattr(workers, "cores", lambda: 1)
+    one = engine.run(counting, 3000, 1)
+    np.testing.assert_array_equal(*(r.values("x", *ESTIMATE) for r in (many, one)))
+    assert engine.run(setting, 4, 0).values("position", *ESTIMATE).shape == (4,)
+
+
+def test_a_batch_that_kills_every_worker_ends_the_study(monkeypatch):
+    monkeypatch.setenv("PKMCAL_TEST_PARENT", str(os.getpid()))
+    pool = workers._Pool([Task(Counting("dies"), batch_of(Counting()))], lambda _k, _done: None)
+    pool.elsewhere()
+    assert isinstance(pool.failure, ResultError)
+    assert "killed again and again" in str(pool.failure)
+
+
+def test_an_error_in_another_process_is_told():
+    pool = workers._Pool([Task(Counting("input"), batch_of(Counting()))], lambda _k, _done: None)
+    pool.elsewhere()
+    assert isinstance(pool.failure, InputError)
+    assert str(pool.failure) == "nothing to count."
+
+
+def test_an_error_here_is_told(alone):
+    with pytest.raises(InputError, match="nothing to count"):
+        engine.run(Counting("input"), 10, 0)
+
+
+def test_what_is_kept_is_what_was_done(tmp_path):
+    setting = Counting()
+    task = Task(setting, batch_of(setting, 5))
+    done = engine.work(task)
+    store = Store.opened(tmp_path, "counting", [], 0)
+    store.save(0, 0, done)
+    found = store.load(0, 0, task.batch)
+    assert found.wall == done.wall
+    np.testing.assert_array_equal(
+        found.samples[ESTIMATE].values["x"], done.samples[ESTIMATE].values["x"]
+    )
+    assert store.load(0, 1, task.batch) is None
+    assert store.load(0, 0, replace(task.batch, runs=4)) is None
+
+
+# ------------------------------------------------------------------ a cluster
+
+
+def test_a_cluster_without_dask_is_told(monkeypatch):
+    monkeypatch.setattr(cluster, "find_spec", lambda _name: None)
+    with pytest.raises(InputError, match=r"dask.distributed.*pip install 'pkmcal\[cluster\]'"):
+        study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_scheduler_that_does_not_answer_is_told(monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(cluster, "TIMEOUT", 1)
+    with pytest.raises(InputError, match=r"no Dask scheduler answers.*127.0.0.1:1"):
+        study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, alone):
+    distributed = pytest.importorskip("distributed")
+    killed: list[int] = []
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as local:
+
+        def told(_text, share):
+            if share > 0.2 and not killed:
+                killed.append(next(iter(local.workers.values())).pid)
+                os.kill(killed[0], signal.SIGKILL)
+
+        many = study("a", ["configurations=5"], runs=600, scheduler=local.scheduler_address,
+                     out=tmp_path / "cluster", progress=told)  # fmt: skip
+    assert killed
+    one = study("a", ["configurations=5"], runs=600)
+    from pkmcal.report.study import document_of, runs_bytes
+
+    assert runs_bytes(many, "study.csv") == runs_bytes(one, "study.csv")
+    assert str(document_of(many)) == str(document_of(one))

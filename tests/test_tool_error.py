@@ -1,0 +1,174 @@
+"""The tool's error over the workspace: against brute force, and on every machine."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pkmcal.calibration.results import load
+from pkmcal.calibration.toolmap import map_of
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import inverse, perturb, pose_difference
+from pkmcal.identify.centres import free_of_gauge, laid_over
+from pkmcal.identify.tool import tool_error
+from pkmcal.mechanisms import catalogue, load_mechanism
+from pkmcal.mechanisms.region import Region, poses_in
+from pkmcal.report.calibration import save
+from pkmcal.simulation.truth import true_machine
+
+NO_SLICES = {"3-rps"}
+"""Machines that cannot move aside without turning."""
+
+
+def known(machine, share=0.02):
+    """A covariance of the free parameters, correlated."""
+    root = machine.parameters.free_matrix() * machine.parameters.tolerances_free() * share
+    mixed = root @ np.random.default_rng(4).normal(size=(root.shape[1],) * 2)
+    return mixed @ mixed.T / root.shape[1]
+
+
+@pytest.fixture(scope="module")
+def small():
+    """A hexapod whose drawing is off, with a covariance, in a few poses."""
+    drawing = load_mechanism("gough-stewart")
+    machine = true_machine(drawing, 1.0, np.random.default_rng(2))
+    poses = poses_in(machine.limits(), Region(turn=0.2), 12)
+    return SimpleNamespace(drawing=drawing, machine=machine, poses=poses, covariance=known(machine))
+
+
+def drawn_poses(case, draws=1500):
+    """Poses at the same readings of machines drawn by the covariance, as changes (draws, n, 6),
+    each laid over the calibrated one by its joint centres.
+    """
+    rng = np.random.default_rng(5)
+    machine, joints = case.machine, case.machine.inverse(case.poses)
+    values, vectors = np.linalg.eigh(case.covariance)
+    half = vectors * np.sqrt(np.maximum(values, 0.0))
+    out = []
+    for _ in range(draws):
+        other = machine.with_values(machine.values + half @ rng.normal(size=len(half)))
+        base = laid_over(other.base_centers(), machine.base_centers())
+        platform = laid_over(other.platform_centers(), machine.platform_centers())
+        found = other.forward(joints, inverse(base) @ case.poses @ platform)
+        out.append(pose_difference(base @ found @ inverse(platform), case.poses))
+    return np.array(out)
+
+
+def test_sigma_is_the_scatter_of_machines_drawn_by_the_covariance(small):
+    """Each drawn machine is laid over by all joint centres, with no word of derivatives."""
+    told = tool_error(
+        small.drawing, small.machine, free_of_gauge(small.machine, small.covariance), small.poses
+    )
+    found = drawn_poses(small)
+    scatter = np.einsum("dni,dnj->nij", found, found) / len(found)
+    scale = np.sqrt(np.einsum("nii->ni", told.covariance)) + 1e-15
+    off = (scatter - told.covariance) / (scale[:, :, None] * scale[:, None])
+    # 1500 draws leave 3.7 % on a variance; four and a half of them, for 432 numbers
+    assert np.abs(off).max() < 0.165
+    drawn = np.sqrt(np.trace(scatter[:, 3:, 3:], axis1=1, axis2=2))
+    np.testing.assert_allclose(told.position, drawn, rtol=0.06)
+
+
+def test_what_frames_do_is_in_no_sigma_where_only_boards_saw_the_machine(small):
+    """Errors that turn and shift the base as a whole: all of it is taken out, at every pose."""
+    from pkmcal.identify.gauge import freedoms, generators
+
+    by = generators(small.machine.layout, small.machine.values) @ freedoms(small.machine)
+    covariance = 1e-6 * by @ by.T
+    told = tool_error(small.drawing, small.machine, covariance, small.poses, legs_seen=False)
+    loose = tool_error(small.drawing, small.machine, covariance, small.poses)
+    assert loose.position.min() > 1e-4
+    assert told.position.max() < 1e-9
+
+
+def test_the_drawings_error_is_that_of_its_poses_at_the_same_readings(small):
+    machine, drawing = small.machine, small.drawing
+    told = tool_error(drawing, machine, small.covariance, small.poses)
+    joints = machine.inverse(small.poses)
+    base = laid_over(drawing.base_centers(), machine.base_centers())
+    platform = laid_over(drawing.platform_centers(), machine.platform_centers())
+    before = base @ drawing.forward(joints) @ inverse(platform)
+    distance = np.linalg.norm(before[:, :3, 3] - small.poses[:, :3, 3], axis=1)
+    np.testing.assert_allclose(told.off_position, distance, rtol=1e-9)
+    assert distance.max() > 1e-4
+    turn = before[:, :3, :3] @ small.poses[:, :3, :3].mT
+    angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    np.testing.assert_allclose(told.off_orientation, angle, atol=1e-7)
+
+
+def test_frames_by_some_of_the_poses(small):
+    """Fitted on all poses or on those that are asked for alone, the same where these are all."""
+    arguments = small.drawing, small.machine, small.covariance
+    whole = tool_error(*arguments, small.poses, legs_seen=False)
+    named = tool_error(*arguments, small.poses, legs_seen=False, fitted=np.arange(12))
+    some = tool_error(*arguments, small.poses, legs_seen=False, fitted=np.arange(6))
+    alone = tool_error(*arguments, small.poses[:6], legs_seen=False)
+    np.testing.assert_array_equal(whole.position, named.position)
+    np.testing.assert_allclose(some.position[:6], alone.position, rtol=1e-9)
+    assert np.abs(some.position - whole.position).max() > 1e-3 * whole.position.max()
+
+
+def test_poses_out_of_reach_are_nan(small):
+    far = small.poses.copy()
+    machine = load_mechanism("delta")
+    far = np.stack([machine.home(), perturb(machine.home(), np.array([0, 0, 0, 2.0, 0, 0]))])
+    told = tool_error(machine, machine, known(machine), far)
+    assert np.isfinite(told.position[0])
+    assert np.isnan(told.position[1])
+    assert np.isnan(told.off_position[1])
+
+
+def test_from_a_calibration_and_from_its_file(calibrated, tmp_path):
+    save(calibrated, tmp_path / "out")
+    poses = calibrated.estimate.state.T_base_platform[:3]
+    told, again = calibrated.tool_error(poses), load(tmp_path / "out").tool_error(poses)
+    assert (told.position > 0).all()
+    np.testing.assert_allclose(again.position, told.position, rtol=1e-9)
+    np.testing.assert_allclose(again.off, told.off, rtol=1e-6, atol=1e-12)
+    assert (told.off_position > 2 * told.position).all()  # the drawing was off by more
+    with pytest.raises(InputError, match="what are no poses"):
+        calibrated.tool_error(poses[0])
+
+
+# the map
+
+
+@pytest.mark.parametrize("name", sorted(catalogue()))
+def test_every_machine_has_a_map(name):
+    drawing = load_mechanism(name)
+    machine = true_machine(drawing, 0.2, np.random.default_rng(3))
+    made = map_of(drawing, machine, known(machine))
+    assert made.spread == 250
+    assert np.isfinite(made.after.position).all()
+    assert (made.after.position > 0).all()
+    assert bool(made.slices) == (name not in NO_SLICES)
+    for cut in made.slices:
+        there = cut.rows >= 0
+        place = made.after.T_base_platform[cut.rows[there], :3, 3]
+        u, v = np.broadcast_arrays(cut.u, cut.v[:, None])
+        cell = cut.u[1] - cut.u[0]
+        assert np.abs(place[:, cut.across] - u[there]).max() < 0.26 * cell
+        assert np.abs(place[:, cut.up] - v[there]).max() < 0.26 * cell
+        assert np.abs(place[:, cut.normal] - cut.level).max() < 0.26 * cell
+    # by the drawing's tolerances alone, fifty times what is known
+    ratio = np.median(made.before.position) / np.median(made.after.position)
+    assert 20 < ratio < 120
+
+
+def test_a_map_of_a_region(small):
+    """Inside it, and what its document tells."""
+    region = Region(x=(-0.02, 0.03), y=(0.0, 0.04))
+    made = map_of(small.drawing, small.machine, small.covariance, region)
+    place = made.after.T_base_platform[:, :3, 3]
+    assert place[:, 0].min() > -0.021
+    assert place[:, 1].max() < 0.041
+    told = made.document()
+    assert told["region"] == {"x": (-0.02, 0.03), "y": (0.0, 0.04), "z": None, "turn": None}
+    even = made.after.position[: made.spread]
+    assert told["sigma"]["position"]["worst"] == pytest.approx(even.max())
+    assert told["sigma"]["position"]["median"] == pytest.approx(np.median(even))
+    assert told["drawing_off"]["position"]["worst"] == pytest.approx(
+        made.after.off_position[: made.spread].max()
+    )
