@@ -254,6 +254,8 @@ def test_what_needs_a_camera_says_so(belts):
         calibrate(folder, refine_camera=True)
     with pytest.raises(ResultError, match="readings are not predicted from themselves"):
         outcome_of(calibrate(folder, holdout=5))
+    with pytest.raises(InputError, match="no station to plan for"):
+        load_session(folder, measured=False)
 
 
 def test_the_page_holds_no_section_of_cameras(belts):
