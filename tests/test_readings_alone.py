@@ -236,6 +236,16 @@ def test_a_machine_without_redundancy_is_refused(tmp_path):
     assert "stations" in str(refused.value.where)
 
 
+def test_readings_that_scatter_more_than_the_drawing_is_off_are_refused(tmp_path):
+    """A centimetre, where an offset is drawn to five millimetres."""
+    drawing, rng = load_mechanism("four-belt"), np.random.default_rng(8)
+    joints = readings(drawing, 20, rng)
+    joints = joints + 0.01 * rng.standard_normal(joints.shape)
+    found = calibrate(write(tmp_path / "wild", drawing, joints, NOISE))
+    assert not found.verdict.usable
+    assert any("may belong to other configurations" in text for text in found.verdict.reasons)
+
+
 def test_what_needs_a_camera_says_so(belts):
     folder, _ = belts
     with pytest.raises(ResultError, match="four steps need photographs"):
@@ -244,6 +254,8 @@ def test_what_needs_a_camera_says_so(belts):
         calibrate(folder, refine_camera=True)
     with pytest.raises(ResultError, match="readings are not predicted from themselves"):
         outcome_of(calibrate(folder, holdout=5))
+    with pytest.raises(InputError, match="no station to plan for"):
+        load_session(folder, measured=False)
 
 
 def test_the_page_holds_no_section_of_cameras(belts):

@@ -13,7 +13,15 @@ from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.byhand import misplaced, place_by_hand, without_misplaced
-from pkmcal.calibration.doubts import check_poses, noise_told, richer_models, scale_doubt
+from pkmcal.calibration.doubts import (
+    as_stated,
+    check_poses,
+    model_at_fault,
+    noise_doubt,
+    noise_told,
+    richer_models,
+    scale_doubt,
+)
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.recognise import (
     boards_of,
@@ -199,8 +207,11 @@ def _identify(
     else:
         turns = identify_poses(session, seen.boards, seen.T_camera_base, cameras, clock.told)
     clock.lap("identify")
-    richer = richer_models(session, turns.measurements, turns.estimate)
-    check_poses(session, turns.measurements, turns.estimate, richer)
+    stated = as_stated(session.machine, turns.measurements, turns.estimate)
+    richer = richer_models(session, turns.measurements, stated)
+    check_poses(session, turns.measurements, stated, richer)
+    if model_at_fault(richer, stated):
+        turns = turns._replace(estimate=stated)
     out = None
     if holdout:
         out = LeftOut(chosen(session.machine, turns.estimate, holdout), turns.measurements)
@@ -232,7 +243,7 @@ def _judge(
         findings=findings,
         richer=found.richer,
         held_out=len(found.out.region.rows) if found.out else 0,
-        doubts=scale_doubt(session, found.estimate),
+        doubts=scale_doubt(session, found.estimate) + noise_doubt(session, found.estimate),
         cautions=noise_told(session, found.estimate),
     )
     clock.lap("identify")

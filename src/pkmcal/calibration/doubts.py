@@ -195,7 +195,7 @@ def _tried(machine: Machine, measurements: Measurements, start: State | None) ->
     try:
         if start is None:
             start = start_from_poses(machine, measurements)
-        return bundle(machine, measurements, start, hopeless=HOPELESS)
+        return bundle(machine, measurements, start, hopeless=HOPELESS, scale_readings=False)
     except (PkmcalError, np.linalg.LinAlgError):
         return None
 
@@ -341,6 +341,35 @@ def check_poses(
         raise _error(session, doubt, estimate.statistics.pose_scale)
 
 
+def as_stated(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:
+    """The estimate with the readings' noise as it is stated, by which mistakes are looked for: a
+    wrong sign, or a model that is too poor, would be taken for noise.
+    """
+    if estimate.statistics.reading_scale <= 1 or not len(measurements.poses):
+        return estimate
+    return bundle(machine, measurements, estimate.state, scale_readings=False)
+
+
+def model_at_fault(richer: tuple[RicherModel, ...], estimate: Estimate) -> bool:
+    """Whether a richer model fits what the estimate's, with noise as stated, does not."""
+    best = min((model.scale for model in richer), default=np.inf)
+    return best < max(POOR, CURED * estimate.statistics.pose_scale)
+
+
+def noise_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
+    """A reason where readings scatter by more than the drawing is off: they tell nothing."""
+    s, tolerance = estimate.statistics, session.machine.document.tolerance
+    units, noise = set(session.machine.joint_units), session.joint_noise * s.reading_scale
+    most = min({"m": tolerance.offset, "rad": tolerance.angle}[unit] for unit in units)
+    if s.reading_scale <= 1 or noise <= most:
+        return ()
+    return (
+        f"The readings scatter by {_lengths(noise, units)}, more than the drawing's tolerance of"
+        f" {_lengths(most, units)}: they may belong to other configurations, or to another"
+        " machine.",
+    )
+
+
 def richer_models(
     session: Session, measurements: Measurements, estimate: Estimate
 ) -> tuple[RicherModel, ...]:
@@ -359,7 +388,7 @@ def richer_models(
             if other.parameters.free_matrix().shape[1] <= unknowns or not alike:
                 continue
             start = start_state(other, measurements, estimate.state.T_camera_base)
-            found = bundle(other, measurements, start, hopeless=HOPELESS)
+            found = bundle(other, measurements, start, hopeless=HOPELESS, scale_readings=False)
         except (PkmcalError, np.linalg.LinAlgError):
             continue
         out.append(RicherModel(name, found.statistics.pose_scale))

@@ -260,6 +260,7 @@ def bundle(
     use_drawing: bool = True,
     robust: bool = True,
     scale_noise: bool = True,
+    scale_readings: bool = True,
     gauge: Gauge | None = None,
     hopeless: float = np.inf,
 ) -> Estimate:
@@ -269,7 +270,8 @@ def bundle(
     use_drawing : take the drawing's values as measurements with their tolerances; radii
         and edge shifts keep theirs in any case.
     robust : let go of edges and poses that do not fit. scale_noise : where the residuals
-        ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each.
+        ask for it, enlarge the stated noise of the edges, and of the poses, by a factor each;
+        scale_readings : and that of the readings, which may become less.
     gauge : frames of the result, three centres by default. hopeless : for what is only tried,
     the factor on the poses' noise beyond which it is given up.
     Raises ResultError where the search cannot start, is given up, or ends without an answer.
@@ -281,7 +283,14 @@ def bundle(
     # mounts are known to be near their start, as far as nothing else tells
     mounts, there = np.array(assembled.priors) == "mount", problem.prior_values(batch)[0]
     problem = replace(problem, prior_target=np.where(mounts, there, problem.prior_target))
-    result = solve_batch(problem, batch, robust=robust, scale_noise=scale_noise, hopeless=hopeless)
+    result = solve_batch(
+        problem,
+        batch,
+        robust=robust,
+        scale_noise=scale_noise,
+        scale_readings=scale_readings,
+        hopeless=hopeless,
+    )
     if result.scale.poses[0] > hopeless:
         raise ResultError(
             what="the measured poses do not fit the machine",

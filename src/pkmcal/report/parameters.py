@@ -78,8 +78,12 @@ class ParameterGroup:
 
 def section(drawing: Machine, estimate: Estimate) -> Part:
     """The table."""
+    seen = estimate.edge_weights.size or estimate.pose_weights.size
     html = page.render(
-        "parameters.html.j2", groups=parameter_groups(drawing, estimate), gauge=estimate.gauge
+        "parameters.html.j2",
+        groups=parameter_groups(drawing, estimate),
+        gauge=estimate.gauge,
+        told="photographs" if seen else "readings",
     )
     return Part("parameters", "Parameters", html=html)
 

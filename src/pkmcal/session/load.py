@@ -132,6 +132,14 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     folder, document = _read(Path(folder))
     schema = validate(document, SessionDocument)
     machine, source = _machine(folder, document, schema.mechanism, model)
+    if not measured and not schema.stations:
+        raise InputError(
+            "there is no station to plan for",
+            where=document.where("stations"),
+            expected="one entry a camera, or a tracker, in one place",
+            next_step="Where readings alone are calibrated from, spread the poses over all that the"
+            " machine reaches",
+        )
     if measured or (folder / schema.joints.file).exists():
         path = _existing(folder, document, schema.joints.file, ("joints", "file"))
         table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
