@@ -18,7 +18,7 @@ from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.report.calibration import save
 from pkmcal.simulation.truth import true_machine
 
-NO_SLICES = {"3-rps"}
+NO_SLICES = {"3-rps", "constant-legs"}
 """Machines that cannot move aside without turning."""
 
 

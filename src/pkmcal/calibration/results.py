@@ -40,6 +40,7 @@ from pkmcal.wording import listed
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
+    from pkmcal.calibration.toolmap import ToolMap
     from pkmcal.identify.unidentified import Findings
 
 MECHANISM, EVERYTHING, REPORT = "mechanism.yaml", "calibration.json", "report.html"
@@ -98,16 +99,17 @@ def texts_of(
     calibration: Calibration,
     not_identified: Sequence[str] = (),
     holdout: dict[str, Any] | None = None,
+    over: ToolMap | str | None = None,
 ) -> dict[str, str]:
     """What a calibration leaves on disk besides its page: texts by their files' names.
 
-    not_identified, holdout : as for :func:`document_of`.
+    not_identified, holdout, over : as for :func:`document_of`.
     """
     from pkmcal.cameras.files import camera_text
 
     texts = {
         MECHANISM: calibrated_mechanism_text(calibration),
-        EVERYTHING: json_text(document_of(calibration, not_identified, holdout)),
+        EVERYTHING: json_text(document_of(calibration, not_identified, holdout, over)),
     }
     cameras = calibration.cameras
     for file in cameras.files if cameras.refined else ():
@@ -136,11 +138,13 @@ def document_of(
     calibration: Calibration,
     not_identified: Sequence[str] = (),
     holdout: dict[str, Any] | None = None,
+    over: ToolMap | str | None = None,
 ) -> dict[str, Any]:
     """The content of calibration.json, plain data without NaN and dates.
 
     not_identified : sentences about what the data could not decide, as the report tells them.
-    holdout : residuals on configurations that were held out, beside those in use.
+    holdout : residuals on configurations that were held out, beside those in use. over : the tool
+    over the workspace, or why there is no map of it.
     """
     session, estimate = calibration.session, calibration.estimate
     document = {
@@ -161,6 +165,7 @@ def document_of(
         "cameras": _cameras(calibration),
         "configurations": _configurations(calibration),
         "statistics": asdict(estimate.statistics),
+        "tool": {"why_not": over} if isinstance(over, str) else over and over.document(),
         "holdout": holdout,
         "residuals": _residuals(calibration),
         "rejected": _rejected(calibration),

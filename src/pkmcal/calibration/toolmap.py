@@ -5,7 +5,7 @@ would be by the drawing's tolerances, and how wrong the drawing was.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,14 +18,20 @@ from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.mechanisms.workspace import ROUGH, Limits, reachable
 
+if TYPE_CHECKING:
+    from pkmcal.calibration.calibrate import Calibration
+
 SPREAD = 250
 """Poses spread over the region, from which figures are told."""
 CELLS = 20
 """Cells along a slice's longer side."""
 HEIGHTS = (0.15, 0.5, 0.85)
 """Where slices lie between the lowest and the highest of those poses."""
-LEAST_CELLS = 8
-"""Fewer make no slice."""
+MORE = 0.08
+"""What slices reach beyond those poses to either side, in their extent."""
+LEAST_CELLS, FILLED = 3, 0.4
+"""Rows and columns of cells, and their part that the machine can take, below which it is no slice:
+a platform that only moves aside as it turns is at one orientation in few places."""
 ASIDE = 0.25
 """Of a cell: how far from its middle a pose may be put by rods and axes."""
 TURNED = np.deg2rad(3.0)
@@ -132,6 +138,17 @@ def map_of(
     return ToolMap(region, len(even), slices, after, before)
 
 
+def of_calibration(calibration: Calibration) -> ToolMap:
+    """The map over the session's workspace. Raises PkmcalError where the calibrated machine has
+    none.
+    """
+    estimate, session = calibration.estimate, calibration.session
+    seen = estimate.edge_weights.size > 0
+    return map_of(
+        session.machine, estimate.machine, estimate.covariance, session.workspace, legs_seen=seen
+    )
+
+
 def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, ...], list[Array]]:
     """Horizontal slices and a vertical one where the machine has a height, and their poses, in the
     order in which the rows count them, after the evenly spread ones.
@@ -139,6 +156,7 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
     places = even[:, :3, 3]
     low, high = places.min(axis=0), places.max(axis=0)
     wide = high - low
+    box = low - MORE * wide, high + MORE * wide
     flat = wide < 1e-3 * wide.max()
     middle = (low + high) / 2
     middle[flat] = limits.home[:3, 3][flat]
@@ -154,8 +172,10 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
     for across, up, level in planes:
         if flat[across] or flat[up]:
             continue
-        made, taken = _slice(limits, region, (across, up, level), (low, high), first)
-        if len(taken) >= LEAST_CELLS:
+        made, taken = _slice(limits, region, (across, up, level), box, first)
+        there = made.rows >= 0
+        rows, columns = there.any(axis=1).sum(), there.any(axis=0).sum()
+        if min(rows, columns) >= LEAST_CELLS and len(taken) >= FILLED * rows * columns:
             out.append(made)
             poses.append(taken)
             first += len(taken)

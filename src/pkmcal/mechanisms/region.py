@@ -10,13 +10,15 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.mechanisms.kinematics import on_manifold
-from pkmcal.mechanisms.workspace import ALLOWED, ROUGH, Limits, extents, is_flat, reachable, spans
+from pkmcal.mechanisms.workspace import ALLOWED, ROUGH, Limits, extents, reachable, spans
 
 Side = tuple[float, float]
 AXES = ("x", "y", "z")
 SPARSE = 200
 """Poses tried for each one wanted, at most: where the machine can take fewer than one in so many,
 fewer are found."""
+FLAT = 0.02
+"""Of the longest way: less is no way of its own, but what crooked axes let a platform do."""
 AT_LEAST = 5000
 """Poses tried before a region counts as out of reach."""
 AT_ONCE = 4096
@@ -106,7 +108,7 @@ def within_reach(limits: Limits, region: Region) -> Within:
     if len(free):
         near, far = spans(limits, limits.home, free)
         low, high = low + near @ free, high + far @ free
-        moves = int(np.count_nonzero(~is_flat(limits, far - near)))
+        moves = int(np.count_nonzero(far - near > FLAT * (far - near).max()))
     for k, (name, side) in enumerate(zip(AXES, region.sides, strict=True)):
         if side is not None and (side[1] < low[k] - ALLOWED or side[0] > high[k] + ALLOWED):
             raise InputError(

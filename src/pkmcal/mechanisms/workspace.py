@@ -361,14 +361,9 @@ def spans(limits: Limits, middle: Array, unit: Array) -> tuple[Array, Array]:
     return 1.1 * far.min(axis=0), 1.1 * far.max(axis=0)
 
 
-def is_flat(limits: Limits, sides: Array) -> Booleans:
-    """Which extents (k,), m, are no way that a machine moves without turning."""
-    return sides < 1e-4 * _reach(limits)
-
-
 def _refuse_flat(limits: Limits, unit: Array, sides: Array) -> None:
     """A grid needs some way along each of its directions."""
-    flat = np.flatnonzero(is_flat(limits, sides))
+    flat = np.flatnonzero(sides < 1e-4 * _reach(limits))
     if flat.size:
         raise InputError(
             what="the workspace has no extent along one of the directions at this orientation",

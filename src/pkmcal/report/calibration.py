@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration import toolmap
 from pkmcal.calibration.results import REPORT, check_output, texts_of
+from pkmcal.calibration.toolmap import ToolMap
+from pkmcal.errors import PkmcalError
 from pkmcal.files import write_folder
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
@@ -28,6 +31,7 @@ from pkmcal.report import (
     residuals,
     scene,
     validation,
+    workspace,
 )
 from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session
@@ -44,7 +48,7 @@ NO_TURN = 1e-9
 
 def outcome_of(calibration: Calibration) -> Outcome:
     """Everything that `pkmcal calibrate` tells and writes."""
-    c, held_out = calibration, holdout_of(calibration)
+    c, held_out, over = calibration, holdout_of(calibration), _tool_map(calibration)
     told = report_of(
         c.session,
         c.observation,
@@ -53,6 +57,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
         findings=c.findings,
         timings=c.timings,
         holdout=held_out,
+        over=over,
     )
     groups = parameters.parameter_groups(c.session.machine, c.estimate)
     open_ = parameters.unidentified(groups, c.estimate, c.findings)
@@ -60,7 +65,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, open_, predicted),
+        texts=texts_of(c, open_, predicted, over),
         summary={
             "verdict": asdict(c.verdict),
             **(told.summary or {}),
@@ -69,6 +74,14 @@ def outcome_of(calibration: Calibration) -> Outcome:
             "timings": c.timings,
         },
     )
+
+
+def _tool_map(calibration: Calibration) -> ToolMap | str:
+    """The tool over the workspace, or the sentence that says why there is no map."""
+    try:
+        return toolmap.of_calibration(calibration)
+    except PkmcalError as error:
+        return f"There is no map of the workspace: {error}"
 
 
 def save(calibration: Calibration, folder: Path | str) -> None:
@@ -87,12 +100,13 @@ def report_of(
     findings: Findings | None = None,
     timings: Mapping[str, float] | None = None,
     holdout: HoldOut | None = None,
+    over: ToolMap | str | None = None,
 ) -> Outcome:
     """The verdict, cards and parts.
 
     findings : what the data tell of the machine; without them their section is left out.
     timings : seconds by step. holdout : what the estimate predicts of configurations that it did
-    not see.
+    not see. over : the tool over the workspace, or why there is no map of it.
     """
     edges = observation.edges
     camera = residuals.camera_numbers(session)
@@ -102,6 +116,7 @@ def report_of(
     photographed = len(edges) > 0 or (not len(observation.poses) and bool(session.station_names))
     parts = (
         scene.section(session, estimate, centres, poses.places(observation, estimate)),
+        workspace.section(session, estimate, over) if over else None,
         parameters.section(session.machine, estimate),
         findings and identifiability.section(findings, estimate.machine.parameters),
         pictures.section(session, edges, estimate, shifts, centres) if photographed else None,

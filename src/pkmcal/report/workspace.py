@@ -1,0 +1,395 @@
+"""The map of the tool's error in the report: slices through the workspace, and points in space."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.calibration.toolmap import Slice, ToolMap
+from pkmcal.geometry.rigid import pose_difference
+from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.tool import ToolError
+from pkmcal.outcome import AXIS, LOOKS, Part, Plot, Row, Table
+from pkmcal.report.scene import markers, space_layout
+from pkmcal.session.load import Session
+from pkmcal.wording import brief, count, number
+
+COLOURS = [[0.0, "--band"], [0.6, "--drawing"], [1.0, "--ink"]]
+NO_TURN = 1e-9
+"""rad; what rounding leaves."""
+PANEL = 170
+"""Height of a row of slices, px."""
+LEFT, RIGHT, TOP, BOTTOM = 92, 74, 26, 40
+"""Margins round the slices, px, in which their names, the legend and the axes' numbers stand."""
+GAP = 0.045
+"""Between slices, as a part of the width."""
+DEEP = 0.2
+"""Of the poses' extent across a slice: how far from it a photographed pose is drawn in it."""
+THIN = 0.2
+"""Part of the widest extent below which a coordinate's own tells nothing."""
+LEAST_TURN = 1.0
+"""Degrees; what turns less is not drawn."""
+HOW = (
+    "Slices are at home's orientation, on one scale of colours; crosses are poses that were"
+    " measured, near the slice. By the drawing: how sure the platform would be by the drawing's"
+    " tolerances. Drawing's error: how far the drawing's pose is from the calibrated at the same"
+    " readings, frames laid over each other. Calibrated: one standard deviation that is left, of"
+    " the geometry; the noise of single readings and what the model leaves out come on top."
+)
+OUTSIDE = (
+    "The platform does not move aside without turning, so there are no slices of one orientation."
+)
+
+
+def section(session: Session, estimate: Estimate, found: ToolMap | str) -> Part:
+    """The section; of a machine without a map the sentence that says why."""
+    name, title, menu = "workspace", "The tool over the workspace", "Workspace"
+    if isinstance(found, str):
+        return Part(name, title, (found,), menu=menu)
+    slices = _slices(session, estimate, found)
+    return Part(
+        name,
+        title,
+        (_said(found), *((HOW,) if slices else (OUTSIDE,))),
+        plots=tuple(plot for plot in (slices, _space(session, estimate, found)) if plot),
+        tables=(_table(found),),
+        menu=menu,
+    )
+
+
+def _quantities(found: ToolMap) -> tuple[tuple[str, Array], ...]:
+    """What is shown of each pose, m, with its name."""
+    return (
+        ("By the drawing, σ", found.before.position),
+        ("Drawing's error", found.after.off_position),
+        ("Calibrated, σ", found.after.position),
+    )
+
+
+def _said(found: ToolMap) -> str:
+    """The main figures in a sentence."""
+    even = slice(0, found.spread)
+    sigma, off = (
+        values[np.isfinite(values)] * 1e3
+        for values in (found.after.position[even], found.after.off_position[even])
+    )
+    text = (
+        f"Over {found.region}, {count(found.spread, 'pose')} spread evenly, the calibrated"
+        f" platform's place is known to {brief(float(np.median(sigma)))} mm (1σ, median), at worst"
+        f" to {brief(float(sigma.max()))} mm"
+    )
+    if not off.size:
+        return f"{text}."
+    return (
+        f"{text}; the drawing's was {brief(float(np.median(off)))} mm off, at worst"
+        f" {brief(float(off.max()))} mm."
+    )
+
+
+def _table(found: ToolMap) -> Table:
+    """Medians and largest over the evenly spread poses."""
+    even = slice(0, found.spread)
+    rows: list[Row] = []
+    turns = float(np.nanmax(found.before.orientation[even])) > NO_TURN
+    kinds = (
+        ("By the drawing's tolerances, σ", found.before.position, found.before.orientation),
+        ("Drawing's error", found.after.off_position, found.after.off_orientation),
+        ("Calibrated, σ", found.after.position, found.after.orientation),
+    )
+    for name, place, turn in kinds:
+        cells = _pair(place[even] * 1e3)
+        rows.append(Row(name, (*cells, *(_pair(np.rad2deg(turn[even])) if turns else ()))))
+    columns = ("Over the region", "place, median, mm", "worst, mm")
+    columns += ("turn, median, °", "worst, °") if turns else ()
+    return Table("", columns, tuple(rows), brief=False)
+
+
+def _pair(values: Array) -> tuple[str, str]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return "–", "–"
+    return brief(float(np.median(known))), brief(float(known.max()))
+
+
+# ------------------------------------------------------------------ slices
+
+
+def _slices(session: Session, estimate: Estimate, found: ToolMap) -> Plot | None:
+    """Every quantity in every slice, one under the other; a single slice's beside each other."""
+    if not found.slices:
+        return None
+    quantities = _quantities(found)
+    single = len(found.slices) == 1
+    across, down = (len(quantities), 1) if single else (len(found.slices), len(quantities))
+    extent = _extent(found)
+    data: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {**LOOKS, "annotations": [], "showlegend": False}
+    for row, (name, values) in enumerate(quantities):
+        for column, cut in enumerate(found.slices):
+            place = (row, 0) if single else (column, row)
+            panel = _panel(place[1] * across + place[0])
+            axes = {"xaxis": f"x{panel}", "yaxis": f"y{panel}"}
+            data.append(_heat(cut, values * 1e3, name, axes))
+            data.append(_crosses(session, estimate, found, cut, axes))
+            _place_axes(layout, cut, panel, place, (across, down), extent)
+            if single or row == 0:
+                layout["annotations"].append(_label(name if single else _title(cut), panel, "top"))
+            if not single and column == 0:
+                layout["annotations"].append(_label(name, panel, "left"))
+    layout["coloraxis"] = _colours(np.concatenate([v for _, v in quantities]) * 1e3)
+    layout["margin"] = {"l": 46 if single else LEFT, "r": RIGHT, "t": TOP, "b": BOTTOM}
+    height = TOP + BOTTOM + PANEL * down + (60 if single else 0)
+    return Plot(
+        "slices",
+        "Before and after, slice by slice",
+        "Point at a cell for its number.",
+        "Heat maps of how sure the platform's place is by the drawing, how far the drawing was"
+        " off, and how sure it is as calibrated, in slices through the workspace. The table below"
+        " has the figures over all of it.",
+        {"data": data, "layout": layout, "config": {}},
+        height=height,
+        width=640 if single else 150 * across + LEFT + RIGHT,
+    )
+
+
+def _panel(count_from_0: int) -> str:
+    """What Plotly calls the axes of a panel, counted from 0: x, x2, x3."""
+    return str(count_from_0 + 1) if count_from_0 else ""
+
+
+def _extent(found: ToolMap) -> Array:
+    """Lowest and highest coordinate of all slices' poses, (3, 2) mm, and a little more."""
+    places = found.after.T_base_platform[found.spread :, :3, 3] * 1e3
+    low, high = places.min(axis=0), places.max(axis=0)
+    more = 0.06 * float((high - low).max())
+    return np.round(np.stack([low - more, high + more], axis=1), 1)
+
+
+def _title(cut: Slice) -> str:
+    return f"{'xyz'[cut.normal]} = {number(cut.level * 1e3, 0)} mm"
+
+
+def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[str, Any]:
+    """A slice's cells, by the logarithm of values (n,), mm."""
+    shown = np.where(cut.rows >= 0, values[cut.rows], np.nan)
+    with np.errstate(divide="ignore"):
+        level = np.log10(shown)
+    one, other = "xyz"[cut.across], "xyz"[cut.up]
+    return {
+        "type": "heatmap",
+        "name": name,
+        "x": np.round(cut.u * 1e3, 1).tolist(),
+        "y": np.round(cut.v * 1e3, 1).tolist(),
+        "z": _listed(level, 3),
+        "customdata": _listed(shown, 4),
+        "hovertemplate": f"{one} %{{x:.0f}}, {other} %{{y:.0f}}, {_title(cut)}<br>{name}:"
+        " %{customdata:.3g} mm<extra></extra>",
+        "hoverongaps": False,
+        "coloraxis": "coloraxis",
+        **axes,
+    }
+
+
+def _listed(values: Array, digits: int) -> list[list[float | None]]:
+    """Rows of numbers with so many digits, None where there is none."""
+    return [
+        [float(f"{x:.{digits}g}") if np.isfinite(x) else None for x in row]
+        for row in values.tolist()
+    ]
+
+
+def _crosses(
+    session: Session, estimate: Estimate, found: ToolMap, cut: Slice, axes: dict[str, str]
+) -> dict[str, Any]:
+    """Measured poses near a slice."""
+    used = np.flatnonzero(estimate.configurations)
+    place = estimate.state.T_base_platform[used, :3, 3]
+    even = found.after.T_base_platform[: found.spread, cut.normal, 3]
+    near = np.abs(place[:, cut.normal] - cut.level) <= DEEP * np.ptp(even) + 1e-6
+    used, place = used[near], place[near]
+    return {
+        "type": "scatter",
+        "mode": "markers",
+        "x": np.round(place[:, cut.across] * 1e3, 1).tolist(),
+        "y": np.round(place[:, cut.up] * 1e3, 1).tolist(),
+        "text": [f"measured: {session.configurations[k]}" for k in used],
+        "hoverinfo": "text",
+        "marker": {
+            "symbol": "x-thin",
+            "size": 7,
+            "line": {"color": "--calibrated", "width": 1.6},
+        },
+        **axes,
+    }
+
+
+def _place_axes(
+    layout: dict[str, Any],
+    cut: Slice,
+    panel: str,
+    place: tuple[int, int],
+    shape: tuple[int, int],
+    extent: Array,
+) -> None:
+    """The axes of one panel in a table of panels; extent : (3, 2) mm."""
+    (column, row), (across, down) = place, shape
+    wide = (1 - GAP * (across - 1)) / across
+    gap = GAP if down > 1 else 0.0
+    tall = (1 - gap * (down - 1)) / down
+    left, top = column * (wide + GAP), 1 - row * (tall + gap)
+    common = {**AXIS, "showgrid": False, "zeroline": False, "tickfont": {"size": 10}}
+    common |= {"nticks": 4, "tickangle": 0}
+    last = row == down - 1
+    one, other = "xyz"[cut.across], "xyz"[cut.up]
+    layout[f"xaxis{panel}"] = {
+        **common,
+        "domain": [left, left + wide],
+        "range": extent[cut.across].tolist(),
+        "anchor": f"y{panel}",
+        "constrain": "domain",
+        "showticklabels": last,
+        "title": {"text": f"{one}, mm" if last else "", "font": {"size": 11}, "standoff": 4},
+    }
+    layout[f"yaxis{panel}"] = {
+        **common,
+        "domain": [max(top - tall, 0.0), top],
+        "range": extent[cut.up].tolist(),
+        "anchor": f"x{panel}",
+        "scaleanchor": f"x{panel}",
+        "constrain": "domain",
+        "title": {"text": f"{other}, mm", "font": {"size": 11}, "standoff": 2},
+    }
+
+
+def _label(text: str, panel: str, side: str) -> dict[str, Any]:
+    """A panel's name, above it or to its left."""
+    at = {"xref": f"x{panel} domain", "yref": f"y{panel} domain", "showarrow": False}
+    font = {"size": 12, "color": "--ink"}
+    if side == "top":
+        return {
+            **at, "text": text, "x": 0.5, "y": 1, "yanchor": "bottom", "xanchor": "center",
+            "font": font,
+        }  # fmt: skip
+    return {
+        **at, "text": text, "xref": "paper", "x": 0, "xshift": -LEFT + 4, "y": 0.5,
+        "textangle": -90, "xanchor": "left", "yanchor": "middle", "font": font,
+    }  # fmt: skip
+
+
+def _colours(values: Array) -> dict[str, Any]:
+    """One scale for all values (n,), mm, by their logarithms."""
+    known = values[np.isfinite(values) & (values > 0)]
+    low, high = np.log10(np.quantile(known, (0.01, 0.995)))
+    high = max(high, low + 0.3)
+    steps = [m * 10.0**k for k in range(-5, 5) for m in (1, 2, 5)]
+    ticks = [s for s in steps if low - 0.02 <= np.log10(s) <= high + 0.02]
+    return {
+        "colorscale": COLOURS,
+        "cmin": round(float(low), 3),
+        "cmax": round(float(high), 3),
+        "colorbar": {
+            "title": {"text": "mm", "side": "top"},
+            "tickvals": [round(float(np.log10(s)), 4) for s in ticks],
+            "ticktext": [f"{s:g}" for s in ticks],
+            "thickness": 12,
+            "outlinewidth": 0,
+            "x": 1.01,
+            "xpad": 4,
+        },
+    }
+
+
+# ------------------------------------------------------------------ in space
+
+
+def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
+    """Which three of the six numbers of poses (n, 4, 4) to draw, and their names: where they are,
+    or, of a platform that hardly moves along some axes, how it turns instead. None where less than
+    three numbers change.
+    """
+    places = np.ptp(poses[:, :3, 3], axis=0)
+    thin = places < THIN * places.max()
+    turns = np.rad2deg(np.ptp(pose_difference(poses, poses[0])[:, :3], axis=0))
+    order = [int(k) for k in np.argsort(-turns) if turns[k] > LEAST_TURN]
+    if np.count_nonzero(thin) > len(order):
+        return None
+    instead = sorted(order[: np.count_nonzero(thin)])
+    which = np.array([*instead, *(3 + np.flatnonzero(~thin))])
+    names = ("turn about x, °", "turn about y, °", "turn about z, °", "x, mm", "y, mm", "z, mm")
+    return which, tuple(names[k] for k in which)
+
+
+def _drawn(poses: Array, home: Array, which: Integers) -> Array:
+    """Numbers (n, 3) of poses that are drawn: turns from home in degrees, places in mm."""
+    turns = np.rad2deg(pose_difference(poses, home)[:, :3])
+    return np.concatenate([turns, poses[:, :3, 3] * 1e3], axis=1)[:, which]
+
+
+def _space(session: Session, estimate: Estimate, found: ToolMap) -> Plot | None:
+    """The evenly spread poses, coloured by what is left, and the measured ones; None of a machine
+    that moves in a plane.
+    """
+    poses = found.after.T_base_platform[: found.spread]
+    axes = _axes(poses)
+    if axes is None:
+        return None
+    which, names = axes
+    even = slice(0, found.spread)
+    after: ToolError = found.after
+    sigma = after.position[even] * 1e3
+    turn = np.rad2deg(after.orientation[even])
+    turns = bool(np.nanmax(turn) > np.rad2deg(NO_TURN))
+    columns = [sigma, after.off_position[even] * 1e3, turn if turns else np.zeros_like(turn)]
+    hover = "<br>".join(f"{name}: %{{{k}:.3g}}" for k, name in zip("xyz", names, strict=True))
+    hover += "<br>σ %{customdata[0]:.3g} mm"
+    hover += ", %{customdata[2]:.2g}°" if turns else ""
+    hover += "<br>drawing's error %{customdata[1]:.3g} mm<extra></extra>"
+    look = {
+        "size": 4,
+        "color": [float(f"{x:.3g}") for x in sigma.tolist()],
+        "colorscale": COLOURS,
+        "showscale": True,
+        "colorbar": {
+            "title": {"text": "σ, mm", "side": "top"},
+            "thickness": 12,
+            "outlinewidth": 0,
+            "x": 1.0,
+            "len": 0.8,
+        },
+    }
+    home = poses[0] if which.min() >= 3 else session.machine.home()
+    used = np.flatnonzero(estimate.configurations)
+    data = [
+        markers(
+            "Calibrated, σ",
+            _drawn(poses, home, which) * 1e-3,
+            look,
+            customdata=_listed(np.column_stack(columns), 3),
+            hovertemplate=hover,
+        ),
+        markers(
+            "Measured",
+            _drawn(estimate.state.T_base_platform[used], home, which) * 1e-3,
+            {"size": 4, "color": "--calibrated", "symbol": "diamond"},
+            hovertext=[f"measured: {session.configurations[k]}" for k in used],
+            hoverinfo="text",
+        ),
+    ]
+    layout = space_layout({"x": 1.45, "y": -1.45, "z": 0.8})
+    layout["showlegend"] = False
+    for axis, name in zip("xyz", names, strict=True):
+        layout["scene"][f"{axis}axis"]["title"] = {"text": name}
+    if which.min() < 3:
+        layout["scene"]["aspectmode"] = "cube"
+    return Plot(
+        "reach",
+        "What is left, in space",
+        "The calibrated platform's σ at the poses of the table, on a scale of its own; diamonds"
+        " were measured. Drag to turn, wheel or pinch to come nearer.",
+        "Points of the workspace in three dimensions, coloured by the standard deviation of the"
+        " platform's place as calibrated.",
+        {"data": data, "layout": layout, "config": {"scrollZoom": True}},
+        height=420,
+    )
