@@ -16,6 +16,7 @@ from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.report.calibration import save
+from pkmcal.report.workspace import section
 from pkmcal.simulation.truth import true_machine
 
 NO_SLICES = {"3-rps", "constant-legs"}
@@ -172,3 +173,56 @@ def test_a_map_of_a_region(small):
     assert told["drawing_off"]["position"]["worst"] == pytest.approx(
         made.after.off_position[: made.spread].max()
     )
+
+
+def page_of(name, **region):
+    """The report's section of a machine whose map is made, and the map."""
+    drawing = load_mechanism(name)
+    machine = true_machine(drawing, 0.2, np.random.default_rng(3))
+    made = map_of(drawing, machine, known(machine), Region(**region))
+    state = SimpleNamespace(T_base_platform=made.after.T_base_platform[:4])
+    estimate = SimpleNamespace(configurations=np.ones(4, dtype=bool), state=state)
+    session = SimpleNamespace(machine=drawing, configurations=tuple("abcd"))
+    return section(session, estimate, made), made
+
+
+def test_the_page_shows_every_cell_with_its_number():
+    part, made = page_of("gough-stewart")
+    slices, space = part.plots
+    heats = [trace for trace in slices.figure["data"] if trace["type"] == "heatmap"]
+    assert len(heats) == 3 * len(made.slices) == 12
+    cut, heat = made.slices[1], heats[2 * 4 + 1]  # the calibrated row comes last
+    shown = np.array(heat["customdata"], dtype=float)
+    assert heat["name"] == "Calibrated, σ"
+    there = cut.rows >= 0
+    np.testing.assert_array_equal(np.isfinite(shown), there)
+    expected = made.after.position[cut.rows[there]] * 1e3
+    np.testing.assert_allclose(shown[there], expected, rtol=1e-3)
+    np.testing.assert_allclose(10 ** np.array(heat["z"], float)[there], expected, rtol=5e-3)
+    assert len(space.figure["data"][0]["x"]) == 250
+    assert "known to" in part.text[0]
+    assert [row.name for row in part.tables[0].rows][-1] == "Calibrated, σ"
+
+
+@pytest.mark.parametrize(
+    ("name", "plots", "axes"),
+    [
+        ("3-rpr", ["slices"], None),
+        ("3-rps", ["reach"], ["turn about x, °", "turn about y, °", "z, mm"]),
+        ("delta", ["slices", "reach"], ["x, mm", "y, mm", "z, mm"]),
+    ],
+)
+def test_machines_of_few_freedoms_are_drawn_by_what_they_do(name, plots, axes):
+    part, _ = page_of(name)
+    assert [plot.name for plot in part.plots] == plots
+    if axes:
+        scene = part.plots[-1].figure["layout"]["scene"]
+        assert [scene[f"{axis}axis"]["title"]["text"] for axis in "xyz"] == axes
+    turns = len(part.tables[0].columns) == 5
+    assert turns == (name != "delta")
+
+
+def test_a_machine_without_a_map_says_why():
+    part = section(None, None, "There is no map of the workspace: out of reach.")
+    assert part.text == ("There is no map of the workspace: out of reach.",)
+    assert part.plots == ()

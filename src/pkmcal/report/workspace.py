@@ -182,7 +182,7 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
         "name": name,
         "x": np.round(cut.u * 1e3, 1).tolist(),
         "y": np.round(cut.v * 1e3, 1).tolist(),
-        "z": _listed(level, 3),
+        "z": _listed(level, 4),
         "customdata": _listed(shown, 4),
         "hovertemplate": f"{one} %{{x:.0f}}, {other} %{{y:.0f}}, {_title(cut)}<br>{name}:"
         " %{customdata:.3g} mm<extra></extra>",
