@@ -15,7 +15,7 @@ from pkmcal.identify.gauge import freedoms, generators, station_generators
 from pkmcal.identify.start import start_state
 from pkmcal.judge.causes import stations_moved, whole_machine, zeros
 from pkmcal.judge.changes import change, chi_square, detectable, look_for_changes
-from pkmcal.judge.held import Kept, Trust, evidence, hold
+from pkmcal.judge.held import KeptStations, Trust, evidence, hold
 from pkmcal.judge.watch import tests_with_kept as judged_with_kept
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.measurements import Measurements
@@ -68,7 +68,7 @@ class Left:
         )
         data = Measurements(edges, readings, 3e-6, 1, np.zeros(1, dtype=int))
         held = hold(calibrated, data, start_state(calibrated, data, now), Trust.full(data))
-        return held, Kept((0,), there, self.joint[: self.n + 6, : self.n + 6])
+        return held, KeptStations((0,), there, self.joint[: self.n + 6, : self.n + 6])
 
     def evidence(self, machine, rng, **more):
         return evidence(*self.looked(machine, rng, **more))

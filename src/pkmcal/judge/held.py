@@ -213,7 +213,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Kept:
+class KeptStations:
     """What a calibration knows, with the places of cameras that are said to stand where it had
     them.
 
@@ -225,19 +225,19 @@ class Kept:
     T_camera_base: Array
     covariance: Array
 
-    def without(self, stations: Sequence[int]) -> Kept:
+    def without(self, stations: Sequence[int]) -> KeptStations:
         """What it knows where some of them do not."""
         n = len(self.covariance) - 6 * len(self.stations)
         left = np.array([k for k, s in enumerate(self.stations) if s not in stations], dtype=int)
         rows = np.r_[:n, (n + 6 * left[:, None] + np.arange(6)).ravel()]
-        return Kept(
+        return KeptStations(
             tuple(self.stations[k] for k in left),
             self.T_camera_base[left],
             self.covariance[np.ix_(rows, rows)],
         )
 
 
-def evidence(held: Held, known: Array | Kept) -> Evidence:
+def evidence(held: Held, known: Array | KeptStations) -> Evidence:
     """What the data tell of a change from the held values: whitened by V = 1 + A C A^T with the
     calibration's covariance C.
 
@@ -246,8 +246,8 @@ def evidence(held: Held, known: Array | Kept) -> Evidence:
     the derivatives at those found.
     """
     machine, n = held.machine, len(held.machine.parameters)
-    if not isinstance(known, Kept):
-        known = Kept((), np.zeros((0, 4, 4)), known)
+    if not isinstance(known, KeptStations):
+        known = KeptStations((), np.zeros((0, 4, 4)), known)
     covariance, stations = known.covariance, known.stations
     problem, state = held.problem.opened(held.state)
     names = (*held.asked, "stations") if stations else held.asked
@@ -279,7 +279,9 @@ def evidence(held: Held, known: Array | Kept) -> Evidence:
     return Evidence(np.linalg.solve(lower, told), np.linalg.solve(lower, by), stations)
 
 
-def _at_kept(rows: Array, left: Array, found: Array, n: int, kept: Kept) -> tuple[Array, Array]:
+def _at_kept(
+    rows: Array, left: Array, found: Array, n: int, kept: KeptStations
+) -> tuple[Array, Array]:
     """Rows by n parameters, all stations' places (S, 4, 4) and cameras, as rows by parameters,
     cameras and the kept stations; and the residuals with these at the calibration's places.
     """

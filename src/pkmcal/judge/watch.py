@@ -26,7 +26,7 @@ from pkmcal.identify.assembly import seen_configurations
 from pkmcal.identify.rows import Kinds
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import ChangeTests, StationTest, look_for_changes
-from pkmcal.judge.held import Held, Kept, Trust, evidence, hold
+from pkmcal.judge.held import Held, KeptStations, Trust, evidence, hold
 from pkmcal.judge.new_data import known_rows, look, read
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.outcome import Verdict
@@ -205,10 +205,10 @@ def _placed(saved: SavedCalibration, session: Session, same_place: Sequence[str]
     return replace(session, stations=stations)
 
 
-def _kept(saved: SavedCalibration, session: Session, same_place: Sequence[str]) -> Kept:
+def _kept(saved: SavedCalibration, session: Session, same_place: Sequence[str]) -> KeptStations:
     """What the calibration knows of its machine and of these stations."""
     places = {station.name: inverse(station.T_base_camera) for station in saved.stations}
-    return Kept(
+    return KeptStations(
         tuple(session.station_names.index(name) for name in same_place),
         np.array([places[name] for name in same_place]).reshape(-1, 4, 4),
         saved.with_stations(same_place),
@@ -216,8 +216,8 @@ def _kept(saved: SavedCalibration, session: Session, same_place: Sequence[str]) 
 
 
 def tests_with_kept(
-    held: Held, kept: Kept, alpha: float
-) -> tuple[ChangeTests, Kept, tuple[StationTest, ...]]:
+    held: Held, kept: KeptStations, alpha: float
+) -> tuple[ChangeTests, KeptStations, tuple[StationTest, ...]]:
     """All tests, the stations that were kept for them, and those that evidently were moved.
 
     Where moved cameras explain the data better than any change of the machine, these are found anew
