@@ -17,9 +17,9 @@ from pkmcal.identify.start import start_state
 from pkmcal.identify.unknowns import BatchState, Unknowns
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.solver import damped_step
-from pkmcal.studies.engine import Batch
 from pkmcal.studies.paper_a import HexapodByAxes
 from pkmcal.studies.simulated import joint_problem
+from pkmcal.studies.tasks import Batch
 from test_identify_scene import FOCAL, make_scene
 
 

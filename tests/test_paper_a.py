@@ -15,7 +15,6 @@ from pkmcal.papers.axis_measurements import (
     to_coordinates,
 )
 from pkmcal.studies import engine
-from pkmcal.studies.engine import Batch
 from pkmcal.studies.paper_a import (
     BOUND,
     EFFECTOR,
@@ -32,6 +31,7 @@ from pkmcal.studies.paper_a import (
 )
 from pkmcal.studies.simulated import Noise
 from pkmcal.studies.statistics import coverage, rms
+from pkmcal.studies.tasks import Batch
 
 
 def study(runs, seed=20020, **setting):

@@ -13,7 +13,6 @@ from conftest import run
 from pkmcal.report.page import page_html
 from pkmcal.studies import engine
 from pkmcal.studies import paper_c_expected as expected
-from pkmcal.studies.engine import Sample
 from pkmcal.studies.paper_c import (
     AXIS,
     BOUND,
@@ -36,6 +35,7 @@ from pkmcal.studies.paper_c_report import reproduced
 from pkmcal.studies.paper_c_validation import before
 from pkmcal.studies.reproduction import Compared
 from pkmcal.studies.statistics import Summary
+from pkmcal.studies.tasks import Sample
 from test_report_page import Found, browse
 
 RUNS = 15

@@ -15,12 +15,12 @@ from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.report.page import page_html
 from pkmcal.studies import engine
 from pkmcal.studies import paper_a_expected as expected
-from pkmcal.studies.engine import Sample
 from pkmcal.studies.paper_a import BOUND, JOINT, METHODS, PRINTED, HexapodByAxes
 from pkmcal.studies.paper_a_photographs import MeasuredNoise
 from pkmcal.studies.paper_a_report import table_1
 from pkmcal.studies.reproduction import PAPERS, Compared, Options, reproduce
 from pkmcal.studies.statistics import Summary
+from pkmcal.studies.tasks import Sample
 from test_report_page import Found, browse
 
 RUNS = 25

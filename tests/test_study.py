@@ -18,7 +18,7 @@ import pytest
 from conftest import run
 from pkmcal.errors import InputError, ResultError
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.studies import cluster, engine, workers
+from pkmcal.studies import cluster, engine, tasks, workers
 from pkmcal.studies.calibrations import (
     ESTIMATE,
     SimulatedCalibrations,
@@ -27,12 +27,12 @@ from pkmcal.studies.calibrations import (
     tool_difference,
 )
 from pkmcal.studies.capture import captured
-from pkmcal.studies.engine import Batch, Population, Sample, Task
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.findings import clustered, study
 from pkmcal.studies.paper_a_joint import JointByAxes
 from pkmcal.studies.store import Store
 from pkmcal.studies.sweep import cells_of, parsed, scaled, subject_of
+from pkmcal.studies.tasks import Batch, Job, Population, Sample
 
 SMALL = ("--vary", "configurations=6", "--vary", "stations=1,2")
 """Of 3-rpr: two combinations in a second or two."""
@@ -358,7 +358,7 @@ class Counting:
     """A setting whose runs are their own random numbers."""
 
     doing = "Counting"
-    quantities = {"x": engine.Quantity("mean")}  # noqa: RUF012 - a test's
+    quantities = {"x": tasks.Quantity("mean")}  # noqa: RUF012 - a test's
 
     def __init__(self, fails: str = "") -> None:
         self.fails = fails
@@ -412,14 +412,14 @@ def test_workers_that_die_are_replaced(monkeypatch):
 
 def test_a_batch_that_kills_every_worker_ends_the_study(monkeypatch):
     monkeypatch.setenv("PKMCAL_TEST_PARENT", str(os.getpid()))
-    pool = workers._Pool([Task(Counting("dies"), batch_of(Counting()))], lambda _k, _done: None)
+    pool = workers._Pool([Job(Counting("dies"), batch_of(Counting()))], lambda _k, _done: None)
     pool.elsewhere()
     assert isinstance(pool.failure, ResultError)
     assert "killed again and again" in str(pool.failure)
 
 
 def test_an_error_in_another_process_is_told():
-    pool = workers._Pool([Task(Counting("input"), batch_of(Counting()))], lambda _k, _done: None)
+    pool = workers._Pool([Job(Counting("input"), batch_of(Counting()))], lambda _k, _done: None)
     pool.elsewhere()
     assert isinstance(pool.failure, InputError)
     assert str(pool.failure) == "nothing to count."
@@ -432,8 +432,8 @@ def test_an_error_here_is_told(alone):
 
 def test_what_is_kept_is_what_was_done(tmp_path):
     setting = Counting()
-    task = Task(setting, batch_of(setting, 5))
-    done = engine.work(task)
+    task = Job(setting, batch_of(setting, 5))
+    done = tasks.work(task)
     store = Store.opened(tmp_path, "counting", [], 0)
     store.save(0, 0, done)
     found = store.load(0, 0, task.batch)

@@ -50,7 +50,7 @@ def study(
     ] = None,
     as_json: console.Json = False,
 ) -> int:
-    """Simulate calibrations: what accuracy a camera, a place or more photographs would give."""
+    """Tell by simulation how accurate calibrations would be."""
     from importlib.util import find_spec
 
     from pkmcal.files import check_own_folder

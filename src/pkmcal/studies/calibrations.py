@@ -50,18 +50,16 @@ from pkmcal.measurements import SHADING_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
-from pkmcal.simulation.edges import moved_outward
+from pkmcal.simulation.edges import FITTED, moved_outward
 from pkmcal.simulation.placement import draw_configurations
 from pkmcal.solver import Stop, take
 from pkmcal.studies.capture import Capture, Design, captured
-from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample
 from pkmcal.studies.estimates import Fitted
+from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
 ESTIMATE: Key = ("joint",)
 BATCH = 10
 """Runs that are solved at once, and that share a plan of photographs."""
-PLACES = 12
-"""Places looked at along an edge; what a shift and a tilt do to it needs no more."""
 ROUGH = np.repeat([np.deg2rad(1.0), 0.01], 3)
 """rad and m, standard deviations by which stations start off: so far is what a search for the drawn
 machine in photographs leaves, as the drawing's own errors do."""
@@ -83,7 +81,7 @@ QUANTITIES: Mapping[str, Quantity] = {
 
 
 @dataclass(frozen=True)
-class Session:
+class SimulatedSessions:
     """One batch of simulated sessions, ready to be calibrated.
 
     capture : their plan. theta (B, P), poses (B, K, 4, 4), internal (B, K, n) : the truth.
@@ -125,7 +123,7 @@ class SimulatedCalibrations:
         """All runs alike."""
         return [Population("machine", runs, self.batch)]
 
-    def draw(self, batch: Batch) -> Session:
+    def draw(self, batch: Batch) -> SimulatedSessions:
         """True machines, their poses at the plan's readings, and what is measured of them."""
         design, rng = self.design, batch.generator(0)
         capture = captured(design, batch.generator(PLAN))
@@ -151,9 +149,9 @@ class SimulatedCalibrations:
         there = problem.prior_values(start).mean(axis=0)  # a metre's knowledge: one for all runs
         target = np.where(mounts, there, problem.prior_target)
         assembled = replace(one, problem=replace(problem, prior_target=target))
-        return Session(capture, theta, poses, internal, assembled, start, drawn)
+        return SimulatedSessions(capture, theta, poses, internal, assembled, start, drawn)
 
-    def solve(self, batch: Batch, data: Session) -> dict[Key, Fitted]:
+    def solve(self, batch: Batch, data: SimulatedSessions) -> dict[Key, Fitted]:
         """The joint estimate, told in the result's frames."""
         problem = data.assembled.problem
         found = solve_batch(problem, data.start)
@@ -178,7 +176,7 @@ class SimulatedCalibrations:
             )
         }
 
-    def _told(self, data: Session, found: BatchResult, run: int) -> tuple[Array, Array]:
+    def _told(self, data: SimulatedSessions, found: BatchResult, run: int) -> tuple[Array, Array]:
         """Parameters (P,) in the result's frames, and their covariance (P, P)."""
         machine, p = data.capture.machine, data.theta.shape[1]
         state = state_of(
@@ -189,7 +187,9 @@ class SimulatedCalibrations:
         theta = machine.parameters.unit_axes(in_gauge(machine, state, self.gauge).theta)
         return theta, full[:p, :p]
 
-    def judge(self, batch: Batch, data: Session, found: Mapping[Key, Fitted]) -> dict[Key, Sample]:
+    def judge(
+        self, batch: Batch, data: SimulatedSessions, found: Mapping[Key, Fitted]
+    ) -> dict[Key, Sample]:
         """Errors of parameters and tool, and what is stated of them."""
         machine, fit = data.capture.machine, found[ESTIMATE]
         by_board = "legs" not in self.design.observe
@@ -200,7 +200,7 @@ class SimulatedCalibrations:
         return {ESTIMATE: judged(parameters, tool, fit)}
 
     def _judged(
-        self, data: Session, fit: Fitted, run: int, joints: Array, *, every: bool
+        self, data: SimulatedSessions, fit: Fitted, run: int, joints: Array, *, every: bool
     ) -> tuple[Array, Array]:
         """One run's errors and their stated deviations, of the parameters (2, P) and of the tool
         (2, W, 6).
@@ -300,7 +300,7 @@ def _sizes(tool: Array) -> tuple[Array, Array]:
     return size[:, 0], size[:, 1]
 
 
-def _truth(data: Session, run: int) -> State:
+def _truth(data: SimulatedSessions, run: int) -> State:
     """What is true of a run."""
     capture = data.capture
     return State(
@@ -372,13 +372,13 @@ def _measured_edges(
         u, m = line_through(a, b)
         exact = edge_normal(u, m, radius[:, own], SIDE_SIGNS[edges.side[own]])
         span = edges.span[own]
-        along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, PLACES)
+        along = span[:, :1] + (span[:, 1:] - span[:, :1]) * np.linspace(0, 1, FITTED)
         points = contour_point(
             a[:, :, None], u[:, :, None], exact[:, :, None], radius[:, own, None],
             np.broadcast_to(along, (runs, *along.shape)),
         )  # fmt: skip
         rays = points / np.sqrt(dot(points, points))[..., None]
-        middle = rays[:, :, PLACES // 2]
+        middle = rays[:, :, FITTED // 2]
         frame = tangent_basis(exact, middle)
         flat = (x.reshape(-1, *x.shape[2:]) for x in (exact, frame, rays))
         shift, tilt = moved_outward(camera, *flat)

@@ -8,7 +8,7 @@ from typing import Any
 
 from pkmcal import __version__
 from pkmcal.errors import InputError, ResultError
-from pkmcal.studies.engine import Done, Finished, Runner, Task, work
+from pkmcal.studies.tasks import Done, Finished, Job, Runner, work
 
 TIMEOUT = 20
 """Seconds for a scheduler to answer, and for its first worker to be there."""
@@ -19,7 +19,7 @@ def _version() -> str:
     return __version__
 
 
-def _worked(task: Task) -> Done:
+def _worked(task: Job) -> Done:
     """On a worker, which keeps to one thread in its linear algebra from then on: its tasks may
     overlap, and each would give the others' threads back when it ends.
     """
@@ -42,7 +42,7 @@ def on_cluster(address: str) -> Runner:
             next_step="Install it with: pip install 'pkmcal[cluster]'",
         )
 
-    def runner(tasks: Sequence[Task], finished: Finished) -> int:
+    def runner(tasks: Sequence[Job], finished: Finished) -> int:
         from distributed import Client
 
         try:
@@ -90,7 +90,7 @@ def _checked(client: Any, address: str) -> int:
     return sum(client.nthreads().values())
 
 
-def _done(client: Any, tasks: Sequence[Task], finished: Finished) -> None:
+def _done(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
     """All tasks; what a worker had in hand when it died is done again by another."""
     from distributed import KilledWorker, as_completed
 

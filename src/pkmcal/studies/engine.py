@@ -1,96 +1,25 @@
 """One engine of Monte-Carlo studies: batches of simulated runs, drawn, solved and judged.
 
-A :class:`Setting` says how machines, configurations and measurements are drawn, which estimators
-are tried, and how far off each is. Runs are worked on in batches, vectorised, on all cores. A batch
-carries the seeds of all that is drawn for it, and depends on nothing else: so results do not depend
-on the number of workers nor on their order, and a batch may be done anywhere.
+Runs are worked on in batches, vectorised, on all cores (:mod:`pkmcal.studies.tasks`). A batch
+depends on its own seeds alone: so results do not depend on the number of workers nor on their
+order, and finished batches can be kept and taken up again.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.studies.estimates import Fitted
-from pkmcal.studies.statistics import STATISTICS, Statistic, Summary
+from pkmcal.studies.statistics import STATISTICS, Summary
+from pkmcal.studies.tasks import Batch, Done, Job, Key, Runner, Sample, Setting
+from pkmcal.studies.workers import on_cores
 
-Key = tuple[str, ...]
-"""What was estimated how: a method's name, after those of the truth and the model where a study has
-several."""
 Told = Callable[[str, float], None]
-
-
-class Population(NamedTuple):
-    """Runs of one kind of truth. batch : how many are solved at once; it belongs to the seeds."""
-
-    name: str
-    runs: int
-    batch: int
-
-
-class Quantity(NamedTuple):
-    """How a quantity is summed up over the runs, and shown: times ``factor``, in ``unit``."""
-
-    statistic: Statistic
-    factor: float = 1.0
-    unit: str = ""
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Runs of one population that are solved at once, with the seed of all that is drawn."""
-
-    population: str
-    runs: int
-    seed: np.random.SeedSequence
-
-    def generator(self, use: int) -> np.random.Generator:
-        """Independent draws for each use: 0 is the simulation, the others are a setting's own."""
-        key = (*self.seed.spawn_key, use)
-        return np.random.default_rng(np.random.SeedSequence(self.seed.entropy, spawn_key=key))
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One method on all runs. values : by quantity, (B,) or (B, n): errors, and what else a run
-    tells. sigma : standard deviations that the method itself states, of the same shape.
-    """
-
-    values: Mapping[str, Array]
-    sigma: Mapping[str, Array] = field(default_factory=dict[str, Array])
-
-
-class Setting(Protocol):
-    """What is studied: a frozen dataclass. quantities : those that are summed up over the runs.
-    doing : what it does, in words.
-    """
-
-    @property
-    def quantities(self) -> Mapping[str, Quantity]: ...
-
-    @property
-    def doing(self) -> str: ...
-
-    def populations(self, runs: int) -> Sequence[Population]:
-        """What ``runs`` runs of the study are made of."""
-        ...
-
-    def draw(self, batch: Batch) -> Any:
-        """True machines and their measurements, in the setting's own form."""
-        ...
-
-    def solve(self, batch: Batch, data: Any) -> Mapping[Key, Fitted]:
-        """Every estimator's answer."""
-        ...
-
-    def judge(self, batch: Batch, data: Any, found: Mapping[Key, Fitted]) -> Mapping[Key, Sample]:
-        """How far each is from the truth."""
-        ...
 
 
 S = TypeVar("S", bound=Setting)
@@ -124,28 +53,7 @@ class StudyResult(Generic[S]):
         return self.samples[key].values[quantity]
 
 
-class Task(NamedTuple):
-    """One batch of one setting: all that a worker needs."""
-
-    setting: Setting
-    batch: Batch
-
-
-class Done(NamedTuple):
-    """A batch's samples, and seconds of its solving: on the clock and of the processor."""
-
-    samples: Mapping[Key, Sample]
-    wall: float
-    cpu: float
-
-
-Finished = Callable[[int, Done], None]
-"""Called with a task's number as soon as it is done, from one thread at a time."""
-Runner = Callable[[Sequence[Task], Finished], int]
-"""Does all tasks in any order, and returns how many workers it had."""
-
-
-class Kept(Protocol):
+class KeptBatches(Protocol):
     """Where finished batches are kept, so that a study goes on where it was stopped."""
 
     def load(self, cell: int, number: int, batch: Batch) -> Done | None:
@@ -168,15 +76,13 @@ def run_all(
     seed: int,
     told: Told | None = None,
     runner: Runner | None = None,
-    kept: Kept | None = None,
+    kept: KeptBatches | None = None,
 ) -> list[StudyResult[S]]:
     """Several settings with the same seeds: what they differ by is theirs, and not the draws'.
 
     runner : all cores of this machine unless given. kept : batches that are finished already are
     taken from there, and new ones put there at once.
     """
-    from pkmcal.studies.workers import on_cores
-
     began = time.perf_counter()
     parts = [
         (cell, number, batch)
@@ -201,8 +107,8 @@ def run_all(
         if told:
             told(settings[cell].doing, len(done) / len(parts))
 
-    tasks = [Task(settings[parts[k][0]], parts[k][2]) for k in left]
-    workers = (runner or on_cores)(tasks, finished) if tasks else 1
+    jobs = [Job(settings[parts[k][0]], parts[k][2]) for k in left]
+    workers = (runner or on_cores)(jobs, finished) if jobs else 1
     wall = time.perf_counter() - began
     out: list[StudyResult[S]] = []
     for cell, setting in enumerate(settings):
@@ -224,20 +130,6 @@ def batches(setting: Setting, runs: int, seed: int) -> list[Batch]:
     ]
     seeds = np.random.SeedSequence(seed).spawn(len(parts))
     return [Batch(name, count, own) for (name, count), own in zip(parts, seeds, strict=True)]
-
-
-def work(task: Task) -> Done:
-    """A batch drawn, solved and judged, on one thread."""
-    from threadpoolctl import threadpool_limits
-
-    setting, batch = task
-    # Small matrices: threads inside the linear algebra would only wait for one another.
-    with threadpool_limits(1, "blas"):
-        data = setting.draw(batch)
-        began, used = time.perf_counter(), time.thread_time()
-        found = setting.solve(batch, data)
-        wall, cpu = time.perf_counter() - began, time.thread_time() - used
-        return Done(setting.judge(batch, data, found), wall, cpu)
 
 
 def collected(parts: Sequence[Mapping[Key, Sample]]) -> dict[Key, Sample]:

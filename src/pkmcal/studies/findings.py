@@ -18,10 +18,11 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.studies.calibrations import ESTIMATE, covered
 from pkmcal.studies.cluster import on_cluster
-from pkmcal.studies.engine import Runner, StudyResult, Told, batches, run_all
+from pkmcal.studies.engine import StudyResult, Told, batches, run_all
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.store import Store
-from pkmcal.studies.sweep import Cell, Setting, Subject, Value, cells_of, parsed, subject_of
+from pkmcal.studies.sweep import Cell, Setting, StudySubject, Value, cells_of, parsed, subject_of
+from pkmcal.studies.tasks import Runner
 
 PROMISE = 0.95
 HELD = 0.02
@@ -99,7 +100,7 @@ class SweepResult:
     they come to. runs, seed : of each. wall : seconds. workers : how many worked.
     """
 
-    subject: Subject
+    subject: StudySubject
     varied: Mapping[str, tuple[Value, ...]]
     cells: tuple[Cell, ...]
     results: tuple[StudyResult[Setting], ...]

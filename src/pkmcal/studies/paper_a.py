@@ -26,7 +26,7 @@ from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
 from pkmcal.papers.four_step import Form, FourSteps, solve
 from pkmcal.papers.leg_axes import Axes, centres_from_axes
-from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, StudyResult
+from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.estimates import Fitted, drawing, freedom, joint
 from pkmcal.studies.simulated import (
     Noise,
@@ -36,6 +36,7 @@ from pkmcal.studies.simulated import (
     simulate,
     spread_evenly,
 )
+from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
 DRAWING, PRINTED, CORRECTED = "drawing", "four steps as printed", "four steps"
 JOINT, BOUND = "joint", "bound"

@@ -6,7 +6,7 @@ import numpy as np
 
 from pkmcal.outcome import Check
 from pkmcal.papers.axis_measurements import AxisNoise
-from pkmcal.studies.engine import Key, StudyResult
+from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.paper_a import (
     BOUND,
     CORRECTED,
@@ -19,6 +19,7 @@ from pkmcal.studies.paper_a import (
 )
 from pkmcal.studies.reproduction import ASIDE, Compared, at_most, compared, prototype_check
 from pkmcal.studies.statistics import ratio
+from pkmcal.studies.tasks import Key
 from pkmcal.wording import number
 
 TABLE_1 = AxisNoise(images=1)

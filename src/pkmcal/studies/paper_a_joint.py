@@ -15,7 +15,6 @@ from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.four_step import solve
 from pkmcal.papers.leg_axes import centres_from_axes
 from pkmcal.studies.calibrations import ESTIMATE, QUANTITIES, judged
-from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.paper_a import (
     EVALUATION,
@@ -31,6 +30,7 @@ from pkmcal.studies.paper_a import (
     thirty,
 )
 from pkmcal.studies.simulated import SimulatedRuns
+from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
 from pkmcal.papers.hand_eye import size_of, solve_pairs
 from pkmcal.papers.inverse_kinematic import Form, PoseFit, fit_poses, pose_problem
 from pkmcal.papers.rotation_axis import rotation_axis
-from pkmcal.studies.engine import Batch, Key, Population, Quantity, Sample, StudyResult
+from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.estimates import (
     Fitted,
     drawing,
@@ -51,6 +51,7 @@ from pkmcal.studies.simulated import (
     measurements,
     simulate,
 )
+from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
 DRAWING, EQ3, EQ5, WHITENED, JOINT, BOUND = (
     "drawing", "eq. 3", "eq. 5", "eq. 5 whitened", "joint", "bound",

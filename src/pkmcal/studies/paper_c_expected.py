@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pkmcal.outcome import Check
-from pkmcal.studies.engine import Key, StudyResult
+from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.paper_c import (
     AXIS,
     BOUND,
@@ -23,6 +23,7 @@ from pkmcal.studies.paper_c_machine import Kind
 from pkmcal.studies.paper_c_validation import Before
 from pkmcal.studies.reproduction import Compared, at_most, compared, prototype_check
 from pkmcal.studies.statistics import ratio
+from pkmcal.studies.tasks import Key
 from pkmcal.wording import number
 
 BEFORE = Before(26e-3, 0.022)

@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 
 from pkmcal.files import read_yaml
 from pkmcal.outcome import Check, Figure, Finding, Level, Outcome, Part, Plot, Row, Table, Verdict
-from pkmcal.studies.engine import Key, Setting, StudyResult
+from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.statistics import Summary
+from pkmcal.studies.tasks import Key, Setting
 from pkmcal.wording import brief, number
 
 PAPERS = ("a", "c")

@@ -26,7 +26,7 @@ from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.files import json_text, plain, write_bytes, write_text
 from pkmcal.mechanisms import Machine
-from pkmcal.studies.engine import Batch, Done, Key, Sample, Setting
+from pkmcal.studies.tasks import Batch, Done, Key, Sample, Setting
 
 FOLDER = "batches"
 DESCRIPTION = "study.json"

@@ -86,7 +86,7 @@ OF_PAPER: Mapping[str, Varied] = {
 
 
 @dataclass(frozen=True)
-class Subject:
+class StudySubject:
     """What is studied: a design, or [A] 4.3. name : in words. warnings : what to know of it."""
 
     name: str
@@ -107,13 +107,13 @@ class Cell:
     setting: Setting
 
 
-def subject_of(origin: str) -> Subject:
+def subject_of(origin: str) -> StudySubject:
     """A paper's letter, a session's folder, a mechanism file or a built-in machine by its name.
 
     Raises InputError where it is none of these.
     """
     if origin == PAPER:
-        return Subject("the joint calibration of [A] 4.3", HexapodByAxes())
+        return StudySubject("the joint calibration of [A] 4.3", HexapodByAxes())
     path = Path(origin)
     if path.is_dir() or path.name == FILE:
         return _of_session(load_session(path))
@@ -125,10 +125,10 @@ def subject_of(origin: str) -> Subject:
             f" {listed(sorted(catalogue()), 20)}",
         )
     machine = load_mechanism(origin, label=None)
-    return Subject(machine.name, Design(machine, (camera_of_size(SIZE),)))
+    return StudySubject(machine.name, Design(machine, (camera_of_size(SIZE),)))
 
 
-def _of_session(session: Session) -> Subject:
+def _of_session(session: Session) -> StudySubject:
     """A session's machine, cameras, stations and noise, and as many configurations."""
     if not session.stations or any(station.handheld for station in session.stations):
         raise InputError(
@@ -167,10 +167,10 @@ def _of_session(session: Session) -> Subject:
         shared=len(seen) > 1 and all(own == seen[0] for own in seen),
         reading_noise=session.joint_noise,
     )
-    return Subject(f"the session {session.folder}", design, tuple(warnings))
+    return StudySubject(f"the session {session.folder}", design, tuple(warnings))
 
 
-def parsed(subject: Subject, texts: Sequence[str]) -> dict[str, tuple[Value, ...]]:
+def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value, ...]]:
     """``NAME=V1,V2,…`` each; raises InputError for what cannot be varied so."""
     out: dict[str, tuple[Value, ...]] = {}
     for text in texts:
@@ -222,7 +222,7 @@ def _value(name: str, varied: Varied, text: str) -> Value:
     return int(value) if varied.whole else value
 
 
-def cells_of(subject: Subject, varied: Mapping[str, Sequence[Value]]) -> list[Cell]:
+def cells_of(subject: StudySubject, varied: Mapping[str, Sequence[Value]]) -> list[Cell]:
     """Every combination of the values."""
     count = math.prod(map(len, varied.values()))
     if count > MOST_CELLS:

@@ -22,7 +22,7 @@ from contextlib import suppress
 from typing import IO, Any
 
 from pkmcal.errors import ResultError
-from pkmcal.studies.engine import Done, Finished, Task, work
+from pkmcal.studies.tasks import Done, Finished, Job, work
 
 DEATHS = 3
 """Workers that one batch may cost before the study gives up."""
@@ -37,7 +37,7 @@ def cores() -> int:
     return min(os.cpu_count() or 1, len(usable(0))) if usable else os.cpu_count() or 1
 
 
-def on_cores(tasks: Sequence[Task], finished: Finished) -> int:
+def on_cores(tasks: Sequence[Job], finished: Finished) -> int:
     """All tasks, on every core; returns the number of workers.
 
     An interruption ends the other processes, lets this one finish its batch, and keeps it.
@@ -64,7 +64,7 @@ def on_cores(tasks: Sequence[Task], finished: Finished) -> int:
 class _Pool:
     """Tasks that wait, and what has come of the others."""
 
-    def __init__(self, tasks: Sequence[Task], finished: Finished) -> None:
+    def __init__(self, tasks: Sequence[Job], finished: Finished) -> None:
         self.tasks, self.finished = tasks, finished
         self.waiting: queue.SimpleQueue[int] = queue.SimpleQueue()
         for number in range(len(tasks)):
@@ -180,7 +180,7 @@ def _closed(stream: IO[bytes]) -> None:
         stream.close()
 
 
-def _asked(process: subprocess.Popen[bytes], task: Task) -> bytes | None:
+def _asked(process: subprocess.Popen[bytes], task: Job) -> bytes | None:
     """What a process answers to a task; None where it has died."""
     if process.stdin is None or process.stdout is None:
         return None
