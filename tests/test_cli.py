@@ -25,7 +25,7 @@ from pkmcal.session.starter import TO_FILL, template_files
 
 COMMANDS = (
     *("demo", "new", "check", "camera", "calibrate", "validate", "servo", "export", "watch"),
-    *("simulate", "study", "reproduce"),
+    *("plan", "simulate", "study", "reproduce"),
 )
 
 
