@@ -63,8 +63,8 @@ def test_a_noise_that_is_stated_wrong_is_found(true, stated):
     np.testing.assert_array_less(found.scale.edges, 1.1)
     error, least = ((r.solution.state.z - truth.z) ** 2 for r in (found, best))
     assert error.sum() == pytest.approx(least.sum(), rel=0.1)
-    variance = np.einsum("bii->bi", found.info.covariance)[:, : error.shape[1]]
-    assert np.mean(error / variance) == pytest.approx(1, abs=0.25)
+    promised, honest = (np.einsum("bii->bi", r.info.covariance).sum() for r in (found, best))
+    assert promised == pytest.approx(honest, rel=0.1)  # which test_bundle holds against repeats
 
 
 def test_a_noise_that_is_stated_right_is_left_alone():

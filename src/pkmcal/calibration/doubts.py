@@ -422,7 +422,7 @@ def noise_told(session: Session, estimate: Estimate) -> tuple[str, ...]:
             _lengths(session.joint_noise * scale, units) for scale in (s.reading_scale, 1.0)
         )
         out.append(
-            f"The readings scatter by {found}; joints.noise in {file} says {stated}. What they"
+            f"The readings scatter by {'' if s.reading_range[0] else 'no more than some '}{found}; joints.noise in {file} says {stated}. What they"
             f" scatter by was used (the data allow {_between(s.reading_range)} times the stated"
             " noise): correct joints.noise, or look for what moves the machine beside its readings."
         )

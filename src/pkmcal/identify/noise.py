@@ -61,11 +61,14 @@ class Components:
 
     def factor(self, kind: int) -> Array:
         """By what to multiply a kind's noise next, (B,): to where c_k is as expected, or, where no
-        noise would be too much, by how much less it is.
+        noise would be too much, by how much less it is. Where the data allow the present noise and
+        any smaller one it stays: they know no better, and a noise of nothing promises too much.
         """
         square = self._variance(kind, self.chi2[:, kind])
         less = np.minimum(self.chi2 / np.maximum(self.freedom, TINY), 1.0)[:, kind]
-        return np.sqrt(np.clip(np.where(square > less, square, less), STEP**-2, STEP**2))
+        step = np.sqrt(np.clip(np.where(square > less, square, less), STEP**-2, STEP**2))
+        low, high = self.interval(kind)
+        return np.where((low == 0) & (high >= 1), 1.0, step)
 
     def interval(self, kind: int) -> tuple[Array, Array]:
         """Factors on a kind's noise, smallest and largest (B,) each, that the data allow; 0 and
