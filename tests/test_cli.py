@@ -24,8 +24,8 @@ from pkmcal.mechanisms import load_mechanism
 from pkmcal.session.starter import TO_FILL, template_files
 
 COMMANDS = (
-    *("demo", "new", "check", "camera", "calibrate", "validate", "servo", "export", "watch"),
-    *("plan", "simulate", "study", "reproduce"),
+    *("demo", "new", "check", "camera", "plan", "calibrate", "validate", "servo", "export"),
+    *("watch", "simulate", "study", "reproduce"),
 )
 
 
