@@ -421,10 +421,12 @@ def noise_told(session: Session, estimate: Estimate) -> tuple[str, ...]:
         found, stated = (
             _lengths(session.joint_noise * scale, units) for scale in (s.reading_scale, 1.0)
         )
+        bound = "" if s.reading_range[0] else "no more than some "
         out.append(
-            f"The readings scatter by {'' if s.reading_range[0] else 'no more than some '}{found}; joints.noise in {file} says {stated}. What they"
-            f" scatter by was used (the data allow {_between(s.reading_range)} times the stated"
-            " noise): correct joints.noise, or look for what moves the machine beside its readings."
+            f"The readings scatter by {bound}{found}; joints.noise in {file} says {stated}. What"
+            f" they scatter by was used (the data allow {_between(s.reading_range)} times the"
+            " stated noise): correct joints.noise, or look for what moves the machine beside its"
+            " readings."
         )
     only_trackers = session.trackers and not any("board" in x.observe for x in session.stations)
     if only_trackers and s.pose_range[1] is not None and s.pose_range[1] < 1:
