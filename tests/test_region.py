@@ -30,6 +30,7 @@ def test_poses_fill_the_box_evenly():
     poses = poses_in(limits, Region(x=(0.0, 0.5), y=(-0.05, 0.05)), 512)
     low, high = np.array([0.0, -0.05, -0.1]), np.array([0.1, 0.05, 0.1])
     cells = np.floor(4 * (poses[:, :3, 3] - low) / (high - low)).astype(int)
+    cells = np.minimum(cells, 3)  # rods of 1000 m turn, and let it a few micrometres further
     count = np.bincount(cells @ [16, 4, 1], minlength=64)
     assert count.sum() == 512
     assert count.min() >= 4  # of 8; points drawn at random leave some cell with 1 or none

@@ -106,7 +106,7 @@ def within_reach(limits: Limits, region: Region) -> Within:
     low = high = limits.home[:3, 3]
     moves = 0
     if len(free):
-        near, far = spans(limits, limits.home, free)
+        near, far = spans(limits, limits.home, free, ROUGH)
         low, high = low + near @ free, high + far @ free
         moves = int(np.count_nonzero(far - near > FLAT * (far - near).max()))
     for k, (name, side) in enumerate(zip(AXES, region.sides, strict=True)):

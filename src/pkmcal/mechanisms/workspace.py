@@ -177,8 +177,8 @@ class Effort:
 
 
 FINE = Effort()
-ROUGH = Effort(steps=40, halvings=5, newton=6, rounds=1)
-"""For a box about the workspace: a thousandth of the longest way."""
+ROUGH = Effort(steps=40, halvings=14, newton=6, rounds=1)
+"""For a box about the workspace."""
 AHEAD = 8
 """Poses of each way at a time."""
 KEPT = 0.99
@@ -351,12 +351,12 @@ def grid(limits: Limits, middle: Array, directions: Array, count: int) -> Grid:
     return Grid(axes, connected, singular.reshape(shape), size)
 
 
-def spans(limits: Limits, middle: Array, unit: Array) -> tuple[Array, Array]:
+def spans(limits: Limits, middle: Array, unit: Array, effort: Effort = FINE) -> tuple[Array, Array]:
     """How far down and up (k,) along unit vectors (k, 3) straight ways from ``middle`` (4, 4) come,
     along them and between them, and a tenth more, m.
     """
     signs = np.array([s for s in itertools.product((-1, 0, 1), repeat=len(unit)) if any(s)])
-    ways = extents(limits, signs @ unit, middle, effort=ROUGH)
+    ways = extents(limits, signs @ unit, middle, effort=effort)
     far = (ways.poses[:, :3, 3] - middle[:3, 3]) @ unit.T
     return 1.1 * far.min(axis=0), 1.1 * far.max(axis=0)
 
