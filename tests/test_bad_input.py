@@ -280,10 +280,10 @@ def test_no_work_is_spent_before_the_output_is_known_to_be_writable(session, mon
 
 
 def test_a_disk_that_fills_up_leaves_nothing(session, monkeypatch):
-    def full(_self, _text, **_):
+    def full(_self, _content):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("pathlib.Path.write_text", full)
+    monkeypatch.setattr("pathlib.Path.write_bytes", full)
     done = run("calibrate", session)
     assert done.code == 2
     assert "cannot be written (No space left on device)" in done.err

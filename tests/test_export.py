@@ -27,7 +27,7 @@ MACHINES = sorted(catalogue())
 DELTAS = ("delta", "linear-delta")
 HEXAPODS = ("gough-stewart", "6-spu-passive")
 EXPRESSED = {
-    "c": MACHINES,
+    "c": tuple(name for name in MACHINES if name != "four-belt"),
     "json": MACHINES,
     "yaml": MACHINES,
     "reprap": DELTAS,
@@ -36,6 +36,7 @@ EXPRESSED = {
     "ros": (),
 }
 REFUSALS = {
+    "c": "do not just hold its platform",
     "reprap": "RepRapFirmware has settings for linear and rotary deltas",
     "klipper": "Klipper has settings for linear and rotary deltas",
     "linuxcnc": "genhexkins moves six telescopic legs on fixed joints",

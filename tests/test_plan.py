@@ -20,7 +20,7 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.start import start_state
-from pkmcal.identify.tool import pose_by_parameters, without_frames
+from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.planning.exchange import INDICES, exchanged, greedy
@@ -60,11 +60,10 @@ def stated_by(rig, measurements, work):
     if rig.T_mount is not None and len(rig.mounts):
         start = replace(start, T_mount=rig.T_mount)
     estimate = bundle(machine, measurements, start, scale_noise=False)
-    covariance = free_of_gauge(estimate)
-    by = pose_by_parameters(machine, machine.inverse(work), work)
-    by = without_frames(machine, work, by, every=not len(measurements.edges))
-    variance = np.einsum("kap,pq,kaq->ka", by, covariance, by)
-    return np.sqrt(variance[:, 3:].sum(1)).mean(), np.sqrt(variance[:, :3].sum(1)).mean()
+    covariance = free_of_gauge(estimate.machine, estimate.covariance)
+    seen = len(measurements.edges) > 0
+    told = tool_error(machine, estimate.machine, covariance, work, legs_seen=seen)
+    return told.position.mean(), told.orientation.mean()
 
 
 @pytest.mark.parametrize("seen", ["legs", "board", "points", "together"])

@@ -325,7 +325,12 @@ def started(out: Path, *more: str) -> subprocess.Popen[bytes]:
     words = [sys.executable, "-m", "pkmcal", "study", *COMMAND, "-o", str(out), *more]
     quiet = subprocess.DEVNULL
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    return subprocess.Popen(words, stdout=quiet, stderr=quiet, env=environment)
+
+    def heard() -> None:
+        """What a shell started in the background ignores is heard again."""
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    return subprocess.Popen(words, stdout=quiet, stderr=quiet, env=environment, preexec_fn=heard)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no kill -9 here")

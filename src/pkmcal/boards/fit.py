@@ -236,9 +236,8 @@ def fit_poses(
     problem = CameraProblem(
         camera, np.zeros(0, dtype=int), views.points, views.pixels[:, None], scale[:, None]
     )
-    found = minimise(
-        problem, CameraState(np.zeros((len(scale), 0)), T_camera_board[:, None]), max_steps=STEPS
-    )
+    # to the end: where another tilt was followed half-way, nobody knows whether it is another one
+    found = minimise(problem, CameraState(np.zeros((len(scale), 0)), T_camera_board[:, None]))
     return found.state.T_camera_board[:, 0], found.cost
 
 
