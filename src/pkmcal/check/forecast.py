@@ -22,11 +22,10 @@ from pkmcal.identify.covariance import information
 from pkmcal.observe.predict import tubes_of
 from pkmcal.planning.first import EdgesOf, FirstEdges, camera_numbers, first_edges
 from pkmcal.planning.information import tool_by_free
+from pkmcal.planning.plan import CAPTURE
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
 from pkmcal.simulation.placement import PANORAMIC, draw_configurations, view_angle
 
-CAPTURE = 15
-"""Photographs a station of a usual capture."""
 NEAR_END = 0.15
 """Part of a joint's range, at either end, in which a reading is an extreme one."""
 QUARTER = np.pi / 2
@@ -195,7 +194,7 @@ def _told(capture: _Capture) -> _Told:
     rng = np.random.default_rng(SEED)
     measurements = rig.measured(capture.joints, capture.T_base_platform, capture.pairs, rng)
     edges = measurements.edges
-    assembled, at_truth = rig.assembled(measurements, capture.joints, capture.T_base_platform)
+    assembled, at_truth = rig.assembled(measurements, capture.T_base_platform)
     problem = assembled.problem
     info = information(problem, at_truth)
     seen = np.flatnonzero(assembled.seen)

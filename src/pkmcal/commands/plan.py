@@ -33,6 +33,7 @@ FILES = {
     "plan.json": NUMBERS,
 }
 STATIONS = {"stations.yaml": "the places, for session.yaml"}
+FILE = "session.yaml"
 LAST = "calibration"
 """Where calibrate writes, inside a session."""
 
@@ -97,7 +98,7 @@ def plan(
     ] = None,
     edge_noise: Annotated[
         float, typer.Option(metavar="PX", help="Of an edge, where no photograph tells.")
-    ] = 0.05,
+    ] = 0.1,
     corner_noise: Annotated[
         float, typer.Option(metavar="PX", help="Of a board's corner, where no photograph tells.")
     ] = 0.05,
@@ -123,7 +124,7 @@ def plan(
                 "a noise cannot be this", where=name, found=f"{value:g}", expected="more than 0"
             )
     is_session = _is_session(subject)
-    folder = out or (Path(subject) / "plan" if is_session else Path("plan"))
+    folder = out or (_folder_of(subject) / "plan" if is_session else Path("plan"))
     files = {**FILES, **(STATIONS if places or best_of else {})}
     check_own_folder(folder, {**FILES, **STATIONS}, "what plan writes", "an earlier plan")
     with console.progress(as_json) as told, threadpool_limits(1, "blas"):
@@ -132,7 +133,14 @@ def plan(
         if is_session:
             _only_of("a machine", {"--camera": camera, "--board": board, "--tracker": tracker})
             source, region = _of_session(
-                Path(subject), after, from_drawing, same_place, edge_noise, corner_noise, seed
+                Path(subject),
+                after,
+                from_drawing,
+                same_place,
+                places is not None,
+                edge_noise,
+                corner_noise,
+                seed,
             )
         else:
             given = {"--after": after, "--same-place": same_place, "--best-of": best_of}
@@ -171,9 +179,17 @@ def _only_of(owner: str, given: Mapping[str, object]) -> None:
 
 
 def _is_session(subject: str) -> bool:
-    """Whether a subject is a session's folder, or its file."""
+    """Whether a subject is a session's folder, or its file; a built-in machine's name is none."""
+    from pkmcal.mechanisms import catalogue
+
+    folder = _folder_of(subject)
+    return (folder / FILE).is_file() or (folder.is_dir() and subject not in catalogue())
+
+
+def _folder_of(subject: str) -> Path:
+    """A session's folder; its file may be named instead."""
     path = Path(subject)
-    return path.is_dir() or path.name == "session.yaml"
+    return path.parent if path.name == FILE else path
 
 
 def _of_session(
@@ -181,6 +197,7 @@ def _of_session(
     after: Path | None,
     from_drawing: bool,
     same_place: bool,
+    anywhere: bool,
     edge_noise: float,
     corner_noise: float,
     seed: int,
@@ -212,7 +229,13 @@ def _of_session(
             expected="--after CALIBRATION, or a session with its calibration",
         )
     subject = of_session(
-        session, saved, same_place=same_place, edge=edge_noise, corner=corner_noise, seed=seed
+        session,
+        saved,
+        same_place=same_place,
+        anywhere=anywhere,
+        edge=edge_noise,
+        corner=corner_noise,
+        seed=seed,
     )
     return subject, session.workspace
 

@@ -312,10 +312,12 @@ def prior_rows(
 
 
 def _size(machine: Machine) -> float:
-    """How large a machine is, m: its platform's height and its joints' distance from the tool."""
-    lift = machine.home()[:3, 3] - machine.base_centers().mean(axis=0)
-    joints = np.linalg.norm(machine.platform_centers(), axis=-1)
-    return float(np.linalg.norm(lift) + joints.max())
+    """How large a machine is, m: from the platform to the farthest joint on the base, and from the
+    tool to the farthest on the platform.
+    """
+    base = np.linalg.norm(machine.base_centers() - machine.home()[:3, 3], axis=-1)
+    platform = np.linalg.norm(machine.platform_centers(), axis=-1)
+    return float(base.max() + platform.max())
 
 
 def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState:

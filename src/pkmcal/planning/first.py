@@ -84,11 +84,12 @@ class FirstEdges:
     edges: tuple[EdgesOf, ...]
 
 
-def spread_over(configuration: Integers, n_stations: int = 1) -> Integers:
+def spread_over(configuration: Integers, n_stations: int = 1, most: int = FIRST) -> Integers:
     """Numbers of the few of a station's photographs that are measured, of different configurations
-    and spread over all. configuration : (n,) of its photographs.
+    and spread over all. configuration : (n,) of its photographs. most : of each station, and of all
+    together as many times more as MEASURED is of FIRST.
     """
-    most = min(FIRST, -(-MEASURED // n_stations))
+    most = min(most, -(-most * MEASURED // (FIRST * n_stations)))
     first = np.sort(np.unique(configuration, return_index=True)[1])
     return first[np.unique(np.linspace(0, len(first) - 1, min(most, len(first))).astype(int))]
 

@@ -157,7 +157,7 @@ def information_of(
     machine, joints, poses = rig.machine, candidates.joints, candidates.T_base_platform
     measurements = rig.measured(joints, poses, candidates.pairs, rng)
     _check_seen(rig, candidates, measurements)
-    assembled, state = rig.assembled(measurements, joints, poses)
+    assembled, state = rig.assembled(measurements, poses)
     problem = assembled.problem
     way, u = directions(machine, problem), problem.unknowns
     reduced = eliminate(problem.linearize(state), np.zeros(1)).rows[0]

@@ -30,6 +30,8 @@ CAPTURE = 15
 """Configurations from each place, unless told."""
 CANDIDATES = 400
 """Configurations among which is chosen."""
+WIDER = 4
+"""Of these for each one wanted, at least."""
 AT_WORK = 60
 """Poses of the workspace at which the tool counts."""
 BETTERED = 8
@@ -83,8 +85,8 @@ class MeasurementPlan:
     subject : what it is for; with the chosen places where these were free. stations : names that
     measure each configuration, (n,) tuples. names, joints (n, m), T_base_platform (n, 4, 4) : the
     configurations, of which those of ``rank`` up to k are the best k from each place. index : what
-    was made small. value : its value, and at_random : that of
-    configurations drawn evenly over the joints' ranges, mean. now, promised, by_chance : accuracy
+    was made small. value : its value, and at_random : that of configurations drawn evenly over the
+    joints' ranges, mean. now, promised, by_chance : accuracy
     before, with the plan, with such configurations. curve : with fewer and with more. region : the
     workspace. blocked : (n,) True where the straight way to a configuration leaves what the machine
     can take, or its legs touch. travel : how long the slowest motor moves in all, in parts of its
@@ -150,7 +152,7 @@ def plan(
     _check(rig, count, index, free_places, best_of)
     region = region or Region()
     work = poses_in(rig.machine.limits(), region, AT_WORK, seed)
-    drawn = configurations(rig.machine, CANDIDATES, rng)
+    drawn = configurations(rig.machine, max(CANDIDATES, WIDER * count), rng)
     told(0.1)
     tried: tuple[TriedPlace, ...] = ()
     if free_places or best_of:
@@ -175,6 +177,12 @@ def _check(rig: Rig, count: int, index: str, free_places: int | None, best_of: i
     if count < 2:
         raise InputError(
             "a plan needs two configurations or more", where="--configurations", found=str(count)
+        )
+    if rig.machine.layout.n_internal:
+        raise InputError(
+            f"mechanism {rig.machine.name!r} has side bars that turn on hinges, and how far they"
+            " turn is not known where nothing was measured, so no plan is made for it",
+            next_step="Plan for the machine with one rod a forearm, such as h4",
         )
     cameras = [one for one in rig.instruments if isinstance(one, LegsFrom | BoardFrom)]
     if free_places and not cameras:

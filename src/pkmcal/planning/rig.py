@@ -33,11 +33,11 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.predict import tubes_of
 from pkmcal.planning.first import EXACT, SEED, EdgePool, Pools, drawn_edges
-from pkmcal.simulation.edges import hidden, pixel_angle, simulate_edges
+from pkmcal.simulation.edges import EdgeNoise, hidden, pixel_angle, simulate_edges
 
-EDGE = 0.05
+EDGE = EdgeNoise().shift
 """px; how far an edge is off across, and its ends when it turns, before any photograph was looked
-at. On matt and painted legs edges are two to three times better, on polished ones as much worse."""
+at: what shading leaves on painted legs and bare rods. Polished ones are worse."""
 CORNER = 0.05
 """px; the same of a board's corner."""
 FLATTEST = np.cos(np.deg2rad(70))
@@ -249,13 +249,10 @@ class Rig:
         )
 
     def assembled(
-        self, measurements: Measurements, joints: Array, T_base_platform: Array
+        self, measurements: Measurements, T_base_platform: Array
     ) -> tuple[Assembled, BatchState]:
         """The joint estimate's problem of these measurements, at the true state."""
         machine = self.machine
-        internal = np.zeros((0, 0))
-        if machine.layout.n_internal:
-            internal = machine.forward_result(joints, T_base_platform).internal
         assembled = assemble(machine, measurements, default_gauge(machine), shading=self.shading)
         state = State(
             machine.values,
@@ -264,7 +261,6 @@ class Rig:
             np.zeros(measurements.n_cameras),
             T_mount=np.zeros((0, 4, 4)) if self.T_mount is None else self.T_mount,
             on_platform=measurements.on_platform,
-            internal=internal,
         )
         return assembled, batch_of(machine, assembled, state)
 

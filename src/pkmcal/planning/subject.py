@@ -43,6 +43,9 @@ from pkmcal.simulation.board import place_board
 from pkmcal.simulation.placement import default_stations, draw_configurations
 from pkmcal.wording import brief, listed
 
+PHOTOGRAPHS = 12
+"""Of a station, whose edges are measured, and twice as many of all together: a plan is made once,
+and a few edges tell shading badly."""
 READING = 3e-6
 """m or rad; noise of a reading where nobody tells: of a good encoder."""
 BOARD = "board"
@@ -53,14 +56,13 @@ class Subject:
     """What a plan is made for.
 
     rig : what measures. known : what an earlier calibration knows. columns : of joints.csv.
-    measured : how many configurations there are already, and names : how those are called. words :
-    where its numbers come from, in sentences. board : fields of the board's file, if one is seen.
+    names : of the configurations that there are already. words : where its numbers come from, in
+    sentences. board : fields of the board's file, if one is seen.
     """
 
     rig: Rig
     known: Known | None
     columns: tuple[str, ...]
-    measured: int
     names: tuple[str, ...]
     words: tuple[str, ...]
     board: dict[str, Any] | None = None
@@ -95,7 +97,7 @@ def of_machine(
     noise = f"Readings are taken to be good to {_length(joint_noise)}"
     if tracker is not None:
         rig = _tracked(machine, tracker, joint_noise)
-        return Subject(rig, None, tuple(columns), 0, (), (noise + ", as told.",))
+        return Subject(rig, None, tuple(columns), (), (noise + ", as told.",))
     cameras = tuple(cameras)
     stations = default_stations(machine, cameras, rng, "platform" if board else None)
     T_camera_base = np.stack([place.T_camera_base() for place in stations])
@@ -112,7 +114,6 @@ def of_machine(
         rig,
         None,
         tuple(columns),
-        0,
         (),
         (f"{noise}, {what}: an assumption.",),
         board.document if board else None,
@@ -191,6 +192,7 @@ def of_session(
     saved: SavedCalibration | None = None,
     *,
     same_place: bool = False,
+    anywhere: bool = False,
     edge: float = EDGE,
     corner: float = CORNER,
     seed: int = 0,
@@ -198,10 +200,13 @@ def of_session(
     """Of a session: from its drawing, its first photographs, or an earlier calibration.
 
     saved : of this machine; its values, its stations' places and what it knows are used.
-    same_place : whether its cameras still stand where they stood. edge, corner : px, where no
-    photograph tells how good edges and corners are.
+    same_place : whether its cameras still stand where they stood. anywhere : that places of its
+    first camera are to be chosen, so that nobody has to say where any stands. edge, corner : px,
+    where no photograph tells how good edges and corners are.
     Raises InputError where nothing tells where a station stands.
     """
+    if anywhere:
+        session = _one_camera(session)
     by_hand = [station.name for station in session.stations if station.handheld]
     if by_hand:
         raise InputError(
@@ -215,7 +220,7 @@ def of_session(
         session = replace(session, machine=saved.machine)
         words.append(f"The machine, and what is known of it, as calibrated in {saved.path.parent}.")
     seen = _Photographed.of(session, saved, np.random.default_rng(seed))
-    T_camera_base = _places(session, saved, seen)
+    T_camera_base = _places(session, saved, seen, anywhere, seed)
     noise = _Noise(edge, corner)
     instruments: list[Instrument] = []
     mounts: list[Mount] = []
@@ -263,10 +268,23 @@ def of_session(
     )
     known = None if saved is None else _known(saved, session, same_place)
     columns = tuple(session.document["joints"]["columns"])
-    measured = int(saved.used.sum()) if saved is not None else 0
     names = session.configurations
     fields = board.document if board else None
-    return Subject(rig, known, columns, measured, names, tuple(words), fields)
+    return Subject(rig, known, columns, names, tuple(words), fields)
+
+
+def _one_camera(session: Session) -> Session:
+    """The session with its first camera alone, on a tripod; a hand's photographs tell no place."""
+    if not session.stations:
+        raise InputError(
+            "there is no camera whose place could be chosen",
+            where="--places",
+            next_step="Leave it out; where a tracker stands does not change what it tells",
+        )
+    first = session.stations[0]
+    if first.handheld:
+        first = replace(first, handheld=False, T_camera_base=None, photographs=())
+    return replace(session, stations=(first,), trackers=())
 
 
 class _Photographed(NamedTuple):
@@ -299,9 +317,12 @@ def _saved_places(session: Session, saved: SavedCalibration) -> Array | None:
     return np.stack([there[name] for name in session.station_names])
 
 
-def _places(session: Session, saved: SavedCalibration | None, seen: _Photographed) -> Array:
+def _places(
+    session: Session, saved: SavedCalibration | None, seen: _Photographed, anywhere: bool, seed: int
+) -> Array:
     """Where all stations stand, (S, 4, 4), by the first that tells: the calibration, the
-    photographs, a pose by hand; a tracker in the base frame.
+    photographs, a pose by hand; a tracker in the base frame. anywhere : where nothing tells, any
+    usual place serves.
     """
     known = None if saved is None else _saved_places(session, saved)
     if known is None:
@@ -310,6 +331,12 @@ def _places(session: Session, saved: SavedCalibration | None, seen: _Photographe
         return known
     out: list[Array] = []
     for station in session.stations:
+        if station.T_camera_base is None and anywhere:
+            seen_on = "platform" if "legs" not in station.observe else None
+            rng = np.random.default_rng(seed)
+            (place,) = default_stations(session.machine, (station.camera,), rng, seen_on)
+            out.append(place.T_camera_base())
+            continue
         if station.T_camera_base is None:
             raise InputError(
                 f"nothing tells where station {station.name} stands",
@@ -326,19 +353,21 @@ def _edge_noise(
     session: Session, legs: list[int], seen: _Photographed, T_camera_base: Array, edge: float
 ) -> tuple[tuple[Pools, ...], float, str]:
     """What each station's edges tell, the shading, and where that comes from."""
-    try:
-        if len(seen.photographs) == len(legs) and all(len(p.images) for p in seen.photographs):
-            rows = [spread_over(p.configuration, len(legs)) for p in seen.photographs]
+    why = "no photograph tells it yet"
+    if len(seen.photographs) == len(legs):
+        rows = [spread_over(p.configuration, len(legs), PHOTOGRAPHS) for p in seen.photographs]
+        try:
             poses = platform_poses(session)
             first = first_edges(session, seen.photographs, rows, T_camera_base[legs], poses)
+        except (PkmcalError, np.linalg.LinAlgError):
+            # `check` and `calibrate` tell what is wrong with them; here they serve nothing
+            why = "the photographs that there are do not tell it; pkmcal check says why"
+        else:
             count = sum(len(row) for row in rows)
             words = f"How good edges are is told by {count} of the photographs that there are."
             return first.pools, first.estimate.statistics.shading, words
-    except (PkmcalError, np.linalg.LinAlgError):
-        pass  # `check` and `calibrate` tell what is wrong with them; here they serve nothing
     pools = (nominal_pools(session.machine, edge),) * len(legs)
-    words = f"Edges are taken to be good to {edge:g} px: no photograph tells it yet."
-    return pools, SHADING_SIGMA, words
+    return pools, SHADING_SIGMA, f"Edges are taken to be good to {edge:g} px: {why}."
 
 
 def _corner_noise(boards: Boards, corner: float) -> tuple[float, str]:

@@ -26,13 +26,13 @@ from pkmcal.outcome import (
     Table,
     Verdict,
 )
-from pkmcal.planning.plan import PAYS, MeasurementPlan, TriedPlace
+from pkmcal.planning.plan import PAYS, Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
 from pkmcal.report.scene import line, markers, space_layout
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.wording import SCALES, amount, brief, count, listed, number
 
-TABLE, DOCUMENT, PAGE_FILE, PLACES = "plan.csv", "plan.json", "plan.html", "stations.yaml"
+TABLE, PLACES = "plan.csv", "stations.yaml"
 FORMAT = 1
 FINEST = 6
 """Decimals of a reading in metres or radians."""
@@ -77,9 +77,7 @@ def outcome_of(found: MeasurementPlan) -> Outcome:
         verdict=Verdict(
             usable=True,
             headline=f"These {count(len(found.names), 'configuration')} will tell the tool's"
-            f" position to {amount(found.promised.position, 'm')} and its orientation to"
-            f" {amount(found.promised.orientation, 'rad')}, standard deviations, mean over the"
-            " workspace.",
+            f" {_known_to(found.promised)}, standard deviations, mean over the workspace.",
             advice=(_paying(found), *_carefully(found)),
         ),
         stamp="Plan",
@@ -110,6 +108,14 @@ def outcome_of(found: MeasurementPlan) -> Outcome:
         document=document_of(found),
         texts=texts,
     )
+
+
+def _known_to(accuracy: Accuracy) -> str:
+    """Position and orientation; a platform that does not turn has no orientation to be known."""
+    words = f"position to {amount(accuracy.position, 'm')}"
+    if not accuracy.orientation:
+        return words
+    return f"{words} and its orientation to {amount(accuracy.orientation, 'rad')}"
 
 
 def _asked(found: MeasurementPlan) -> str:
@@ -234,18 +240,19 @@ def _curve(found: MeasurementPlan) -> Part:
         height=340,
     )
     wanted = {3, 5, 8, 10, 15, 20, 30, 50}
+    turns = here.orientation > 0
     few = [a for a in found.curve if a.count in wanted or a.count >= here.count]
     rows = [
         Row(
             f"{a.count:g}",
-            (amount(a.position, "m"), amount(a.orientation, "rad")),
+            (amount(a.position, "m"), *([amount(a.orientation, "rad")] if turns else [])),
             mark="good" if a.count == here.count else None,
         )
         for a in few
     ]
     table = Table(
         "What so many from each place tell",
-        ("Configurations", "position", "orientation"),
+        ("Configurations", "position", *(["orientation"] if turns else [])),
         tuple(rows),
         "Standard deviations of the tool, mean over the workspace. Fewer: those of the lowest"
         " ranks. More: these again, as often.",
@@ -447,7 +454,7 @@ def document_of(found: MeasurementPlan) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def _told(accuracy: Any) -> dict[str, float]:
+def _told(accuracy: Accuracy) -> dict[str, float]:
     return {
         "configurations": accuracy.count,
         "position": accuracy.position,
