@@ -39,19 +39,35 @@ MOSTLY = 0.5
 """Part of an edge that has to be free for it to be expected: its place is fitted to as much."""
 EXACT = EdgeNoise(1e-3, 1e-3)
 """px; errors of edges that are simulated for where they lie, and how they turn by a pixel."""
+SAME_LENGTH = 0.01
+"""Part of its length by which an edge may differ, and be as long: where all are."""
 SEED = 7
 
 
 class EdgePool(NamedTuple):
-    """What one edge may tell: informations (n, 2, 2), px^-2 of shift and tilt, and chances (n,)."""
+    """What one edge may tell: informations (n, 2, 2), px^-2 of shift and tilt, weights (n,), and
+    lengths (n,) in px of the edges that told it.
+    """
 
     told: Array
-    chance: Array
+    weight: Array
+    length: Array
 
-    @property
-    def mean(self) -> Array:
-        """What it tells on average, (2, 2)."""
-        return np.einsum("n,nij->ij", self.chance, self.told)
+    def chances(self, length: Array) -> Array:
+        """(m, n) chance of each, for edges of m lengths in px.
+
+        Long edges are found more often and tell more: those of about the same length count most,
+        by a Gaussian of the width that serves the density of the lengths best (Scott's rule).
+        """
+        at = np.log(self.length)
+        mean = np.average(at, weights=self.weight)
+        spread = np.sqrt(np.average((at - mean) ** 2, weights=self.weight))
+        effective = self.weight.sum() ** 2 / np.sum(self.weight**2)
+        width = max(spread * effective**-0.2, SAME_LENGTH)
+        far = ((np.log(length)[:, None] - at) / width) ** 2 / 2
+        # beyond the longest and the shortest it is these that are asked
+        chance = self.weight * np.exp(far.min(axis=1, keepdims=True) - far)
+        return chance / chance.sum(axis=1, keepdims=True)
 
 
 Pools = tuple[EdgePool, ...]
@@ -196,7 +212,9 @@ def _told(
     told = np.zeros((*shape, 2, 2))  # lost edges stay zero
     told[place(edges)] = own.mT @ (np.linalg.inv(edges.covariance) * weight[:, None, None]) @ own
     kind = np.stack([tubes.tube, tubes.side], axis=1)
-    pools = tuple(_pools(told[s], expected[s], kind) for s in range(len(few)))
+    long = np.ones(shape)
+    long[place(ideal)] = pixel_lengths(ideal)
+    pools = tuple(_pools(told[s], long[s], expected[s], kind) for s in range(len(few)))
     sigma = np.full((len(few), n_legs), np.nan)
     pixel = np.linalg.norm(edges.shift, axis=-1)
     across = np.sqrt(edges.covariance[:, 0, 0]) / pixel * estimate.statistics.noise_scale
@@ -210,19 +228,27 @@ def _told(
     return FirstEdges(estimate, pools, sigma, by_station)
 
 
-def _pools(told: Array, expected: Booleans, kind: Integers) -> Pools:
+def _pools(told: Array, length: Array, expected: Booleans, kind: Integers) -> Pools:
     """What edges of a station may tell, by edge (E,): its tube's own, and that of all of its kind.
 
-    told : (K, E, 2, 2), zero where lost; expected : (K, E). kind : (E, 2) tube and side. Edges
-    differ: a mean would promise more than edges of which some tell much and others nothing.
+    told : (K, E, 2, 2), zero where lost; length : (K, E), px; expected : (K, E). kind : (E, 2) tube
+    and side. Edges differ: a mean would promise more than edges of which some tell much and others
+    nothing.
     """
     out: list[EdgePool] = []
     for e in range(told.shape[1]):
         alike = np.all(kind == kind[e], axis=1)
-        own = told[expected[:, e], e]
-        like = told[:, alike][expected[:, alike]]
-        chance = np.concatenate([np.ones(len(own)), np.full(len(like), OWN / max(len(like), 1))])
-        out.append(EdgePool(np.concatenate([own, like]), chance / max(chance.sum(), 1.0)))
+        mine, like = expected[:, e], expected[:, alike]
+        weight = np.concatenate(
+            [np.ones(mine.sum()), np.full(like.sum(), OWN / max(like.sum(), 1))]
+        )
+        out.append(
+            EdgePool(
+                np.concatenate([told[mine, e], told[:, alike][like]]),
+                weight,
+                np.concatenate([length[mine, e], length[:, alike][like]]),
+            )
+        )
     return tuple(out)
 
 
@@ -233,18 +259,20 @@ def drawn_edges(
     that tell nothing go. Without ``rng`` each tells what such an edge does on average.
     """
     tubes = tubes_of(machine)
-    own = np.zeros((len(edges), 2, 2))
+    own, length = np.zeros((len(edges), 2, 2)), pixel_lengths(edges)
     for e in range(len(tubes)):
         alike = (edges.leg == tubes.leg[e]) & (edges.tube == tubes.tube[e])
         alike &= edges.side == tubes.side[e]
         for s, station in enumerate(pools):
             mine, pool = np.flatnonzero(alike & (edges.station == s)), station[e]
-            if not len(pool.told):
+            if not len(pool.told) or not mine.size:
                 continue
+            chance = pool.chances(length[mine])
             if rng is None:
-                own[mine] = pool.mean
+                own[mine] = np.tensordot(chance, pool.told, axes=1)
             else:
-                own[mine] = pool.told[rng.choice(len(pool.told), len(mine), p=pool.chance)]
+                drawn = rng.random((len(mine), 1)) > np.cumsum(chance, axis=1)
+                own[mine] = pool.told[np.minimum(drawn.sum(axis=1), len(pool.told) - 1)]
     told = np.linalg.eigvalsh(own)[:, 0] > 0
     edges, own = edges.select(told), own[told]
     unit = pixel_turns(edges)
@@ -257,3 +285,8 @@ def pixel_turns(edges: EdgeSet) -> Array:
     The Cholesky factor of their covariance: their bases have the shift first.
     """
     return np.linalg.cholesky(edges.covariance) / EXACT.shift
+
+
+def pixel_lengths(edges: EdgeSet) -> Array:
+    """Lengths (N,) in px of simulated edges, by how little they turn when an end moves by one."""
+    return 2 / np.linalg.norm(pixel_turns(edges)[:, :, 1], axis=1)

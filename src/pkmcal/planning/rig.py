@@ -73,7 +73,7 @@ class Instrument(Protocol):
 
 def nominal_pools(machine: Machine, sigma: float = EDGE) -> Pools:
     """Edges that are all found, sigma (px) off across and as much by turning."""
-    one = EdgePool(np.eye(2)[None] / sigma**2, np.ones(1))
+    one = EdgePool(np.eye(2)[None] / sigma**2, np.ones(1), np.ones(1))
     return (one,) * len(tubes_of(machine))
 
 
