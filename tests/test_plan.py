@@ -127,7 +127,8 @@ def toy(seed=0, n=14, p=3):
     known = np.eye(p + 2) * 0.1
     known[:p, :p] += np.eye(p) * 0.9
     machine = np.eye(p, p + 2)
-    return CandidateRows(rows, np.zeros(n, int), known, machine, rng.normal(size=(5, 6, p)))
+    where = np.arange(n, dtype=float)[:, None]
+    return CandidateRows(rows, np.zeros(n, int), where, known, machine, rng.normal(size=(5, 6, p)))
 
 
 @pytest.mark.parametrize("name", list(INDICES))
@@ -143,6 +144,19 @@ def test_exchange_comes_near_the_best_of_all_subsets(name, seed):
     value = float(index.value(info.covariance(info.of(found))))
     # exchanges one by one end in one of the best two hundredths of 1001 subsets
     assert np.sum(np.array(every) < value - 1e-12) < 20
+
+
+def test_no_configuration_is_measured_twice():
+    info = toy(3)
+    rows = np.repeat(info.rows[:7], 2, axis=0)
+    rows[0:2] *= 50.0  # by far the best, and the same twice
+    where = np.repeat(np.arange(7.0), 2)[:, None] + np.tile([0.0, 0.05], 7)[:, None]
+    info = replace(info, rows=rows, where=where)
+    index = INDICES["D"](info)
+    chosen = greedy(info, 5, index).chosen
+    for found in (chosen, exchanged(info, chosen, index)):
+        assert len(set(found // 2)) == 5
+        assert 0 in found // 2
 
 
 @pytest.mark.parametrize("name", list(INDICES))

@@ -22,13 +22,18 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Integers
 from pkmcal.planning.information import CandidateRows
 
 TRIED = 24
 """Candidates that are tried exactly; the others are farther by what the index' slope promises."""
 PASSES = 12
 """Rounds of exchanges; they end before, as a rule after three."""
+SAME = 0.1
+"""Part of its range by which some motor's reading differs at least between two configurations that
+one group measures. A photograph taken twice shows the same shading before the same background: its
+errors are the same, however often it is counted.
+"""
 GAIN = 1e-6
 """Relative gain below which an exchange is rounding."""
 UNSEEN = 1e-6
@@ -162,12 +167,10 @@ def greedy(info: CandidateRows, count: int, index: Index, told: Told | None = No
     Each group has ``count`` candidates or more. told : called with the share done.
     """
     work, groups = _Work(info, index), int(info.group.max()) + 1
-    free = np.ones(len(info.group), dtype=bool)
     chosen, path = list[int](), list[Array]()
     work.begin([])
     for k in range(count * groups):
-        best = work.best(k % groups, free)
-        free[best] = False
+        best = work.best(k % groups, chosen)
         work.add(best, 1.0)
         chosen.append(best)
         path.append(work.machine)
@@ -179,16 +182,12 @@ def greedy(info: CandidateRows, count: int, index: Index, told: Told | None = No
 def exchanged(info: CandidateRows, chosen: Integers, index: Index) -> Integers:
     """A choice (n,) bettered: each is put back for the best of its group, until none gains."""
     work, now = _Work(info, index), [int(c) for c in chosen]
-    free = np.ones(len(info.group), dtype=bool)
-    free[now] = False
     work.begin(now)
     value = float(index.value(work.machine))
     for _ in range(PASSES):
         for k, old in enumerate(now):
             work.add(old, -1.0)
-            free[old] = True
-            now[k] = work.best(int(info.group[old]), free)
-            free[now[k]] = False
+            now[k] = work.best(int(info.group[old]), now[:k] + now[k + 1 :])
             work.add(now[k], 1.0)
         work.begin(now)  # without the rounding of so many steps
         before, value = value, float(index.value(work.machine))
@@ -206,7 +205,7 @@ class _Work:
         diagonal = np.diag(info.known) + np.einsum("nri,nri->i", info.rows, info.rows)
         self._unit = np.sqrt(diagonal)
         self._rows = info.rows / self._unit
-        self._group = info.group
+        self._group, self._where = info.group, info.where
         self._known = info.known / np.outer(self._unit, self._unit)
         self._way = info.machine / self._unit
         self._index = index
@@ -231,15 +230,23 @@ class _Work:
         inner = np.eye(len(rows)) + sign * across @ rows.T
         self._covariance = self._covariance - sign * across.T @ np.linalg.solve(inner, across)
 
-    def best(self, group: int, free: Booleans) -> int:
-        """The free candidate of a group whose coming makes the index smallest."""
+    def best(self, group: int, taken: list[int]) -> int:
+        """The candidate of a group, none of those taken nor the same as one of them, whose coming
+        makes the index smallest.
+        """
         now = self.machine
         to_slope = self._covariance @ (self._way.T @ self._index.slope(now))
         begin, end = np.searchsorted(self._group, [group, group + 1])
+        own = np.array([t for t in taken if begin <= t < end], dtype=int)
+        free = np.ones(end - begin, dtype=bool)
+        free[own - begin] = False
+        apart = np.abs(self._where[begin:end, None] - self._where[own]).max(axis=-1)
+        new = free & (apart >= SAME).all(axis=1)
+        free = new if new.any() else free
         rows = self._rows[begin:end]  # a view: copies of all would cost more than the sums
         first = (rows.reshape(-1, rows.shape[-1]) @ to_slope).reshape(len(rows), -1)
-        gain = np.where(free[begin:end], np.einsum("nk,nk->n", first, first), -1.0)
-        top = np.argsort(-gain, kind="stable")[: min(TRIED, int(free[begin:end].sum()))]
+        gain = np.where(free, np.einsum("nk,nk->n", first, first), -1.0)
+        top = np.argsort(-gain, kind="stable")[: min(TRIED, int(free.sum()))]
         rows = rows[top]
         across = rows @ self._covariance
         inner = np.eye(rows.shape[1]) + across @ rows.mT

@@ -32,6 +32,7 @@ from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.planning.rig import LegsFrom, Rig, all_pairs
+from pkmcal.planning.route import spans
 from pkmcal.solver import eliminate
 from pkmcal.wording import listed
 
@@ -103,21 +104,23 @@ class CandidateRows:
     """Rows of all candidates, and what they are for.
 
     rows : (n, r, na) on the shared unknowns in their own units. group : (n,) in increasing order,
-    which group of stations measures each. known : (na, na) information
-    beforehand, with the drawing's. machine : (p, na) the machine's directions, of which the drawing
-    alone knows each to one. work : (M, 6, p) turn and shift of the platform at M poses of the
-    workspace by each direction, rad and m.
+    which group of stations measures each. where : (n, m) its readings, in parts of the motors'
+    ranges. known : (na, na) information beforehand, with the drawing's. machine : (p, na) the
+    machine's directions, of which the drawing alone knows each to one. work : (M, 6, p) turn and
+    shift of the platform at M poses of the workspace by each direction, rad and m.
     """
 
     rows: Array
     group: Integers
+    where: Array
     known: Array
     machine: Array
     work: Array
 
     def only(self, chosen: Integers) -> CandidateRows:
         """Of some candidates."""
-        return replace(self, rows=self.rows[chosen], group=self.group[chosen])
+        parts = self.rows[chosen], self.group[chosen], self.where[chosen]
+        return replace(self, rows=parts[0], group=parts[1], where=parts[2])
 
     def of(self, chosen: Integers, times: float = 1.0) -> Array:
         """(na, na) information of a choice of candidates, each measured ``times`` over."""
@@ -177,6 +180,7 @@ def information_of(
     return CandidateRows(
         rows=rows,
         group=candidates.group,
+        where=joints / spans(joints, machine.joint_ranges),
         known=total,
         machine=directed,
         work=tool_by_free(rig, problem, machine.inverse(work), work) @ way.to_z,

@@ -443,11 +443,11 @@ def _with_places(
         alone[s] = first.tool(after)[0]
     roots = np.stack([_padded_root(told[s]) for s in range(len(told))])
     same = np.zeros(len(roots), dtype=int)
-    whole = CandidateRows(roots, same, start, np.eye(len(start)), first.work)
+    number = np.arange(len(roots), dtype=float)[:, None]  # no two places are the same
+    whole = CandidateRows(roots, same, number, start, np.eye(len(start)), first.work)
     rule = INDICES[index](whole)
-    number = free_places or best_of or 1
-    best = exchanged(whole, greedy(whole, number, rule).chosen, rule)
-    best = np.sort(best)
+    wanted = free_places or best_of or 1
+    best = np.sort(exchanged(whole, greedy(whole, wanted, rule).chosen, rule))
     tried = tuple(
         TriedPlace(place, float(alone[k]), bool(k in best)) for k, place in enumerate(spots)
     )

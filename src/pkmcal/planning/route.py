@@ -15,12 +15,17 @@ LONGEST = 3
 
 def distances(joints: Array, ranges: Array) -> Array:
     """(n, n) how long the slowest motor needs from each of the readings (n, m) to each, in parts of
-    its range (m, 2), or of what the readings span where the file gives none.
+    its range (m, 2).
     """
-    span = ranges[:, 1] - ranges[:, 0]
-    own = np.ptp(joints, axis=0)
-    span = np.where(np.isfinite(span) & (span > 0), span, np.where(own > 0, own, 1.0))
-    return np.abs((joints[:, None] - joints) / span).max(axis=-1)
+    return np.abs((joints[:, None] - joints) / spans(joints, ranges)).max(axis=-1)
+
+
+def spans(joints: Array, ranges: Array) -> Array:
+    """(m,) lengths of the motors' ranges (m, 2), or of what the readings (n, m) span where the file
+    gives none.
+    """
+    span, own = ranges[:, 1] - ranges[:, 0], np.ptp(joints, axis=0)
+    return np.where(np.isfinite(span) & (span > 0), span, np.where(own > 0, own, 1.0))
 
 
 def shortest_way(
