@@ -16,7 +16,6 @@ from conftest import run
 from pkmcal.calibration.results import load
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
-from pkmcal.geometry.rigid import inverse
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.start import start_state
@@ -387,13 +386,13 @@ def test_the_promise_is_kept_by_photographs(seed, tmp_path):
     few, whole = tmp_path / "few", tmp_path / "whole"
     size = ["--size", "640x480", "--seed", str(seed)]
     assert run("simulate", str(few), "--configurations", "4", *size).code == 0
-    assert run("plan", str(few), "-n", "6").code == 0
-    made = run("simulate", str(whole), "--plan", str(few / "plan"), "--seed", str(seed + 50))
+    assert run("plan", str(few), "-n", "8").code == 0
+    # by the same seed it is the same machine in the same room, its cameras set up once more
+    made = run("simulate", str(whole), "--plan", str(few / "plan"), "--seed", str(seed))
     assert made.code == 0, made.err
     out = tmp_path / "out"
     assert run("calibrate", str(whole), "-o", str(out)).code == 0
     saved, told = load(out), json.loads((few / "plan" / "plan.json").read_text())
     work = poses_in(saved.machine.limits(), Region(), AT_WORK, 0)
     stated = float(saved.tool_error(work).position.mean())
-    assert told["promised"]["position"] == pytest.approx(stated, rel=0.25)
-    assert inverse(work).shape == work.shape
+    assert told["promised"]["position"] == pytest.approx(stated, rel=0.15)

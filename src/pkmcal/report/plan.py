@@ -50,9 +50,10 @@ HOW = (
     " Stations, edge shifts, shading and boards stay unknown, so what is promised is what calibrate"
     " then states, as far as the photographs turn out as good as assumed.",
     "Configurations are taken greedily, then each is exchanged for the best of all others until"
-    " nothing gains (Fedorov), then moved by a part of the motors' ranges and exchanged again. They"
-    " are within the joints' ranges, in home's assembly, away from singular poses, with legs clear"
-    " of each other; what lies outside the picture or behind a leg tells nothing.",
+    " nothing gains (Fedorov), then moved by a part of the motors' ranges and exchanged again. Two"
+    " of a place differ by a tenth of some motor's range at least: a photograph taken twice errs by"
+    " the same. They are within the joints' ranges, in home's assembly, away from singular poses,"
+    " with legs clear of each other; what lies outside the picture or behind a leg tells nothing.",
 )
 
 
