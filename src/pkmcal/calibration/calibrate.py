@@ -13,6 +13,7 @@ from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.byhand import misplaced, place_by_hand, without_misplaced
+from pkmcal.calibration.departures import Departed, departures
 from pkmcal.calibration.doubts import (
     as_stated,
     check_poses,
@@ -57,7 +58,7 @@ class Calibration:
     boards : the calibration board, where stations observe one. findings : what the data tell of
     the machine and what they leave open. timings : seconds by step. holdout : configurations that
     the estimate did not see, where that was asked for; :func:`pkmcal.judge.holdouts.holdout_of`
-    tells what it predicts of them.
+    tells what it predicts of them. departures : what the data show that the model does not have.
     """
 
     session: Session
@@ -72,6 +73,7 @@ class Calibration:
     boards: Boards = field(default_factory=Boards)
     findings: Findings | None = None
     holdout: LeftOut | None = None
+    departures: tuple[Departed, ...] = ()
 
     @property
     def machine(self) -> Machine:
@@ -236,6 +238,10 @@ def _judge(
         ]
         session = replace(session, stations=tuple(refined))
     findings = _findings(found.turns.measurements, found.estimate)
+    departed: tuple[Departed, ...] = ()
+    if method == "bundle":  # the papers' methods end at no minimum of the joint problem
+        turns = found.turns
+        departed = departures(session, turns.observation, turns.measurements, found.estimate)
     verdict = judge(
         found.turns.observation,
         found.estimate,
@@ -243,8 +249,15 @@ def _judge(
         findings=findings,
         richer=found.richer,
         held_out=len(found.out.region.rows) if found.out else 0,
-        doubts=scale_doubt(session, found.estimate) + noise_doubt(session, found.estimate),
-        cautions=noise_told(session, found.estimate),
+        doubts=(
+            *scale_doubt(session, found.estimate),
+            *noise_doubt(session, found.estimate),
+            *(one.sentence for one in departed if one.against),
+        ),
+        cautions=(
+            *(one.sentence for one in departed if not one.against),
+            *noise_told(session, found.estimate, bool(departed)),
+        ),
     )
     clock.lap("identify")
     return Calibration(
@@ -260,6 +273,7 @@ def _judge(
         boards=seen.boards,
         findings=findings,
         holdout=found.out,
+        departures=departed,
     )
 
 

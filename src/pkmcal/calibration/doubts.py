@@ -413,8 +413,11 @@ def scale_doubt(session: Session, estimate: Estimate) -> tuple[str, ...]:
     )
 
 
-def noise_told(session: Session, estimate: Estimate) -> tuple[str, ...]:
-    """Sentences where the data do not allow a noise that session.yaml states."""
+def noise_told(session: Session, estimate: Estimate, departed: bool = False) -> tuple[str, ...]:
+    """Sentences where the data do not allow a noise that session.yaml states.
+
+    departed : whether something was found that makes readings scatter.
+    """
     s, out = estimate.statistics, list[str]()
     units, file = set(session.machine.joint_units), "session.yaml"
     if s.reading_scale != 1 and not _within(1.0, s.reading_range):
@@ -425,8 +428,12 @@ def noise_told(session: Session, estimate: Estimate) -> tuple[str, ...]:
         out.append(
             f"The readings scatter by {bound}{found}; joints.noise in {file} says {stated}. What"
             f" they scatter by was used (the data allow {_between(s.reading_range)} times the"
-            " stated noise): correct joints.noise, or look for what moves the machine beside its"
-            " readings."
+            " stated noise): "
+            + (
+                "what is named before may be all that they scatter by."
+                if departed
+                else "correct joints.noise, or look for what moves the machine beside its readings."
+            )
         )
     only_trackers = session.trackers and not any("board" in x.observe for x in session.stations)
     if only_trackers and s.pose_range[1] is not None and s.pose_range[1] < 1:

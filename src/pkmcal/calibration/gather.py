@@ -8,6 +8,7 @@ unknown of its own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -23,6 +24,7 @@ from pkmcal.measurements import (
     EdgeSet,
     Measurements,
     Mount,
+    Observation,
     PoseSet,
     concatenate,
 )
@@ -110,6 +112,29 @@ def focal_part(camera: Camera) -> Array:
     """
     focal = [name.startswith("focal.") for name in camera.parameter_names]
     return np.where(focal, camera.parameters, 0.0)
+
+
+def edges_by_camera(observation: Observation, cameras: Sequence[Camera]) -> Array:
+    """Turns (N, 2, n) of the measured normals by their camera's parameters, their pixels held.
+
+    cameras : (S,) of the stations that have one, which come first; n of the widest. A plane that
+    holds the rays r has ``r . n = 0``; as rays turn by dr, ``r . dn = -n . dr``, least squares over
+    the pixels that support an edge.
+    """
+    edges, at = observation.edges, observation.point_edge
+    widest = max((len(camera.parameters) for camera in cameras), default=0)
+    ray, turn = np.zeros((len(at), 3)), np.zeros((len(at), 3, widest))
+    for station, camera in enumerate(cameras):
+        mine = edges.station[at] == station
+        ray[mine] = camera.ray(observation.points[mine])
+        turn[mine, :, : len(camera.parameters)] = camera.ray_jacobians(observation.points[mine])[1]
+    good = np.isfinite(ray).all(axis=1) & np.isfinite(turn).all(axis=(1, 2))
+    rows = np.einsum("ni,nij->nj", ray[good], edges.basis[at[good]])
+    value = -np.einsum("nip,ni->np", turn[good], edges.normal[at[good]])
+    normal, right = np.zeros((len(edges), 2, 2)), np.zeros((len(edges), 2, widest))
+    np.add.at(normal, at[good], rows[:, :, None] * rows[:, None])
+    np.add.at(right, at[good], rows[:, :, None] * value[:, None])
+    return np.linalg.pinv(normal, hermitian=True) @ right
 
 
 def refinement_of(session: Session, refine: bool) -> CameraRefinement:
@@ -212,10 +237,20 @@ Set = TypeVar("Set", PoseSet, EdgeSet)
 
 def _breathing(measured: Set, cameras: CameraRefinement) -> Set:
     """What was measured, with what the excess of each photograph's focal lengths does to it."""
-    widest = measured.by_intrinsics.shape[-1]
-    focal = np.zeros((len(cameras.of_station), widest))
-    for k in np.flatnonzero(cameras.breathes):
-        part = focal_part(cameras.camera(cameras.of_station[k]))
-        focal[k, : len(part)] = part[:widest]
-    by_focal = (measured.by_intrinsics @ focal[measured.station][..., None])[..., 0]
-    return replace(measured, by_focal=by_focal)
+    each = [
+        cameras.camera(file) if breathes else None
+        for file, breathes in zip(cameras.of_station, cameras.breathes, strict=True)
+    ]
+    return replace(measured, by_focal=by_focal(measured.by_intrinsics, measured.station, each))
+
+
+def by_focal(by: Array, station: Integers, cameras: Sequence[Camera | None]) -> Array:
+    """What focal lengths that grow by their own size do, (N, d), where measurements answer to their
+    camera's parameters by ``by`` (N, d, n). station : (N,); of those without a camera nothing.
+    """
+    focal = np.zeros((int(station.max(initial=-1)) + 1, by.shape[-1]))
+    for k, camera in enumerate(cameras[: len(focal)]):
+        if camera is not None and by.shape[-1]:
+            part = focal_part(camera)
+            focal[k, : len(part)] = part
+    return (by @ focal[station][..., None])[..., 0]

@@ -171,6 +171,7 @@ def document_of(
         "rejected": _rejected(calibration),
         "mechanism": estimate.machine.to_document(),
         "session": {"folder": session.folder.resolve().name, **session.document},
+        "departures": [one.document() for one in calibration.departures],
         "warnings": session.warnings,
         "versions": versions(),
         "timings": {name: round(value, 3) for name, value in calibration.timings.items()},

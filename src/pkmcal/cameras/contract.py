@@ -11,9 +11,10 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
@@ -50,6 +51,18 @@ class CameraSchema(Schema):
                 "which is millimetres divided by the size of a pixel in mm"
             )
         return focal
+
+
+class LensDeparture(NamedTuple):
+    """How a camera may be another than its file says, by k numbers.
+
+    columns : (n, k) change of its parameters by them. says : what to say of them, (k,), and of
+    their standard deviations.
+    """
+
+    kind: str
+    columns: Array
+    says: Callable[[Array, Array], str]
 
 
 @dataclass(frozen=True)
@@ -123,6 +136,40 @@ class Camera(ABC):
         k = np.zeros(len(cls.parameter_names) - 4 - len(own))
         k[: len(document.distortion)] = document.distortion
         return cls(document.image_size, np.concatenate([document.focal, document.center, own, k]))
+
+    def departures(self) -> tuple[LensDeparture, ...]:
+        """What is wrong first, where anything is: focus, the picture cut otherwise, a lens whose
+        distortion was left out.
+        """
+        eye, lens = np.eye(len(self.parameters)), 4 + len(self.own)
+        focal = np.where(np.arange(len(self.parameters)) < 2, self.parameters, 0.0)
+        name, before = self.parameter_names[lens], float(self.parameters[lens])
+        return (
+            LensDeparture(
+                "focal length",
+                focal[:, None],
+                lambda v, s: (
+                    f"focal lengths fit that are {abs(v[0]):.2%} ± {s[0]:.2%}"
+                    f" {'longer' if v[0] > 0 else 'shorter'}"
+                ),
+            ),
+            LensDeparture(
+                "picture centre",
+                eye[:, 2:4],
+                lambda v, s: (
+                    f"a centre fits that is {v[0]:+.1f} ± {s[0]:.1f} px in x and"
+                    f" {v[1]:+.1f} ± {s[1]:.1f} px in y beside its own"
+                ),
+            ),
+            LensDeparture(
+                "distortion",
+                eye[:, lens : lens + 1],
+                lambda v, s: (
+                    f"a distortion {name} of {before + v[0]:.3g} ± {s[0]:.2g} fits, not of"
+                    f" {before:.3g}"
+                ),
+            ),
+        )
 
     def document(self) -> dict[str, Any]:
         """The fields of a camera file, the inverse of :meth:`from_document`."""

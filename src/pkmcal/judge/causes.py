@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.calibration.gather import by_focal, edges_by_camera
 from pkmcal.cameras import Camera
 from pkmcal.identify.gauge import centre_index
 from pkmcal.judge.held import MOVED, RATIO, Evidence
@@ -23,8 +24,6 @@ from pkmcal.wording import split_name
 
 Side = Literal["base", "platform"]
 SIDES: tuple[Side, Side] = ("base", "platform")
-
-FOCAL = ("focal.x", "focal.y")
 
 
 @dataclass(frozen=True)
@@ -190,53 +189,13 @@ def magnified(
     """
     number = np.asarray(measurements.camera_of_station)
     n_cameras = int(number.max(initial=-1)) + 1
-    poses = measurements.poses
+    edges, poses = measurements.edges, measurements.poses
+    by_edges = by_focal(edges_by_camera(observation, cameras), edges.station, cameras)
+    by_poses = by_focal(poses.by_intrinsics, poses.station, cameras)
     return replace(
         measurements,
-        edges=replace(
-            measurements.edges, by_intrinsics=_edges_magnified(observation, cameras)[..., None]
-        ),
-        poses=replace(poses, by_intrinsics=_poses_magnified(measurements, cameras)[..., None]),
+        edges=replace(edges, by_intrinsics=by_edges[..., None]),
+        poses=replace(poses, by_intrinsics=by_poses[..., None]),
         intrinsics_factor=np.ones((n_cameras, 1, 1)),
         intrinsics_at=np.zeros((n_cameras, 1)),
     )
-
-
-def _focal(camera: Camera) -> Array:
-    """Change (n,) of the parameters when the focal lengths grow by their own size."""
-    focal = np.isin(np.array(camera.parameter_names), FOCAL)
-    return np.where(focal, camera.parameters, 0.0)
-
-
-def _edges_magnified(observation: Observation, cameras: Sequence[Camera]) -> Array:
-    """Turns (N, 2) of the measured normals, their pixels held, by the relative excess.
-
-    A plane that holds the rays r has ``r . n = 0``; as rays turn by dr, ``r . dn = -n . dr``, least
-    squares over an edge's points.
-    """
-    edges, at = observation.edges, observation.point_edge
-    ray, turn = np.zeros((2, len(at), 3))
-    for station, camera in enumerate(cameras):
-        mine = edges.station[at] == station
-        ray[mine] = camera.ray(observation.points[mine])
-        by = camera.ray_jacobians(observation.points[mine])[1]
-        turn[mine] = by @ _focal(camera)
-    good = np.isfinite(ray + turn).all(axis=1)
-    rows = np.einsum("ni,nij->nj", ray[good], edges.basis[at[good]])
-    value = -np.einsum("ni,ni->n", turn[good], edges.normal[at[good]])
-    normal, right = np.zeros((len(edges), 2, 2)), np.zeros((len(edges), 2))
-    np.add.at(normal, at[good], rows[:, :, None] * rows[:, None])
-    np.add.at(right, at[good], rows * value[:, None])
-    return (np.linalg.pinv(normal, hermitian=True) @ right[..., None])[..., 0]
-
-
-def _poses_magnified(measurements: Measurements, cameras: Sequence[Camera]) -> Array:
-    """Changes (N, 6) of the boards' poses, corners held, by the relative excess; a tracker's 0."""
-    poses = measurements.poses
-    out = np.zeros((len(poses), 6))
-    if not poses.by_intrinsics.shape[-1]:
-        return out
-    for station, camera in enumerate(cameras):
-        mine, focal = poses.station == station, _focal(camera)
-        out[mine] = poses.by_intrinsics[mine, :, : len(focal)] @ focal
-    return out

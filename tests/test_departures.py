@@ -1,0 +1,271 @@
+"""What a session takes for granted and is not so is named, with its size, and nothing else."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from conftest import run
+from pkmcal import calibrate
+from pkmcal.boards.poses import pose_set
+from pkmcal.calibration.departures import FEWEST, LEVEL
+from pkmcal.calibration.gather import edges_by_camera
+from pkmcal.calibration.results import load
+from pkmcal.geometry.rigid import perturb
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.score import Departures, columns_of
+from pkmcal.identify.start import start_state
+from pkmcal.measurements import EdgeSet, Measurements, Mount, concatenate
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.planning.subject import of_machine
+from pkmcal.simulation import simulate_edges
+from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.edges import EdgeNoise
+from pkmcal.simulation.placement import draw_configurations
+
+NOISE = EdgeNoise(0.1, 0.1)
+
+
+def measured(seed, *, scale=None, turned=None, play=None, machine=None, count=30):
+    """A hexapod's edges and readings, from one place, with a departure."""
+    rng = np.random.default_rng(seed)
+    drawing = machine or load_mechanism("gough-stewart")
+    table = drawing.parameters
+    true = drawing.with_values(
+        table.drawing + table.free_matrix() @ (table.tolerances_free() * rng.standard_normal(
+            table.free_matrix().shape[1]))
+    )  # fmt: skip
+    camera = camera_of_size((1280, 960))
+    rig = of_machine(drawing, [camera, camera], drawing.joint_names, seed=seed).rig
+    poses, _ = draw_configurations(true, count, 0.5, rng)
+    poses = poses[:count]
+    pairs = np.array([(s, k) for s in (0, 1) for k in range(count)])
+    where = rig.T_station_base
+    sets = []
+    for part in (pairs[:, 1] < count // 2, pairs[:, 1] >= count // 2):
+        T = where.copy()
+        if turned is not None and part[-1]:
+            T[0] = perturb(T[0], turned)
+        edges, joints = simulate_edges(true, T, camera, poses, NOISE, rng, photographs=pairs[part])
+        sets.append(edges)
+    if scale:
+        joints[:, scale[0]] /= 1 + scale[1]
+    if play:
+        way = np.sign(np.diff(joints[:, play[0]], prepend=joints[0, play[0]]))
+        joints[:, play[0]] -= play[1] / 2 * way
+    data = Measurements(concatenate(sets), joints, 3e-6, 2, np.zeros(2, dtype=int))
+    return drawing, data, where
+
+
+def score_tests(drawing, data, where, readings, moved):
+    """Score tests of an estimate of the data: by changes of the readings (K, m, 1), and of the
+    first camera's place from the middle on.
+    """
+    estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
+    assembled = assemble(estimate.machine, data, default_gauge(drawing))
+    state = batch_of(estimate.machine, assembled, estimate.state)
+    problem = assembled.problem
+    columns = [columns_of(problem, state, readings=by) for by in readings]
+    if moved:
+        begin = problem.unknowns.stations.start
+        by = problem.linearize(state).by_shared[0, :, :, begin : begin + 6]
+        later = np.arange(len(by)) >= len(by) // 2
+        columns.append(np.where(later[:, None, None], by, 0.0))
+    return estimate, Departures(problem, state, columns)
+
+
+def scales(data):
+    eye = np.eye(data.joints.shape[1])
+    return [(data.joints * one)[..., None] for one in eye]
+
+
+def plays(data):
+    way = np.sign(np.diff(data.joints, axis=0, prepend=data.joints[:1])) / 2
+    return [(way * one)[..., None] for one in np.eye(data.joints.shape[1])]
+
+
+def test_the_scale_that_fits_is_found_and_its_gain_is_that_of_another_estimate():
+    drawing, data, where = measured(1, scale=(2, 2e-3))
+    estimate, tests = score_tests(drawing, data, where, scales(data), False)
+    found = tests.found(LEVEL)
+    assert found[0][0] == 2
+    fit = tests.fitted([2])[0]
+    assert abs(fit.value[0] - 2e-3) < 4 * fit.sigma[0]
+    assert fit.sigma[0] < 1e-3
+    # an independent oracle: the readings put right by as much, and everything estimated again
+    joints = data.joints.copy()
+    joints[:, 2] *= 1 + fit.value[0]
+    again = bundle(
+        drawing, replace(data, joints=joints), start_state(drawing, data, where), scale_noise=False
+    )
+    gain = estimate.statistics.chi2 - again.statistics.chi2
+    assert gain == pytest.approx(tests.scores()[2].chi2, rel=0.05)
+    moved = again.machine.values - estimate.machine.values
+    offsets = drawing.parameters.of_kind("offset")
+    np.testing.assert_allclose(moved[offsets], fit.moved[offsets], atol=0.1 * np.abs(moved).max())
+
+
+def test_play_and_a_pushed_camera_are_told_from_each_other():
+    drawing, data, where = measured(2, play=(4, 4e-4))
+    _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
+    assert [k for k, _ in tests.found(LEVEL)] == [6 + 4]
+    assert tests.fitted([10])[0].value[0] == pytest.approx(4e-4, rel=0.2)
+    step = np.array([0.0, 0.0, 0.0, 6e-4, -5e-4, 4e-4])
+    drawing, data, where = measured(3, turned=step)
+    _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
+    assert [k for k, _ in tests.found(LEVEL)] == [12]
+    fit = tests.fitted([12])[0]
+    off = fit.value - step
+    assert np.all(np.abs(off) < 4 * fit.sigma + 0.05 * np.abs(step))
+
+
+def test_two_departures_are_found_one_after_the_other():
+    drawing, data, where = measured(4, scale=(0, 4e-3), play=(3, 5e-4))
+    _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
+    assert {k for k, _ in tests.found(LEVEL)} == {0, 6 + 3}
+    one, other = tests.fitted([0, 9])
+    assert one.value[0] == pytest.approx(4e-3, rel=0.3)
+    assert other.value[0] == pytest.approx(5e-4, rel=0.3)
+
+
+def false_alarms(seeds):
+    chances = []
+    for seed in seeds:
+        drawing, data, where = measured(seed, count=16)
+        _, tests = score_tests(drawing, data, where, scales(data) + plays(data), True)
+        chances.append([score.chance for score in tests.scores()])
+    return np.array(chances)
+
+
+def test_right_sessions_have_chances_like_dice():
+    chances = false_alarms(range(100, 112))
+    assert chances.min() > LEVEL / chances.shape[1] / 10
+    assert abs(chances.mean() - 0.5) < 4 * 0.289 / np.sqrt(chances.size / 2)
+
+
+@pytest.mark.slow
+def test_right_sessions_have_chances_like_dice_often():
+    chances = false_alarms(range(500))
+    count = chances.shape[1]
+    alarms = np.mean(chances.min(axis=1) < LEVEL / count)
+    assert alarms < 0.015
+    assert abs(np.mean(chances < 0.1) - 0.1) < 0.02
+
+
+def test_what_no_data_see_is_not_tested():
+    drawing, data, where = measured(5, count=12)
+    nothing = np.zeros((*data.joints.shape, 1))
+    # off by the same everywhere is its offset, an unknown of which the drawing alone says more
+    offset = nothing.copy()
+    offset[:, 1] = 1.0
+    _, tests = score_tests(drawing, data, where, [nothing, offset], False)
+    assert [score.dof for score in tests.scores()] == [0, 1]
+    assert tests.found(LEVEL) == []
+    none, some = tests.fitted([0, 1])
+    assert none.sigma[0] == np.inf
+    offsets = np.flatnonzero(drawing.parameters.of_kind("offset"))
+    assert some.sigma[0] > drawing.parameters.tolerance[offsets[1]]
+
+
+def test_boards_of_another_size_show_where_readings_give_the_scale():
+    machine = load_mechanism("delta")
+    rng = np.random.default_rng(3)
+    poses, _ = draw_configurations(machine, 24, 0.5, rng)
+    poses = poses[:24]
+    camera = np.array([[1, 0, 0, 0.05], [0, -1, 0, 0.02], [0, 0, -1, 0.9], [0, 0, 0, 1.0]])
+    seen = perturb(camera @ poses, 2e-5 * rng.standard_normal((24, 6)))
+    seen[:, :3, 3] *= 1 / 1.004
+    covariance = np.tile(np.eye(6) * 4e-10, (24, 1, 1))
+    boards = pose_set(0, np.arange(24), 0, seen, covariance)
+    joints = machine.inverse(poses)
+    mounts = (Mount("board", "platform"),)
+    data = Measurements(
+        EdgeSet.empty(), joints, 1e-5, 1, np.zeros(1, dtype=int), poses=boards, mounts=mounts
+    )
+    start = replace(start_state(machine, data, camera[None]), T_mount=np.eye(4)[None])
+    estimate = bundle(machine, data, start, scale_noise=False)
+    assembled = assemble(estimate.machine, data, default_gauge(machine))
+    state = batch_of(estimate.machine, assembled, estimate.state)
+    by = np.zeros((24, 6, 1))
+    by[:, 3:, 0] = seen[:, :3, 3]
+    columns = columns_of(assembled.problem, state, poses=assembled.places.poses.filled(by))
+    tests = Departures(assembled.problem, state, [columns])
+    fit = tests.fitted([0])[0]
+    assert abs(fit.value[0] - 0.004) < 4 * fit.sigma[0] + 2e-4
+
+
+# ------------------------------------------------------------------ on photographs
+
+
+def scaled_readings(folder, column, factor):
+    path = folder / "joints.csv"
+    head, *rows = list(csv.reader(path.read_text().splitlines()))
+    for row in rows:
+        row[column] = repr(float(row[column]) * factor)
+    path.write_text("\n".join(",".join(row) for row in [head, *rows]) + "\n")
+
+
+def test_an_encoder_of_another_scale_is_named_and_the_result_refused(session, tmp_path):
+    scaled_readings(session, 4, 1 / 1.02)
+    out = tmp_path / "out"
+    result = run("calibrate", str(session), "-o", str(out))
+    told = " ".join((result.out + result.err).split())
+    assert result.code == 1
+    assert "The readings of leg4 have another scale" in told
+    assert "Multiply this column of joints.csv by 1.0" in told
+    (found,) = load(out).document["departures"]
+    assert found["kind"] == "reading scale"
+    assert found["value"][0] == pytest.approx(0.02, rel=0.25)
+    assert found["moves_tool_in_sigmas"] > 1
+
+
+def test_another_camera_is_named(session):
+    path = session / "cameras" / "camera.yaml"
+    document = yaml.safe_load(path.read_text())
+    document["focal"] = [1.03 * f for f in document["focal"]]
+    path.write_text(yaml.safe_dump(document))
+    found = calibrate(session)
+    (one,) = found.departures
+    assert (one.kind, one.of) == ("focal length", "cameras/camera.yaml")
+    assert one.value[0] == pytest.approx(-0.03, rel=0.3)
+    assert "--refine-camera" in one.sentence
+    told = (*found.verdict.reasons, *found.verdict.warnings)
+    assert one.sentence in told
+
+
+def test_a_right_session_names_nothing(calibrated):
+    assert calibrated.departures == ()
+    assert len(calibrated.session.stations[0].photographs) < 2 * FEWEST
+
+
+def test_edges_answer_to_their_cameras_parameters(calibrated):
+    """Against finite differences: the plane through an edge's pixels, by another camera."""
+    observation = calibrated.observation
+    cameras = [station.camera for station in calibrated.session.stations]
+    by = edges_by_camera(observation, cameras)
+    step = 1e-4 * np.array([100, 100, 100, 100, 1, 1, 1, 1, 1])
+    for p in (0, 3, 4):
+        moved = []
+        for sign in (1, -1):
+            change = sign * step[p] * np.eye(9)[p]
+            other = [replace(c, parameters=c.parameters + change) for c in cameras]
+            moved.append([plane(observation, other, k) for k in (0, 50, 200)])
+        for row, ahead, behind in zip((0, 50, 200), *moved, strict=True):
+            turn = observation.edges.basis[row].T @ (ahead - behind) / (2 * step[p])
+            np.testing.assert_allclose(
+                by[row, :, p], turn, rtol=0.02, atol=2e-2 * np.abs(turn).max()
+            )
+
+
+def plane(observation, cameras, k):
+    """Normal of the plane through the rays of an edge's pixels."""
+    pixels = observation.points[observation.point_edge == k]
+    rays = cameras[observation.edges.station[k]].ray(pixels)
+    normal = np.linalg.svd(rays)[2][-1]
+    return normal * np.sign(normal @ observation.edges.normal[k])
