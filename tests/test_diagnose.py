@@ -143,6 +143,20 @@ def test_two_photographs_exchanged_beside_two_of_one_configuration():
     )
 
 
+def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely():
+    """Of the right one the machine is a little less sure, as with many photographs it may be."""
+    rng = np.random.default_rng(0)
+    wrong = looked_for(rng, pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(True))
+    right = looked_for(rng, pictures(), by_hand=given(True))
+    stations = [
+        station._replace(name=name, found=replace(station.found, by_chance=by_chance))
+        for station, name, by_chance in [(right, "side", 1e-5), (wrong, "front", 1e-6)]
+    ]
+    error = mistake(stations, rng)
+    assert "photographs of front bear each other's names" in str(error)
+    assert "images/front/e.png fits configuration e" in str(error)
+
+
 @pytest.mark.parametrize("by_hand", [True, also(False)])
 def test_mirrored_photographs(by_hand):
     """A hexapod with its legs numbered backwards is its own mirror image: both are said."""

@@ -91,8 +91,12 @@ def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError
     # one station that is where the user says shows that its readings are in order
     in_order = any(s.by_hand is not None and not s.elsewhere for s in stations)
     error = _mixed_up(worst, in_order, rng)
-    if error is not None or not bad:
+    if error is not None:
         return error
+    if not bad:  # readings are wrong for all stations, but names for one alone
+        rest = (station for station in stations if station is not worst)
+        errors = (_likelier(s, list(_other_photographs(s)), True, rng) for s in rest)
+        return next((error for error in errors if error is not None), None)
     others = [station.name for station in bad if station is not worst]
     return InputError(
         f"the machine is not recognised in the photographs of {worst.name}"
@@ -158,7 +162,17 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
         if evidence > own or station.elsewhere:
             likely.append((evidence, other))
     best = sorted(likely, key=lambda item: -item[0])[:SEARCHED]
-    searched = [(find_station(h.view, station.by_hand, rng), h) for _, h in best]
+    return _likelier(station, [other for _, other in best], in_order, rng)
+
+
+def _likelier(
+    station: SeenStation, others: list[Hypothesis], in_order: bool, rng: np.random.Generator
+) -> InputError | None:
+    """The likeliest of hypotheses, searched in full, that explain a station better than the
+    session, if any; with it those that it does not exclude.
+    """
+    view, found = station.view, station.found
+    searched = [(find_station(h.view, station.by_hand, rng), h) for h in others]
     places = np.stack([found.T_camera_base, *(f.T_camera_base for f, _ in searched)])
     named = evidence_from(view, places)
     odds = [(evidence_from(h.view, places) - named) / found.grain for _, h in searched]
