@@ -13,10 +13,10 @@ from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import StationView, find_station
 from pkmcal.observe.tables import distance_tables
-from test_observe_drawing import camera_of, machine, photographs, poses, redrawn
+from test_observe_drawing import camera_of, draw, machine, photographs, poses, redrawn, tubes_at
 from test_observe_search import clouds, rough_pose
 
-NAMES = tuple("abcdef")
+NAMES = tuple("abcdefg")
 
 
 def pictures():
@@ -37,7 +37,7 @@ def looked_for(rng, pictures, readings=None, configuration=None, mechanism=None,
         mechanism,
         camera_of(),
         tubes_of(mechanism),
-        np.arange(6) if configuration is None else np.asarray(configuration),
+        np.arange(len(pictures)) if configuration is None else np.asarray(configuration),
         readings,
         mechanism.forward_result(readings).T_base_platform,
         distance_tables(pictures),
@@ -47,6 +47,14 @@ def looked_for(rng, pictures, readings=None, configuration=None, mechanism=None,
         found = max(found, find_station(view, None, rng), key=lambda f: (f.good, f.evidence))
     files = [f"images/front/{name}.png" for name in NAMES]
     return SeenStation("front", files, NAMES, view, by_hand, found)
+
+
+def b_again():
+    """The pictures and readings of a to f, and of a seventh that is b once more but for noise."""
+    picture, _ = draw(tubes_at(machine(), poses()[1]), seed=6)
+    readings = machine().inverse(np.concatenate([poses(), poses()[1:2]]))
+    readings += 3e-6 * np.random.default_rng(0).normal(size=readings.shape)
+    return [*pictures(), picture], readings
 
 
 def readings_with(order):
@@ -112,6 +120,40 @@ def test_two_photographs_exchanged(by_hand):
     error = said(pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(by_hand))
     assert "photographs of front bear each other's names" in str(error)
     assert "images/front/b.png fits configuration b" in str(error)
+    assert "images/front/e.png fits configuration e" in str(error)
+
+
+def test_photographs_of_one_configuration_are_not_taken_for_exchanged():
+    """Though another search ends where photographs fit better: as it does, under any names."""
+    rng = np.random.default_rng(1)
+    images, readings = b_again()
+    station = looked_for(rng, images, readings, by_hand=given(True))
+    short = station.found.evidence - 50 * station.found.grain
+    station = station._replace(found=replace(station.found, evidence=short))
+    assert mistake([station], rng) is None
+
+
+def test_two_photographs_exchanged_beside_two_of_one_configuration():
+    images, readings = b_again()
+    order = [0, 1, 3, 2, 4, 5, 6]
+    error = said(images, readings, configuration=order, by_hand=given(True))
+    assert error is not None
+    assert error.found == (
+        "images/front/c.png fits configuration c; images/front/d.png fits configuration d"
+    )
+
+
+def test_two_photographs_exchanged_at_the_station_that_is_recognised_most_surely():
+    """Of the right one the machine is a little less sure, as with many photographs it may be."""
+    rng = np.random.default_rng(0)
+    wrong = looked_for(rng, pictures(), configuration=[0, 4, 2, 3, 1, 5], by_hand=given(True))
+    right = looked_for(rng, pictures(), by_hand=given(True))
+    stations = [
+        station._replace(name=name, found=replace(station.found, by_chance=by_chance))
+        for station, name, by_chance in [(right, "side", 1e-5), (wrong, "front", 1e-6)]
+    ]
+    error = mistake(stations, rng)
+    assert "photographs of front bear each other's names" in str(error)
     assert "images/front/e.png fits configuration e" in str(error)
 
 

@@ -24,6 +24,7 @@ from pkmcal.observe.stations import (
     FoundStation,
     StationView,
     evidence_by_name,
+    evidence_from,
     evidence_nearby,
     find_station,
     settled,
@@ -71,10 +72,13 @@ class SeenStation(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """What the photographs may show instead, and the error that names it."""
+    """What the photographs may show instead, the error that names it, and the logarithm of how many
+    of its kind it was chosen from.
+    """
 
     view: StationView
     error: InputError
+    log_choices: float = 0.0
 
 
 def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError | None:
@@ -87,8 +91,12 @@ def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError
     # one station that is where the user says shows that its readings are in order
     in_order = any(s.by_hand is not None and not s.elsewhere for s in stations)
     error = _mixed_up(worst, in_order, rng)
-    if error is not None or not bad:
+    if error is not None:
         return error
+    if not bad:  # readings are wrong for all stations, but names for one alone
+        rest = (station for station in stations if station is not worst)
+        errors = (_likelier(s, list(_other_photographs(s)), True, rng) for s in rest)
+        return next((error for error in errors if error is not None), None)
     others = [station.name for station in bad if station is not worst]
     return InputError(
         f"the machine is not recognised in the photographs of {worst.name}"
@@ -154,13 +162,30 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
         if evidence > own or station.elsewhere:
             likely.append((evidence, other))
     best = sorted(likely, key=lambda item: -item[0])[:SEARCHED]
-    searched = [(find_station(h.view, station.by_hand, rng), h) for _, h in best]
-    better = [(f, h) for f, h in searched if _replaces(f, station, in_order)]
+    return _likelier(station, [other for _, other in best], in_order, rng)
+
+
+def _likelier(
+    station: SeenStation, others: list[Hypothesis], in_order: bool, rng: np.random.Generator
+) -> InputError | None:
+    """The likeliest of hypotheses, searched in full, that explain a station better than the
+    session, if any; with it those that it does not exclude.
+    """
+    view, found = station.view, station.found
+    searched = [(find_station(h.view, station.by_hand, rng), h) for h in others]
+    places = np.stack([found.T_camera_base, *(f.T_camera_base for f, _ in searched)])
+    named = evidence_from(view, places)
+    odds = [(evidence_from(h.view, places) - named) / found.grain for _, h in searched]
+    better = [
+        (o, h)
+        for o, (f, h) in zip(odds, searched, strict=True)
+        if _replaces(f, o - h.log_choices, station, in_order)
+    ]
     if not better:
         return None
-    better.sort(key=lambda item: -item[0].evidence)
+    better.sort(key=lambda item: -item[0])
     first, error = better[0][0], better[0][1].error
-    also = [h.error.what for other, h in better[1:] if first.likelier(other) < DECIDED]
+    also = [h.error.what for o, h in better[1:] if first - o < DECIDED]
     if station.elsewhere and found.good:
         also.append("the pose by hand is of another side of the machine")
     if not also:
@@ -169,16 +194,16 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
     return InputError(error.what, where=error.where, found=said, next_step=error.next_step)
 
 
-def _replaces(found: FoundStation, station: SeenStation, in_order: bool) -> bool:
-    """Whether a hypothesis explains a station better than its own readings. Where these put the
-    camera elsewhere than the user, and no other station shows that they are in order, to be
-    recognised where the user says is enough.
+def _replaces(found: FoundStation, odds: float, station: SeenStation, in_order: bool) -> bool:
+    """Whether a hypothesis, found there, explains a station better than its own readings, by log
+    odds against these. Where they put the camera elsewhere than the user, and no other station
+    shows that they are in order, to be recognised where the user says is enough.
     """
     if not found.good or station._replace(found=found).elsewhere:
         return False
     if station.elsewhere and station.found.good and not in_order:
         return True
-    return found.likelier(station.found) > DECIDED
+    return odds > DECIDED
 
 
 def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
@@ -224,16 +249,21 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
     if not 2 < len(names) == len(np.unique(names)):
         return
     columns = np.arange(len(names))
+    # any name could be on each photograph, and the fewest that bear wrong ones are two; without
+    # this, photographs of configurations that are alike would change names for nothing
+    choices = math.log(len(names))
+    keeps = np.eye(len(names)) * station.found.grain * (DECIDED / 2 + choices)
     for _ in range(ASSIGNED):  # the wrong names have moved the pose, and it the names
         fits = evidence_by_name(replace(view, configuration=names[columns]), T_camera_base, names)
-        before, columns = columns, linear_sum_assignment(-fits)[1]
+        before, columns = columns, linear_sum_assignment(-(fits + keeps))[1]
         if np.array_equal(before, columns):
             break
         T_camera_base = settled(replace(view, configuration=names[columns]), T_camera_base)
     moved = np.flatnonzero(columns != np.arange(len(names)))
     if 0 < len(moved) <= len(names) // 2:
         right = replace(view, configuration=names[columns])
-        yield Hypothesis(right, _misnamed(station, moved, names[columns[moved]]))
+        error = _misnamed(station, moved, names[columns[moved]])
+        yield Hypothesis(right, error, len(moved) * choices)
 
 
 def _two_legs(a: int, b: int) -> InputError:

@@ -464,6 +464,17 @@ def settled(view: StationView, T_camera_base: Array) -> Array:
     return settle(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0]
 
 
+def evidence_from(view: StationView, places: Array) -> float:
+    """The most evidence, of all photographs, to which any of the places (H, 4, 4) settles.
+
+    Searches end up to fifty measurements apart, whatever they look for; so explanations of the same
+    photographs are compared from the same places.
+    """
+    every = view.few(len(view.configuration))
+    places = settle(view, places, every, 8, 8)
+    return float(evidence_of(view, places, every, 8).sum(axis=-1).max())
+
+
 def evidence_nearby(
     view: StationView, starts: Array, wide: bool, rng: np.random.Generator
 ) -> float:
