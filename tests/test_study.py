@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import re
 import signal
@@ -18,6 +19,7 @@ import pytest
 from conftest import run
 from pkmcal.errors import InputError, ResultError
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.report.study import document_of, runs_bytes
 from pkmcal.studies import cluster, engine, tasks, workers
 from pkmcal.studies.calibrations import (
     ESTIMATE,
@@ -28,8 +30,9 @@ from pkmcal.studies.calibrations import (
 )
 from pkmcal.studies.capture import captured
 from pkmcal.studies.estimates import Fitted
-from pkmcal.studies.findings import clustered, study
+from pkmcal.studies.findings import SweepResult, clustered, study
 from pkmcal.studies.paper_a_joint import JointByAxes
+from pkmcal.studies.statistics import Summary
 from pkmcal.studies.store import Store
 from pkmcal.studies.sweep import cells_of, parsed, scaled, subject_of
 from pkmcal.studies.tasks import Batch, Job, Population, Sample
@@ -244,6 +247,55 @@ def test_standard_errors_know_of_batches():
     batch = np.repeat(np.arange(25), 8)
     errors = [clustered(np.repeat(row, 8), batch).error for row in means]
     assert np.mean(np.square(errors)) == pytest.approx(1 / 25, rel=0.05)
+
+
+def test_calibrations_that_all_fail_are_told(tmp_path, alone):
+    """A thousand times the noise of [A] Table 1: no calibration can be used, and that is said."""
+    done = run("study", "a", "--vary", "axis_noise=1,1000", "--runs", 4, "-o", tmp_path)
+    assert done.code == 1, done.err
+    assert "Too few calibrations of some combinations can be used" in done.out
+    assert "axis noise 1000: 100 % of the calibrations fail" in done.out
+    assert "nan" not in done.out
+    told = json.loads((tmp_path / "study.json").read_text())
+    good, bad = told["combinations"]
+    assert good["deviations_hold"] is True
+    assert bad["deviations_hold"] is None
+    assert bad["position"] == {"value": None, "standard_error": None}
+    assert told["gains"] == []
+
+
+def test_one_run_tells_no_standard_error():
+    one = clustered(np.array([0.3]), np.array([5]))
+    assert one.value == 0.3
+    assert np.isnan(one.error)
+
+
+def test_parameters_keep_their_names_where_legs_and_boards_are_compared(alone):
+    """With legs the tubes' radii are parameters as well, between the others."""
+    found = study("h4", ["observe=board,legs", "stations=1", "configurations=6"], runs=2)
+    told = [cell["covered_by_parameter"] for cell in document_of(found)["combinations"]]
+    for names, cell in zip(told, found.cells, strict=True):
+        assert list(names) == [name for name, _ in cell.setting.parameters]
+    radius = "legs[1].tubes[1].radius"
+    assert radius in told[1]
+    assert radius not in told[0]
+
+
+def test_what_chance_does_is_no_gain():
+    """Three values that do not matter, each told from two batches of runs: one study in twenty may
+    call the largest difference a gain, and two standard errors would do so in half of them."""
+    rng = np.random.default_rng(4)
+    cell = study("a", (), runs=2).found[0]
+    calls = 0
+    for means in rng.normal(1.0, 0.1, (400, 3, 2)):
+        cells = tuple(
+            replace(cell, values={"legs": k}, freedom=1,
+                    position=Summary(pair.mean(), abs(np.diff(pair)[0]) / 2))
+            for k, pair in zip((3, 4, 5), means, strict=True)
+        )  # fmt: skip
+        subject = subject_of("a")
+        calls += SweepResult(subject, {"legs": (3, 4, 5)}, (), (), cells, 20, 0).gains[0].sure
+    assert calls <= 0.05 * 400
 
 
 # ------------------------------------------------------------------ the command
@@ -484,7 +536,5 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, alone):
                      out=tmp_path / "cluster", progress=told)  # fmt: skip
     assert killed
     one = study("a", ["configurations=5"], runs=600)
-    from pkmcal.report.study import document_of, runs_bytes
-
     assert runs_bytes(many, "study.csv") == runs_bytes(one, "study.csv")
     assert str(document_of(many)) == str(document_of(one))

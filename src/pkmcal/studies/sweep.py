@@ -107,6 +107,14 @@ class Cell:
     setting: Setting
 
 
+def in_words(values: Mapping[str, Value]) -> str:
+    """A combination in words, such as "stations 2, edge noise 0.1"; empty where nothing varies."""
+    return ", ".join(
+        f"{name.replace('_', ' ')} {value if isinstance(value, str) else f'{value:g}'}"
+        for name, value in values.items()
+    )
+
+
 def subject_of(origin: str) -> StudySubject:
     """A paper's letter, a session's folder, a mechanism file or a built-in machine by its name.
 
