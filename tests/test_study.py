@@ -491,15 +491,51 @@ def test_what_is_kept_is_what_was_done(tmp_path):
     setting = Counting()
     task = Job(setting, batch_of(setting, 5))
     done = tasks.work(task)
-    store = Store.opened(tmp_path, "counting", [], 0)
-    store.save(0, 0, done)
-    found = store.load(0, 0, task.batch)
-    assert found.wall == done.wall
-    np.testing.assert_array_equal(
-        found.samples[ESTIMATE].values["x"], done.samples[ESTIMATE].values["x"]
-    )
-    assert store.load(0, 1, task.batch) is None
-    assert store.load(0, 0, replace(task.batch, runs=4)) is None
+    with Store.opened(tmp_path, "counting", [], 0) as store:
+        store.save(0, 0, done)
+        found = store.load(0, 0, task.batch)
+        assert found.wall == done.wall
+        np.testing.assert_array_equal(
+            found.samples[ESTIMATE].values["x"], done.samples[ESTIMATE].values["x"]
+        )
+        assert store.load(0, 1, task.batch) is None
+        assert store.load(0, 0, replace(task.batch, runs=4)) is None
+
+
+def test_two_studies_do_not_work_in_one_folder_at_once(tmp_path, alone):
+    """Neither another one nor the same again; once the first has ended, its command goes on."""
+    first = started(tmp_path)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("batches/*.npz")):
+        assert first.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    for words in (COMMAND, ("a", "--runs", "4")):
+        done = run("study", *words, "-o", tmp_path)
+        assert done.code == 2
+        assert "another study works in this folder. Wait until it has ended" in done.err
+    assert first.poll() is None
+    first.kill()
+    first.wait()
+    with pytest.raises(InputError, match="the batches of another study"):
+        study("a", (), runs=4, out=tmp_path)
+    settings = [cell.setting for cell in cells_of(subject_of("a"), {"configurations": (5, 6)})]
+    with Store.opened(tmp_path, "the same", settings, 0) as store:
+        assert store.load(0, 0, batch_of(settings[0], 1000)) is not None
+
+
+def test_an_impossible_combination_is_named_before_the_others_are_done(tmp_path, alone):
+    vary = [SMALL[1], "stations=1", "focal=900", "distance=2,0.1"]
+    with pytest.raises(InputError, match=r"distance 0.1: a camera does not see the machine"):
+        study("3-rpr", vary, runs=200, out=tmp_path)
+    assert len(list(tmp_path.glob("batches/*.npz"))) == 1
+
+
+def test_a_folder_where_nothing_was_finished_is_free(tmp_path, alone):
+    """After a combination that nobody can photograph, the command is mended, and runs."""
+    with pytest.raises(InputError, match=r"does not see the machine"):
+        study("3-rpr", ["focal=900", "distance=0.1"], runs=2, out=tmp_path)
+    assert study("3-rpr", ["stations=1", SMALL[1]], runs=2, out=tmp_path).runs == 2
 
 
 # ------------------------------------------------------------------ a cluster
@@ -517,6 +553,37 @@ def test_a_scheduler_that_does_not_answer_is_told(monkeypatch):
     monkeypatch.setattr(cluster, "TIMEOUT", 1)
     with pytest.raises(InputError, match=r"no Dask scheduler answers.*127.0.0.1:1"):
         study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
+
+
+@pytest.mark.parametrize("address", ["", "nonsense", "host:port", "ftp://10.0.0.1:21", "tcp://:1"])
+def test_what_is_no_address_is_told_at_once(address):
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match=r"no address of a Dask scheduler.*tcp://10.0.0.1:8786"):
+        study("a", (), runs=4, scheduler=address)
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_scheduler_that_goes_away_is_told(tmp_path):
+    """What was finished by then is kept."""
+    distributed, dask = (pytest.importorskip(name) for name in ("distributed", "dask"))
+    local = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None,
+        protocol="tcp",
+    )  # fmt: skip
+    with (
+        local,
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+        pytest.raises(ResultError, match="the scheduler of the cluster is gone"),
+    ):
+        study(
+            "a",
+            ["configurations=5"],
+            runs=2000,
+            scheduler=local.scheduler_address,
+            out=tmp_path,
+            progress=lambda _text, share: share > 0.1 and local.close(),
+        )
+    assert list(tmp_path.glob("batches/*.npz"))
 
 
 @pytest.mark.filterwarnings("default")

@@ -8,6 +8,7 @@ failed are counted, and left out of all else.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +22,16 @@ from pkmcal.studies.cluster import on_cluster
 from pkmcal.studies.engine import StudyResult, Told, batches, run_all
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.store import Store
-from pkmcal.studies.sweep import Cell, Setting, StudySubject, Value, cells_of, parsed, subject_of
+from pkmcal.studies.sweep import (
+    Cell,
+    Setting,
+    StudySubject,
+    Value,
+    cells_of,
+    in_words,
+    parsed,
+    subject_of,
+)
 from pkmcal.studies.tasks import Runner
 
 PROMISE = 0.95
@@ -168,20 +178,23 @@ def study(
     values by name, every combination of which is tried. runs : simulated calibrations of each. out
     : a folder in which finished batches are kept, and from which a study goes on. scheduler : the
     address of a Dask cluster. progress : called with what is done and the share of it.
-    Raises InputError for what cannot be studied, and where ``out`` holds another study.
+    Raises InputError for what cannot be studied, where ``out`` holds another study, and while
+    another process works there.
     """
     if isinstance(vary, Mapping):
         vary = [f"{name}={','.join(map(str, values))}" for name, values in vary.items()]
     if runs < 2:
         raise InputError("a study needs two runs at least", found=str(runs))
-    runner: Runner | None = on_cluster(scheduler) if scheduler else None
+    runner: Runner | None = None if scheduler is None else on_cluster(scheduler)
     begun = subject_of(subject)
     varied = parsed(begun, vary)
     cells = cells_of(begun, varied)
     settings = [cell.setting for cell in cells]
     told = " ".join([subject, *vary])
-    store = Store.opened(Path(out), told, settings, seed) if out is not None else None
-    results = run_all(settings, runs, seed, progress, runner, store)
+    names = [in_words(cell.values) for cell in cells]
+    opened = nullcontext() if out is None else Store.opened(Path(out), told, settings, seed)
+    with opened as store:
+        results = run_all(settings, runs, seed, progress, runner, store, names)
     found = tuple(found_of(cell, result) for cell, result in zip(cells, results, strict=True))
     return SweepResult(begun, varied, tuple(cells), tuple(results), found, runs, seed)
 
