@@ -74,11 +74,13 @@ def test_a_grid_has_every_combination():
     [
         (["station=1"], "this cannot be varied.*expected stations"),
         (["colour=1"], "this cannot be varied.*NAME=V1,V2"),
-        (["stations"], "stations cannot be this"),
+        (["stations"], "a value is missing; found stations, expected stations=V1,V2"),
+        (["stations="], "a value is missing"),
+        (["stations=1,,2"], "a value is missing"),
         (["stations=1,x"], "stations cannot be this.*a whole number of 1 to 100"),
         (["stations=1.5"], "stations cannot be this"),
         (["edge_noise=-1"], "edge_noise cannot be this.*px"),
-        (["stations=1,1"], "stand twice"),
+        (["stations=1,1"], "a value stands twice"),
         (["stations=1", "stations=2"], "varied twice"),
         (["camera=telescope"], "no such camera.*a camera's file"),
         (["observe=arms"], "no such observe.*legs, board and legs\\+board"),
@@ -88,6 +90,18 @@ def test_what_cannot_be_varied_is_told(words, message):
     with pytest.raises(InputError) as caught:
         parsed(subject_of("3-rpr"), words)
     assert re.search(message, str(caught.value))
+
+
+@pytest.mark.parametrize(
+    "vary", ["legs=3", ["legs=3"], {"legs": [3]}, {"legs": 3}, {"legs": np.array([3])}]
+)
+def test_one_value_may_stand_alone(vary, alone):
+    assert study("a", vary, runs=2).varied == {"legs": (3,)}
+
+
+def test_a_camera_by_its_name_is_one_value():
+    with pytest.raises(InputError, match=r"no such camera.*found telescope"):
+        study("3-rpr", {"camera": "telescope"}, runs=2)
 
 
 def test_too_many_combinations_are_refused():

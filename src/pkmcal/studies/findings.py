@@ -164,7 +164,7 @@ class SweepResult:
 
 def study(
     subject: str,
-    vary: Mapping[str, Sequence[Value]] | Sequence[str] = (),
+    vary: Mapping[str, Value | Sequence[Value]] | Sequence[str] = (),
     *,
     runs: int = 100,
     seed: int = 0,
@@ -174,15 +174,19 @@ def study(
 ) -> SweepResult:
     """How accurate calibrations would be, by simulation; the same as the command.
 
-    subject : a session's folder, a mechanism file, a built-in machine or ``a``, [A] 4.3. vary :
-    values by name, every combination of which is tried. runs : simulated calibrations of each. out
-    : a folder in which finished batches are kept, and from which a study goes on. scheduler : the
-    address of a Dask cluster. progress : called with what is done and the share of it.
+    subject : a session's folder, a mechanism file, a built-in machine or ``a``, [A] 4.3. vary : a
+    value or several by name, or texts ``NAME=V1,V2``; every combination is tried. runs : simulated
+    calibrations of each. out : a folder in which finished batches are kept, and from which a study
+    goes on. scheduler : the address of a Dask cluster. progress : called with what is done and the
+    share of it.
     Raises InputError for what cannot be studied, where ``out`` holds another study, and while
     another process works there.
     """
     if isinstance(vary, Mapping):
-        vary = [f"{name}={','.join(map(str, values))}" for name, values in vary.items()]
+        each = {name: np.atleast_1d(values) for name, values in vary.items()}
+        vary = [f"{name}={','.join(map(str, values))}" for name, values in each.items()]
+    elif isinstance(vary, str):
+        vary = [vary]
     if runs < 2:
         raise InputError("a study needs two runs at least", found=str(runs))
     runner: Runner | None = None if scheduler is None else on_cluster(scheduler)

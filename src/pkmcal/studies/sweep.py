@@ -194,14 +194,14 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
             )
         if name in out:
             raise InputError("a name is varied twice", where="--vary", found=name)
-        values = [_value(name, subject.names[name], part.strip()) for part in rest.split(",")]
-        if not equals or len(set(values)) < len(values):
+        parts = [part.strip() for part in rest.split(",")]
+        if not equals or not all(parts):
             raise InputError(
-                "values are missing, or stand twice",
-                where="--vary",
-                found=text,
-                expected=f"{name}=V1,V2",
+                "a value is missing", where="--vary", found=text, expected=f"{name}=V1,V2"
             )
+        values = [_value(name, subject.names[name], part) for part in parts]
+        if len(set(values)) < len(values):
+            raise InputError("a value stands twice", where="--vary", found=text)
         out[name] = tuple(values)
     return out
 
