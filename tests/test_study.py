@@ -276,6 +276,18 @@ def test_calibrations_that_all_fail_are_told(tmp_path, alone):
     assert bad["deviations_hold"] is None
     assert bad["position"] == {"value": None, "standard_error": None}
     assert told["gains"] == []
+    page = (tmp_path / "study.html").read_text()  # of which a browser reads every plot
+    figures = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)
+    assert len(figures) == 2
+    assert all("NaN" not in figure for figure in figures)
+
+
+def test_a_platform_that_does_not_turn_is_told_no_turns(tmp_path, alone):
+    out = tmp_path / "out"
+    done = run("study", "delta", *SMALL[:2], "--vary", "stations=1", "--runs", 4, "-o", out)
+    assert done.code == 0, done.err
+    assert re.search(r"Calibrations leave \S+ mm at the tool", done.out)
+    assert "mrad" not in re.sub("<script.*?</script>", "", (out / "study.html").read_text())
 
 
 def test_one_run_tells_no_standard_error():

@@ -34,6 +34,8 @@ from pkmcal.wording import amount, brief, count, decimals, number
 
 MOST_LINES = 8
 """Curves in one plot; where there would be more, they are taken together."""
+MOST_TICKS = 8
+"""Values that an axis names; of more, as many as it chooses."""
 MANY_FAILED = 0.1
 """Share of failed runs from which a combination is named."""
 HOW = (
@@ -108,7 +110,7 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
     if len(study.found) == 1:
         cell = study.found[0]
         left = amount(cell.position.value, "m")
-        if cell.orientation.value > 0:  # a delta's platform does not turn
+        if _turns(study):
             left += f" and {amount(cell.orientation.value, 'rad')}"
         return f"Calibrations leave {left} at the tool. {text}"
     sure = [gain for gain in gains if gain.sure]
@@ -151,22 +153,26 @@ def shown(study: SweepResult, name: str, value: Value) -> str:
 # ------------------------------------------------------------------ cards and tables
 
 
+def _turns(study: SweepResult) -> bool:
+    """Whether the platform turns at all; a delta's does not."""
+    return not all(cell.orientation.value == 0 for cell in study.found)
+
+
 def _cards(study: SweepResult) -> tuple[Figure, ...]:
     """Of the best combination."""
     best = min(study.found, key=lambda cell: np.nan_to_num(cell.position.value, nan=np.inf))
     which = f"with {in_words(best.values)}" if len(study.found) > 1 else "root mean square"
-    one = 1e3
-    position, turn = one * best.position.value, one * best.orientation.value
+    off = ((brief(1e3 * best.position.value), "mm"), (brief(1e3 * best.orientation.value), "mrad"))
+    below = ((brief(1e3 * best.position_95), "mm"), (brief(1e3 * best.orientation_95), "mrad"))
+    shown = slice(None) if _turns(study) else slice(1)
     return (
         Figure(
             "How far off is the tool after a calibration?",
-            ((brief(position), "mm"), (brief(turn), "mrad")),
-            f"{which}; ± {brief(one * best.position.error)} mm by chance",
+            off[shown],
+            f"{which}; ± {brief(1e3 * best.position.error)} mm by chance",
         ),
         Figure(
-            "What stays below in 95 % of the workspace?",
-            ((brief(one * best.position_95), "mm"), (brief(one * best.orientation_95), "mrad")),
-            "over all runs and poses",
+            "What stays below in 95 % of the workspace?", below[shown], "over all runs and poses"
         ),
         Figure(
             "Do its 95 % intervals hold?",
@@ -183,25 +189,27 @@ def _cards(study: SweepResult) -> tuple[Figure, ...]:
 
 def _table(study: SweepResult) -> Table:
     """A row a combination."""
-    rows: list[Row] = []
+    rows, turns = list[Row](), _turns(study)
     for cell in study.found:
+        turn = (
+            _with_error(1e3 * cell.orientation.value, 1e3 * cell.orientation.error),
+            brief(1e3 * cell.orientation_sigma),
+            brief(1e3 * cell.orientation_95),
+        )
         cells = (
             _with_error(1e3 * cell.position.value, 1e3 * cell.position.error),
             brief(1e3 * cell.position_sigma),
             number(100 * cell.covered.value, 1),
             number(100 * cell.covered_tool.value, 1),
             brief(1e3 * cell.position_95),
-            _with_error(1e3 * cell.orientation.value, 1e3 * cell.orientation.error),
-            brief(1e3 * cell.orientation_sigma),
-            brief(1e3 * cell.orientation_95),
+            *(turn if turns else ()),
             number(100 * cell.failed.value, 1),
         )
         mark = Level.DOUBTFUL if cell.honest is False else None
         rows.append(Row(in_words(cell.values) or study.subject.name, cells, mark=mark))
-    heads = (
-        "", "tool, mm", "stated", "held, %", "tool's, %", "95 % below, mm", "tool, mrad",
-        "stated, mrad", "95 % below, mrad", "failed, %",
-    )  # fmt: skip
+    heads = ("", "tool, mm", "stated", "held, %", "tool's, %", "95 % below, mm")
+    heads += ("tool, mrad", "stated, mrad", "95 % below, mrad") if turns else ()
+    heads += ("failed, %",)
     legend = (
         "stated: deviation that calibrations tell of themselves; held: share of",
         "95 % intervals that hold the truth, of all parameters and of the tool's pose",
@@ -310,6 +318,8 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
         numbers = [v for v in x if not isinstance(v, str)]
         if numbers and min(numbers) > 0 and max(numbers) / min(numbers) >= 8:
             layout["xaxis"] |= {"type": "log"}
+        if numbers and len(numbers) <= MOST_TICKS:
+            layout["xaxis"] |= {"tickvals": numbers, "ticktext": [f"{v:g}" for v in numbers]}
         caption = "Bars are two standard errors of the simulation; dotted: what is stated."
         out.append(
             Plot(
