@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -174,6 +175,31 @@ def test_a_session_gives_its_cameras_stations_and_noise(demo):
     np.testing.assert_array_equal(plan.T_camera_base, design.T_camera_base)
     moved = cells_of(subject, parsed(subject, ["stations=2"]))[0].setting.design
     assert moved.T_camera_base is None
+
+
+def test_a_session_without_photographs_can_be_studied(session):
+    """Before any is taken: fifteen from each place; and its workspace is said to be left out."""
+    shutil.rmtree(session / "images")
+    with (session / "session.yaml").open("a") as file:
+        file.write("workspace: {turn: 0.1}\n")
+    for named in (session, session / "session.yaml"):
+        subject = subject_of(str(named))
+        assert subject.design.configurations == 15
+        assert not subject.design.shared
+        assert subject.design.T_camera_base.shape == (3, 4, 4)
+        assert "over the whole reach, not over its workspace" in subject.warnings[0]
+        assert "There are no photographs yet: 15 are taken" in subject.warnings[1]
+
+
+def test_a_folder_called_like_a_machine_is_not_taken_for_a_session(tmp_path, monkeypatch, demo):
+    monkeypatch.chdir(tmp_path)
+    Path("delta").mkdir()
+    assert subject_of("delta").name == "delta"
+    shutil.copytree(demo.session, "h4")
+    assert subject_of("h4").name == "the session h4"
+    Path("mine").mkdir()
+    with pytest.raises(InputError, match=r"mine: the folder holds no session.yaml"):
+        subject_of("mine")
 
 
 # ------------------------------------------------------------------ what is simulated

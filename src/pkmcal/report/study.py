@@ -115,7 +115,7 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
         return f"Calibrations leave {left} at the tool. {text}"
     sure = [gain for gain in gains if gain.sure]
     if not sure:
-        return f"{text} Nothing of what was varied matters more than chance does."
+        return f"{text} Nothing of what was varied shows beyond chance in so many runs."
     gain = sure[0]
     return (
         f"{text} Most is gained by {_name(gain.name)}: from"

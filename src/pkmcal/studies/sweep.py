@@ -23,7 +23,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, MechanismDocument, catalogue, load_mechanism
 from pkmcal.mechanisms.machine import machine_from_document
-from pkmcal.session.load import FILE, Session, load_session
+from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
@@ -122,10 +122,10 @@ def subject_of(origin: str) -> StudySubject:
     """
     if origin == PAPER:
         return StudySubject("the joint calibration of [A] 4.3", HexapodByAxes())
-    path = Path(origin)
-    if path.is_dir() or path.name == FILE:
-        return _of_session(load_session(path))
-    if origin not in catalogue() and path.suffix not in (".yaml", ".yml"):
+    folder = session_folder(origin)
+    if folder is not None:
+        return _of_session(load_session(folder, measured=False))
+    if origin not in catalogue() and Path(origin).suffix not in (".yaml", ".yml"):
         raise InputError(
             "there is nothing of this name to study",
             found=origin,
@@ -151,6 +151,8 @@ def _of_session(session: Session) -> StudySubject:
         warnings.append("The board on the base is left out: what it adds is not simulated.")
     if session.trackers:
         warnings.append("Trackers are left out: only what cameras see is simulated.")
+    if session.workspace is not None:
+        warnings.append("The tool's errors are told over the whole reach, not over its workspace.")
     words = [{w for w in s.observe if not (on_base and w == "board")} for s in session.stations]
     if any(own != words[0] for own in words) or not words[0]:
         raise InputError(
@@ -163,6 +165,9 @@ def _of_session(session: Session) -> StudySubject:
     if len(known) < len(places):
         warnings.append("Stations without a pose stand where a camera sees the machine well.")
     seen = [{p.configuration for p in station.photographs} for station in session.stations]
+    usual = Design.configurations
+    if not any(seen):
+        warnings.append(f"There are no photographs yet: {usual} are taken from each place.")
     board = None if session.board is None or on_base else load_board(session.board)
     design = Design(
         session.machine,
@@ -171,8 +176,10 @@ def _of_session(session: Session) -> StudySubject:
         T_camera_base=np.stack(known) if len(known) == len(places) else None,
         observe=tuple(word for word in ("legs", "board") if word in words[0]),
         board=board,
-        configurations=max(2, round(float(np.median([len(own) for own in seen])))),
-        shared=len(seen) > 1 and all(own == seen[0] for own in seen),
+        configurations=max(2, round(float(np.median([len(own) for own in seen]))))
+        if any(seen)
+        else usual,
+        shared=len(seen) > 1 and any(seen) and all(own == seen[0] for own in seen),
         reading_noise=session.joint_noise,
     )
     return StudySubject(f"the session {session.folder}", design, tuple(warnings))
