@@ -11,6 +11,7 @@ import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.commands.numbers import check_positive
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -115,14 +116,9 @@ def plan(
     from pkmcal.report.plan import outcome_of
     from pkmcal.session.load import session_folder
 
-    for name, value in (
-        ("--edge-noise", edge_noise), ("--corner-noise", corner_noise),
-        ("--joint-noise", joint_noise),
-    ):  # fmt: skip
-        if not 0 < value < 100:
-            raise InputError(
-                "a noise cannot be this", where=name, found=f"{value:g}", expected="more than 0"
-            )
+    check_positive("--edge-noise", edge_noise, 100)
+    check_positive("--corner-noise", corner_noise, 100)
+    check_positive("--joint-noise", joint_noise, 1)
     session = session_folder(subject)
     folder = out or (Path("plan") if session is None else session / "plan")
     files = {**FILES, **(STATIONS if places or best_of else {})}
