@@ -117,6 +117,11 @@ def test_an_unknown_subject_is_told():
         subject_of("gough")
 
 
+def test_hinged_bars_are_told():
+    with pytest.raises(InputError, match=r"'h4-rods' has side bars.*one rod a forearm, such as h4"):
+        subject_of("h4-rods")
+
+
 @pytest.mark.parametrize("name", ["gough-stewart", "h4", "hexaglide", "delta", "3-rpr"])
 def test_a_machine_of_another_size_is_the_same_machine(name):
     """Twice as large, it reaches twice as far with the same angles and twice the lengths."""

@@ -124,7 +124,9 @@ def subject_of(origin: str) -> StudySubject:
         return StudySubject("the joint calibration of [A] 4.3", HexapodByAxes())
     folder = session_folder(origin)
     if folder is not None:
-        return _of_session(load_session(folder, measured=False))
+        session = load_session(folder, measured=False)
+        _check_no_hinges(session.machine)
+        return _of_session(session)
     if origin not in catalogue() and Path(origin).suffix not in (".yaml", ".yml"):
         raise InputError(
             "there is nothing of this name to study",
@@ -133,7 +135,19 @@ def subject_of(origin: str) -> StudySubject:
             f" {listed(sorted(catalogue()), 20)}",
         )
     machine = load_mechanism(origin, label=None)
+    _check_no_hinges(machine)
     return StudySubject(machine.name, Design(machine, (camera_of_size(SIZE),)))
+
+
+def _check_no_hinges(machine: Machine) -> None:
+    """Configurations are drawn by the pose alone."""
+    if machine.layout.n_internal:
+        raise InputError(
+            f"mechanism {machine.name!r} has side bars that turn on hinges, and how far they turn"
+            " is not known where it is drawn",
+            expected="platform joints other than hinged-bar",
+            next_step="Study the machine with one rod a forearm, such as h4",
+        )
 
 
 def _of_session(session: Session) -> StudySubject:
