@@ -25,6 +25,7 @@ from pkmcal.mechanisms import Machine, MechanismDocument, catalogue, load_mechan
 from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.placement import check_drawable
 from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
 from pkmcal.studies.paper_a import HexapodByAxes
@@ -125,7 +126,7 @@ def subject_of(origin: str) -> StudySubject:
     folder = session_folder(origin)
     if folder is not None:
         session = load_session(folder, measured=False)
-        _check_no_hinges(session.machine)
+        check_drawable(session.machine)
         return _of_session(session)
     if origin not in catalogue() and Path(origin).suffix not in (".yaml", ".yml"):
         raise InputError(
@@ -135,19 +136,8 @@ def subject_of(origin: str) -> StudySubject:
             f" {listed(sorted(catalogue()), 20)}",
         )
     machine = load_mechanism(origin, label=None)
-    _check_no_hinges(machine)
+    check_drawable(machine)
     return StudySubject(machine.name, Design(machine, (camera_of_size(SIZE),)))
-
-
-def _check_no_hinges(machine: Machine) -> None:
-    """Configurations are drawn by the pose alone."""
-    if machine.layout.n_internal:
-        raise InputError(
-            f"mechanism {machine.name!r} has side bars that turn on hinges, and how far they turn"
-            " is not known where it is drawn",
-            expected="platform joints other than hinged-bar",
-            next_step="Study the machine with one rod a forearm, such as h4",
-        )
 
 
 def _of_session(session: Session) -> StudySubject:
