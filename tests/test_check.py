@@ -64,6 +64,16 @@ def test_progress_is_told_in_order(session):
     assert told[-1][1] == "What such photographs will give"
 
 
+def test_a_workspace_that_the_machine_does_not_come_to(session):
+    with (session / "session.yaml").open("a") as file:
+        file.write("workspace: {z: [1.0, 2.0]}\n")
+    found = check_session(session)
+    assert found.exit_code == 1
+    (text,) = texts(found, Level.DOUBTFUL)
+    assert text.startswith("session.yaml, workspace: the machine does not come to the workspace")
+    assert "found z from 1 to 2 m" in text
+
+
 def test_blurred_photographs(session):
     changed(session, lambda picture: cv2.GaussianBlur(picture, (0, 0), 1.8), "station1")
     found = check_session(session)

@@ -329,7 +329,11 @@ def test_simulate_a_machine_and_a_camera_of_ones_own(tmp_path, demo):
     [
         ("--size", "3x4", "no size of a photograph; found 3x4, expected width x height"),
         ("--size", "large", "found large, expected width x height"),
-        ("--joint-noise", "0", "a reading's noise cannot be this; found 0, expected more than 0"),
+        (
+            "--joint-noise",
+            "0",
+            "this number cannot be used; found 0, expected more than 0 and at most 1",
+        ),
         ("--joint-noise", "nan", "found nan"),
         ("--mechanism", "gough-stuart", "found gough-stuart, expected gough-stewart"),
         ("--mechanism", "mine.yaml", "mine.yaml: the file does not exist"),

@@ -126,10 +126,10 @@ def test_one_way(tmp_path):
     ("options", "sentence"),
     [
         (("--law", "points"), "no such law of control; found points, expected edges or directions"),
-        (("--gain", 0), "--gain: a loop cannot have this"),
+        (("--gain", 0), "--gain: this number cannot be used"),
         (("--gain", 30, "--delay", 3), "--gain: the loop is unstable"),
-        (("--rate", -5), "--rate: a loop cannot have this"),
-        (("--speed", 0), "--speed: a loop cannot have this"),
+        (("--rate", -5), "--rate: this number cannot be used"),
+        (("--speed", 0), "--speed: this number cannot be used"),
         (("--duration", 3000), "--duration: the runs would have too many samples"),
         (("--legs", "1,1"), "--legs: no list of legs; found 1,1"),
         (("--legs", "x"), "--legs: no list of legs; found x"),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +20,7 @@ import pytest
 from conftest import run
 from pkmcal.errors import InputError, ResultError
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.report.study import document_of, runs_bytes
 from pkmcal.studies import cluster, engine, tasks, workers
 from pkmcal.studies.calibrations import (
     ESTIMATE,
@@ -28,8 +31,9 @@ from pkmcal.studies.calibrations import (
 )
 from pkmcal.studies.capture import captured
 from pkmcal.studies.estimates import Fitted
-from pkmcal.studies.findings import clustered, study
+from pkmcal.studies.findings import SweepResult, clustered, study
 from pkmcal.studies.paper_a_joint import JointByAxes
+from pkmcal.studies.statistics import Summary
 from pkmcal.studies.store import Store
 from pkmcal.studies.sweep import cells_of, parsed, scaled, subject_of
 from pkmcal.studies.tasks import Batch, Job, Population, Sample
@@ -71,11 +75,13 @@ def test_a_grid_has_every_combination():
     [
         (["station=1"], "this cannot be varied.*expected stations"),
         (["colour=1"], "this cannot be varied.*NAME=V1,V2"),
-        (["stations"], "stations cannot be this"),
+        (["stations"], "a value is missing; found stations, expected stations=V1,V2"),
+        (["stations="], "a value is missing"),
+        (["stations=1,,2"], "a value is missing"),
         (["stations=1,x"], "stations cannot be this.*a whole number of 1 to 100"),
         (["stations=1.5"], "stations cannot be this"),
         (["edge_noise=-1"], "edge_noise cannot be this.*px"),
-        (["stations=1,1"], "stand twice"),
+        (["stations=1,1"], "a value stands twice"),
         (["stations=1", "stations=2"], "varied twice"),
         (["camera=telescope"], "no such camera.*a camera's file"),
         (["observe=arms"], "no such observe.*legs, board and legs\\+board"),
@@ -85,6 +91,18 @@ def test_what_cannot_be_varied_is_told(words, message):
     with pytest.raises(InputError) as caught:
         parsed(subject_of("3-rpr"), words)
     assert re.search(message, str(caught.value))
+
+
+@pytest.mark.parametrize(
+    "vary", ["legs=3", ["legs=3"], {"legs": [3]}, {"legs": 3}, {"legs": np.array([3])}]
+)
+def test_one_value_may_stand_alone(vary, alone):
+    assert study("a", vary, runs=2).varied == {"legs": (3,)}
+
+
+def test_a_camera_by_its_name_is_one_value():
+    with pytest.raises(InputError, match=r"no such camera.*found telescope"):
+        study("3-rpr", {"camera": "telescope"}, runs=2)
 
 
 def test_too_many_combinations_are_refused():
@@ -97,6 +115,11 @@ def test_too_many_combinations_are_refused():
 def test_an_unknown_subject_is_told():
     with pytest.raises(InputError, match=r"there is nothing of this name to study.*gough-stewart"):
         subject_of("gough")
+
+
+def test_hinged_bars_are_told():
+    with pytest.raises(InputError, match=r"'h4-rods' has side bars.*one rod a forearm, such as h4"):
+        subject_of("h4-rods")
 
 
 @pytest.mark.parametrize("name", ["gough-stewart", "h4", "hexaglide", "delta", "3-rpr"])
@@ -157,6 +180,31 @@ def test_a_session_gives_its_cameras_stations_and_noise(demo):
     np.testing.assert_array_equal(plan.T_camera_base, design.T_camera_base)
     moved = cells_of(subject, parsed(subject, ["stations=2"]))[0].setting.design
     assert moved.T_camera_base is None
+
+
+def test_a_session_without_photographs_can_be_studied(session):
+    """Before any is taken: fifteen from each place; and its workspace is said to be left out."""
+    shutil.rmtree(session / "images")
+    with (session / "session.yaml").open("a") as file:
+        file.write("workspace: {turn: 0.1}\n")
+    for named in (session, session / "session.yaml"):
+        subject = subject_of(str(named))
+        assert subject.design.configurations == 15
+        assert not subject.design.shared
+        assert subject.design.T_camera_base.shape == (3, 4, 4)
+        assert "over the whole reach, not over its workspace" in subject.warnings[0]
+        assert "There are no photographs yet: 15 are taken" in subject.warnings[1]
+
+
+def test_a_folder_called_like_a_machine_is_not_taken_for_a_session(tmp_path, monkeypatch, demo):
+    monkeypatch.chdir(tmp_path)
+    Path("delta").mkdir()
+    assert subject_of("delta").name == "delta"
+    shutil.copytree(demo.session, "h4")
+    assert subject_of("h4").name == "the session h4"
+    Path("mine").mkdir()
+    with pytest.raises(InputError, match=r"mine: the folder holds no session.yaml"):
+        subject_of("mine")
 
 
 # ------------------------------------------------------------------ what is simulated
@@ -244,6 +292,67 @@ def test_standard_errors_know_of_batches():
     batch = np.repeat(np.arange(25), 8)
     errors = [clustered(np.repeat(row, 8), batch).error for row in means]
     assert np.mean(np.square(errors)) == pytest.approx(1 / 25, rel=0.05)
+
+
+def test_calibrations_that_all_fail_are_told(tmp_path, alone):
+    """A thousand times the noise of [A] Table 1: no calibration can be used, and that is said."""
+    done = run("study", "a", "--vary", "axis_noise=1,1000", "--runs", 4, "-o", tmp_path)
+    assert done.code == 1, done.err
+    assert "Too few calibrations of some combinations can be used" in done.out
+    assert "axis noise 1000: 100 % of the calibrations fail" in done.out
+    assert "nan" not in done.out
+    told = json.loads((tmp_path / "study.json").read_text())
+    good, bad = told["combinations"]
+    assert good["deviations_hold"] is True
+    assert bad["deviations_hold"] is None
+    assert bad["position"] == {"value": None, "standard_error": None}
+    assert told["gains"] == []
+    page = (tmp_path / "study.html").read_text()  # of which a browser reads every plot
+    figures = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)
+    assert len(figures) == 2
+    assert all("NaN" not in figure for figure in figures)
+
+
+def test_a_platform_that_does_not_turn_is_told_no_turns(tmp_path, alone):
+    out = tmp_path / "out"
+    done = run("study", "delta", *SMALL[:2], "--vary", "stations=1", "--runs", 4, "-o", out)
+    assert done.code == 0, done.err
+    assert re.search(r"Calibrations leave \S+ mm at the tool", done.out)
+    assert "mrad" not in re.sub("<script.*?</script>", "", (out / "study.html").read_text())
+
+
+def test_one_run_tells_no_standard_error():
+    one = clustered(np.array([0.3]), np.array([5]))
+    assert one.value == 0.3
+    assert np.isnan(one.error)
+
+
+def test_parameters_keep_their_names_where_legs_and_boards_are_compared(alone):
+    """With legs the tubes' radii are parameters as well, between the others."""
+    found = study("h4", ["observe=board,legs", "stations=1", "configurations=6"], runs=2)
+    told = [cell["covered_by_parameter"] for cell in document_of(found)["combinations"]]
+    for names, cell in zip(told, found.cells, strict=True):
+        assert list(names) == [name for name, _ in cell.setting.parameters]
+    radius = "legs[1].tubes[1].radius"
+    assert radius in told[1]
+    assert radius not in told[0]
+
+
+def test_what_chance_does_is_no_gain():
+    """Three values that do not matter, each told from two batches of runs: one study in twenty may
+    call the largest difference a gain, and two standard errors would do so in half of them."""
+    rng = np.random.default_rng(4)
+    cell = study("a", (), runs=2).found[0]
+    calls = 0
+    for means in rng.normal(1.0, 0.1, (400, 3, 2)):
+        cells = tuple(
+            replace(cell, values={"legs": k}, freedom=1,
+                    position=Summary(pair.mean(), abs(np.diff(pair)[0]) / 2))
+            for k, pair in zip((3, 4, 5), means, strict=True)
+        )  # fmt: skip
+        subject = subject_of("a")
+        calls += SweepResult(subject, {"legs": (3, 4, 5)}, (), (), cells, 20, 0).gains[0].sure
+    assert calls <= 0.05 * 400
 
 
 # ------------------------------------------------------------------ the command
@@ -439,15 +548,51 @@ def test_what_is_kept_is_what_was_done(tmp_path):
     setting = Counting()
     task = Job(setting, batch_of(setting, 5))
     done = tasks.work(task)
-    store = Store.opened(tmp_path, "counting", [], 0)
-    store.save(0, 0, done)
-    found = store.load(0, 0, task.batch)
-    assert found.wall == done.wall
-    np.testing.assert_array_equal(
-        found.samples[ESTIMATE].values["x"], done.samples[ESTIMATE].values["x"]
-    )
-    assert store.load(0, 1, task.batch) is None
-    assert store.load(0, 0, replace(task.batch, runs=4)) is None
+    with Store.opened(tmp_path, "counting", [], 0) as store:
+        store.save(0, 0, done)
+        found = store.load(0, 0, task.batch)
+        assert found.wall == done.wall
+        np.testing.assert_array_equal(
+            found.samples[ESTIMATE].values["x"], done.samples[ESTIMATE].values["x"]
+        )
+        assert store.load(0, 1, task.batch) is None
+        assert store.load(0, 0, replace(task.batch, runs=4)) is None
+
+
+def test_two_studies_do_not_work_in_one_folder_at_once(tmp_path, alone):
+    """Neither another one nor the same again; once the first has ended, its command goes on."""
+    first = started(tmp_path)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("batches/*.npz")):
+        assert first.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    for words in (COMMAND, ("a", "--runs", "4")):
+        done = run("study", *words, "-o", tmp_path)
+        assert done.code == 2
+        assert "another study works in this folder. Wait until it has ended" in done.err
+    assert first.poll() is None
+    first.kill()
+    first.wait()
+    with pytest.raises(InputError, match="the batches of another study"):
+        study("a", (), runs=4, out=tmp_path)
+    settings = [cell.setting for cell in cells_of(subject_of("a"), {"configurations": (5, 6)})]
+    with Store.opened(tmp_path, "the same", settings, 0) as store:
+        assert store.load(0, 0, batch_of(settings[0], 1000)) is not None
+
+
+def test_an_impossible_combination_is_named_before_the_others_are_done(tmp_path, alone):
+    vary = [SMALL[1], "stations=1", "focal=900", "distance=2,0.1"]
+    with pytest.raises(InputError, match=r"distance 0.1: a camera does not see the machine"):
+        study("3-rpr", vary, runs=200, out=tmp_path)
+    assert len(list(tmp_path.glob("batches/*.npz"))) == 1
+
+
+def test_a_folder_where_nothing_was_finished_is_free(tmp_path, alone):
+    """After a combination that nobody can photograph, the command is mended, and runs."""
+    with pytest.raises(InputError, match=r"does not see the machine"):
+        study("3-rpr", ["focal=900", "distance=0.1"], runs=2, out=tmp_path)
+    assert study("3-rpr", ["stations=1", SMALL[1]], runs=2, out=tmp_path).runs == 2
 
 
 # ------------------------------------------------------------------ a cluster
@@ -467,6 +612,37 @@ def test_a_scheduler_that_does_not_answer_is_told(monkeypatch):
         study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
 
 
+@pytest.mark.parametrize("address", ["", "nonsense", "host:port", "ftp://10.0.0.1:21", "tcp://:1"])
+def test_what_is_no_address_is_told_at_once(address):
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match=r"no address of a Dask scheduler.*tcp://10.0.0.1:8786"):
+        study("a", (), runs=4, scheduler=address)
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_scheduler_that_goes_away_is_told(tmp_path):
+    """What was finished by then is kept."""
+    distributed, dask = (pytest.importorskip(name) for name in ("distributed", "dask"))
+    local = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None,
+        protocol="tcp",
+    )  # fmt: skip
+    with (
+        local,
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+        pytest.raises(ResultError, match="the scheduler of the cluster is gone"),
+    ):
+        study(
+            "a",
+            ["configurations=5"],
+            runs=2000,
+            scheduler=local.scheduler_address,
+            out=tmp_path,
+            progress=lambda _text, share: share > 0.1 and local.close(),
+        )
+    assert list(tmp_path.glob("batches/*.npz"))
+
+
 @pytest.mark.filterwarnings("default")
 def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, alone):
     distributed = pytest.importorskip("distributed")
@@ -484,7 +660,5 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, alone):
                      out=tmp_path / "cluster", progress=told)  # fmt: skip
     assert killed
     one = study("a", ["configurations=5"], runs=600)
-    from pkmcal.report.study import document_of, runs_bytes
-
     assert runs_bytes(many, "study.csv") == runs_bytes(one, "study.csv")
     assert str(document_of(many)) == str(document_of(one))

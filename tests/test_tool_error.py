@@ -222,6 +222,26 @@ def test_machines_of_few_freedoms_are_drawn_by_what_they_do(name, plots, axes):
     assert turns == (name != "delta")
 
 
+@pytest.mark.parametrize(
+    ("name", "region", "slices", "said"),
+    [
+        ("gough-stewart", {"z": (0.36, 0.36)}, [(0, 1, 0.36)], "z 360 mm"),
+        ("gough-stewart", {"x": (0.02, 0.02)}, [(1, 2, 0.02)], "x 20 mm"),
+        ("gough-stewart", {"x": (0.01, 0.01), "y": (0.0, 0.0)}, [], "x 10 mm, y 0 mm"),
+        ("3-rpr", {"y": (0.0, 0.0)}, [], "y 0 mm"),
+        ("gough-stewart", {"x": (0.0, 0.0), "y": (0.0, 0.0), "z": (0.36, 0.36)}, [], "z 360 mm"),
+    ],
+)
+def test_a_plane_a_line_and_a_point_are_regions_too(name, region, slices, said):
+    """A plane is cut where it is, not at home; a line and a point have no slices, and say why."""
+    part, made = page_of(name, **region)
+    cuts = [(cut.across, cut.up, cut.level) for cut in made.slices]
+    assert cuts == [(*plane[:2], pytest.approx(plane[2], abs=1e-6)) for plane in slices]
+    assert all(np.count_nonzero(cut.rows >= 0) > 50 for cut in made.slices)
+    assert said in part.text[0]
+    assert ("extent along one axis at most" in part.text[1]) == (not slices)
+
+
 def test_a_machine_without_a_map_says_why():
     part = section(None, None, "There is no map of the workspace: out of reach.")
     assert part.text == ("There is no map of the workspace: out of reach.",)

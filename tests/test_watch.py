@@ -52,6 +52,31 @@ FEW = 4
 """Configurations of a session that watches."""
 
 
+def made_calibration():
+    """The estimate of a hexapod from three stations: its machine is the truth of these tests."""
+    drawing = load_mechanism("gough-stewart")
+    truth = draw_truth(drawing, (CAMERA,) * 3, Settings(stations=3, configurations=8), 1)
+    edges, readings = simulate_edges(
+        truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
+        np.random.default_rng(1), photographs=truth.photographs,
+    )  # fmt: skip
+    data = Measurements(edges, readings, 3e-6, 3, np.zeros(3, dtype=int))
+    start = start_state(drawing, data, truth.T_camera_base)
+    return bundle(drawing, data, start, robust=False, scale_noise=False)
+
+
+def photographs_of(machine):
+    """One camera and thirty poses, of which those that watch take some."""
+    settings = Settings(stations=1, configurations=30, tolerance=0.0)
+    return draw_truth(machine, (CAMERA,), settings, 5)
+
+
+def half_of(covariance):
+    """H with H H^T the covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
 class Watched:
     """A hexapod with a calibration from three stations, and places to photograph it anew.
 
@@ -59,20 +84,10 @@ class Watched:
     """
 
     def __init__(self):
-        drawing = load_mechanism("gough-stewart")
-        truth = draw_truth(drawing, (CAMERA,) * 3, Settings(stations=3, configurations=8), 1)
-        edges, readings = simulate_edges(
-            truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
-            np.random.default_rng(1), photographs=truth.photographs,
-        )  # fmt: skip
-        data = Measurements(edges, readings, 3e-6, 3, np.zeros(3, dtype=int))
-        start = start_state(drawing, data, truth.T_camera_base)
-        made = bundle(drawing, data, start, robust=False, scale_noise=False)
+        made = made_calibration()
         self.true, self.covariance = made.machine, made.covariance
-        values, vectors = np.linalg.eigh(made.covariance)
-        self.half = vectors * np.sqrt(np.maximum(values, 0.0))
-        settings = Settings(stations=1, configurations=30, tolerance=0.0)
-        self.pool = draw_truth(self.true, (CAMERA,), settings, 5)
+        self.half = half_of(made.covariance)
+        self.pool = photographs_of(self.true)
 
     def calibrated(self, rng):
         """The true machine with a calibration's errors."""

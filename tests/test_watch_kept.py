@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from pkmcal.geometry.rigid import perturb, pose_difference
-from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import freedoms, generators, station_generators
 from pkmcal.identify.start import start_state
 from pkmcal.judge.causes import stations_moved, whole_machine, zeros
@@ -19,11 +18,8 @@ from pkmcal.judge.held import KeptStations, Trust, evidence, hold
 from pkmcal.judge.watch import tests_with_kept as judged_with_kept
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.measurements import Measurements
-from pkmcal.mechanisms import load_mechanism
-from pkmcal.simulation import Settings
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
-from pkmcal.simulation.truth import draw_truth
-from test_watch import ALPHA, CAMERA, moved
+from test_watch import ALPHA, CAMERA, half_of, made_calibration, moved, photographs_of
 
 SESSIONS = 30
 FEW = 5
@@ -38,22 +34,12 @@ class Left:
     """
 
     def __init__(self):
-        drawing = load_mechanism("gough-stewart")
-        truth = draw_truth(drawing, (CAMERA,) * 3, Settings(stations=3, configurations=8), 1)
-        edges, readings = simulate_edges(
-            truth.machine, truth.T_camera_base, CAMERA, truth.T_base_platform, EdgeNoise(),
-            np.random.default_rng(1), photographs=truth.photographs,
-        )  # fmt: skip
-        data = Measurements(edges, readings, 3e-6, 3, np.zeros(3, dtype=int))
-        start = start_state(drawing, data, truth.T_camera_base)
-        made = bundle(drawing, data, start, robust=False, scale_noise=False)
+        made = made_calibration()
         self.true, self.T_camera_base = made.machine, made.state.T_camera_base
         self.n = len(made.covariance)
         self.joint = made.joint_covariance
-        values, vectors = np.linalg.eigh(self.joint)
-        self.half = vectors * np.sqrt(np.maximum(values, 0.0))
-        settings = Settings(stations=1, configurations=30, tolerance=0.0)
-        self.poses = draw_truth(self.true, (CAMERA,), settings, 5).T_base_platform
+        self.half = half_of(self.joint)
+        self.poses = photographs_of(self.true).T_base_platform
 
     def looked(self, machine, rng, by=None, few=FEW):
         """A calibration with errors, held on what the first camera sees of a machine; by : how the

@@ -29,6 +29,8 @@ HEIGHTS = (0.15, 0.5, 0.85)
 """Where slices lie between the lowest and the highest of those poses."""
 MORE = 0.08
 """What slices reach beyond those poses to either side, in their extent."""
+NO_EXTENT = 1e-3
+"""Part of those poses' widest extent below which an axis has none."""
 LEAST_CELLS, FILLED = 3, 0.4
 """Rows and columns of cells, and their part that the machine can take, below which it is no slice:
 a platform that only moves aside as it turns is at one orientation in few places."""
@@ -157,9 +159,8 @@ def _slices(limits: Limits, region: Region, even: Array) -> tuple[tuple[Slice, .
     low, high = places.min(axis=0), places.max(axis=0)
     wide = high - low
     box = low - MORE * wide, high + MORE * wide
-    flat = wide < 1e-3 * wide.max()
+    flat = wide <= NO_EXTENT * wide.max()
     middle = (low + high) / 2
-    middle[flat] = limits.home[:3, 3][flat]
     if flat[2]:
         planes = [(0, 1, float(middle[2]))]
     else:

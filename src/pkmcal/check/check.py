@@ -43,6 +43,7 @@ from pkmcal.files import plain
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.verdict import POOR
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
+from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
 from pkmcal.observe.images import decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
@@ -217,7 +218,7 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
         session = load_session(folder)
     except PkmcalError as error:
         return SessionCheck(str(folder), (wrong(error), *findings))
-    findings += [note(text) for text in session.warnings]
+    findings += [note(text) for text in session.warnings] + _workspace(session)
     told("Reading photographs", 0.1)
     photographs, broken = _decoded(session)
     told("Recognising the machine", 0.4)
@@ -245,6 +246,17 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
         advice=advice(seen.look, expected) if seen.look else (),
         look=seen.look,
     )
+
+
+def _workspace(session: Session) -> list[Finding]:
+    """Whether the drawing's machine comes to the workspace that the session names."""
+    if session.workspace is None:
+        return []
+    try:
+        poses_in(session.machine.limits(), session.workspace, 1)
+    except PkmcalError as error:
+        return [doubtful(str(error.located("session.yaml, workspace")))]
+    return []
 
 
 def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Finding]]:

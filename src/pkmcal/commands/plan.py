@@ -11,6 +11,7 @@ import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.commands.numbers import check_positive
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ FILES = {
     "plan.json": NUMBERS,
 }
 STATIONS = {"stations.yaml": "the places, for session.yaml"}
-FILE = "session.yaml"
 LAST = "calibration"
 """Where calibrate writes, inside a session."""
 
@@ -114,26 +114,22 @@ def plan(
     from pkmcal.files import check_own_folder
     from pkmcal.planning.plan import plan as run
     from pkmcal.report.plan import outcome_of
+    from pkmcal.session.load import session_folder
 
-    for name, value in (
-        ("--edge-noise", edge_noise), ("--corner-noise", corner_noise),
-        ("--joint-noise", joint_noise),
-    ):  # fmt: skip
-        if not 0 < value < 100:
-            raise InputError(
-                "a noise cannot be this", where=name, found=f"{value:g}", expected="more than 0"
-            )
-    is_session = _is_session(subject)
-    folder = out or (_folder_of(subject) / "plan" if is_session else Path("plan"))
+    check_positive("--edge-noise", edge_noise, 100)
+    check_positive("--corner-noise", corner_noise, 100)
+    check_positive("--joint-noise", joint_noise, 1)
+    session = session_folder(subject)
+    folder = out or (Path("plan") if session is None else session / "plan")
     files = {**FILES, **(STATIONS if places or best_of else {})}
     check_own_folder(folder, {**FILES, **STATIONS}, "what plan writes", "an earlier plan")
     with console.progress(as_json) as told, threadpool_limits(1, "blas"):
         told("Looking at what there is", 0.0)
         region = None
-        if is_session:
+        if session is not None:
             _only_of("a machine", {"--camera": camera, "--board": board, "--tracker": tracker})
             source, region = _of_session(
-                Path(subject),
+                session,
                 after,
                 from_drawing,
                 same_place,
@@ -176,20 +172,6 @@ def _only_of(owner: str, given: Mapping[str, object]) -> None:
     for name, value in given.items():
         if value:
             raise InputError(f"this option is for {owner}", where=name, next_step="Leave it out")
-
-
-def _is_session(subject: str) -> bool:
-    """Whether a subject is a session's folder, or its file; a built-in machine's name is none."""
-    from pkmcal.mechanisms import catalogue
-
-    folder = _folder_of(subject)
-    return (folder / FILE).is_file() or (folder.is_dir() and subject not in catalogue())
-
-
-def _folder_of(subject: str) -> Path:
-    """A session's folder; its file may be named instead."""
-    path = Path(subject)
-    return path.parent if path.name == FILE else path
 
 
 def _of_session(

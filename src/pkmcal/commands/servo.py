@@ -9,6 +9,7 @@ import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS, PAGE, finish
+from pkmcal.commands.numbers import check_positive
 from pkmcal.errors import InputError
 
 FILES = {"servo.html": PAGE, "servo.json": NUMBERS}
@@ -92,10 +93,10 @@ def servo(
     from pkmcal.simulation.edges import EdgeNoise
 
     law_named(law)
-    _positive("--gain", gain, 1000)
-    _positive("--rate", rate, 10000)
-    _positive("--speed", 1.0 if speed is None else speed, 1e6)
-    _positive("--duration", 1.0 if duration is None else duration, 3600)
+    check_positive("--gain", gain, 1000)
+    check_positive("--rate", rate, 10000)
+    check_positive("--speed", 1.0 if speed is None else speed, 1e6)
+    check_positive("--duration", 1.0 if duration is None else duration, 3600)
     loop = LoopSettings(
         law=law,
         gain=gain,
@@ -125,11 +126,3 @@ def servo(
     with console.progress(as_json) as told:
         outcome = outcome_of(subject, study(subject.scene, plan, told))
     return finish(outcome, folder, FILES, as_json=as_json)
-
-
-def _positive(where: str, value: float, most: float) -> None:
-    if not 0 < value <= most:
-        raise InputError(
-            "a loop cannot have this", where=where, found=f"{value:g}",
-            expected=f"more than 0 and at most {most:g}",
-        )  # fmt: skip

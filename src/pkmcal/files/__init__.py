@@ -15,6 +15,7 @@ from pkmcal.files.documents import (
     yaml_text,
 )
 from pkmcal.files.exif import Exif, read_exif, with_exif
+from pkmcal.files.locking import alone_in
 from pkmcal.files.schema import Schema, field_path, validate
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
@@ -33,6 +34,7 @@ __all__ = [
     "Exif",
     "Keys",
     "Schema",
+    "alone_in",
     "check_own_folder",
     "check_writable",
     "closest",

@@ -77,7 +77,8 @@ class Region:
 
     def __str__(self) -> str:
         boxed = [
-            f"{name} {side[0] * 1e3:.4g} to {side[1] * 1e3:.4g} mm"
+            f"{name} {side[0] * 1e3:.4g}"
+            + (f" to {side[1] * 1e3:.4g} mm" if side[1] > side[0] else " mm")
             for name, side in zip(AXES, self.sides, strict=True)
             if side is not None
         ]

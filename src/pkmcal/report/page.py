@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from pkmcal.files import plain
 from pkmcal.wording import count
 
 if TYPE_CHECKING:
@@ -54,7 +56,13 @@ def environment() -> jinja2.Environment:
     shared: dict[str, Any] = {"count": count}
     environment.globals.update(shared)
     environment.filters["leg"] = _colour_class
+    environment.policies["json.dumps_function"] = _as_json
     return environment
+
+
+def _as_json(value: Any, **options: Any) -> str:
+    """What a page's scripts read: browsers stop at NaN, and would then draw no plot at all."""
+    return json.dumps(plain(value), allow_nan=False, **options)
 
 
 @cache

@@ -29,11 +29,13 @@ from pkmcal.outcome import (
 from pkmcal.studies.calibrations import ESTIMATE
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.findings import HELD, PROMISE, SHARES, CellFindings, Gain, SweepResult
-from pkmcal.studies.sweep import Setting, Value
+from pkmcal.studies.sweep import Setting, Value, in_words
 from pkmcal.wording import amount, brief, count, decimals, number
 
 MOST_LINES = 8
 """Curves in one plot; where there would be more, they are taken together."""
+MOST_TICKS = 8
+"""Values that an axis names; of more, as many as it chooses."""
 MANY_FAILED = 0.1
 """Share of failed runs from which a combination is named."""
 HOW = (
@@ -58,7 +60,7 @@ HOW_PAPER = (
 
 def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
     """Everything that ``pkmcal study`` tells and writes. table : the name of the runs' table."""
-    gains, bad = study.gains, [cell for cell in study.found if not cell.honest]
+    gains, bad = study.gains, [c for c in study.found if c.honest is False]
     failing = [cell for cell in study.found if cell.failed.value > MANY_FAILED]
     paper = not hasattr(study.subject.design, "observe")
     runs = count(study.runs, "simulated calibration")
@@ -94,8 +96,9 @@ def outcome_of(study: SweepResult, *, table: str = "study.csv") -> Outcome:
 def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) -> str:
     """The verdict in a sentence or two."""
     covered = [c.covered.value for c in study.found] + [c.covered_tool.value for c in study.found]
-    if not np.isfinite(covered).all():
-        return "Not every combination has a calibration that may be used."
+    if any(cell.honest is None for cell in study.found):
+        where = " of some combinations" if len(study.found) > 1 else ""
+        return f"Too few calibrations{where} can be used to tell how good they are."
     low, high = 100 * min(covered), 100 * max(covered)
     share = f"{low:.1f} %" if round(high - low, 1) == 0 else f"{low:.1f} to {high:.1f} %"
     if bad:
@@ -106,11 +109,13 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
         text = f"The stated deviations hold: {share} of the 95 % intervals do."
     if len(study.found) == 1:
         cell = study.found[0]
-        left = f"{amount(cell.position.value, 'm')} and {amount(cell.orientation.value, 'rad')}"
+        left = amount(cell.position.value, "m")
+        if _turns(study):
+            left += f" and {amount(cell.orientation.value, 'rad')}"
         return f"Calibrations leave {left} at the tool. {text}"
     sure = [gain for gain in gains if gain.sure]
     if not sure:
-        return f"{text} Nothing of what was varied matters more than chance does."
+        return f"{text} Nothing of what was varied shows beyond chance in so many runs."
     gain = sure[0]
     return (
         f"{text} Most is gained by {_name(gain.name)}: from"
@@ -121,7 +126,7 @@ def _headline(study: SweepResult, gains: list[Gain], bad: list[CellFindings]) ->
 
 
 def _reason(cell: CellFindings) -> str:
-    where = f"{_label(cell)}: " if cell.values else ""
+    where = f"{in_words(cell.values)}: " if cell.values else ""
     tool, own = 100 * cell.covered_tool.value, 100 * cell.covered.value
     return (
         f"{where}95 % intervals hold {own:.1f} % of the parameters and {tool:.1f} % of the tool's"
@@ -130,7 +135,7 @@ def _reason(cell: CellFindings) -> str:
 
 
 def _failing(cell: CellFindings) -> str:
-    where = f"{_label(cell)}: " if cell.values else ""
+    where = f"{in_words(cell.values)}: " if cell.values else ""
     return f"{where}{100 * cell.failed.value:.0f} % of the calibrations fail or do not converge."
 
 
@@ -145,38 +150,34 @@ def shown(study: SweepResult, name: str, value: Value) -> str:
     return f"{text}{unit}" if unit == "°" else f"{text} {unit}".rstrip()
 
 
-def _label(cell: CellFindings) -> str:
-    """A combination in words."""
-    return ", ".join(
-        f"{_name(name)} {value if isinstance(value, str) else f'{value:g}'}"
-        for name, value in cell.values.items()
-    )
-
-
 # ------------------------------------------------------------------ cards and tables
+
+
+def _turns(study: SweepResult) -> bool:
+    """Whether the platform turns at all; a delta's does not."""
+    return not all(cell.orientation.value == 0 for cell in study.found)
 
 
 def _cards(study: SweepResult) -> tuple[Figure, ...]:
     """Of the best combination."""
     best = min(study.found, key=lambda cell: np.nan_to_num(cell.position.value, nan=np.inf))
-    which = f"with {_label(best)}" if len(study.found) > 1 else "root mean square"
-    one = 1e3
-    position, turn = one * best.position.value, one * best.orientation.value
+    which = f"with {in_words(best.values)}" if len(study.found) > 1 else "root mean square"
+    off = ((brief(1e3 * best.position.value), "mm"), (brief(1e3 * best.orientation.value), "mrad"))
+    below = ((brief(1e3 * best.position_95), "mm"), (brief(1e3 * best.orientation_95), "mrad"))
+    shown = slice(None) if _turns(study) else slice(1)
     return (
         Figure(
             "How far off is the tool after a calibration?",
-            ((brief(position), "mm"), (brief(turn), "mrad")),
-            f"{which}; ± {one * best.position.error:.2g} mm by chance",
+            off[shown],
+            f"{which}; ± {brief(1e3 * best.position.error)} mm by chance",
         ),
         Figure(
-            "What stays below in 95 % of the workspace?",
-            ((brief(one * best.position_95), "mm"), (brief(one * best.orientation_95), "mrad")),
-            "over all runs and poses",
+            "What stays below in 95 % of the workspace?", below[shown], "over all runs and poses"
         ),
         Figure(
             "Do its 95 % intervals hold?",
             ((number(100 * best.covered.value, 1), "%"),),
-            f"of all parameters; {100 * best.covered_tool.value:.1f} % of the tool's poses",
+            f"of all parameters; {number(100 * best.covered_tool.value, 1)} % of the tool's poses",
         ),
         Figure(
             "Does it always converge?",
@@ -188,25 +189,27 @@ def _cards(study: SweepResult) -> tuple[Figure, ...]:
 
 def _table(study: SweepResult) -> Table:
     """A row a combination."""
-    rows: list[Row] = []
+    rows, turns = list[Row](), _turns(study)
     for cell in study.found:
-        cells = (
-            _with_error(1e3 * cell.position.value, 1e3 * cell.position.error),
-            brief(1e3 * cell.position_sigma),
-            f"{100 * cell.covered.value:.1f}",
-            f"{100 * cell.covered_tool.value:.1f}",
-            brief(1e3 * cell.position_95),
+        turn = (
             _with_error(1e3 * cell.orientation.value, 1e3 * cell.orientation.error),
             brief(1e3 * cell.orientation_sigma),
             brief(1e3 * cell.orientation_95),
-            f"{100 * cell.failed.value:.1f}",
         )
-        mark = None if cell.honest else Level.DOUBTFUL
-        rows.append(Row(_label(cell) or study.subject.name, cells, mark=mark))
-    heads = (
-        "", "tool, mm", "stated", "held, %", "tool's, %", "95 % below, mm", "tool, mrad",
-        "stated, mrad", "95 % below, mrad", "failed, %",
-    )  # fmt: skip
+        cells = (
+            _with_error(1e3 * cell.position.value, 1e3 * cell.position.error),
+            brief(1e3 * cell.position_sigma),
+            number(100 * cell.covered.value, 1),
+            number(100 * cell.covered_tool.value, 1),
+            brief(1e3 * cell.position_95),
+            *(turn if turns else ()),
+            number(100 * cell.failed.value, 1),
+        )
+        mark = Level.DOUBTFUL if cell.honest is False else None
+        rows.append(Row(in_words(cell.values) or study.subject.name, cells, mark=mark))
+    heads = ("", "tool, mm", "stated", "held, %", "tool's, %", "95 % below, mm")
+    heads += ("tool, mrad", "stated, mrad", "95 % below, mrad") if turns else ()
+    heads += ("failed, %",)
     legend = (
         "stated: deviation that calibrations tell of themselves; held: share of",
         "95 % intervals that hold the truth, of all parameters and of the tool's pose",
@@ -215,17 +218,18 @@ def _table(study: SweepResult) -> Table:
 
 
 def _with_error(value: float, error: float) -> str:
-    """A figure with its standard error in the same decimals."""
-    places = decimals(value)
-    return f"{number(value, places)} ± {number(error, places)}" if np.isfinite(value) else "–"
+    """A figure with its standard error, as many decimals as show one digit of both."""
+    if not np.isfinite(error):
+        return brief(value)
+    places = max(decimals(value), decimals(error) - 1 if error > 0 else 0)
+    return f"{number(value, places)} ± {number(error, places)}"
 
 
 def _honesty(study: SweepResult) -> Part:
     """How often intervals hold, of each size and of each kind of parameter."""
     kinds: dict[str, list[float]] = {}
-    names = study.cells[0].setting.parameters
     for cell in study.found:
-        for (name, _), share in zip(names, cell.by_parameter.tolist(), strict=False):
+        for name, share in zip(cell.parameters, cell.by_parameter.tolist(), strict=True):
             if np.isfinite(share):
                 kinds.setdefault(_kind(name), []).append(share)
     rows = [
@@ -282,9 +286,7 @@ def _groups(study: SweepResult, name: str) -> Iterator[tuple[str, list[CellFindi
         rest = {key: value for key, value in cell.values.items() if key != name}
         others.setdefault(tuple(rest.items()), []).append(cell)
     for rest, cells in others.items():
-        told = [f"{_name(k)} {v if isinstance(v, str) else f'{v:g}'}" for k, v in rest
-                if len(study.varied[k]) > 1]  # fmt: skip
-        yield ", ".join(told), cells
+        yield in_words({k: v for k, v in rest if len(study.varied[k]) > 1}), cells
 
 
 def _curves(study: SweepResult) -> tuple[Plot, ...]:
@@ -316,6 +318,8 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
         numbers = [v for v in x if not isinstance(v, str)]
         if numbers and min(numbers) > 0 and max(numbers) / min(numbers) >= 8:
             layout["xaxis"] |= {"type": "log"}
+        if numbers and len(numbers) <= MOST_TICKS:
+            layout["xaxis"] |= {"tickvals": numbers, "ticktext": [f"{v:g}" for v in numbers]}
         caption = "Bars are two standard errors of the simulation; dotted: what is stated."
         out.append(
             Plot(
@@ -333,8 +337,11 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
 def _held(study: SweepResult) -> Plot:
     """Intervals that hold against their promise, all combinations together."""
     x = (100 * SHARES).tolist()
-    own = 100 * np.nanmean([cell.held for cell in study.found], axis=0)
-    tool = 100 * np.nanmean([cell.held_tool for cell in study.found], axis=0)
+    used = [cell for cell in study.found if np.isfinite(cell.held).all()]
+    own, tool = (
+        100 * np.mean(shares, axis=0) if used else np.full(len(SHARES), np.nan)
+        for shares in ([cell.held for cell in used], [cell.held_tool for cell in used])
+    )
     line = {"color": "--quiet", "dash": "dash"}
     data = [
         _trace("as promised", [50, 100], [50, 100], "--quiet", line=line, mode="lines"),
@@ -360,14 +367,13 @@ def document_of(study: SweepResult) -> dict[str, Any]:
     """Everything for programs, m and rad; nothing of how long it took, so that the same study is
     the same file.
     """
-    names = [name for name, _ in study.cells[0].setting.parameters]
     return {
         "pkmcal_study": 1,
         "subject": study.subject.name,
         "vary": {name: list(values) for name, values in study.varied.items()},
         "runs": study.runs,
         "seed": study.seed,
-        "combinations": [_cell(cell, names) for cell in study.found],
+        "combinations": [_cell(cell) for cell in study.found],
         "gains": [
             {
                 "name": g.name, "from": g.worst, "to": g.best,
@@ -379,7 +385,7 @@ def document_of(study: SweepResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _cell(cell: CellFindings, names: list[str]) -> dict[str, Any]:
+def _cell(cell: CellFindings) -> dict[str, Any]:
     summaries = ("position", "orientation", "covered", "covered_tool", "failed")
     out: dict[str, Any] = {"values": dict(cell.values), "runs": cell.runs}
     for name in summaries:
@@ -390,7 +396,9 @@ def _cell(cell: CellFindings, names: list[str]) -> dict[str, Any]:
     out["intervals"] = {
         "promised": SHARES, "parameters": cell.held, "tool": cell.held_tool,
     }  # fmt: skip
-    out["covered_by_parameter"] = dict(zip(names, cell.by_parameter.tolist(), strict=False))
+    out["covered_by_parameter"] = dict(
+        zip(cell.parameters, cell.by_parameter.tolist(), strict=True)
+    )
     return out | {"deviations_hold": cell.honest}
 
 

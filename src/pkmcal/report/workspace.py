@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.calibration.toolmap import Slice, ToolMap
+from pkmcal.calibration.toolmap import NO_EXTENT, Slice, ToolMap
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import ToolError
@@ -41,6 +41,7 @@ HOW = (
 OUTSIDE = (
     "The platform does not move aside without turning, so there are no slices of one orientation."
 )
+NARROW = "The workspace has an extent along one axis at most, so there are no slices."
 
 
 def section(session: Session, estimate: Estimate, found: ToolMap | str) -> Part:
@@ -49,14 +50,22 @@ def section(session: Session, estimate: Estimate, found: ToolMap | str) -> Part:
     if isinstance(found, str):
         return Part(name, title, (found,), menu=menu)
     slices = _slices(session, estimate, found)
+    how = HOW if slices else NARROW if _narrow(found) else OUTSIDE
     return Part(
         name,
         title,
-        (_said(found), *((HOW,) if slices else (OUTSIDE,))),
+        (_said(found), how),
         plots=tuple(plot for plot in (slices, _space(session, estimate, found)) if plot),
         tables=(_table(found),),
         menu=menu,
     )
+
+
+def _narrow(found: ToolMap) -> bool:
+    """Whether the region itself, and not the machine, leaves no plane to cut."""
+    named = any(side is not None and side[0] == side[1] for side in found.region.sides)
+    wide = np.ptp(found.after.T_base_platform[: found.spread, :3, 3], axis=0)
+    return named and int(np.count_nonzero(wide > NO_EXTENT * wide.max())) < 2
 
 
 def _quantities(found: ToolMap) -> tuple[tuple[str, Array], ...]:
@@ -310,7 +319,7 @@ def _axes(poses: Array) -> tuple[Integers, tuple[str, ...]] | None:
     three numbers change.
     """
     places = np.ptp(poses[:, :3, 3], axis=0)
-    thin = places < THIN * places.max()
+    thin = places <= THIN * places.max()
     turns = np.rad2deg(np.ptp(pose_difference(poses, poses[0])[:, :3], axis=0))
     order = [int(k) for k in np.argsort(-turns) if turns[k] > LEAST_TURN]
     if np.count_nonzero(thin) > len(order):

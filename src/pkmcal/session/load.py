@@ -19,7 +19,7 @@ from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable, Document, Keys, read_csv, read_yaml, shown, validate, wanted_file
 from pkmcal.geometry.rigid import pose
-from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region
 from pkmcal.session.exif import EXIF, camera_by_exif
 from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
@@ -121,6 +121,17 @@ class Session:
     def other_model(self, name: str | None) -> Machine:
         """Another model of the same machine."""
         return load_mechanism(self.mechanism, model=name)
+
+
+def session_folder(subject: str) -> Path | None:
+    """The folder of the session that a subject names, by itself or by its file; None where it is a
+    machine: a folder that is called like a built-in machine and holds no session is not meant.
+    """
+    path = Path(subject)
+    folder = path.parent if path.name == FILE else path
+    if (folder / FILE).is_file() or (folder.is_dir() and subject not in catalogue()):
+        return folder
+    return None
 
 
 def load_session(folder: Path | str, model: str | None = None, *, measured: bool = True) -> Session:

@@ -22,6 +22,7 @@ from pkmcal.mechanisms.kinematics import on_manifold, singularity
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.session.schema import Body
 from pkmcal.simulation.drives import drives_of, reaches
+from pkmcal.wording import listed
 
 FARTHEST_TILT = np.deg2rad(35)
 """More than universal joints of this kind allow."""
@@ -62,6 +63,19 @@ UPRIGHT = 1 / 3
 """Share of the photographs for which the telephone is held upright: the sensor lies on its side."""
 
 Vector = tuple[float, float, float]
+
+
+def check_drawable(machine: Machine) -> None:
+    """Raise `InputError` for a machine whose poses do not tell how all its parts stand."""
+    layout, legs = machine.layout, machine.document.legs
+    hinged = {legs[j].platform.joint for j in np.flatnonzero(layout.internal >= 0)}
+    if hinged:
+        raise InputError(
+            what=f"mechanism {machine.name!r} has side bars that turn on hinges, and how far they"
+            " turn is not known where it is drawn",
+            expected=f"platform joints other than {listed(sorted(hinged))}",
+            next_step="take the machine with one rod a forearm, such as h4",
+        )
 
 
 def draw_configurations(

@@ -20,7 +20,7 @@ from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.mechanisms.carriers.contract import PLANAR
 from pkmcal.simulation.board import board_part, holder_part
-from pkmcal.simulation.placement import one_a_station
+from pkmcal.simulation.placement import check_drawable, one_a_station
 from pkmcal.simulation.render import PixelRays, ScenePart, Sensor, photograph, render
 from pkmcal.simulation.scene import Discs, Finish, Room, discs_of, machine_parts, room_of
 from pkmcal.simulation.surfaces import SmoothNoise
@@ -33,7 +33,6 @@ from pkmcal.simulation.truth import (
     stream,
     truth_document,
 )
-from pkmcal.wording import listed
 
 Progress = Callable[[int, int], None]
 QUALITY = 95
@@ -172,17 +171,7 @@ def _check(folder: Path, drawing: Machine) -> None:
             what=f"mechanism {drawing.name!r} has no tubes, so its photographs would show no legs",
             expected="tubes: [{radius: ..., from: ..., to: ...}] on its legs",
         )
-    hinged = {
-        drawing.document.legs[j].platform.joint
-        for j in np.flatnonzero(drawing.layout.internal >= 0)
-    }
-    if hinged:
-        raise InputError(
-            what=f"mechanism {drawing.name!r} has side bars that turn on hinges, and how far they"
-            " turn is not known where it is drawn",
-            expected=f"platform joints other than {listed(sorted(hinged))}",
-            next_step="simulate the machine with one rod a forearm, such as h4",
-        )
+    check_drawable(drawing)
     try:
         drawing.home()
     except GeometryError as error:  # the drawing is the user's: it is at fault

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
+from urllib.parse import urlsplit
 
 from pkmcal import __version__
 from pkmcal.errors import InputError, ResultError
@@ -12,6 +14,17 @@ from pkmcal.studies.tasks import Done, Finished, Job, Runner, work
 
 TIMEOUT = 20
 """Seconds for a scheduler to answer, and for its first worker to be there."""
+SCHEMES = ("tcp", "tls", "ws", "wss")
+EXPECTED = "the address that dask scheduler prints, such as tcp://10.0.0.1:8786"
+
+
+def _is_address(text: str) -> bool:
+    """Whether a text names a host and a port, and how to speak with it."""
+    try:
+        parts = urlsplit(text if "://" in text else f"tcp://{text}")
+        return parts.scheme in SCHEMES and bool(parts.hostname) and bool(parts.port)
+    except ValueError:  # a port that is no number
+        return False
 
 
 def _version() -> str:
@@ -41,6 +54,11 @@ def on_cluster(address: str) -> Runner:
             where="--scheduler",
             next_step="Install it with: pip install 'pkmcal[cluster]'",
         )
+    if not _is_address(address):  # which Dask's client only tells after it has begun, and late
+        raise InputError(
+            "this is no address of a Dask scheduler",
+            where="--scheduler", found=f"'{address}'", expected=EXPECTED,
+        )  # fmt: skip
 
     def runner(tasks: Sequence[Job], finished: Finished) -> int:
         from distributed import Client
@@ -52,13 +70,17 @@ def on_cluster(address: str) -> Runner:
                 "no Dask scheduler answers",
                 where="--scheduler",
                 found=f"{address}: {str(error) or type(error).__name__}",
-                expected="the address that dask scheduler prints, such as tcp://10.0.0.1:8786",
+                expected=EXPECTED,
             ) from None
+        log = logging.getLogger("distributed.client")
+        level = log.level
+        log.setLevel(logging.CRITICAL)  # what a lost scheduler means is told by the error here
         try:
             workers = _checked(client, address)
             _done(client, tasks, finished)
         finally:
             client.close()
+            log.setLevel(level)
         return workers
 
     return runner
@@ -92,7 +114,7 @@ def _checked(client: Any, address: str) -> int:
 
 def _done(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
     """All tasks; what a worker had in hand when it died is done again by another."""
-    from distributed import KilledWorker, as_completed
+    from distributed import CancelledError, KilledWorker, as_completed
 
     futures = {client.submit(_worked, task, pure=False): k for k, task in enumerate(tasks)}
     try:
@@ -106,5 +128,11 @@ def _done(client: Any, tasks: Sequence[Job], finished: Finished) -> None:
             found=str(error),
             next_step="Look whether they have enough memory; what is finished is kept",
         ) from None
+    except CancelledError:  # of all that waited, where the client lost its scheduler
+        raise ResultError(
+            "the scheduler of the cluster is gone",
+            next_step="Start it again; what is finished is kept, and the same command goes on",
+        ) from None
     finally:
-        client.cancel(list(futures))
+        if client.status == "running":
+            client.cancel(list(futures))

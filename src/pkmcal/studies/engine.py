@@ -77,11 +77,13 @@ def run_all(
     told: Told | None = None,
     runner: Runner | None = None,
     kept: KeptBatches | None = None,
+    names: Sequence[str] = (),
 ) -> list[StudyResult[S]]:
     """Several settings with the same seeds: what they differ by is theirs, and not the draws'.
 
     runner : all cores of this machine unless given. kept : batches that are finished already are
-    taken from there, and new ones put there at once.
+    taken from there, and new ones put there at once. names : of the settings, for errors.
+    Raises what a setting raises, with its name.
     """
     began = time.perf_counter()
     parts = [
@@ -89,6 +91,8 @@ def run_all(
         for cell, setting in enumerate(settings)
         for number, batch in enumerate(batches(setting, runs, seed))
     ]
+    # The first batch of every setting first: one that cannot be simulated is told at once.
+    parts.sort(key=lambda part: (part[1], part[0]))
     done: dict[int, Done] = {}
     for k, part in enumerate(parts):
         found = kept.load(*part) if kept else None
@@ -107,7 +111,8 @@ def run_all(
         if told:
             told(settings[cell].doing, len(done) / len(parts))
 
-    jobs = [Job(settings[parts[k][0]], parts[k][2]) for k in left]
+    jobs = [Job(settings[cell], batch, names[cell] if names else "")
+            for cell, _, batch in (parts[k] for k in left)]  # fmt: skip
     workers = (runner or on_cores)(jobs, finished) if jobs else 1
     wall = time.perf_counter() - began
     out: list[StudyResult[S]] = []

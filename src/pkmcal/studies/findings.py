@@ -8,6 +8,7 @@ failed are counted, and left out of all else.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +22,16 @@ from pkmcal.studies.cluster import on_cluster
 from pkmcal.studies.engine import StudyResult, Told, batches, run_all
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.store import Store
-from pkmcal.studies.sweep import Cell, Setting, StudySubject, Value, cells_of, parsed, subject_of
+from pkmcal.studies.sweep import (
+    Cell,
+    Setting,
+    StudySubject,
+    Value,
+    cells_of,
+    in_words,
+    parsed,
+    subject_of,
+)
 from pkmcal.studies.tasks import Runner
 
 PROMISE = 0.95
@@ -36,13 +46,13 @@ class CellFindings:
     """One combination.
 
     runs, failed : how many, and the share that did not converge, or had to be refused. freedom : of
-    what standard errors are told from. position (m)
-    and orientation (rad) : the tool's errors over the workspace, root mean square; ``_95`` : that
-    95 % of them stay below; ``_sigma`` : what
-    calibrations state, their mean. covered, covered_tool : share of
-    95 % intervals that hold the truth, of all parameters and of the tool's pose. held, held_tool :
-    (n,) the same of the intervals of SHARES. chi2 : per degree of freedom. by_parameter : (P,)
-    share of each parameter's 95 % intervals, NaN of what has none.
+    what standard errors are told from, less than one where fewer than two runs can be used.
+    position (m) and orientation (rad) : the tool's errors over the workspace, root mean square;
+    ``_95`` : that 95 % of them stay below; ``_sigma`` : what calibrations state, their mean.
+    covered, covered_tool : share of 95 % intervals that hold the truth, of all parameters and of
+    the tool's pose. held, held_tool : (n,) the same of the intervals of SHARES. chi2 : per degree
+    of freedom. parameters : (P,) names. by_parameter : (P,) share of each parameter's 95 %
+    intervals, NaN of what has none.
     """
 
     values: Mapping[str, Value]
@@ -60,14 +70,19 @@ class CellFindings:
     held: Array
     held_tool: Array
     chi2: float
+    parameters: tuple[str, ...]
     by_parameter: Array
 
     @property
-    def honest(self) -> bool:
-        """Whether 95 % intervals hold often enough, chance aside (Student's, both ways)."""
+    def honest(self) -> bool | None:
+        """Whether 95 % intervals hold often enough, chance aside (Student's, both ways); None where
+        fewer than two runs can be used.
+        """
         from scipy.special import stdtrit
 
-        few = float(stdtrit(max(self.freedom, 1), 0.975))
+        if self.freedom < 1:
+            return None
+        few = float(stdtrit(self.freedom, 0.975))
         return all(
             s.value + few * s.error >= PROMISE - HELD for s in (self.covered, self.covered_tool)
         )
@@ -120,24 +135,24 @@ class SweepResult:
 
     @property
     def gains(self) -> list[Gain]:
-        """Names with more than one value, the one with most gain first."""
-        several = [name for name, values in self.varied.items() if len(values) > 1]
-        return sorted((self._gain(name) for name in several), key=lambda g: -g.times)
+        """Names of which two values or more have calibrations that can be used, the one with most
+        gain first.
+        """
+        found = (self._gain(name) for name in self.varied)
+        return sorted((gain for gain in found if gain), key=lambda g: -g.times)
 
-    def _gain(self, name: str) -> Gain:
+    def _gain(self, name: str) -> Gain | None:
         """Of one name."""
-        means = [self.at(name, value) for value in self.varied[name]]
-        order = np.argsort([mean.value for mean in means])
-        best, worst = int(order[0]), int(order[-1])
-        apart = means[worst].value - means[best].value
-        return Gain(
-            name,
-            self.varied[name][worst],
-            self.varied[name][best],
-            means[worst].value,
-            means[best].value,
-            bool(apart > 2 * np.hypot(means[worst].error, means[best].error)),
-        )
+        means = {value: self.at(name, value) for value in self.varied[name]}
+        means = {value: mean for value, mean in means.items() if np.isfinite(mean.value)}
+        if len(means) < 2:
+            return None
+        best, worst = (end(means, key=lambda v: means[v].value) for end in (min, max))
+        before, after = means[worst], means[best]
+        freedom = min(cell.freedom for cell in self.found if np.isfinite(cell.position.value))
+        pairs = len(means) * (len(means) - 1) // 2
+        sure = before.value - after.value > _by_chance(before.error, after.error, freedom, pairs)
+        return Gain(name, worst, best, before.value, after.value, sure)
 
     def at(self, name: str, value: Value) -> Summary:
         """The tool's position error where a name has a value, root mean square over all else."""
@@ -149,7 +164,7 @@ class SweepResult:
 
 def study(
     subject: str,
-    vary: Mapping[str, Sequence[Value]] | Sequence[str] = (),
+    vary: Mapping[str, Value | Sequence[Value]] | Sequence[str] = (),
     *,
     runs: int = 100,
     seed: int = 0,
@@ -159,24 +174,31 @@ def study(
 ) -> SweepResult:
     """How accurate calibrations would be, by simulation; the same as the command.
 
-    subject : a session's folder, a mechanism file, a built-in machine or ``a``, [A] 4.3. vary :
-    values by name, every combination of which is tried. runs : simulated calibrations of each. out
-    : a folder in which finished batches are kept, and from which a study goes on. scheduler : the
-    address of a Dask cluster. progress : called with what is done and the share of it.
-    Raises InputError for what cannot be studied, and where ``out`` holds another study.
+    subject : a session's folder, a mechanism file, a built-in machine or ``a``, [A] 4.3. vary : a
+    value or several by name, or texts ``NAME=V1,V2``; every combination is tried. runs : simulated
+    calibrations of each. out : a folder in which finished batches are kept, and from which a study
+    goes on. scheduler : the address of a Dask cluster. progress : called with what is done and the
+    share of it.
+    Raises InputError for what cannot be studied, where ``out`` holds another study, and while
+    another process works there.
     """
     if isinstance(vary, Mapping):
-        vary = [f"{name}={','.join(map(str, values))}" for name, values in vary.items()]
+        each = {name: np.atleast_1d(values) for name, values in vary.items()}
+        vary = [f"{name}={','.join(map(str, values))}" for name, values in each.items()]
+    elif isinstance(vary, str):
+        vary = [vary]
     if runs < 2:
         raise InputError("a study needs two runs at least", found=str(runs))
-    runner: Runner | None = on_cluster(scheduler) if scheduler else None
+    runner: Runner | None = None if scheduler is None else on_cluster(scheduler)
     begun = subject_of(subject)
     varied = parsed(begun, vary)
     cells = cells_of(begun, varied)
     settings = [cell.setting for cell in cells]
     told = " ".join([subject, *vary])
-    store = Store.opened(Path(out), told, settings, seed) if out is not None else None
-    results = run_all(settings, runs, seed, progress, runner, store)
+    names = [in_words(cell.values) for cell in cells]
+    opened = nullcontext() if out is None else Store.opened(Path(out), told, settings, seed)
+    with opened as store:
+        results = run_all(settings, runs, seed, progress, runner, store, names)
     found = tuple(found_of(cell, result) for cell, result in zip(cells, results, strict=True))
     return SweepResult(begun, varied, tuple(cells), tuple(results), found, runs, seed)
 
@@ -188,6 +210,7 @@ def found_of(cell: Cell, result: StudyResult[Setting]) -> CellFindings:
     sizes = [batch.runs for batch in batches(result.setting, result.runs, result.seed)]
     batch = np.repeat(np.arange(len(sizes)), sizes)
     good = values["failed"] == 0
+    groups = len(np.unique(batch[good]))
 
     def summed(name: str) -> Summary:
         return clustered(values[name][good], batch[good])
@@ -197,14 +220,14 @@ def found_of(cell: Cell, result: StudyResult[Setting]) -> CellFindings:
         root = float(np.sqrt(square.value))
         return Summary(root, square.error / (2 * max(root, 1e-300)))
 
-    tool = values["tool"][good].reshape(int(good.sum()), -1, 2, 3)
-    size = np.sqrt(np.where(np.isfinite(tool).any(-1), np.nansum(tool**2, axis=-1), np.nan))
     e, s = values["parameters"][good], sigma["parameters"][good]
     t, st = values["tool"][good], sigma["tool"][good]
+    parts = t.reshape(*t.shape[:-1], 2, 3)
+    size = np.sqrt(np.where(np.isfinite(parts).any(-1), np.nansum(parts**2, axis=-1), np.nan))
     return CellFindings(
         values=cell.values,
         runs=result.runs,
-        freedom=(len(sizes) if len(sizes) > 1 else result.runs) - 1,
+        freedom=(groups if groups > 1 else int(good.sum())) - 1,
         failed=clustered(values["failed"], batch),
         position=rooted("position"),
         orientation=rooted("orientation"),
@@ -217,22 +240,36 @@ def found_of(cell: Cell, result: StudyResult[Setting]) -> CellFindings:
         held=np.array([_mean(covered(e, s, float(share))) for share in SHARES]),
         held_tool=np.array([_mean(covered(t, st, float(share))) for share in SHARES]),
         chi2=_mean(values["chi2"][good]),
+        parameters=tuple(name for name, _ in result.setting.parameters),
         by_parameter=_by_parameter(e, s),
     )
 
 
 def clustered(values: Array, batch: Integers) -> Summary:
     """Mean of values (B,) and its standard error where runs of a batch (B,) go together; of one
-    batch alone, that of its runs.
+    batch alone, that of its runs; NaN of a single run, which tells no scatter, and of none.
     """
-    if not len(values):
-        return Summary(np.nan, np.nan)
+    if len(values) < 2:
+        return Summary(float(values[0]) if len(values) else np.nan, np.nan)
     mean, groups = float(values.mean()), len(np.unique(batch))
     if groups == 1:
         batch, groups = np.arange(len(values)), len(values)
     sums = np.bincount(batch, weights=values - mean)
     spread = float(np.sqrt(np.sum(sums**2))) / len(values)
-    return Summary(mean, spread * float(np.sqrt(groups / max(groups - 1, 1))))
+    return Summary(mean, spread * float(np.sqrt(groups / (groups - 1))))
+
+
+def _by_chance(one: float, other: float, freedom: int, pairs: int) -> float:
+    """By how much two means of these standard errors, told from ``freedom`` each, may differ by
+    chance: 95 % of the largest differences of so many pairs are less (Welch 1947; Bonferroni).
+    """
+    from scipy.special import stdtrit
+
+    variance = one**2 + other**2
+    if not variance > 0:  # NaN where a single run tells no scatter
+        return 0.0 if variance == 0 else np.inf
+    told = freedom * variance**2 / (one**4 + other**4)
+    return float(stdtrit(told, 1 - 0.025 / pairs) * np.sqrt(variance))
 
 
 def _by_parameter(errors: Array, sigma: Array) -> Array:

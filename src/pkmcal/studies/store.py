@@ -1,9 +1,9 @@
 """Finished batches of a study on disk, so that it goes on where it was stopped.
 
 A folder ``batches`` beside the results holds one file a batch, written whole or not at all, and
-``study.json``, which says of what study they are. A batch depends on its own seed alone, so a study
-that was stopped and goes on, on any number of workers, ends at the same numbers as one that was
-not. More runs of the same study take the finished ones in.
+``study.json``, which says of what study they are; one process at a time works there. A batch
+depends on its own seed alone, so a study that was stopped and goes on, on any number of workers,
+ends at the same numbers as one that was not. More runs of the same study take the finished ones in.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import hashlib
 import io
 import json
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from pkmcal.arrays import Array
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
-from pkmcal.files import json_text, plain, write_bytes, write_text
+from pkmcal.files import alone_in, json_text, plain, write_bytes, write_text
 from pkmcal.mechanisms import Machine
 from pkmcal.studies.tasks import Batch, Done, Key, Sample, Setting
 
@@ -41,30 +42,35 @@ class Store:
     folder: Path
 
     @classmethod
-    def opened(cls, out: Path, told: str, settings: Sequence[Setting], seed: int) -> Store:
-        """The store in a results folder, made or found there.
+    @contextmanager
+    def opened(
+        cls, out: Path, told: str, settings: Sequence[Setting], seed: int
+    ) -> Generator[Store]:
+        """The store in a results folder, made or found there, for this process alone.
 
-        told : the study in words. Raises InputError where it holds another study.
+        told : the study in words. Raises InputError where it holds finished batches of another
+        study, and while another process works in it.
         """
         folder = out / FOLDER
         path = folder / DESCRIPTION
         own = {"study": told, "seed": seed, "pkmcal": __version__}
         own |= {"digest": digest([plainly(setting) for setting in settings], seed)}
-        if path.is_file():
-            before = _description(path)
-            if before.get("digest") != own["digest"]:
-                raise InputError(
-                    "the folder holds the batches of another study",
-                    where=str(folder),
-                    found=_in_words(before),
-                    expected=_in_words(own),
-                    next_step="Name another folder with -o, or remove this one",
-                )
-        else:
-            write_text(path, json_text(own))
-        for left in folder.glob(".*.part"):  # of a process that was killed while it wrote
-            left.unlink(missing_ok=True)
-        return cls(folder)
+        with alone_in(folder, "study"):
+            if any(folder.glob("*.npz")):
+                before = _description(path)
+                if before.get("digest") != own["digest"]:
+                    raise InputError(
+                        "the folder holds the batches of another study",
+                        where=str(folder),
+                        found=_in_words(before),
+                        expected=_in_words(own),
+                        next_step="Name another folder with -o, or remove this one",
+                    )
+            else:
+                write_text(path, json_text(own))
+            for left in folder.glob(".*.part"):  # of a process that was killed while it wrote
+                left.unlink(missing_ok=True)
+            yield cls(folder)
 
     def load(self, cell: int, number: int, batch: Batch) -> Done | None:
         """A finished batch; None where it is still to be done, or has another number of runs."""
@@ -126,7 +132,7 @@ def plainly(value: Any) -> Any:
 def _description(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
+    except (OSError, ValueError):
         found = None
     if isinstance(found, dict):
         return found

@@ -23,8 +23,9 @@ from pkmcal.errors import InputError
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, MechanismDocument, catalogue, load_mechanism
 from pkmcal.mechanisms.machine import machine_from_document
-from pkmcal.session.load import FILE, Session, load_session
+from pkmcal.session.load import Session, load_session, session_folder
 from pkmcal.simulation.demo import camera_of_size
+from pkmcal.simulation.placement import check_drawable
 from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
 from pkmcal.studies.paper_a import HexapodByAxes
@@ -107,6 +108,14 @@ class Cell:
     setting: Setting
 
 
+def in_words(values: Mapping[str, Value]) -> str:
+    """A combination in words, such as "stations 2, edge noise 0.1"; empty where nothing varies."""
+    return ", ".join(
+        f"{name.replace('_', ' ')} {value if isinstance(value, str) else f'{value:g}'}"
+        for name, value in values.items()
+    )
+
+
 def subject_of(origin: str) -> StudySubject:
     """A paper's letter, a session's folder, a mechanism file or a built-in machine by its name.
 
@@ -114,10 +123,12 @@ def subject_of(origin: str) -> StudySubject:
     """
     if origin == PAPER:
         return StudySubject("the joint calibration of [A] 4.3", HexapodByAxes())
-    path = Path(origin)
-    if path.is_dir() or path.name == FILE:
-        return _of_session(load_session(path))
-    if origin not in catalogue() and path.suffix not in (".yaml", ".yml"):
+    folder = session_folder(origin)
+    if folder is not None:
+        session = load_session(folder, measured=False)
+        check_drawable(session.machine)
+        return _of_session(session)
+    if origin not in catalogue() and Path(origin).suffix not in (".yaml", ".yml"):
         raise InputError(
             "there is nothing of this name to study",
             found=origin,
@@ -125,6 +136,7 @@ def subject_of(origin: str) -> StudySubject:
             f" {listed(sorted(catalogue()), 20)}",
         )
     machine = load_mechanism(origin, label=None)
+    check_drawable(machine)
     return StudySubject(machine.name, Design(machine, (camera_of_size(SIZE),)))
 
 
@@ -143,6 +155,8 @@ def _of_session(session: Session) -> StudySubject:
         warnings.append("The board on the base is left out: what it adds is not simulated.")
     if session.trackers:
         warnings.append("Trackers are left out: only what cameras see is simulated.")
+    if session.workspace is not None:
+        warnings.append("The tool's errors are told over the whole reach, not over its workspace.")
     words = [{w for w in s.observe if not (on_base and w == "board")} for s in session.stations]
     if any(own != words[0] for own in words) or not words[0]:
         raise InputError(
@@ -155,6 +169,9 @@ def _of_session(session: Session) -> StudySubject:
     if len(known) < len(places):
         warnings.append("Stations without a pose stand where a camera sees the machine well.")
     seen = [{p.configuration for p in station.photographs} for station in session.stations]
+    usual = Design.configurations
+    if not any(seen):
+        warnings.append(f"There are no photographs yet: {usual} are taken from each place.")
     board = None if session.board is None or on_base else load_board(session.board)
     design = Design(
         session.machine,
@@ -163,8 +180,10 @@ def _of_session(session: Session) -> StudySubject:
         T_camera_base=np.stack(known) if len(known) == len(places) else None,
         observe=tuple(word for word in ("legs", "board") if word in words[0]),
         board=board,
-        configurations=max(2, round(float(np.median([len(own) for own in seen])))),
-        shared=len(seen) > 1 and all(own == seen[0] for own in seen),
+        configurations=max(2, round(float(np.median([len(own) for own in seen]))))
+        if any(seen)
+        else usual,
+        shared=len(seen) > 1 and any(seen) and all(own == seen[0] for own in seen),
         reading_noise=session.joint_noise,
     )
     return StudySubject(f"the session {session.folder}", design, tuple(warnings))
@@ -186,14 +205,14 @@ def parsed(subject: StudySubject, texts: Sequence[str]) -> dict[str, tuple[Value
             )
         if name in out:
             raise InputError("a name is varied twice", where="--vary", found=name)
-        values = [_value(name, subject.names[name], part.strip()) for part in rest.split(",")]
-        if not equals or len(set(values)) < len(values):
+        parts = [part.strip() for part in rest.split(",")]
+        if not equals or not all(parts):
             raise InputError(
-                "values are missing, or stand twice",
-                where="--vary",
-                found=text,
-                expected=f"{name}=V1,V2",
+                "a value is missing", where="--vary", found=text, expected=f"{name}=V1,V2"
             )
+        values = [_value(name, subject.names[name], part) for part in parts]
+        if len(set(values)) < len(values):
+            raise InputError("a value stands twice", where="--vary", found=text)
         out[name] = tuple(values)
     return out
 

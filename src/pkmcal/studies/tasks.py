@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.errors import PkmcalError
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.statistics import Statistic
 
@@ -92,10 +93,11 @@ class Setting(Protocol):
 
 
 class Job(NamedTuple):
-    """One batch of one setting: all that a worker needs."""
+    """One batch of one setting: all that a worker needs. name : what errors say it is."""
 
     setting: Setting
     batch: Batch
+    name: str = ""
 
 
 class Done(NamedTuple):
@@ -116,11 +118,14 @@ def work(task: Job) -> Done:
     """A batch drawn, solved and judged, on one thread."""
     from threadpoolctl import threadpool_limits
 
-    setting, batch = task
-    # Small matrices: threads inside the linear algebra would only wait for one another.
-    with threadpool_limits(1, "blas"):
-        data = setting.draw(batch)
-        began, used = time.perf_counter(), time.thread_time()
-        found = setting.solve(batch, data)
-        wall, cpu = time.perf_counter() - began, time.thread_time() - used
-        return Done(setting.judge(batch, data, found), wall, cpu)
+    setting, batch = task.setting, task.batch
+    try:
+        # Small matrices: threads inside the linear algebra would only wait for one another.
+        with threadpool_limits(1, "blas"):
+            data = setting.draw(batch)
+            began, used = time.perf_counter(), time.thread_time()
+            found = setting.solve(batch, data)
+            wall, cpu = time.perf_counter() - began, time.thread_time() - used
+            return Done(setting.judge(batch, data, found), wall, cpu)
+    except PkmcalError as error:
+        raise (error.located(task.name) if task.name else error) from None
