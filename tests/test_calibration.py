@@ -11,7 +11,6 @@ import pytest
 import pkmcal
 from pkmcal.cameras import camera_models
 from pkmcal.commands.comparison import compare
-from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres, apply
@@ -180,9 +179,21 @@ def test_cameras_are_refined(demo, calibrated):
     assert np.all(np.diag(refined.covariance)[:2] < sigma[:2] ** 2)
 
 
-def test_a_camera_without_covariance_is_not_refined(demo):
-    with pytest.raises(InputError, match="the camera's covariance is not known"):
-        pkmcal.calibrate(demo.session, refine_camera=True)
+def test_a_camera_without_covariance_is_refined_from_what_is_usual(demo):
+    session = load_session(demo.session)
+    camera = session.stations[0].camera
+    off = 0.006 * np.where(np.arange(len(camera.parameters)) < 2, camera.parameters, 0.0)
+    wrong = replace(camera, parameters=camera.parameters + off, covariance=None)
+    stations = tuple(replace(s, camera=wrong) for s in session.stations)
+    found = pkmcal.calibrate(replace(session, stations=stations), refine_camera=True)
+    refined = found.cameras.result(found.estimate, session.stations[0].camera_file)
+    left, sigma = refined.parameters - camera.parameters, np.sqrt(np.diag(refined.covariance))
+    assert np.all(np.abs(left[:5]) < 3.5 * sigma[:5])
+    assert np.all(sigma[:2] < 0.005 * camera.parameters[:2])
+    assert sigma[5:].max() == 0  # nobody said that these are unknown
+    (told,) = [w for w in found.verdict.warnings if "states no covariance" in w]
+    assert "focal lengths to 0.5%, the centre to 1% of the width" in told
+    assert found.departures == ()
 
 
 def test_state_of_a_calibration_closes(calibrated):

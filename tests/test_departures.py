@@ -239,6 +239,34 @@ def test_another_camera_is_named(session):
     assert one.sentence in told
 
 
+def test_one_wrong_reading_is_named_with_its_configuration(session):
+    path = session / "joints.csv"
+    lines = path.read_text().splitlines()
+    cells = lines[6].split(",")
+    cells[3] = repr(float(cells[3]) + 0.004)
+    lines[6] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+    found = calibrate(session)
+    (one,) = found.departures
+    assert (one.kind, one.of) == ("reading", f"leg3, {cells[0]}")
+    assert one.value[0] == pytest.approx(-0.004, rel=0.3)
+    assert f"The reading of leg3 in configuration {cells[0]} is off" in one.sentence
+    assert "mm less" in one.sentence
+
+
+def test_a_frozen_reading_is_named(session):
+    path = session / "joints.csv"
+    head, *rows = list(csv.reader(path.read_text().splitlines()))
+    for row in rows:
+        row[2] = rows[0][2]
+    path.write_text("\n".join(",".join(row) for row in [head, *rows]) + "\n")
+    result = run("calibrate", str(session))
+    told = " ".join((result.out + result.err).split())
+    assert result.code == 2
+    assert "joints.csv, column leg2: the readings of leg2 are frozen" in told
+    assert f"in all {len(rows)} configurations" in told
+
+
 def test_a_right_session_names_nothing(calibrated):
     assert calibrated.departures == ()
     assert len(calibrated.session.stations[0].photographs) < 2 * FEWEST

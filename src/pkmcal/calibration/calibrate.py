@@ -17,6 +17,7 @@ from pkmcal.calibration.departures import Departed, departures
 from pkmcal.calibration.doubts import (
     as_stated,
     check_poses,
+    lens_told,
     model_at_fault,
     noise_doubt,
     noise_told,
@@ -257,6 +258,7 @@ def _judge(
         cautions=(
             *(one.sentence for one in departed if not one.against),
             *noise_told(session, found.estimate, bool(departed)),
+            *lens_told(found.turns.cameras),
         ),
     )
     clock.lap("identify")

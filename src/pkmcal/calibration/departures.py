@@ -20,7 +20,7 @@ from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.rows import Kinds
-from pkmcal.identify.score import Departures, Fit, Score, columns_of
+from pkmcal.identify.score import Departures, Freed, Score, columns_of
 from pkmcal.identify.tool import ToolError, tool_error
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements, Observation
@@ -33,6 +33,8 @@ AGAINST = 1.0
 """Standard deviations by which a departure moves the tool, beyond which the result is refused."""
 FEWEST = 3
 """Configurations on either side of a movement: fewer are outliers."""
+SLIPS = 300
+"""Single readings that are tried at most."""
 MOMENTS = 12
 """Times at most, spread over a station's photographs, at which it may have moved."""
 
@@ -112,10 +114,12 @@ def departures(
     )
     assembled = replace(assembled, problem=problem)
     at = _At(session, observation, told, assembled, batch_of(machine, assembled, estimate.state))
-    tried = [one for declared in DECLARED for one in declared(at)]
+    families = [list(declared(at)) for declared in DECLARED]
+    tried = [one for family in families for one in family]
     if not tried:
         return ()
-    tests = Departures(problem, at.state, [one.columns for one in tried])
+    number = np.repeat(np.arange(len(families)), [len(family) for family in families])
+    tests = Departures(problem, at.state, [one.columns for one in tried], number.tolist())
     found = tests.found(LEVEL)
     fits = tests.fitted([k for k, _ in found]) if found else []
     used = estimate.configurations
@@ -132,7 +136,7 @@ def departures(
     )
 
 
-def _departed(one: Departure, score: Score, fit: Fit, tool: ToolError) -> Departed:
+def _departed(one: Departure, score: Score, fit: Freed, tool: ToolError) -> Departed:
     moved = np.linalg.norm((tool.by_parameters @ fit.moved)[:, 3:], axis=-1)
     shift = float(np.sqrt(np.nanmean(moved**2)))
     sigma = float(np.sqrt(np.nanmean(tool.position**2)))
@@ -199,6 +203,35 @@ def _play(at: _At) -> Iterator[Departure]:
             )
 
         yield Departure("backlash", name, at.columns(readings=by), words)
+
+
+def _slips(at: _At) -> Iterator[Departure]:
+    """A single reading that is wrong: of those configurations whose rows fit worst, where there are
+    too many to try all.
+    """
+    told, names = at.measurements, at.session.document["joints"]["columns"]
+    units, m = at.session.machine.joint_units, told.joints.shape[1]
+    seen = np.flatnonzero(at.assembled.seen)
+    cost = np.sum(at.assembled.problem.residuals(at.state).value[0] ** 2, axis=-1)
+    for k in np.sort(np.argsort(-cost, kind="stable")[: max(SLIPS // m, 1)]).tolist():
+        configuration = at.session.configurations[seen[k]]
+        for j, (name, unit) in enumerate(zip(names, units, strict=True)):
+            by = np.zeros((*told.joints.shape, 1))
+            by[seen[k], j] = 1.0
+
+            def words(
+                value: Array, sigma: Array, of: str = configuration, name: str = name,
+                unit: str = unit,
+            ) -> tuple[str, str]:  # fmt: skip
+                return (
+                    f"The reading of {name} in configuration {of} is off: what was seen tells"
+                    f" {amount(abs(value[0]), unit)} {'more' if value[0] > 0 else 'less'}, to"
+                    f" {amount(sigma[0], unit)}",
+                    "Look it up where readings are logged, and whether this photograph bears the"
+                    " right name, or leave the configuration out",
+                )
+
+            yield Departure("reading", f"{name}, {configuration}", at.columns(readings=by), words)
 
 
 def _lenses(at: _At) -> Iterator[Departure]:
@@ -296,6 +329,7 @@ def _tripods(at: _At) -> Iterator[Departure]:
 DECLARED: Sequence[Callable[[_At], Iterator[Departure]]] = (
     _scales,
     _play,
+    _slips,
     _lenses,
     _boards,
     _tripods,

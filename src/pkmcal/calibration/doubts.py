@@ -17,6 +17,9 @@ from typing import Literal
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.calibration.gather import CameraRefinement
+from pkmcal.calibration.recognise import frozen_in
+from pkmcal.cameras.contract import USUAL_CENTRE, USUAL_DISTORTION, USUAL_FOCAL
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse, pose, pose_difference, rotation_vector
 from pkmcal.identify.assembly import assemble, batch_of
@@ -338,7 +341,7 @@ def check_poses(
         return
     doubt = find_doubt(session.machine, measurements, estimate)
     if doubt is not None:
-        raise _error(session, doubt, estimate.statistics.pose_scale)
+        raise frozen_in(session) or _error(session, doubt, estimate.statistics.pose_scale)
 
 
 def as_stated(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:
@@ -445,6 +448,25 @@ def noise_told(session: Session, estimate: Estimate, departed: bool = False) -> 
             " deviations follow."
         )
     return tuple(out)
+
+
+def lens_told(cameras: CameraRefinement) -> tuple[str, ...]:
+    """A sentence for each camera that was refined and whose file does not tell how well it is
+    known.
+    """
+    usual = ", ".join(
+        (
+            f"focal lengths to {USUAL_FOCAL:.1%}",
+            f"the centre to {USUAL_CENTRE:.0%} of the width",
+            f"distortion to {USUAL_DISTORTION:g}",
+        )
+    )
+    return tuple(
+        f"{file} states no covariance, so its camera was taken to be known as cameras usually are:"
+        f" {usual}. One that `pkmcal camera` calibrates is better known."
+        for file, camera in zip(cameras.files, cameras.calibrated, strict=True)
+        if cameras.refined and camera.covariance is None
+    )
 
 
 def _within(value: float, limits: tuple[float, float | None]) -> bool:

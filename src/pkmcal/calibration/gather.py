@@ -138,7 +138,7 @@ def edges_by_camera(observation: Observation, cameras: Sequence[Camera]) -> Arra
 
 
 def refinement_of(session: Session, refine: bool) -> CameraRefinement:
-    """The session's cameras, held or to be refined; an InputError where one has no covariance.
+    """The session's cameras, held or to be refined; an InputError where there is none.
 
     A camera of which EXIF alone tells is refined in any case.
     """
@@ -157,7 +157,7 @@ def refinement_of(session: Session, refine: bool) -> CameraRefinement:
             next_step="Leave --refine-camera out",
         )
     roots = [
-        covariance_root(file, camera)
+        covariance_root(camera)
         if refine or file in rough
         else np.zeros((len(camera.parameters), 0))
         for file, camera in cameras.items()
@@ -167,18 +167,15 @@ def refinement_of(session: Session, refine: bool) -> CameraRefinement:
     return CameraRefinement(files, calibrated, factor, np.zeros((len(files), r)), *stations)
 
 
-def covariance_root(file: str, camera: Camera) -> Array:
-    """F (n, r) of a camera; what its calibration held fixed has no variance and no column."""
-    if camera.covariance is None:
-        raise InputError(
-            "the camera's covariance is not known, so its intrinsics cannot be refined",
-            where=file,
-            expected="covariance: [[...], ...], as `pkmcal camera` writes it",
-            next_step="Calibrate the camera with `pkmcal camera`, or leave --refine-camera out",
-        )
-    scale = np.sqrt(np.diag(camera.covariance))
+def covariance_root(camera: Camera) -> Array:
+    """F (n, r) of a camera; what its calibration held fixed has no variance and no column. A camera
+    whose file states no covariance has a usual one.
+    """
+    stated = camera.covariance
+    covariance = camera.usual_covariance() if stated is None else stated
+    scale = np.sqrt(np.diag(covariance))
     scale[scale == 0] = 1.0
-    values, vectors = np.linalg.eigh(camera.covariance / np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     used = values > 1e-12 * values[-1]
     return scale[:, None] * vectors[:, used] * np.sqrt(values[used])
 

@@ -24,6 +24,7 @@ from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import label_of
 from pkmcal.session.poses import check_lengths
+from pkmcal.session.readings import frozen
 from pkmcal.wording import listed
 
 WORKERS = 2
@@ -248,10 +249,11 @@ def mistake_in(
     rng: np.random.Generator,
 ) -> InputError | None:
     """The error about stations that were not recognised, or show something else than the session
-    says: the usual mix-ups are tried.
+    says: the usual mix-ups are tried. A reading that never moved is named before all others, for it
+    may look like any of them.
     """
     stations = [session.stations[p.station] for p in photographs]
-    return mistake(
+    error = mistake(
         [
             SeenStation(
                 station.name,
@@ -267,6 +269,13 @@ def mistake_in(
         ],
         rng,
     )
+    return error and (frozen_in(session) or error)
+
+
+def frozen_in(session: Session) -> InputError | None:
+    """The error about readings that never moved."""
+    joints = session.document["joints"]
+    return frozen(session.joints, session.joint_noise, joints["columns"], joints["file"])
 
 
 def station_poses(

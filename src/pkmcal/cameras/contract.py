@@ -53,15 +53,22 @@ class CameraSchema(Schema):
         return focal
 
 
+USUAL_FOCAL, USUAL_CENTRE, USUAL_DISTORTION = 0.005, 0.01, 0.05
+"""Standard deviations of a camera whose file states none: of its focal lengths, relative; of its
+centre, in parts of the picture's width; of its first term of distortion. A zoom ring turned by a
+hair, a sensor that is not centred behind its lens, and the distortion of most lenses."""
+
+
 class LensDeparture(NamedTuple):
     """How a camera may be another than its file says, by k numbers.
 
-    columns : (n, k) change of its parameters by them. says : what to say of them, (k,), and of
-    their standard deviations.
+    columns : (n, k) change of its parameters by them. usual : their standard deviation where nobody
+    calibrated the camera with care. says : what to say of them, (k,), and of their deviations.
     """
 
     kind: str
     columns: Array
+    usual: float
     says: Callable[[Array, Array], str]
 
 
@@ -148,6 +155,7 @@ class Camera(ABC):
             LensDeparture(
                 "focal length",
                 focal[:, None],
+                USUAL_FOCAL,
                 lambda v, s: (
                     f"focal lengths fit that are {abs(v[0]):.2%} ± {s[0]:.2%}"
                     f" {'longer' if v[0] > 0 else 'shorter'}"
@@ -156,6 +164,7 @@ class Camera(ABC):
             LensDeparture(
                 "picture centre",
                 eye[:, 2:4],
+                USUAL_CENTRE * self.image_size[0],
                 lambda v, s: (
                     f"a centre fits that is {v[0]:+.1f} ± {s[0]:.1f} px in x and"
                     f" {v[1]:+.1f} ± {s[1]:.1f} px in y beside its own"
@@ -164,12 +173,19 @@ class Camera(ABC):
             LensDeparture(
                 "distortion",
                 eye[:, lens : lens + 1],
+                USUAL_DISTORTION,
                 lambda v, s: (
                     f"a distortion {name} of {before + v[0]:.3g} ± {s[0]:.2g} fits, not of"
                     f" {before:.3g}"
                 ),
             ),
         )
+
+    def usual_covariance(self) -> Array:
+        """(n, n) of the parameters where no calibration tells it: of what departs first."""
+        parts = [part.usual * part.columns for part in self.departures()]
+        columns = np.concatenate(parts, axis=1)
+        return columns @ columns.T
 
     def document(self) -> dict[str, Any]:
         """The fields of a camera file, the inverse of :meth:`from_document`."""

@@ -26,9 +26,10 @@ from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.solver import eliminate, inverse_root, stacked
 
-SEEN = 1e-6
+SEEN = 1e-10
 """Part of a departure's squared rows that has to be left beside all unknowns for the data to see
-it; less is rounding."""
+it; less is rounding. Of what a reading tells of a pose, a hundred times sharper than the edges,
+a ten-thousandth is left."""
 MOST = 4
 """Departures that are looked for one after the other; more are a session with other troubles."""
 
@@ -36,7 +37,7 @@ MOST = 4
 @dataclass(frozen=True)
 class Score:
     """What one departure would gain: chi2 by dof numbers, chance of as much by chance alone in this
-    test, and ``adjusted``, in the largest of all tests that were made.
+    test, and ``adjusted``, in any of all tests that were made, families counting alike.
     """
 
     chi2: float
@@ -46,7 +47,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Fit:
+class Freed:
     """A departure as the data tell it: value, sigma (k,), and moved (P,), what taking it up does to
     the machine's parameters, m and rad. What the data do not see has an infinite sigma.
     """
@@ -59,8 +60,19 @@ class Fit:
 class Departures:
     """Columns of departures beside the estimate's own, at its minimum (the problem's first run)."""
 
-    def __init__(self, problem: Problem, state: BatchState, columns: Sequence[Array]) -> None:
-        """Of departures by their rows' derivatives (K', r, k), by configuration."""
+    def __init__(
+        self,
+        problem: Problem,
+        state: BatchState,
+        columns: Sequence[Array],
+        families: Sequence[int] | None = None,
+    ) -> None:
+        """Of departures by their rows' derivatives (K', r, k), by configuration.
+
+        families : of which each is; among many departures of one kind the single one has to gain
+        more, and those of other kinds do not pay for it. One family if absent.
+        """
+        self._family = np.zeros(len(columns), dtype=int) if families is None else np.array(families)
         linear, ends = problem.linearize(state), np.cumsum([part.shape[-1] for part in columns])
         self._parts: list[Integers] = [
             np.arange(end - part.shape[-1], end) for part, end in zip(columns, ends, strict=True)
@@ -96,8 +108,11 @@ class Departures:
             along = u[:, (s**2 > SEEN) & (k not in freed)].T @ value
             chi2, dof = float(along @ along), len(along)
             out.append(Score(chi2, dof, float(chdtrc(dof, chi2)) if dof else 1.0))
-        count = sum(score.dof > 0 for score in out)
-        return [replace(s, adjusted=min(count * s.chance, 1.0)) for s in out]
+        tested = np.bincount(self._family, weights=[score.dof > 0 for score in out])
+        times = np.count_nonzero(tested) * tested[self._family]
+        return [
+            replace(s, adjusted=min(n * s.chance, 1.0)) for s, n in zip(out, times, strict=True)
+        ]
 
     def found(self, alpha: float) -> list[tuple[int, Score]]:
         """Those that the data show at a level ``alpha`` of all tests together (Bonferroni), one
@@ -106,13 +121,13 @@ class Departures:
         out: list[tuple[int, Score]] = []
         while len(out) < min(MOST, len(self._parts)):
             scores = self.scores([k for k, _ in out])
-            best = min(range(len(scores)), key=lambda k: scores[k].chance)
+            best = min(range(len(scores)), key=lambda k: scores[k].adjusted)
             if scores[best].adjusted > alpha:
                 break
             out.append((best, scores[best]))
         return out
 
-    def fitted(self, freed: Sequence[int]) -> list[Fit]:
+    def fitted(self, freed: Sequence[int]) -> list[Freed]:
         """What some departures come to, all free together."""
         columns = self._columns(freed)
         u, s, vt = np.linalg.svd(self._left[:, columns], full_matrices=False)
@@ -124,7 +139,7 @@ class Departures:
         sigma[hidden] = np.inf
         ends = np.cumsum([len(self._parts[k]) for k in freed])
         return [
-            Fit(v, s, self._moves[:, self._parts[k]] @ v)
+            Freed(v, s, self._moves[:, self._parts[k]] @ v)
             for k, v, s in zip(
                 freed, np.split(value, ends[:-1]), np.split(sigma, ends[:-1]), strict=True
             )

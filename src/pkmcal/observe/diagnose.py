@@ -42,7 +42,7 @@ machine of three or six equal parts looks the same from there."""
 ASSIGNED = 3
 """Rounds of names for photographs, and of the pose that these tell."""
 SEARCHED = 3
-"""Hypotheses, likeliest first, that are searched in full."""
+"""Hypotheses about the readings, likeliest first, that are searched in full."""
 
 
 class SeenStation(NamedTuple):
@@ -155,14 +155,14 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
         starts.append(station.by_hand)
     begin = np.array(starts).reshape(-1, 4, 4)
     own = evidence_nearby(view, begin, wide, rng)
-    likely: list[tuple[float, Hypothesis]] = [(np.inf, h) for h in _other_photographs(station)]
+    likely: list[tuple[float, Hypothesis]] = []
     for other in _hypotheses(station):
         evidence = evidence_nearby(other.view, begin, wide, rng)
         # where the machine is as the user says, another word has to be better there at once
         if evidence > own or station.elsewhere:
             likely.append((evidence, other))
-    best = sorted(likely, key=lambda item: -item[0])[:SEARCHED]
-    return _likelier(station, [other for _, other in best], in_order, rng)
+    best = [other for _, other in sorted(likely, key=lambda item: -item[0])[:SEARCHED]]
+    return _likelier(station, [*_other_photographs(station), *best], in_order, rng)
 
 
 def _likelier(

@@ -9,7 +9,7 @@ from math import pi
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
 from pkmcal.wording import listed
@@ -131,8 +131,30 @@ def _check_ranges(table: CsvTable, ranges: Array) -> list[str]:
     ]
 
 
+def standing(joints: Array, noise: float) -> Booleans:
+    """(m,) which of the readings (K, m) never move by more than their noise."""
+    return np.ptp(joints, axis=0) <= _ALIKE * noise
+
+
+def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> InputError | None:
+    """The error about readings that never moved, where the data contradict the readings."""
+    still = np.flatnonzero(standing(joints, noise)).tolist() if len(joints) else []
+    if not still:
+        return None
+    names = [columns[k] for k in still]
+    return InputError(
+        f"the readings of {listed(names)} are frozen: they never change, and what was seen does not"
+        " fit the readings",
+        where=f"{file}, column {names[0]}",
+        found=f"{joints[0, still[0]]:g} in all {len(joints)} configurations",
+        expected="readings that follow the motor",
+        next_step="Look at the encoder, its cable and the program that logs it. If this motor was"
+        " really held, something else is wrong",
+    )
+
+
 def _check_movement(table: CsvTable, noise: float) -> list[str]:
-    still = np.ptp(table.values, axis=0) <= _ALIKE * noise
+    still = standing(table.values, noise)
     if still.all():
         raise InputError(
             "all configurations are alike: no joint moves by more than its noise",
