@@ -222,8 +222,12 @@ FACTS: dict[str, Fact] = {
     "none": Fact(lambda _f, _r: None, ()),
     "encoder's scale 1 %": Fact(scaled(0.01), ("another scale",)),
     "encoder's scale .1 %": Fact(scaled(0.001), ("another scale",)),
-    "board's squares .2 %": Fact(board(0.002), ("squares", "scale"), ("board",)),
-    "board's squares 1 %": Fact(board(0.01), ("squares", "another size"), ("board",)),
+    "board's squares .2 %": Fact(
+        board(0.002), ("squares are", "board came out", "as if the board"), ("board",)
+    ),
+    "board's squares 1 %": Fact(
+        board(0.01), ("squares are", "as if the board", "another size"), ("board",)
+    ),
     "focal length .2 %": Fact(focal(0.002), ("is not the one that took",)),
     "focal length 1 %": Fact(focal(0.01), ("is not the one that took",)),
     "centre 3 px": Fact(centre(3.0), ("is not the one that took",)),
@@ -269,6 +273,8 @@ def simulated(seen: str, seed: int, keep: Path) -> Path:
     if not folder.exists():
         _, cameras, settings, drawing = ingredients(seen, seed)
         simulate_session(folder, drawing, cameras, settings, seed=seed)
+        if seen == "board":  # a print is not exact, as a simulated board says of itself
+            edited(folder / "board.yaml", lambda document: document.pop("tolerance"))
     return folder
 
 

@@ -201,10 +201,15 @@ def concatenate(sets: Sequence[Set]) -> Set:
 
 @dataclass(frozen=True)
 class Mount:
-    """What a board or a tracker's target is fixed to; its place there is estimated."""
+    """What a board or a tracker's target is fixed to; its place there is estimated.
+
+    tolerance : standard deviation of a board's size, relative: its squares are all larger or
+    smaller by one factor, which is estimated where the data tell it.
+    """
 
     name: str
     body: Literal["base", "platform"]
+    tolerance: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,12 @@ Count = Annotated[int, Field(ge=3, le=100)]
 Counts = tuple[Count, Count]
 InnerCorners = tuple[Annotated[int, Field(ge=3, le=100)], Annotated[int, Field(ge=3, le=100)]]
 Length = Annotated[float, Field(gt=0)]
+Tolerance = Annotated[
+    float, Field(ge=0, le=0.05, description="standard deviation of the board's size, relative")
+]
+PRINTED = 1e-3
+"""Standard deviation of a printed board's size, relative, unless its file says otherwise: paper
+moves by as much with the air's moisture, and printers' feeds differ by more."""
 LONGEST = 5.0
 """m; a square or marker longer than this was written in millimetres."""
 
@@ -56,6 +62,7 @@ class CharucoSchema(_Dictionary):
     square: Length = Field(description="the length of a square's side in metres")
     marker: Length = Field(description="the length of a marker's side in metres")
     legacy: bool = False
+    tolerance: Tolerance = PRINTED
 
     @field_validator("square", "marker")
     @classmethod
@@ -73,6 +80,7 @@ class ChessboardSchema(Schema):
     corners: InnerCorners | None = None
     squares: Counts | None = Field(default=None, validate_default=True)
     square: Length = Field(description="the length of a square's side in metres")
+    tolerance: Tolerance = PRINTED
 
     @field_validator("squares")
     @classmethod
@@ -101,6 +109,7 @@ class GridSchema(_Dictionary):
     marker: Length = Field(description="the length of a marker's side in metres")
     gap: Length = Field(description="the distance between two markers in metres")
     first_id: Annotated[int, Field(ge=0)] = 0
+    tolerance: Tolerance = PRINTED
 
     @field_validator("marker", "gap")
     @classmethod
@@ -128,6 +137,11 @@ class Board:
     points: Array
     lines: tuple[tuple[int, ...], ...]
     document: dict[str, Any]
+
+    @property
+    def tolerance(self) -> float:
+        """Standard deviation of its size, relative: all squares are larger or smaller alike."""
+        return self.document.get("tolerance", PRINTED)
 
     @property
     def described(self) -> str:

@@ -61,11 +61,13 @@ class StationBoard:
 class Boards:
     """The board in all stations that observe it.
 
-    stations : by their number in the session. body : what the board is fixed to.
+    stations : by their number in the session. body : what the board is fixed to. tolerance :
+    standard deviation of its size, relative.
     """
 
     stations: Mapping[int, StationBoard] = field(default_factory=dict[int, StationBoard])
     body: Body = "platform"
+    tolerance: float = 0.0
 
     @property
     def poses(self) -> PoseSet:
@@ -130,7 +132,7 @@ def find_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> B
             found[number] = seen
     for entry, detections in by_hand.items():
         _check_shown(entry, board, detections)
-    return Boards(found, session.board_body)
+    return Boards(found, session.board_body, board.tolerance)
 
 
 def board_of(session: Session) -> Board | None:

@@ -23,6 +23,7 @@ from pkmcal.calibration.doubts import (
     noise_told,
     richer_models,
     scale_doubt,
+    sizes_told,
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.recognise import (
@@ -260,6 +261,7 @@ def _judge(
             *noise_told(session, found.estimate, bool(departed)),
             *lens_told(found.turns.cameras),
         ),
+        hints=sizes_told(session, found.turns.measurements, found.estimate),
     )
     clock.lap("identify")
     return Calibration(

@@ -273,22 +273,28 @@ def _lens_words(
 
 
 def _boards(at: _At) -> Iterator[Departure]:
-    """A board whose squares are not as large as its file says."""
-    poses = at.measurements.poses
-    for m, mount in enumerate(at.measurements.mounts):
+    """A board whose squares are not as large as its file says, by more than its tolerance."""
+    poses, mounts = at.measurements.poses, at.measurements.mounts
+    unsure = np.cumsum([mount.tolerance > 0 for mount in mounts])
+    for m, mount in enumerate(mounts):
         if mount.name != "board":
             continue
         by = np.zeros((len(poses), 6, 1))
         mine = poses.mount == m
         by[mine, 3:, 0] = poses.T_station_target[mine, :3, 3]
         file = at.session.document["board"]["file"]
+        # as far as the tolerance allowed the estimate has gone already
+        gone = mount.tolerance and mount.tolerance * at.state.sizes[0, unsure[m] - 1]
 
-        def words(value: Array, sigma: Array, file: str = file) -> tuple[str, str]:
+        def words(
+            value: Array, sigma: Array, file: str = file, gone: float = float(gone)
+        ) -> tuple[str, str]:
+            size = gone + value[0]
             return (
-                f"The board's squares are {_percent(value[0], sigma[0])}"
-                f" {'larger' if value[0] > 0 else 'smaller'} than {file} says",
+                f"The board's squares are {_percent(size, sigma[0])}"
+                f" {'larger' if size > 0 else 'smaller'} than {file} says",
                 f"Measure them over as many as there are; if a ruler agrees, multiply square and"
-                f" marker by {1 + value[0]:.5f}",
+                f" marker by {1 + size:.5f}",
             )
 
         yield Departure("board size", file, at.columns(poses=by), words)

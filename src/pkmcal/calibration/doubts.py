@@ -53,6 +53,8 @@ CERTAIN = 12.0
 """Standard deviations by which a board has to have moved, all six numbers together."""
 ENOUGH = 4.0
 """Standard deviations that it may leave: a drawing's own errors are in them."""
+OPEN = 0.7
+"""Part of its tolerance from which a board's size is known from its file: the data say less."""
 HOPELESS = 50.0
 """Factor on the poses' noise beyond which, after a first search, a mistake put right is none, and a
 richer model no help: what is believed ends below ENOUGH."""
@@ -467,6 +469,28 @@ def lens_told(cameras: CameraRefinement) -> tuple[str, ...]:
         for file, camera in zip(cameras.files, cameras.calibrated, strict=True)
         if cameras.refined and camera.covariance is None
     )
+
+
+def sizes_told(session: Session, measurements: Measurements, estimate: Estimate) -> tuple[str, ...]:
+    """A sentence on how large the board is, where that is not known exactly."""
+    tolerances = [mount.tolerance for mount in measurements.mounts if mount.tolerance > 0]
+    told = zip(tolerances, estimate.state.sizes, estimate.size_sigma, strict=False)
+    out: list[str] = []
+    for tolerance, value, sigma in told:
+        file = session.document["board"]["file"]
+        if sigma > OPEN:
+            out.append(
+                f"Nothing but {file} tells how large the board is: to {100 * tolerance:.2g} %, its"
+                " tolerance, and standard deviations contain that. Measure its squares over as many"
+                " as there are, correct square and marker, and state how well you measured."
+            )
+        else:
+            out.append(
+                f"The board came out {100 * tolerance * abs(value):.3f} ±"
+                f" {100 * tolerance * sigma:.3f} % {'larger' if value > 0 else 'smaller'} than"
+                f" {file} says; that is taken into account."
+            )
+    return tuple(out)
 
 
 def _within(value: float, limits: tuple[float, float | None]) -> bool:

@@ -192,7 +192,7 @@ def measurements_of(
     # A tracker has no camera; the first one's number moves nothing of what it measured.
     number = [numbers[name] for name in files] + [0] * len(session.trackers)
     # What targets are fixed to: the board, then each tracker's own.
-    mounts = [Mount("board", boards.body)] if boards.stations else []
+    mounts = [Mount("board", boards.body, boards.tolerance)] if boards.stations else []
     poses, edges = boards.poses, EdgeSet.empty() if edges is None else edges
     breathing = np.zeros(0)
     if cameras is not None and cameras.active and session.stations:

@@ -300,15 +300,21 @@ def _focal_scale(calibration: Calibration, number: int) -> dict[str, Any]:
 
 def _targets(calibration: Calibration) -> list[dict[str, Any]]:
     """Boards, and what trackers measured, on their body; sigma null where nothing tells it."""
-    estimate, names = calibration.estimate, [m.name for m in calibration.measurements.mounts]
+    estimate, mounts = calibration.estimate, calibration.measurements.mounts
+    sizes = iter(zip(estimate.state.sizes, estimate.size_sigma, strict=True))
     out: list[dict[str, Any]] = []
-    for m, name in enumerate(names):
+    for m, mount in enumerate(mounts):
+        size: dict[str, float] = {}
+        if mount.tolerance > 0:
+            value, deviation = next(sizes)
+            size = {"size": 1 + mount.tolerance * value, "sigma_size": mount.tolerance * deviation}
         body = "platform" if estimate.state.on_platform[m] else "base"
         sigma = np.sqrt(np.maximum(np.diag(estimate.mount_covariance[m]), 0.0))
         known = [float(x) if x < OPEN else None for x in sigma]
         out.append(
             {
-                "name": name,
+                "name": mount.name,
+                **size,
                 "fixed_to": body,
                 f"T_{body}_target": estimate.state.T_mount[m],
                 "sigma_rotation": known[:3],

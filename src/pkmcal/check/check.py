@@ -503,7 +503,8 @@ def check_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> 
     checks = {number: _board_check(one) for number, one in found.items()}
     for number, check in checks.items():
         findings += _board_findings(session, number, check)
-    return BoardsCheck(Boards(found, session.board_body), checks, tuple(findings))
+    boards = Boards(found, session.board_body, board.tolerance)
+    return BoardsCheck(boards, checks, tuple(findings))
 
 
 def _unseen(one: StationBoard) -> str:

@@ -54,7 +54,7 @@ class Assembled:
     seen : (K,) configurations with at least one edge, or pose of a board on the platform, or all
     without a station; only they are in the problem. places : where each kind's measurements stand
     among the seen ones. priors : names of the kinds of the prior rows, (c,): drawing, camera,
-    shading, breathing, mount or gauge.
+    shading, breathing, size, mount or gauge.
     """
 
     problem: Problem
@@ -97,6 +97,7 @@ def assemble(
         n_lines=int(line.max(initial=-1)) + 1,
         n_mounts=len(measurements.mounts),
         n_breathing=len(measurements.breathing_at),
+        n_sizes=sum(mount.tolerance > 0 for mount in measurements.mounts),
     )
     prior, target, kinds = prior_rows(
         machine,
@@ -252,6 +253,7 @@ def _poses(measurements: Measurements, at: Places) -> tuple[PoseBlocks, PoseData
         present=at.present,
         on_platform=measurements.on_platform,
         camera=at.filled(camera),
+        tolerance=np.array([mount.tolerance for mount in measurements.mounts], dtype=float),
     )
     target = at.filled(poses.T_station_target)
     target[~at.present] = np.eye(4)
@@ -274,8 +276,8 @@ def prior_rows(
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
     Without the drawing the frames are free, so the gauge's constraints stand in as rows: they
-    can be met exactly, hence fix the frames and pull on nothing else. Intrinsics, shading
-    and breathing stand in units of their prior. on_platform : (M,) mounts.
+    can be met exactly, hence fix the frames and pull on nothing else. Intrinsics, shading,
+    breathing and sizes stand in units of their prior. on_platform : (M,) mounts.
 
     What is on a platform is as near its start as the machine is large. Where a platform turns about
     one axis, nothing tells along it how high the board sits; its tilt by a tenth of a degree then
@@ -294,6 +296,7 @@ def prior_rows(
         ("camera", u.columns("optics"), optics),
         ("shading", u.columns("shading"), lines),
         ("breathing", u.columns("breathing"), np.ones(u.n_breathing)),
+        ("size", u.columns("sizes"), np.ones(u.n_sizes)),
         ("mount", places, np.full(len(places), _size(machine) if len(places) else 1.0)),
     )
     rows: list[Array] = []
@@ -328,6 +331,7 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
     if state.intrinsics.shape[-1] == u.n_optics - 1:
         optics[: len(state.intrinsics), 1:] = state.intrinsics
     breathing = state.breathing if len(state.breathing) else np.zeros(u.n_breathing)
+    sizes = state.sizes if len(state.sizes) == u.n_sizes else np.zeros(u.n_sizes)
     internal = np.zeros((len(state.T_base_platform), machine.layout.n_internal))
     if state.internal.shape == internal.shape:
         internal = state.internal
@@ -340,6 +344,7 @@ def batch_of(machine: Machine, assembled: Assembled, state: State) -> BatchState
         internal[assembled.seen][None],
         np.zeros((1, u.n_lines)),
         breathing[None],
+        sizes[None],
     )
 
 
@@ -361,4 +366,5 @@ def state_of(assembled: Assembled, batch: BatchState, start: State) -> State:
         assembled.problem.pose_blocks.on_platform,
         internal,
         batch.breathing[0],
+        batch.sizes[0],
     )

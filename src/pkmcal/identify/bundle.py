@@ -363,6 +363,7 @@ def _estimate(
         pose_weights=weights.poses,
         line_shading=result.problem.data.shading[0],
         breathing_sigma=np.sqrt(np.diagonal(result.info.covariance[0])[u.breathing]),
+        size_sigma=np.sqrt(np.diagonal(result.info.covariance[0])[u.sizes]),
     )
 
 

@@ -22,7 +22,8 @@ class State:
     T_mount : (M, 4, 4) boards in the frame of what they are fixed to, T_base_board or
     T_platform_board by ``on_platform`` (M,). internal : (K, n) hinges of an articulated platform.
     breathing : (S,) change of the stations' focal lengths from ``Measurements.breathing_at``, in
-    the same units; empty where none breathes.
+    the same units; empty where none breathes. sizes : (n,) excess of the boards' sizes over what
+    their files say, of those of unsure size, in their tolerances.
     """
 
     theta: Array
@@ -34,6 +35,7 @@ class State:
     on_platform: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
     internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
     breathing: Array = field(default_factory=lambda: np.zeros(0))
+    sizes: Array = field(default_factory=lambda: np.zeros(0))
 
 
 def told_unknowns(state: State) -> Unknowns:
@@ -100,6 +102,7 @@ class Estimate:
     pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
     line_shading : (n,) px, standard deviation of each tube's side's shading at each station.
     breathing_sigma : (S,) standard deviations of ``state.breathing``, in the same units.
+    size_sigma : (n,) the same of ``state.sizes``.
     configurations : (K,) True where the configuration was seen and its pose estimated.
     gauge : its name for people.
     """
@@ -120,6 +123,7 @@ class Estimate:
     pose_weights: Array = field(default_factory=lambda: np.zeros(0))
     line_shading: Array = field(default_factory=lambda: np.zeros(0))
     breathing_sigma: Array = field(default_factory=lambda: np.zeros(0))
+    size_sigma: Array = field(default_factory=lambda: np.zeros(0))
 
     def as_found(self, measurements: Measurements) -> Measurements:
         """The measurements with the readings' noise as the data show it."""

@@ -302,6 +302,9 @@ class Problem:
         ]
         if u.n_breathing:
             parts.append((_columns(u.breathing, boards.station, 1), poses.by_breathing))
+        if u.n_sizes:  # an exact size's rows are zero, whatever column they are written to
+            number = np.maximum(boards.size[boards.mount], 0)
+            parts.append((_columns(u.sizes, number, 1), poses.by_size))
         out = np.zeros((*poses.value.shape, u.count))
         for columns, values in parts:
             np.put_along_axis(out, columns[None, :, :, None], values, axis=-1)
@@ -345,6 +348,7 @@ class Problem:
         x[:, u.optics] = state.optics.reshape(len(x), -1)
         x[:, u.shading] = state.shading
         x[:, u.breathing] = state.breathing
+        x[:, u.sizes] = state.sizes
         mounts = x[:, u.mounts].reshape(len(x), -1, 6)  # of which only places are known
         mounts[..., 3:] = state.T_mount[..., :3, 3]
         return x @ self.prior.T
@@ -362,6 +366,7 @@ class Problem:
             state.T_mount,
             state.optics,
             state.breathing,
+            state.sizes,
         )
 
     def _by_noise(self, c: Closure, rows: Array) -> Array:
@@ -430,6 +435,7 @@ class Problem:
             state.internal + motion[..., 6:] + turned_back(layout, slides)[:, None],
             state.shading + shared[:, u.shading],
             state.breathing + shared[:, u.breathing],
+            state.sizes + shared[:, u.sizes],
         )
         return self._closed(state, self._in_frames(inner, y[..., 0], slides), shared, own)
 

@@ -344,7 +344,8 @@ class PoseBlocks:
     """Where the poses are: K configurations of G poses, padded; the same for all runs.
 
     station, mount, camera : (K, G). present : (K, G) False for padding. on_platform : (M,) of the
-    mounts.
+    mounts. tolerance : (M,) of the sizes of boards, relative; those that have one are unknowns, in
+    their order.
     """
 
     station: Integers
@@ -352,10 +353,18 @@ class PoseBlocks:
     present: Booleans
     on_platform: Booleans
     camera: Integers
+    tolerance: Array
+
+    @property
+    def size(self) -> Integers:
+        """(M,) number of each mount's size among those that are unknown; -1 for an exact one."""
+        unsure = self.tolerance > 0
+        return np.where(unsure, np.cumsum(unsure) - 1, -1)
 
     def among(self, configurations: slice) -> PoseBlocks:
         """Those of some configurations."""
-        return replace(_among(self, configurations, 0), on_platform=self.on_platform)
+        whole = _among(self, configurations, 0)
+        return replace(whole, on_platform=self.on_platform, tolerance=self.tolerance)
 
 
 @dataclass(frozen=True)
@@ -380,8 +389,8 @@ class PoseData:
 
 class PoseRows(NamedTuple):
     """Rows (B, K, G, 6) and their derivatives, (B, K, G, 6, 6) each: by their station, by the
-    platform's pose and by their mount; by their camera's unknowns (B, K, G, 6, w), and by their
-    station's focal breathing (B, K, G, 6, 1).
+    platform's pose and by their mount; by their camera's unknowns (B, K, G, 6, w), by their
+    station's focal breathing and by their board's size (B, K, G, 6, 1).
     """
 
     value: Array
@@ -390,6 +399,7 @@ class PoseRows(NamedTuple):
     by_mount: Array
     by_optics: Array
     by_breathing: Array
+    by_size: Array
 
 
 def pose_rows(
@@ -400,16 +410,18 @@ def pose_rows(
     T_mount: Array,
     optics: Array,
     breathing: Array,
+    sizes: Array,
 ) -> PoseRows:
     """Whitened errors of the predicted poses.
 
     T_camera_base (B, S, 4, 4), poses T_base_platform (B, K, 4, 4), T_mount (B, M, 4, 4), optics
-    (B, C, w), breathing (B, S) or (B, 0).
+    (B, C, w), breathing (B, S) or (B, 0), sizes (B, n). A board that is larger by a share s stands
+    farther from the camera by the same share.
     """
     if not blocks.present.size:
         none = np.zeros((*poses.shape[:2], 0, 6, 6))
         optics = np.zeros((*none.shape[:-1], optics.shape[-1]))
-        return PoseRows(none[..., 0], none, none, none, optics, none[..., :1])
+        return PoseRows(none[..., 0], none, none, none, optics, none[..., :1], none[..., :1])
     moving = blocks.on_platform[blocks.mount][..., None, None]
     camera = T_camera_base[:, blocks.station]
     body = np.where(moving, poses[:, :, None], np.eye(4))
@@ -433,6 +445,10 @@ def pose_rows(
     value = (weigh @ error[..., None] + by_optics @ optics[:, blocks.camera, :, None])[..., 0]
     if breathing.shape[-1]:
         value = value + by_breathing[..., 0] * breathing[:, blocks.station, None]
+    away = -blocks.tolerance[blocks.mount][..., None] * data.T_station_target[..., :3, 3]
+    by_size = weigh @ np.concatenate([np.zeros_like(away), away], axis=-1)[..., None]
+    if sizes.shape[-1]:
+        value = value + by_size[..., 0] * sizes[:, blocks.size[blocks.mount], None]
     return PoseRows(
         value,
         rows(eye, -skew(place[..., 0]), eye),
@@ -440,6 +456,7 @@ def pose_rows(
         rows(rot_c @ rot_b, np.zeros((3, 3)), rot_c @ rot_b),
         by_optics,
         by_breathing,
+        by_size,
     )
 
 

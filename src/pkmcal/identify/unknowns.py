@@ -10,6 +10,8 @@ Shared by all configurations, in this order of columns:
   standard deviation).
 - **breathing** : of each station's photograph the excess of its focal lengths, where the camera is
   held by hand (in units of its standard deviation).
+- **sizes** : of each board whose size is not known exactly, the excess of its size over what its
+  file says (in units of its tolerance).
 - **mounts** : left perturbation of each T_mount, of boards and targets.
 
 Each configuration has unknowns of its own besides: the platform's motion (left perturbation of
@@ -28,7 +30,15 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 
 Name = Literal[
-    "machine", "stations", "edge shifts", "intrinsics", "optics", "shading", "breathing", "mounts"
+    "machine",
+    "stations",
+    "edge shifts",
+    "intrinsics",
+    "optics",
+    "shading",
+    "breathing",
+    "sizes",
+    "mounts",
 ]
 
 
@@ -38,7 +48,7 @@ class Unknowns:
 
     n_free : of the machine. n_optics : of each camera, one and the refined intrinsics. n_lines :
     tubes' sides at stations with a shading of their own. n_breathing : stations where focal lengths
-    breathe, all or none.
+    breathe, all or none. n_sizes : boards of unsure size.
     """
 
     n_free: int
@@ -48,6 +58,7 @@ class Unknowns:
     n_lines: int = 0
     n_mounts: int = 0
     n_breathing: int = 0
+    n_sizes: int = 0
 
     @cached_property
     def machine(self) -> slice:
@@ -76,9 +87,14 @@ class Unknowns:
         return slice(self.shading.stop, self.shading.stop + self.n_breathing)
 
     @cached_property
+    def sizes(self) -> slice:
+        """The boards' sizes' columns."""
+        return slice(self.breathing.stop, self.breathing.stop + self.n_sizes)
+
+    @cached_property
     def mounts(self) -> slice:
         """The mounts' columns, six each."""
-        return slice(self.breathing.stop, self.breathing.stop + 6 * self.n_mounts)
+        return slice(self.sizes.stop, self.sizes.stop + 6 * self.n_mounts)
 
     @cached_property
     def count(self) -> int:
@@ -92,7 +108,7 @@ class Unknowns:
             "edge shifts": optics[:, 0],
             "intrinsics": optics[:, 1:].ravel(),
         }
-        for name in ("machine", "stations", "optics", "shading", "breathing", "mounts"):
+        for name in ("machine", "stations", "optics", "shading", "breathing", "sizes", "mounts"):
             part: slice = getattr(self, name)
             where[name] = np.arange(part.start, part.stop)
         none = np.zeros(0, dtype=int)
@@ -111,7 +127,8 @@ class BatchState:
     """Values of the unknowns of B runs: z (B, nz) free parameters, T_camera_base (B, S, 4, 4),
     T_base_platform (B, K, 4, 4), optics (B, C, w), T_mount (B, M, 4, 4) of boards,
     internal (B, K, n) of articulated platforms, shading (B, n) of the lines, outward, in units of
-    its standard deviation, breathing (B, n) of the stations' focal lengths, in units of its own.
+    its standard deviation, breathing (B, n) of the stations' focal lengths, sizes (B, n) of the
+    boards of unsure size, in units of their own.
     """
 
     z: Array
@@ -122,6 +139,7 @@ class BatchState:
     internal: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     shading: Array = field(default_factory=lambda: np.zeros((0, 0)))
     breathing: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    sizes: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         """Runs without boards or hinges get none each, so that all fields select alike."""
@@ -134,3 +152,5 @@ class BatchState:
             object.__setattr__(self, "shading", np.zeros((len(self.z), 0)))
         if len(self.breathing) != len(self.z):
             object.__setattr__(self, "breathing", np.zeros((len(self.z), 0)))
+        if len(self.sizes) != len(self.z):
+            object.__setattr__(self, "sizes", np.zeros((len(self.z), 0)))

@@ -62,6 +62,7 @@ def judge(
     richer: tuple[RicherModel, ...] = (),
     doubts: tuple[str, ...] = (),
     cautions: tuple[str, ...] = (),
+    hints: tuple[str, ...] = (),
     held_out: int = 0,
 ) -> Verdict:
     """The verdict on an estimate of a session by a method.
@@ -69,7 +70,8 @@ def judge(
     told : what the data tell of the machine; findings : the same in words, made from ``told`` and
     the edges where absent. Without both, values that the data do not decide speak for themselves.
     richer : models of the machine that were tried because this one is too poor for the poses.
-    doubts : further reasons against it, cautions : further warnings, found in the session.
+    doubts : further reasons against it, cautions : further warnings, hints : further advice, found
+    in the session.
     held_out : configurations that were left out on purpose.
     """
     if findings is None and told is not None:
@@ -98,7 +100,7 @@ def judge(
     else:
         headline = _headline(observation, estimate)
     return Verdict(
-        not reasons, headline, reasons, warnings, tuple(_advice(estimate) + _harmless(small))
+        not reasons, headline, reasons, warnings, (*_advice(estimate), *hints, *_harmless(small))
     )
 
 

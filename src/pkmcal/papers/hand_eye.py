@@ -89,15 +89,14 @@ class PairProblem:
     def linearize(self, state: Pair) -> Linear:
         """Residuals and exact Jacobian: six numbers of the camera, six of the mount."""
         one = np.zeros((self.body.shape[1], 1), dtype=int)
-        blocks = PoseBlocks(one, one, one == 0, np.ones(1, dtype=bool), one)
+        blocks = PoseBlocks(one, one, one == 0, np.ones(1, dtype=bool), one, np.zeros(1))
         data = PoseData(
             self.seen[:, :, None], np.diag(1 / self._sigma), self.weight[:, :, None],
             np.zeros((1, 1, 1, 6, 0)),
         )  # fmt: skip
         camera, mount = state.T_camera_base[:, None], state.T_mount[:, None]
-        rows = pose_rows(
-            blocks, data, camera, self.body, mount, np.zeros((1, 1, 0)), np.zeros((1, 0))
-        )
+        none = np.zeros((1, 0))
+        rows = pose_rows(blocks, data, camera, self.body, mount, none[:, None], none, none)
         value = rows.value[:, :, 0]
         return Linear(
             value,

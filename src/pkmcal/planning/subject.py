@@ -109,7 +109,11 @@ def of_machine(
         machine, names, cameras, T_camera_base, joint_noise, _Noise(edge, corner), board,
         T_platform_board,
     )  # fmt: skip
-    what = f"corners of the board to {corner:g} px" if board else f"edges of legs to {edge:g} px"
+    what = (
+        f"corners of the board to {corner:g} px, and its size to be exact"
+        if board
+        else f"edges of legs to {edge:g} px"
+    )
     return Subject(
         rig,
         None,
@@ -152,7 +156,7 @@ def _seen(
             )
         else:
             instruments.append(LegsFrom(s, camera, T, pools))
-    mounts = (Mount(BOARD, "platform"),) if board is not None else ()
+    mounts = (Mount(BOARD, "platform", board.tolerance),) if board is not None else ()
     if board is None:
         check_tubes(machine)
     numbers = np.array([list(dict.fromkeys(map(id, cameras))).index(id(c)) for c in cameras])
@@ -229,7 +233,7 @@ def of_session(
     board: Board | None = None
     if has_board and session.board is not None and session.board_body == "platform":
         board = load_board(session.board)
-        mounts.append(Mount(BOARD, "platform"))
+        mounts.append(Mount(BOARD, "platform", board.tolerance))
         T_mount.append(_board_place(session, board, saved, seen, T_camera_base, seed))
         sigma, told = _corner_noise(seen.boards, noise.corner)
         words.append(told)

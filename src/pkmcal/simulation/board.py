@@ -220,6 +220,7 @@ def board_for(machine: Machine, on: Body = "base") -> Board:
             "square": square,
             "marker": round(0.75 * square, 4),
             "dictionary": "DICT_4X4_50",
+            "tolerance": 0.0,
         }
     )
 

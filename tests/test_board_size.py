@@ -1,0 +1,133 @@
+"""A board's size that is known to a tolerance: estimated where data tell it, in sigma where not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pkmcal.boards.board import PRINTED, board_from_document
+from pkmcal.boards.poses import pose_set
+from pkmcal.errors import InputError
+from pkmcal.files import Document
+from pkmcal.geometry.rigid import perturb
+from pkmcal.identify.assembly import assemble, batch_of
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.centres import free_of_gauge
+from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.start import start_state
+from pkmcal.identify.tool import tool_error
+from pkmcal.measurements import EdgeSet, Measurements, Mount
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms.region import Region, poses_in
+from pkmcal.simulation.placement import draw_configurations
+
+CAMERA = np.array([[1, 0, 0, 0.02], [0, -1, 0, -0.03], [0, 0, -1, 0.6], [0, 0, 0, 1.0]])
+NOISE = np.array([3e-4, 3e-4, 3e-4, 3e-5, 3e-5, 6e-5])
+TOLERANCE = 2e-3
+
+
+def seen_by(drawing, rng, size, tolerance, count=20):
+    """A machine within its tolerances, and what a camera measures of a board that is larger than
+    its file says by the share ``size``.
+    """
+    table = drawing.parameters
+    free = table.free_matrix()
+    change = free @ (table.tolerances_free() * rng.standard_normal(free.shape[1]))
+    true = drawing.with_values(table.unit_axes(table.drawing + change))
+    poses = draw_configurations(true, count, 0.5, rng)[0][:count]
+    there = perturb(CAMERA @ poses, NOISE * rng.standard_normal((count, 6)))
+    there[:, :3, 3] /= 1 + size
+    covariance = np.tile(np.diag(NOISE**2), (count, 1, 1))
+    readings = true.inverse(poses) + 1e-5 * rng.standard_normal((count, drawing.n_joints))
+    data = Measurements(
+        EdgeSet.empty(),
+        readings,
+        1e-5,
+        1,
+        np.zeros(1, dtype=int),
+        poses=pose_set(0, np.arange(count), 0, there, covariance),
+        mounts=(Mount("board", "platform", tolerance),),
+    )
+    return true, data
+
+
+def estimated(drawing, data):
+    start = start_state(drawing, data, CAMERA[None])
+    return bundle(drawing, data, replace(start, T_mount=np.eye(4)[None]), scale_noise=False)
+
+
+def test_derivatives_by_the_size_are_those_of_the_residuals():
+    drawing = load_mechanism("linear-delta")
+    rng = np.random.default_rng(0)
+    _, data = seen_by(drawing, rng, 0.001, TOLERANCE)
+    both = replace(
+        data,
+        mounts=(Mount("tool", "platform"), Mount("board", "platform", TOLERANCE)),
+        poses=replace(data.poses, mount=np.arange(20) % 2),
+    )
+    assembled = assemble(drawing, both, default_gauge(drawing))
+    start = start_state(drawing, both, CAMERA[None])
+    state = batch_of(drawing, assembled, replace(start, T_mount=np.tile(np.eye(4), (2, 1, 1))))
+    state = replace(state, sizes=np.array([[0.4]]))
+    problem = assembled.problem
+    sizes = problem.unknowns.sizes
+    assert sizes.stop - sizes.start == 1
+    by = problem.linearize(state).by_shared[0, :, :, sizes.start]
+    ahead, behind = (
+        problem.residuals(replace(state, sizes=state.sizes + step)).value[0]
+        for step in (1e-3, -1e-3)
+    )
+    np.testing.assert_allclose(by, (ahead - behind) / 2e-3, rtol=1e-6, atol=1e-8)
+    assert np.any(by[1::2] != 0)
+    assert np.all(by[::2] == 0)  # what a tracker measures has no size
+
+
+def test_readings_of_carriages_tell_how_large_the_board_is():
+    drawing = load_mechanism("linear-delta")
+    _, data = seen_by(drawing, np.random.default_rng(1), 0.003, TOLERANCE)
+    found = estimated(drawing, data)
+    value, sigma = TOLERANCE * found.state.sizes[0], TOLERANCE * found.size_sigma[0]
+    assert sigma < 0.3 * TOLERANCE
+    assert abs(value - 0.003) < 4 * sigma
+
+
+def errors_at_the_tool(name, runs, tolerance, assumed):
+    """z of the tool's displacement, by run: root mean square over the workspace of what is left
+    when frames are laid over each other, over its stated deviation.
+    """
+    drawing = load_mechanism(name)
+    work = poses_in(drawing.limits(), Region(), 30)
+    out = []
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        true, data = seen_by(drawing, rng, tolerance * rng.standard_normal(), assumed)
+        found = estimated(drawing, data)
+        covariance = free_of_gauge(found.machine, found.covariance)
+        told = tool_error(true, found.machine, covariance, work, legs_seen=False)
+        square = np.nanmean(told.off_position**2) / np.nanmean(told.position**2)
+        out.append(np.sqrt(square))
+    return np.array(out)
+
+
+def test_sigma_contains_the_size_where_nothing_tells_it():
+    runs = 24
+    z = np.mean(errors_at_the_tool("delta", runs, TOLERANCE, TOLERANCE) ** 2)
+    blind = np.mean(errors_at_the_tool("delta", runs, TOLERANCE, 0.0) ** 2)
+    # the size is one direction, and most of the tool's error: squares scatter as of one normal
+    assert abs(z - 1) < 4 * np.sqrt(2 / runs)
+    assert blind > 1 + 10 * np.sqrt(2 / runs)
+
+
+def test_files_say_how_well_the_size_is_known():
+    fields = {"type": "chessboard", "corners": [7, 6], "square": 0.03}
+
+    def board(**more):
+        return board_from_document(Document("board.yaml", "board.yaml", fields | more, {}))
+
+    assert board().tolerance == PRINTED
+    assert board(tolerance=0).tolerance == 0
+    assert board(tolerance=2e-4).document["tolerance"] == 2e-4
+    with pytest.raises(InputError, match="tolerance"):
+        board(tolerance=0.2)
