@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from pkmcal.errors import InputError
+from pkmcal.files.writing import settle
 
 LONGEST_SHOWN = 60
 """Characters of a found value that a message quotes: enough to recognise it, short enough for
@@ -28,6 +29,7 @@ def read_text(path: Path, label: str | None = None) -> str:
     """
     label = label or path.name
     try:
+        settle(path.parent)
         raw = path.read_bytes()
     except FileNotFoundError:
         raise InputError(
