@@ -202,6 +202,41 @@ def test_an_image_of_another_size(session):
     )
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders here")
+def test_a_pipe_with_the_name_of_a_photograph(session):
+    path = photographs(session, "station2")[1]
+    path.unlink()
+    os.mkfifo(path)
+    refused(session, f"images/station2/{path.name}: this is a pipe, not a file")
+
+
+def test_a_folder_with_the_name_of_a_photograph(session):
+    path = photographs(session, "station2")[1]
+    path.unlink()
+    path.mkdir()
+    refused(session, f"images/station2/{path.name}: this is a folder, not a file")
+
+
+def test_a_folder_beside_the_photographs_is_nobodys_business(session):
+    path = photographs(session, "station2")[1].with_name("thumbnails.png")
+    path.mkdir()
+    assert run("check", session, "--json").json["exit_code"] == 0
+
+
+def test_a_zero_in_a_pattern(session):
+    replaced(session, "session.yaml", "images: ", 'images: "a\\0{configuration}.png" # ', 1)
+    refused(session, "session.yaml, line ", "images: this text holds a character")
+
+
+def test_a_damaged_photograph_is_told_by_pkmcal_alone(session, capfd):
+    path = photographs(session, "station2")[1]
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+    refused(session, f"images/station2/{path.name}: the photograph cannot be decoded; found a PNG")
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_photograph_cut_short(session):
     path = photographs(session, "station2")[1]
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])

@@ -94,6 +94,8 @@ def _top(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    # What OpenCV cannot read is told in sentences of our own.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     with withstanding():
         try:
             code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)

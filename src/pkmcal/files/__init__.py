@@ -15,6 +15,8 @@ from pkmcal.files.documents import (
     yaml_text,
 )
 from pkmcal.files.exif import Exif, read_exif, with_exif
+from pkmcal.files.headers import stated_size
+from pkmcal.files.regular import check_regular
 from pkmcal.files.schema import Schema, field_path, validate
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
@@ -37,6 +39,7 @@ __all__ = [
     "Keys",
     "Schema",
     "check_own_folder",
+    "check_regular",
     "check_writable",
     "closest",
     "csv_text",
@@ -55,6 +58,7 @@ __all__ = [
     "settle",
     "shown",
     "staged_folder",
+    "stated_size",
     "validate",
     "wanted_file",
     "with_exif",

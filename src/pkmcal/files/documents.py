@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from pkmcal.errors import InputError
+from pkmcal.files.regular import check_regular
 from pkmcal.files.writing import settle
 
 LONGEST_SHOWN = 60
@@ -30,13 +31,12 @@ def read_text(path: Path, label: str | None = None) -> str:
     label = label or path.name
     try:
         settle(path.parent)
+        check_regular(path, label)
         raw = path.read_bytes()
     except FileNotFoundError:
         raise InputError(
             "the file does not exist", where=label, expected=wanted_file(path)
         ) from None
-    except IsADirectoryError:
-        raise InputError("this is a folder", where=label, expected="a file") from None
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(f"the file cannot be read ({reason})", where=label) from None

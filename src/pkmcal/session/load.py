@@ -17,7 +17,17 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
-from pkmcal.files import CsvTable, Document, Keys, read_csv, read_yaml, shown, validate, wanted_file
+from pkmcal.files import (
+    CsvTable,
+    Document,
+    Keys,
+    check_regular,
+    read_csv,
+    read_yaml,
+    shown,
+    validate,
+    wanted_file,
+)
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.mechanisms.region import Region
@@ -227,7 +237,7 @@ def _read(folder: Path) -> tuple[Path, Document]:
         folder = folder.parent
     if not folder.is_dir():
         raise InputError("there is no such session folder", where=str(folder))
-    if not (folder / FILE).is_file():
+    if not (folder / FILE).exists():
         below = sorted(path.parent.name for path in folder.glob(f"*/{FILE}"))
         raise InputError(
             f"the folder holds no {FILE}",
@@ -251,14 +261,18 @@ def _read(folder: Path) -> tuple[Path, Document]:
 def _existing(folder: Path, document: Document, name: str, keys: Keys) -> Path:
     """The path of a file that session.yaml names, relative to it."""
     path = folder / name
-    if path.is_file():
-        return path
-    raise InputError(
-        "this is a folder, not a file" if path.exists() else "there is no such file",
-        where=document.where(*keys),
-        found=name,
-        expected="a file" if path.exists() else wanted_file(path),
-    )
+    try:
+        check_regular(path, name)
+    except FileNotFoundError:
+        raise InputError(
+            "there is no such file",
+            where=document.where(*keys),
+            found=name,
+            expected=wanted_file(path),
+        ) from None
+    except InputError as error:
+        raise error.located(document.where(*keys)) from None
+    return path
 
 
 def _machine(
