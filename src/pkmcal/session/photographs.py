@@ -152,7 +152,11 @@ def _none_found(folder: Path, wildcard: str, pattern: str, where: str) -> InputE
     while "*" in str(place):
         place = place.parent
     found = f"no folder {place}"
-    if place.is_dir():
+    try:
+        standing = place.is_dir()
+    except OSError:  # such as a name that no folder can have
+        standing = False
+    if standing:
         entries = sorted(entry.name for entry in place.iterdir())
         others = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
         found = f"{others} {entries[0]} in {place}" if entries else f"nothing in {place}"
