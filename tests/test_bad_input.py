@@ -202,6 +202,80 @@ def test_an_image_of_another_size(session):
     )
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders here")
+def test_a_pipe_with_the_name_of_a_photograph(session):
+    path = photographs(session, "station2")[1]
+    path.unlink()
+    os.mkfifo(path)
+    refused(session, f"images/station2/{path.name}: this is a pipe, not a file")
+
+
+def test_a_folder_with_the_name_of_a_photograph(session):
+    path = photographs(session, "station2")[1]
+    path.unlink()
+    path.mkdir()
+    refused(session, f"images/station2/{path.name}: this is a folder, not a file")
+
+
+def test_a_folder_beside_the_photographs_is_nobodys_business(session):
+    path = photographs(session, "station2")[1].with_name("thumbnails.png")
+    path.mkdir()
+    assert run("check", session, "--json").json["exit_code"] == 0
+
+
+LONG = "n" * 5000
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "said"),
+    [
+        ("session.yaml", "mechanism: ", f"mechanism: {LONG} # ", "mechanism: the file"),
+        ("session.yaml", "mechanism: ", f"mechanism: {LONG}.yaml # ", "mechanism: the file"),
+        ("session.yaml", "images/station1", f"images/{LONG}", "images: there is no photograph"),
+        ("session.yaml", "{configuration}", f"{{{LONG}}}", "this placeholder is not known"),
+        ("session.yaml", "joints:", f"a: !{LONG} 3\njoints:", "is not allowed"),
+        ("joints.csv", "0003", LONG, "joints.csv, line 5: this name is too long"),
+        ("joints.csv", "leg3", LONG, "joints.csv, line 1: this name is too long"),
+        ("mechanism.yaml", "name: ", f"name: {LONG} # ", "expected text of 255 characters at most"),
+    ],
+)  # fmt: skip
+def test_names_of_five_thousand_letters(session, name, old, new, said):
+    replaced(session, name, old, new, 1)
+    assert len(refused(session, said)) < 1000
+
+
+def test_a_path_through_what_was_not_measured(session):
+    replaced(
+        session, "session.yaml", "joints:", "paths: {ruler: ['0000', '0001', 'x']}\njoints:", 1
+    )
+    refused(
+        session, "session.yaml, line 3, paths.ruler[3]: there is no such configuration; found x"
+    )
+
+
+def test_a_path_that_is_too_short(session):
+    replaced(
+        session, "session.yaml", "joints:", "paths: {ruler: ['0000', '0000', '0001']}\njoints:", 1
+    )
+    refused(
+        session, "session.yaml, line 3, paths.ruler: too few configurations for a straight path"
+    )
+
+
+def test_a_zero_in_a_pattern(session):
+    replaced(session, "session.yaml", "images: ", 'images: "a\\0{configuration}.png" # ', 1)
+    refused(session, "session.yaml, line ", "images: this text holds a character")
+
+
+def test_a_damaged_photograph_is_told_by_pkmcal_alone(session, capfd):
+    path = photographs(session, "station2")[1]
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+    refused(session, f"images/station2/{path.name}: the photograph cannot be decoded; found a PNG")
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_photograph_cut_short(session):
     path = photographs(session, "station2")[1]
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])

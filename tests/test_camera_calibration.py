@@ -20,7 +20,7 @@ from pkmcal.boards.fit import (
     settled_poses,
     views_of,
 )
-from pkmcal.boards.selection import line_offsets, positions
+from pkmcal.boards.selection import _tries, first_fit, line_offsets, positions
 from pkmcal.cameras import camera_models
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import apply, pose, pose_difference, rotation
@@ -310,3 +310,24 @@ def test_the_page(calibrated, tmp_path):
 def test_importing_cameras_needs_no_opencv():
     code = "import sys, pkmcal.cameras; sys.exit('cv2' in sys.modules or 'scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_tries_that_do_not_see_a_whole_view_are_no_start(monkeypatch):
+    # Some mirrors that are tried first have no ray at all for small views near the border.
+    monkeypatch.setitem(DEPTH, "pinhole", 1.2)
+    poses = poses_for(TRUE["pinhole"], 25, seed=5)
+    views = views_of(detections(TRUE["pinhole"], poses), BOARD)
+    known = [np.isfinite(c.ray(views.pixels)).all(axis=-1) for c in _tries("unified", SIZE)]
+    assert any((rays.sum(axis=-1) < 4).any() for rays in known)
+    fit = first_fit("unified", views, SIZE)
+    assert fit is not None
+    assert np.linalg.norm(fit.T_camera_board[:, :3, 3] - poses[:, :3, 3], axis=-1).max() < 0.1
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_board_that_no_ray_meets_has_a_pose_that_can_be_computed_with():
+    rays = np.full((len(BOARD.points), 3), np.nan)
+    pose_of_none = linear_poses(rays, BOARD.points)
+    for camera in TRUE.values():
+        camera.project(apply(pose_of_none, BOARD.points))

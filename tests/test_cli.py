@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -82,13 +84,66 @@ def test_the_documentation_tells_of_all_commands_and_options():
     assert re.findall(r"^## pkmcal (\w+)", text, re.MULTILINE) == list(COMMANDS)
 
 
-def test_a_reader_that_leaves_is_no_error():
-    code = (
-        "import sys, os; from pkmcal.commands.cli import main; r, w = os.pipe(); os.dup2(w, 1);"
-        " os.close(w); os.close(r); sys.exit(main(['--help']))"
-    )
-    done = python("-c", code)
-    assert (done.returncode, done.stderr) == (0, "")
+TELLS = """
+import sys
+from pkmcal.commands import cli, console
+
+@cli.app.command("tell")
+def tell() -> int:
+    for _ in range(10_000):
+        console.out().print("some thing that was found")
+    console.print_json({"verdict": "not to be used"})
+    return 1
+
+sys.exit(cli.main(["tell"]))
+"""
+"""A command that says more than a pipe holds of a result that should not be used."""
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_leaves_changes_nothing(unbuffered, monkeypatch):
+    monkeypatch.setenv("PYTHONUNBUFFERED", unbuffered)
+    for merged in (subprocess.PIPE, subprocess.STDOUT):
+        with subprocess.Popen(
+            [sys.executable, "-c", TELLS], stdout=subprocess.PIPE, stderr=merged, text=True
+        ) as told:
+            assert told.stdout.readline() == "some thing that was found\n"
+            told.stdout.close()
+            if told.stderr:
+                assert told.stderr.read() == ""
+        assert told.returncode == 1  # the command's own
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device here that is always full")
+@pytest.mark.parametrize("words", [["--help"], ["new", "NEW", "--json"], ["new", "NEW"]])
+@pytest.mark.parametrize(("end", "reason"), [(">/dev/full", "No space left"), (">&-", "Bad file")])
+def test_an_answer_that_cannot_be_given_is_told_once(words, end, reason, tmp_path):
+    words = [str(tmp_path / "new") if word == "NEW" else word for word in words]
+    done = shell(words, end)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"Error: standard output cannot be written ({reason}")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device here that is always full")
+@pytest.mark.parametrize("end", [">/dev/full", ">&-"])
+def test_a_mistake_is_told_where_an_answer_cannot_be_given(end):
+    for words in (["calibrate", "nowhere"], ["calibrate", "nowhere", "--json"]):
+        done = shell(words, end)
+        assert done.returncode == 2
+        assert done.stderr == "Error: nowhere: there is no such session folder.\n"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="closing by the shell's own words")
+def test_nobody_needs_to_hear_of_a_mistake():
+    assert shell(["calibrate", "nowhere"], "2>&-").returncode == 2
+    assert shell(["calibrate", "nowhere"], "<&- >&- 2>&-").returncode == 2
+
+
+def shell(words, end):
+    """One command as a shell runs it, its streams sent elsewhere."""
+    line = shlex.join([sys.executable, "-m", "pkmcal", *words]) + " " + end
+    return subprocess.run(line, shell=True, capture_output=True, text=True, check=False)
 
 
 # demo

@@ -80,3 +80,13 @@ def test_located_adds_the_place_and_keeps_the_rest():
     assert str(placed) == "session.yaml, line 9: up is zero; found [0, 0, 0]."
     assert bare.where is None
     assert placed.located("left").where == "left: session.yaml, line 9"
+
+
+def test_names_that_nothing_can_have_are_shortened():
+    error = InputError("no", where=f"a/{'n' * 5000} line 2", found="n" * 5000)
+    short = f"{'n' * 40}…{'n' * 20}"
+    assert str(error) == f"a/{short} line 2: no; found {short}."
+    told = InputError("no", found="w " * 5000, next_step="m" * 5000)
+    assert len(str(told)) < 700
+    path = "/" + "/".join(["folder" * 20] * 20)
+    assert path in str(InputError("no", where=path))  # a long path is needed whole

@@ -1,12 +1,16 @@
 """Sizes of photographs, read without decoding them."""
 
+import os
 import struct
+import zlib
 
 import cv2
 import numpy as np
 import pytest
 
 from pkmcal.errors import InputError
+from pkmcal.files import read_text
+from pkmcal.observe.images import decode
 from pkmcal.session.photographs import photograph_header
 
 
@@ -55,3 +59,47 @@ def test_broken_images(tmp_path, content, sentence):
 def test_an_image_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         photograph_header(tmp_path / "none.png")
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_a_size_that_a_file_of_this_length_cannot_hold(tmp_path, suffix, monkeypatch):
+    path = tmp_path / f"a.{suffix}"
+    image(path, 37, 21)
+    data = bytearray(path.read_bytes())
+    monkeypatch.setattr(cv2, "imread", lambda *_: pytest.fail("decoded"))
+    if suffix == "png":
+        data[16:24] = struct.pack(">II", 30000, 30000)
+        path.write_bytes(data)  # first as a disk spoils it, with the old checksum
+        with pytest.raises(InputError, match="not an image that can be read"):
+            photograph_header(path)
+        data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    else:
+        at = data.index(b"\xff\xc0") + 5
+        data[at : at + 4] = struct.pack(">HH", 30000, 30000)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="not an image that can be read"):
+        photograph_header(path)
+
+
+def test_pictures_of_one_colour_are_not_too_small_for_their_size(tmp_path):
+    for suffix in ("png", "jpg"):
+        path = tmp_path / f"a.{suffix}"
+        assert cv2.imwrite(str(path), np.zeros((3000, 4000), np.uint8))
+        assert photograph_header(path) == (4000, 3000)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in folders here")
+def test_what_is_no_file_is_named_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "device.png").symlink_to("/dev/zero")
+    (tmp_path / "link.png").symlink_to("nowhere")
+    for name, said in (
+        ("pipe", "this is a pipe, not a file"),
+        ("folder", "this is a folder, not a file"),
+        ("device", "this is a device, not a file"),
+        ("link", "this is a link to what is not there; found nowhere"),
+    ):
+        for read in (photograph_header, lambda p, label: decode(p, (4, 4), label), read_text):
+            with pytest.raises(InputError, match=f"^a.png: {said}"):
+                read(tmp_path / f"{name}.png", "a.png")

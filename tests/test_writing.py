@@ -1,13 +1,27 @@
 """Outputs: whole or not at all, and nothing left behind."""
 
+import contextlib
 import os
+import shutil
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from pkmcal.calibration.results import check_output, load
 from pkmcal.errors import InputError
-from pkmcal.files import check_writable, staged_folder, write_bytes, write_text
+from pkmcal.files import (
+    check_own_folder,
+    check_writable,
+    read_text,
+    staged_folder,
+    write_bytes,
+    write_folder,
+    write_text,
+)
+from pkmcal.files.writing import COMMITTED
 
 
 def fault(function, *arguments, **keywords):
@@ -110,3 +124,119 @@ def test_a_clash_is_noticed_before_anything_is_moved(tmp_path):
 
     assert "a folder stands where a file should go" in fault(work)
     assert everything_in(tmp_path) == ["b"]
+
+
+KILLED = """
+import itertools, os, shutil, signal, sys
+from pathlib import Path
+from pkmcal.commands import calibrate, cli
+
+session, new, keep = map(Path, sys.argv[1:])
+finish, out = calibrate.finish, session / "calibration"
+old = keep / "old"
+shutil.copytree(out, old)
+
+
+def count_down(event, values):
+    # Opens for writing, renames, removals: what changes a folder. Each tells of itself before.
+    changes = event in ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate") or (
+        event == "open" and isinstance(values[2], int) and values[2] & (os.O_WRONLY | os.O_RDWR)
+    )
+    if changes and str(session) in os.path.abspath(str(values[0])):
+        global left
+        left -= 1
+        if left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def again_and_again(*words, **named):
+    # The calibration is computed once, and told again and again, with less and less time for it.
+    global left
+    for left in itertools.count():
+        shutil.rmtree(out)
+        shutil.copytree(old, out)
+        child = os.fork()
+        if child == 0:
+            sys.addaudithook(count_down)
+            os._exit(finish(*words, **named))
+        if os.waitpid(child, 0)[1] == 0:
+            break
+        shutil.copytree(out, keep / f"{left:03d}")
+    shutil.copytree(out, new)
+    return 0
+
+
+calibrate.finish = again_and_again
+sys.exit(cli.main(["calibrate", str(session), "--quiet"]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and SIGKILL")
+def test_a_result_is_the_old_or_the_new_wherever_calibrate_is_killed(demo, session, tmp_path):
+    out, keep, new = session / "calibration", tmp_path / "killed", tmp_path / "new"
+    shutil.copytree(demo.calibration, out)
+    for path in out.iterdir():  # an old result that differs in every file, and has one more
+        path.write_text(path.read_text().replace("hexapod", "hexapod-before").replace("0.1", "0.2"))
+    (out / "camera-front.yaml").write_text("model: pinhole\n")
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, session, new, keep],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    before, after = contents_of(keep / "old"), contents_of(new)
+    assert not before.items() & after.items()
+    assert set(before) - set(after) == {"camera-front.yaml"}
+    states = [path for path in sorted(keep.iterdir()) if path.name != "old"]
+    seen = []
+    for state in states:
+        again = tmp_path / f"again-{state.name}"
+        shutil.copytree(state, again)
+        with contextlib.suppress(InputError):
+            load(state)  # whoever reads finds one of the two
+        visible = {k: v for k, v in contents_of(state).items() if not k.startswith(".stage.")}
+        assert visible in (before, after)
+        seen.append(visible == after)
+        # and the next run is not kept from working, nor keeps anything of this one
+        write_folder(again, dict.fromkeys(after, "2"), check_output(again))
+        assert contents_of(again) == dict.fromkeys(after, b"2")
+    # Old ones, then new ones; some of the new ones were finished by who read them.
+    assert seen == sorted(seen)
+    assert 5 < seen.index(True) < len(seen) - 3
+
+
+def contents_of(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_what_a_killed_run_left_is_in_nobodys_way(tmp_path):
+    for name in (".stage.0123456789ab.part", ".probe.0123456789ab.part"):
+        (tmp_path / name / "new").mkdir(parents=True)
+    assert check_own_folder(tmp_path, ["a"], "a trial") == []
+    write_folder(tmp_path, {"a": "1"})
+    assert everything_in(tmp_path) == ["a"]
+
+
+def test_of_an_earlier_result_no_file_stays(tmp_path):
+    (tmp_path / "mine").write_text("1")
+    write_folder(tmp_path, {"a": "1", "b": "1"})
+    write_folder(tmp_path, {"b": "2"}, over=["a", "b", "c"])
+    assert everything_in(tmp_path) == ["b", "mine"]
+
+
+def test_a_replacement_that_cannot_be_finished_is_told(tmp_path, monkeypatch):
+    write_text(tmp_path / COMMITTED / "new" / "a", "1")
+
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", refuse)
+        assert "cannot be moved to their place (Permission denied)" in fault(
+            read_text, tmp_path / "a"
+        )
+    assert read_text(tmp_path / "a") == "1"
+    assert everything_in(tmp_path) == ["a"]

@@ -7,7 +7,14 @@ and leaves with `exit_code`. Anything else that escapes is a defect of pkmcal.
 
 from __future__ import annotations
 
+import re
 from typing import Any, ClassVar, Self
+
+LONGEST_NAME = 255
+"""Characters of a name; file systems take no longer ones."""
+_LONG_NAME = re.compile(rf"[^\s/\\]{{{LONGEST_NAME + 1},}}")
+LONGEST_FOUND = 500
+"""Characters of what was found: enough to recognise it by."""
 
 
 class PkmcalError(Exception):
@@ -30,12 +37,12 @@ class PkmcalError(Exception):
         expected: object = None,
         next_step: str | None = None,
     ) -> None:
-        self.what = what
-        self.where = where
-        self.found = None if found is None else str(found)
-        self.expected = None if expected is None else str(expected)
-        self.next_step = next_step
-        super().__init__(what)
+        self.what = _brief(what)
+        self.where = None if where is None else _brief(where)
+        self.found = None if found is None else _brief(str(found), LONGEST_FOUND)
+        self.expected = None if expected is None else _brief(str(expected))
+        self.next_step = None if next_step is None else _brief(next_step)
+        super().__init__(self.what)
 
     def __str__(self) -> str:
         sentence = f"{self.where}: {self.what}" if self.where else self.what
@@ -92,6 +99,12 @@ class ResultError(PkmcalError):
 
 class GeometryError(PkmcalError):
     """No usable answer here: a leg through the camera, a singular pose, no convergence."""
+
+
+def _brief(text: str, most: int | None = None) -> str:
+    """Text without what is too long to be a name, of which both ends are enough to recognise it."""
+    text = _LONG_NAME.sub(lambda name: f"{name[0][:40]}…{name[0][-20:]}", text)
+    return text if most is None or len(text) <= most else f"{text[: most - 1]}…"
 
 
 def _rebuild(kind: type[PkmcalError], fields: dict[str, Any]) -> PkmcalError:

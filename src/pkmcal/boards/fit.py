@@ -370,7 +370,8 @@ def linear_poses(rays: Array, points: Array) -> Array:
     """Poses (..., 4, 4) with rays (..., N, 3) parallel to T points (N, 3), points on a plane z = 0.
 
     ray x (r1 X + r2 Y + t) = 0 is linear in r1, r2 and t, for rays to all sides; r1 and r2 are
-    made orthonormal afterwards. NaN rays are left out.
+    made orthonormal afterwards. NaN rays are left out; poses that fewer than four rays leave open
+    are any.
     """
     known = np.asarray(np.isfinite(rays).all(axis=-1))
     s = np.where(known[..., None], rays, 0.0)
@@ -384,7 +385,8 @@ def linear_poses(rays: Array, points: Array) -> Array:
     m1, m2, m0 = vector[..., 0, :] / spread, vector[..., 1, :] / spread, vector[..., 2, :]
     m0 = m0 - m1 * middle[0] - m2 * middle[1]
     size = np.sqrt(np.linalg.norm(m1, axis=-1) * np.linalg.norm(m2, axis=-1))
-    size = np.maximum(size, 1e-300)[..., None]
+    # Of a unit vector; where nothing is known it may be zero, and less than rounding means nothing.
+    size = np.maximum(size, np.finfo(float).eps)[..., None]
     x, y = points[:, :1], points[:, 1:2]
     there = m1[..., None, :] * x + m2[..., None, :] * y + m0[..., None, :]
     ahead = np.einsum("...ni,...ni->...", s, there)

@@ -50,6 +50,8 @@ LEAST_GAIN = 0.01
 """Share by which the error on left-out views must fall for a term to be worth having."""
 MOST_CORNERS = 1500
 """Corners in all that the choice looks at; the final fit takes every one."""
+LEAST_RAYS = 4
+"""Corners that fix a board's pose."""
 LEAST_OF_VIEW = 12
 """Corners that every view keeps, where it has them."""
 HOPELESS = 5.0
@@ -67,7 +69,10 @@ def first_fit(model: str, views: Views, image_size: tuple[int, int]) -> CameraFi
     """The best fit without distortion, None where no try gives finite pixels."""
     scored: list[tuple[float, Camera, Array]] = []
     for camera in _tries(model, image_size):
-        poses = linear_poses(camera.ray(views.pixels), views.points)
+        rays = camera.ray(views.pixels)
+        if np.isfinite(rays).all(axis=-1).sum(axis=-1).min() < LEAST_RAYS:
+            continue  # it did not take these photographs, and has no pose to begin from
+        poses = linear_poses(rays, views.points)
         off = camera.project(apply(poses[:, None], views.points)) - views.pixels
         distance = np.linalg.norm(off, axis=-1)[views.seen]
         # Lost corners count as far.

@@ -23,6 +23,7 @@ from pkmcal.files import (
     Document,
     Schema,
     check_writable,
+    entries,
     json_text,
     plain,
     read_json,
@@ -72,27 +73,26 @@ Row4 = tuple[float, float, float, float]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 
 
-def check_output(folder: Path | str) -> None:
+def check_output(folder: Path | str) -> list[str]:
     """Raise `InputError` where a result cannot go into `folder`; call it before the work.
 
     Only a new or empty folder, or an earlier result, is written to: a session's own
-    mechanism.yaml must not be lost to its calibrated one.
+    mechanism.yaml must not be lost to its calibrated one. Returns the files of that result.
     """
     folder = Path(folder)
     check_writable(folder)
-    if not folder.is_dir():
-        return
-    entries = sorted(entry.name for entry in folder.iterdir())
-    foreign = [name for name in entries if name not in FILES and not CAMERA_FILE.fullmatch(name)]
+    standing = entries(folder)
+    foreign = [name for name in standing if name not in FILES and not CAMERA_FILE.fullmatch(name)]
     # A mechanism.yaml without the rest is somebody's drawing.
-    if foreign or (entries and EVERYTHING not in entries):
+    if foreign or (standing and EVERYTHING not in standing):
         raise InputError(
             "the output folder holds something other than a calibration",
             where=str(folder),
-            found=listed(foreign or entries, 4),
+            found=listed(foreign or standing, 4),
             expected="a new or empty folder, or an earlier calibration to replace",
             next_step="Name another folder with -o, or move these files away",
         )
+    return standing
 
 
 def texts_of(

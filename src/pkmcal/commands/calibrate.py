@@ -69,7 +69,7 @@ def calibrate(
 
     loaded = load_session(session, model)
     folder = out or loaded.folder / "calibration"
-    check_output(folder)
+    over = check_output(folder)
     with console.progress(quiet) as told:
         found = run(
             loaded,
@@ -81,4 +81,4 @@ def calibrate(
         )
         told("Writing the report", 0.97)
         outcome = outcome_of(found)
-    return finish(outcome, folder, FILES, as_json=as_json, quiet=quiet)
+    return finish(outcome, folder, FILES, over=over, as_json=as_json, quiet=quiet)

@@ -6,7 +6,6 @@ pkmcal; 130 interrupted. No mistake of a user's ends in a traceback.
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import sys
@@ -33,6 +32,7 @@ from pkmcal.commands import (
     watch,
 )
 from pkmcal.commands.console import print_error
+from pkmcal.commands.streams import LostOutput, withstanding
 from pkmcal.errors import InputError, PkmcalError
 
 DEFECT = 70
@@ -94,25 +94,19 @@ def _top(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    for stream in (sys.stdout, sys.stderr):
-        # A terminal that lacks a sign shows ? for it; that is no reason to fail.
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
-    try:
-        code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
-        sys.stdout.flush()
-    except (BrokenPipeError, SystemExit):  # typer and Rich leave by the latter
-        # The reader of a pipe, such as head, has gone: nobody is left to tell anything, and Python
-        # would complain at exit, when it flushes what is left.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except KeyboardInterrupt:
-        code = INTERRUPTED
-    except Exception as error:  # noqa: BLE001 - the last resort, which tells defects from mistakes
-        return _failed(error, words)
-    if code == INTERRUPTED:  # typer turns Ctrl-C into this code
-        return _failed(KeyboardInterrupt(), words)
-    return code if isinstance(code, int) else 0
+    # What OpenCV cannot read is told in sentences of our own.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    with withstanding():
+        try:
+            code = app(words or ["--help"], prog_name="pkmcal", standalone_mode=False)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+        except Exception as error:  # noqa: BLE001 - the last resort, which tells defects from mistakes
+            return _failed(error, words)
+        if code == INTERRUPTED:  # typer turns Ctrl-C into this code
+            return _failed(KeyboardInterrupt(), words)
+        return code if isinstance(code, int) else 0
 
 
 def _failed(error: BaseException, words: list[str]) -> int:
@@ -120,10 +114,15 @@ def _failed(error: BaseException, words: list[str]) -> int:
     if os.environ.get(DEBUG):
         traceback.print_exception(error, file=sys.stderr)
     told, code = _in_words(error, words)
-    if "--json" in words:
-        typer.echo(json.dumps({**told.as_dict(), "exit_code": code}, ensure_ascii=False))
-    else:
-        print_error(str(told))
+    if "--json" in words and not isinstance(error, LostOutput):
+        try:
+            typer.echo(json.dumps({**told.as_dict(), "exit_code": code}, ensure_ascii=False))
+            sys.stdout.flush()
+        except LostOutput:
+            pass  # what went wrong first is told, where something still can be
+        else:
+            return code
+    print_error(str(told))
     return code
 
 

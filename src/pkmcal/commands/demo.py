@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 from math import degrees
 from pathlib import Path
@@ -92,19 +91,21 @@ def demo(
 
 def _make_room(out: Path) -> None:
     """Remove an earlier demonstration; anything else in the folder is somebody's."""
-    if not out.is_dir() or not any(out.iterdir()):
+    from pkmcal.files import entries, remove_folder
+
+    standing = entries(out)
+    if not standing:
         return
-    entries = sorted(entry.name for entry in out.iterdir())
-    if not (out / SESSION / "truth.json").is_file() or set(entries) - {SESSION, CALIBRATION}:
+    if not (out / SESSION / "truth.json").is_file() or set(standing) - {SESSION, CALIBRATION}:
         raise InputError(
             "the folder for the demonstration holds something else",
             where=str(out),
-            found=", ".join(entries[:3]),
+            found=", ".join(standing[:3]),
             expected="a new or empty folder, or an earlier demonstration to replace",
             next_step="Name another folder with -o",
         )
-    for name in entries:
-        shutil.rmtree(out / name)
+    for name in standing:  # the session last: it tells whose the folder is
+        remove_folder(out / name)
 
 
 def _tell_comparison(out: Console, found: AgainstTruth) -> None:

@@ -7,7 +7,7 @@ outcome holds no text of that name itself.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,24 +28,28 @@ def finish(
     folder: Path,
     files: Mapping[str, str],
     *,
+    over: Collection[str] = (),
     as_json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Write the files, tell what was found, and return the exit code.
 
-    quiet : say nothing of a result that may be used, and one sentence of another.
+    over : files of an earlier result, of which none is to stay. quiet : say nothing of a result
+    that may be used, and one sentence of another.
     """
     with console.progress(as_json or quiet) as told:
         told("Writing the report", 0.97)
-        write(outcome, folder, files)
+        write(outcome, folder, files, over)
     return answer(outcome, folder, files, as_json=as_json, quiet=quiet)
 
 
-def write(outcome: Outcome, folder: Path, files: Mapping[str, str]) -> None:
+def write(
+    outcome: Outcome, folder: Path, files: Mapping[str, str], over: Collection[str] = ()
+) -> None:
     """Write the files, whole or not at all."""
     from pkmcal.files import write_folder
 
-    write_folder(folder, contents(outcome, files))
+    write_folder(folder, contents(outcome, files), over)
 
 
 def answer(

@@ -122,7 +122,7 @@ def plan(
     session = session_folder(subject)
     folder = out or (Path("plan") if session is None else session / "plan")
     files = {**FILES, **(STATIONS if places or best_of else {})}
-    check_own_folder(folder, {**FILES, **STATIONS}, "what plan writes", "an earlier plan")
+    over = check_own_folder(folder, {**FILES, **STATIONS}, "what plan writes", "an earlier plan")
     with console.progress(as_json) as told, threadpool_limits(1, "blas"):
         told("Looking at what there is", 0.0)
         region = None
@@ -164,7 +164,7 @@ def plan(
             seed=seed,
             told=lambda share: told("Choosing configurations", 0.1 + 0.85 * share),
         )
-    return finish(outcome_of(found), folder, files, as_json=as_json)
+    return finish(outcome_of(found), folder, files, over=over, as_json=as_json)
 
 
 def _only_of(owner: str, given: Mapping[str, object]) -> None:

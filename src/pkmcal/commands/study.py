@@ -67,7 +67,7 @@ def study(
     name = f"study.{table.value}"
     files = {"study.html": PAGE, "study.json": NUMBERS, name: ROWS}
     ours = {"study.html", "study.json", *(f"study.{kind.value}" for kind in TableFormat), FOLDER}
-    check_own_folder(out, ours, "a study", "an earlier study")
+    over = check_own_folder(out, ours, "a study", "an earlier study")
     try:
         with console.progress(as_json) as told:
             found = simulated(
@@ -81,4 +81,4 @@ def study(
                 [("", f"What is finished lies in {out}; the same command goes on from there.")],
             )
         raise
-    return finish(outcome_of(found, table=name), out, files, as_json=as_json)
+    return finish(outcome_of(found, table=name), out, files, over=over, as_json=as_json)

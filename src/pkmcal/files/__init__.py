@@ -15,12 +15,17 @@ from pkmcal.files.documents import (
     yaml_text,
 )
 from pkmcal.files.exif import Exif, read_exif, with_exif
+from pkmcal.files.headers import stated_size
 from pkmcal.files.locking import alone_in
+from pkmcal.files.regular import check_regular
 from pkmcal.files.schema import Schema, field_path, validate
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
     check_own_folder,
     check_writable,
+    entries,
+    remove_folder,
+    settle,
     staged_folder,
     write_bytes,
     write_folder,
@@ -36,9 +41,11 @@ __all__ = [
     "Schema",
     "alone_in",
     "check_own_folder",
+    "check_regular",
     "check_writable",
     "closest",
     "csv_text",
+    "entries",
     "field_path",
     "json_text",
     "listed",
@@ -49,8 +56,11 @@ __all__ = [
     "read_json",
     "read_text",
     "read_yaml",
+    "remove_folder",
+    "settle",
     "shown",
     "staged_folder",
+    "stated_size",
     "validate",
     "wanted_file",
     "with_exif",

@@ -15,6 +15,8 @@ import numpy as np
 import yaml
 
 from pkmcal.errors import InputError
+from pkmcal.files.regular import check_regular
+from pkmcal.files.writing import settle
 
 LONGEST_SHOWN = 60
 """Characters of a found value that a message quotes: enough to recognise it, short enough for
@@ -28,13 +30,13 @@ def read_text(path: Path, label: str | None = None) -> str:
     """
     label = label or path.name
     try:
+        settle(path.parent)
+        check_regular(path, label)
         raw = path.read_bytes()
     except FileNotFoundError:
         raise InputError(
             "the file does not exist", where=label, expected=wanted_file(path)
         ) from None
-    except IsADirectoryError:
-        raise InputError("this is a folder", where=label, expected="a file") from None
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(f"the file cannot be read ({reason})", where=label) from None
@@ -49,6 +51,15 @@ def read_text(path: Path, label: str | None = None) -> str:
             expected="UTF-8",
             next_step="Save it as UTF-8 in the editor",
         ) from None
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise InputError(
+            "the file is not text",
+            where=f"{label}, line {line}",
+            found="a zero byte",
+            expected="UTF-8, which has none",
+            next_step="Save it as UTF-8 in the editor",
+        )
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -85,6 +96,13 @@ Keys = tuple[str | int, ...]
 MOST_VALUES = 200_000
 """Values a file may expand to. A large machine has a thousand; aliases of aliases reach billions
 from one short line, and would fill the memory."""
+MOST_CHARACTERS = 10_000_000
+"""The same of their texts."""
+DEEPEST = 50
+"""Levels of lists and mappings in one another. A machine has six; programs that read JSON give up
+at two hundred or so."""
+_NO_TEXT = re.compile("[\0\ud800-\udfff]")
+"""Zero, which no file's name may hold, and halves of characters, which cannot be written."""
 
 _TAG = "tag:yaml.org,2002:"
 _SCALARS = (
@@ -167,8 +185,6 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
             where=label + line,
             next_step="Check indentation, quotes and brackets on this line and the one above",
         ) from None
-    except RecursionError:
-        raise InputError("the file is nested too deeply to be read", where=label) from None
     except yaml.reader.ReaderError as error:
         raise InputError(
             "not a text file", where=label, found=f"character #x{error.character:04x}"
@@ -180,7 +196,41 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
             found=shown(data),
             expected="lines of the form key: value",
         )
-    return Document(path, label, data, builder.lines)
+    return _checked(Document(path, label, data, builder.lines))
+
+
+def _checked(document: Document) -> Document:
+    """The same, if all its texts can be written, and nothing in it is nested too deeply."""
+    todo: list[tuple[Keys, Any]] = [((), document.data)]
+    while todo:
+        keys, value = todo.pop()
+        if len(keys) > DEEPEST:
+            raise InputError(
+                f"nested too deeply, in more than {DEEPEST} levels", where=document.where(*keys)
+            )
+        if isinstance(value, str):
+            _check_characters(document, keys, value)
+        elif isinstance(value, dict):
+            for key, item in value.items():
+                _check_characters(document, (*keys, key), key)
+                todo.append(((*keys, key), item))
+        elif isinstance(value, list):
+            todo += [
+                ((*keys, k), item)
+                for k, item in enumerate(value)
+                if isinstance(item, str | dict | list)
+            ]
+    return document
+
+
+def _check_characters(document: Document, keys: Keys, text: str) -> None:
+    if bad := _NO_TEXT.search(text):
+        raise InputError(
+            "this text holds a character that cannot be written",
+            where=_NO_TEXT.sub("?", document.where(*keys)),
+            found=f"\\u{ord(bad[0]):04x} in {shown(text)}",
+            expected="letters, digits and signs",
+        )
 
 
 def yaml_text(data: Mapping[str, Any]) -> str:
@@ -193,9 +243,24 @@ def yaml_text(data: Mapping[str, Any]) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader with YAML 1.2's scalars."""
+    """PyYAML's safe loader with YAML 1.2's scalars, and an end of nesting."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
+    depth = 0
+    top = ""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.depth == 1:
+            self.top = getattr(index, "value", "")
+        if self.depth > DEEPEST:
+            mark = self.peek_event().start_mark
+            what = f"{self.top} is nested too deeply, in more than {DEEPEST} levels"
+            raise yaml.MarkedYAMLError(problem=what, problem_mark=mark)
+        self.depth += 1
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self.depth -= 1
 
 
 class _Dumper(yaml.SafeDumper):
@@ -221,6 +286,10 @@ for _name, _pattern, _first in _SCALARS:
         )
 
 
+_Pairs = dict[str, tuple[yaml.Node, yaml.Node]]
+"""A mapping's keys with their own nodes and those of their values."""
+
+
 class _Builder:
     """Turns a YAML node tree into plain data, noting lines and refusing what would be misread."""
 
@@ -229,14 +298,16 @@ class _Builder:
         self.label = label
         self.lines: dict[Keys, int] = {}
         self._open: set[int] = set()
+        self._merged: dict[int, _Pairs] = {}
         self._count = 0
+        self._characters = 0
 
     def value(self, node: yaml.Node, keys: Keys) -> Any:
         """Plain data of a node that stands at `keys`."""
         self.lines.setdefault(keys, node.start_mark.line + 1)
-        self._count += 1
-        if id(node) in self._open or self._count > MOST_VALUES:
-            raise self._error(node, "an alias (*) repeats without end, or far too often")
+        self._count_up(node)
+        if len(keys) > DEEPEST:
+            raise self._error(node, f"nested too deeply, in more than {DEEPEST} levels", keys)
         self._open.add(id(node))
         try:
             if isinstance(node, yaml.MappingNode) and node.tag == _TAG + "map":
@@ -258,14 +329,41 @@ class _Builder:
                     next_step="Remove one of the two",
                 )
             seen[key] = line
-        # Merges (<<) put their pairs first, so that a mapping's own keys win; writing the pairs
-        # back keeps an alias to this node from meeting them as duplicates.
-        self.loader.flatten_mapping(node)
-        pairs = {self._key(pair[0]): pair for pair in node.value}
-        node.value = list(pairs.values())
+        pairs = self._pairs(node)
         for key, (key_node, _) in pairs.items():
             self.lines[(*keys, key)] = key_node.start_mark.line + 1
         return {key: self.value(child, (*keys, key)) for key, (_, child) in pairs.items()}
+
+    def _pairs(self, node: yaml.MappingNode) -> _Pairs:
+        """A mapping's pairs, those that it merges (<<) first; its own win, and then the first."""
+        if id(node) in self._merged:
+            return self._merged[id(node)]
+        pairs: _Pairs = {}
+        own: _Pairs = {}
+        self._open.add(id(node))
+        for key_node, child in node.value:
+            if key_node.tag != _TAG + "merge":
+                own[self._key(key_node)] = key_node, child
+                continue
+            several = isinstance(child, yaml.SequenceNode)
+            for merged in reversed(child.value) if several else [child]:
+                if not isinstance(merged, yaml.MappingNode):
+                    raise self._error(merged, "<< merges mappings, and this is none")
+                self._count_up(merged)
+                for key, pair in self._pairs(merged).items():
+                    self._count_up(merged)
+                    pairs[key] = pair
+        self._open.discard(id(node))
+        pairs.update(own)
+        return self._merged.setdefault(id(node), pairs)
+
+    def _count_up(self, node: yaml.Node) -> None:
+        """Count a value, and refuse what an alias repeats too often."""
+        self._count += 1
+        self._characters += len(node.value) if isinstance(node, yaml.ScalarNode) else 0
+        often = self._count > MOST_VALUES or self._characters > MOST_CHARACTERS
+        if id(node) in self._open or often:
+            raise self._error(node, "an alias (*) repeats without end, or far too often")
 
     def _scalar(self, node: yaml.Node) -> str | int | float | bool | None:
         kind = node.tag.removeprefix(_TAG)
@@ -281,8 +379,9 @@ class _Builder:
             raise self._error(node, "a key is a list or a mapping; it should be a word")
         return node.value
 
-    def _error(self, node: yaml.Node, what: str) -> InputError:
-        return InputError(what, where=f"{self.label}, line {node.start_mark.line + 1}")
+    def _error(self, node: yaml.Node, what: str, keys: Keys = ()) -> InputError:
+        place = f", {field_path(keys)}" if keys else ""
+        return InputError(what, where=f"{self.label}, line {node.start_mark.line + 1}{place}")
 
 
 _WIDEST = 160
@@ -351,7 +450,7 @@ def read_json(path: Path | str, label: str | None = None) -> Document:
         raise InputError("not valid JSON", where=label, found=str(error)) from None
     if not isinstance(data, dict):
         raise InputError("the top of the file is not an object", where=label, found=shown(data))
-    return Document(path, label, data, {})
+    return _checked(Document(path, label, data, {}))
 
 
 def _refuse(constant: str) -> float:

@@ -148,6 +148,7 @@ _EXPECTED = {
     "literal_error": "{expected}",
     "too_long": "at most {max_length}",
     "too_short": "at least {min_length}",
+    "string_too_long": "text of {max_length} characters at most",
     "string_too_short": "text of {min_length} characters at least",
 }
 """What each of pydantic's error types wants, in a reader's words; the rest keep pydantic's."""

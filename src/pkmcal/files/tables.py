@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.errors import InputError
+from pkmcal.errors import LONGEST_NAME, InputError
 from pkmcal.files.documents import closest, read_text, shown
 from pkmcal.wording import listed
 
@@ -70,6 +70,8 @@ def read_csv(
     values = [_numbers(cells, header, f"{label}, line {line}") for line, cells in body]
     lines = tuple(line for line, _ in body)
     names = tuple(cells[0] for _, cells in body)
+    for name, line in zip(names, lines, strict=True):
+        _check_length([name], f"{label}, line {line}")
     _check_names(names, lines, key, label)
     return CsvTable(label, tuple(header[1:]), names, np.array(values, dtype=float), lines)
 
@@ -125,6 +127,7 @@ def _check_header(header: list[str], key: str, columns: Sequence[str] | None, wh
             expected=key,
             next_step=f"Begin the file with the line {key},<one column a number>",
         )
+    _check_length(header, where)
     if "" in header:
         number = header.index("") + 1
         raise InputError(f"column {number} of the header has no name", where=where)
@@ -187,6 +190,17 @@ def _number(cell: str, where: str) -> float:
     else:
         what, expected = "this is not a number", "a number, such as 0.3476 or 1.2e-3"
     raise InputError(what, where=where, found=shown(cell), expected=expected)
+
+
+def _check_length(names: Sequence[str], where: str) -> None:
+    for name in names:
+        if len(name) > LONGEST_NAME:
+            raise InputError(
+                "this name is too long",
+                where=where,
+                found=f"{shown(name)} of {len(name)} characters",
+                expected=f"at most {LONGEST_NAME}, as file systems take",
+            )
 
 
 def _check_names(names: tuple[str, ...], lines: tuple[int, ...], key: str, label: str) -> None:

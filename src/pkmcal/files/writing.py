@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Collection, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pkmcal.errors import InputError
 from pkmcal.wording import listed
+
+COMMITTED = ".pkmcal-replacing"
+"""Inside a folder: all that was written for it, complete, on the way to its place."""
+STAGE, PROBE = "stage", "probe"
+_NEW, _GONE = "new", "gone"
+"""In a stage: the files as they will stand, and empty ones that name those which go."""
+_LEFT_OVER = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part")
+"""Names of `_beside`."""
 
 
 def check_writable(folder: Path | str) -> None:
@@ -28,7 +37,7 @@ def check_writable(folder: Path | str) -> None:
             "outputs cannot go here", where=str(folder), found=f"{standing} is a file",
             expected="a folder",
         )  # fmt: skip
-    probe = _beside(standing / "probe")
+    probe = _beside(standing / PROBE)
     try:
         probe.mkdir()
         probe.rmdir()
@@ -38,14 +47,15 @@ def check_writable(folder: Path | str) -> None:
 
 def check_own_folder(
     folder: Path, names: Collection[str], what: str, earlier: str | None = None
-) -> None:
+) -> list[str]:
     """Raise `InputError` where a folder holds anything but our own files of these names.
 
     what : such as "a validation"; earlier : "an earlier validation" unless given.
+    Returns what it holds.
     """
     check_writable(folder)
-    entries = sorted(e.name for e in folder.iterdir()) if folder.is_dir() else []
-    foreign = [name for name in entries if name not in names]
+    standing = entries(folder)
+    foreign = [name for name in standing if name not in names]
     if foreign:
         raise InputError(
             f"the output folder holds something other than {what}",
@@ -55,11 +65,27 @@ def check_own_folder(
             " to replace",
             next_step="Name another folder with -o, or move these files away",
         )
+    return standing
 
 
-def write_folder(folder: Path, texts: Mapping[str, str | bytes]) -> None:
-    """Write texts, or bytes, by their files' names, all of them or none."""
-    with staged_folder(folder) as stage:
+def entries(folder: Path) -> list[str]:
+    """Sorted names in a folder, none where there is no folder; what a run that was killed left
+    there is none of them.
+    """
+    if not folder.is_dir():
+        return []
+    settle(folder)
+    return sorted(e.name for e in folder.iterdir() if not _LEFT_OVER.fullmatch(e.name))
+
+
+def write_folder(
+    folder: Path, texts: Mapping[str, str | bytes], over: Collection[str] = ()
+) -> None:
+    """Write texts, or bytes, by their files' names, all of them or none.
+
+    over : files of an earlier result, of which none is to stay.
+    """
+    with staged_folder(folder, over) as stage:
         for name, text in texts.items():
             content = text.encode("utf-8") if isinstance(text, str) else text
             (stage / name).write_bytes(content)
@@ -78,9 +104,7 @@ def write_bytes(path: Path | str, content: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("xb") as stream:
             stream.write(content)
-            stream.flush()
-            # Without it, a power cut after the move can leave the new name on an empty file.
-            os.fsync(stream.fileno())
+        _to_disk(part)
         part.replace(path)
     except OSError as error:
         raise _unwritable(path, error) from None
@@ -89,40 +113,115 @@ def write_bytes(path: Path | str, content: bytes) -> None:
 
 
 @contextmanager
-def staged_folder(folder: Path | str) -> Generator[Path]:
-    """Give an empty folder to write into; on leaving without an error, move all of it to `folder`.
+def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[Path]:
+    """Give an empty folder to write into; on leaving without an error, all of it is in `folder`.
 
-    A new folder appears in one step. In one that is there already the files are replaced one by
-    one after all of them have been written, and others in it stay. On an error nothing changes.
+    over : names of files in `folder` that go, unless they were written again. Others stay.
+    A new folder appears in one step. What is to go into one that is there already is put into it
+    under the name COMMITTED, in one step, and moved to its place from there. A run that is killed
+    leaves the old files before that step, and after it COMMITTED, from which `settle` goes on: the
+    next time that anything here is read or written. On an error nothing changes.
     """
     folder = Path(folder)
     check_writable(folder)
+    settle(folder)
     # Inside a folder that exists, because that may be a mount of its own, where moves would copy.
-    stage = _beside(folder / "stage") if folder.is_dir() else _beside(folder)
+    stage = _beside(folder / STAGE) if folder.is_dir() else _beside(folder)
+    new, gone = stage / _NEW, stage / _GONE
     try:
-        stage.mkdir(parents=True)
-        yield stage
-        _move(stage, folder)
+        new.mkdir(parents=True)
+        gone.mkdir()
+        yield new
+        written = _files(new)
+        for path in written:
+            _to_disk(path)
+        if folder.exists():
+            _check_clash(new, folder)
+            for name in over:
+                if new / name not in written and (folder / name).is_file():
+                    (gone / name).touch()
+            stage.replace(folder / COMMITTED)
+            settle(folder)
+        else:
+            new.replace(folder)
+        _sweep(folder)
     except OSError as error:
         raise _unwritable(folder, error) from None
     finally:
         shutil.rmtree(stage, ignore_errors=True)
 
 
-def _move(stage: Path, folder: Path) -> None:
-    """Move what was staged to its place."""
-    if not folder.exists():
-        stage.replace(folder)
+def remove_folder(folder: Path) -> None:
+    """Remove a folder in one step, so that no part of it is ever taken for the whole."""
+    left = _beside(folder)
+    folder.replace(left)
+    shutil.rmtree(left)
+
+
+def settle(folder: Path) -> None:
+    """Finish a replacement of files in `folder` in which a run was killed, if there is one.
+
+    Several processes may do so at once, and it may be killed as well: what is moved is moved.
+    Raises `InputError` where that is not allowed here.
+    """
+    committed = folder / COMMITTED
+    if not committed.is_dir():
         return
-    files = [path for path in sorted(stage.rglob("*")) if not path.is_dir()]
-    targets = [folder / path.relative_to(stage) for path in files]
-    for target in targets:
-        # Looked for before the first move, so that a clash leaves the folder as it was.
-        if target.is_dir():
+    new, gone = committed / _NEW, committed / _GONE
+    try:
+        for mark in _files(gone):
+            (folder / mark.relative_to(gone)).unlink(missing_ok=True)
+            mark.unlink(missing_ok=True)
+        for path in _files(new):
+            target = folder / path.relative_to(new)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with suppress(FileNotFoundError):  # another process was faster
+                path.replace(target)
+    except OSError as error:
+        raise InputError(
+            f"new files cannot be moved to their place ({error.strerror or error})",
+            where=str(folder),
+            found=f"what a run that was cut short left in {COMMITTED}",
+            next_step="Close programs that hold these files, make the folder writable, and run"
+            " this again",
+        ) from None
+    # Folder by folder, so that files which another process commits meanwhile are safe.
+    for path in sorted(committed.rglob("*"), reverse=True):
+        with suppress(OSError):
+            path.rmdir()
+    with suppress(OSError):
+        committed.rmdir()
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.rglob("*")) if not path.is_dir()]
+
+
+def _to_disk(path: Path) -> None:
+    """Without it, a power cut after a move can leave the new name on an empty file."""
+    with path.open("r+b") as stream:
+        os.fsync(stream.fileno())
+
+
+def _check_clash(new: Path, folder: Path) -> None:
+    """Look for what would stop a move before the first, so that the folder stays as it was."""
+    for path in new.rglob("*"):
+        target = folder / path.relative_to(new)
+        if path.is_dir() and target.exists() and not target.is_dir():
+            raise NotADirectoryError(20, "a file stands where a folder should go", str(target))
+        if target.is_dir() and not path.is_dir():
             raise IsADirectoryError(21, "a folder stands where a file should go", str(target))
-    for path, target in zip(files, targets, strict=True):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        path.replace(target)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what runs that were killed left of their attempts; of two that work at once, the
+    first to finish wins.
+    """
+    for place, names in ((folder, (STAGE, PROBE)), (folder.parent, (folder.name, PROBE))):
+        for path in list(place.iterdir()):
+            left = _LEFT_OVER.fullmatch(path.name)
+            if left and left["name"] in names and path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
 
 
 def _beside(path: Path) -> Path:

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.errors import InputError
 from pkmcal.judge.prediction import Prediction
 from pkmcal.mechanisms import Machine
-from pkmcal.session.load import Session
-
-SHORTEST = 3
-"""Points without which nothing is straight or bent."""
+from pkmcal.session.load import SHORTEST_PATH, Session
 
 
 @dataclass(frozen=True)
@@ -51,30 +46,12 @@ def straightness(points: Array) -> Straightness:
 
 
 def paths_of(session: Session) -> dict[str, list[int]]:
-    """Rows of the straight paths' configurations, by the paths' names.
-
-    Raises InputError where the session does not know one, or names too few.
-    """
-    paths: dict[str, Any] = session.document.get("paths") or {}
-    out: dict[str, list[int]] = {}
-    for name, members in paths.items():
-        for k, member in enumerate(members):
-            if member not in session.configurations:
-                raise InputError(
-                    "there is no such configuration",
-                    where=f"session.yaml, paths.{name}[{k + 1}]",
-                    found=member,
-                    expected=f"a name from {session.document['joints']['file']}",
-                )
-        if len(set(members)) < SHORTEST:
-            raise InputError(
-                "too few configurations for a straight path",
-                where=f"session.yaml, paths.{name}",
-                found=str(len(set(members))),
-                expected=f"{SHORTEST} at least",
-            )
-        out[name] = [session.configurations.index(member) for member in members]
-    return out
+    """Rows of the straight paths' configurations, by the paths' names."""
+    paths: dict[str, list[str]] = session.document.get("paths") or {}
+    return {
+        name: [session.configurations.index(member) for member in members]
+        for name, members in paths.items()
+    }
 
 
 def line_path(
@@ -90,7 +67,7 @@ def line_path(
     return LinePath(
         name=name,
         n=len(rows),
-        seen=straightness(seen[:, :3, 3]) if len(seen) >= SHORTEST else None,
+        seen=straightness(seen[:, :3, 3]) if len(seen) >= SHORTEST_PATH else None,
         drawing=by[0],
         calibrated=by[1],
     )

@@ -17,6 +17,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from pkmcal.arrays import Array
+from pkmcal.errors import LONGEST_NAME
 from pkmcal.files import Schema
 from pkmcal.mechanisms.carriers.contract import (
     Carrier,
@@ -205,7 +206,7 @@ class Model(Schema):
 class MechanismDocument(Schema):
     """A whole mechanism file."""
 
-    name: str
+    name: Annotated[str, Field(max_length=LONGEST_NAME)]
     motion: Motion
     legs: Annotated[tuple[Leg, ...], AfterValidator(_some_legs)]
     tolerance: Tolerance = Tolerance()

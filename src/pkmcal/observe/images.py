@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
 from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,10 @@ import numpy as np
 
 from pkmcal.arrays import Integers
 from pkmcal.errors import InputError
-from pkmcal.files import read_exif
+from pkmcal.files import check_regular, read_exif, stated_size
 
-PNG_END = b"IEND\xaeB`\x82"
+PNG_START = 8
+"""Bytes before a PNG file's first chunk: length, kind, body and checksum of kind and body."""
 JPEG_END = b"\xff\xd9"
 
 
@@ -28,13 +31,20 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
     import cv2
 
     try:
+        check_regular(path, label)
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=label) from None
-    if data[:4] == b"\x89PNG" and PNG_END not in data:
-        raise _broken(label, "a PNG file that ends early")
+    if data[:4] == b"\x89PNG":
+        _check_png(data, label)
     if data[:2] == b"\xff\xd8" and not _jpeg_reaches_its_end(data):
         raise _broken(label, "a JPEG file that ends early")
+    # before decoding, which takes the memory that the header asks for
+    size = stated_size(BytesIO(data))
+    if size and min(size) == 0:
+        raise _broken(label, "no readable image")
+    if size and tuple(image_size) not in (size, size[::-1]):
+        raise _other_size(label, size, image_size)
     # a turned picture would no longer be its camera's: flags that ask for turning are ignored where
     # the size is the camera's
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
@@ -51,14 +61,31 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         way = cv2.ROTATE_90_CLOCKWISE if clockwise else cv2.ROTATE_90_COUNTERCLOCKWISE
         return np.ascontiguousarray(cv2.rotate(image, way))
     if (image.shape[1], image.shape[0]) != tuple(image_size):
-        raise InputError(
-            "the photograph has another size than its camera",
-            where=label,
-            found=f"{image.shape[1]}x{image.shape[0]} pixels",
-            expected=f"{image_size[0]}x{image_size[1]}, the camera file's image_size",
-            next_step="Use the photograph as the camera gave it, neither scaled nor cropped",
-        )
+        raise _other_size(label, (image.shape[1], image.shape[0]), image_size)
     return image
+
+
+def _check_png(data: bytes, label: str) -> None:
+    """Raise `InputError` where a PNG file is cut short, or a byte of it is not what it was."""
+    at = PNG_START
+    while (end := at + 12 + int.from_bytes(data[at : at + 4])) <= len(data):
+        body = data[at + 4 : end - 4]
+        if zlib.crc32(body) != int.from_bytes(data[end - 4 : end]):
+            raise _broken(label, "a PNG file that is damaged")
+        if body.startswith(b"IEND"):
+            return
+        at = end
+    raise _broken(label, "a PNG file that ends early")
+
+
+def _other_size(label: str, found: tuple[int, int], image_size: tuple[int, int]) -> InputError:
+    return InputError(
+        "the photograph has another size than its camera",
+        where=label,
+        found=f"{found[0]}x{found[1]} pixels",
+        expected=f"{image_size[0]}x{image_size[1]}, the camera file's image_size",
+        next_step="Use the photograph as the camera gave it, neither scaled nor cropped",
+    )
 
 
 def _jpeg_reaches_its_end(data: bytes) -> bool:

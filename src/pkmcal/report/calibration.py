@@ -86,9 +86,9 @@ def _tool_map(calibration: Calibration) -> ToolMap | str:
 
 def save(calibration: Calibration, folder: Path | str) -> None:
     """Write a calibration's three files into `folder`, whole or not at all."""
-    check_output(folder)
+    over = check_output(folder)
     found = outcome_of(calibration)
-    write_folder(Path(folder), {REPORT: page.page_html(found), **found.texts})
+    write_folder(Path(folder), {REPORT: page.page_html(found), **found.texts}, over)
 
 
 def report_of(

@@ -16,8 +16,19 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera, load_camera
-from pkmcal.errors import InputError
-from pkmcal.files import CsvTable, Document, Keys, read_csv, read_yaml, shown, validate, wanted_file
+from pkmcal.errors import LONGEST_NAME, InputError
+from pkmcal.files import (
+    CsvTable,
+    Document,
+    Keys,
+    check_regular,
+    closest,
+    read_csv,
+    read_yaml,
+    shown,
+    validate,
+    wanted_file,
+)
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region
@@ -45,6 +56,8 @@ __all__ = [
 
 FILE = "session.yaml"
 VERSION = 1
+SHORTEST_PATH = 3
+"""Configurations without which nothing is straight or bent."""
 # A camera nearer to what it looks at than this has two equal points written, not a view.
 _NEAREST = 1e-6  # m
 # Under a degree between view and up, a rough up of a few digits leaves the roll to chance.
@@ -179,6 +192,8 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
             trackers.append(read_poses(path, given.poses, table.names, *noise, name))
         else:
             trackers.append(PoseTable.to_come(name, given.poses, *noise))
+    if measured:
+        _check_paths(document, schema, table)
     _check_distinct(document, stations)
     _check_names(document, (*stations, *trackers))
     if measured and schema.stations:
@@ -238,7 +253,7 @@ def _read(folder: Path) -> tuple[Path, Document]:
         folder = folder.parent
     if not folder.is_dir():
         raise InputError("there is no such session folder", where=str(folder))
-    if not (folder / FILE).is_file():
+    if not (folder / FILE).exists():
         below = sorted(path.parent.name for path in folder.glob(f"*/{FILE}"))
         raise InputError(
             f"the folder holds no {FILE}",
@@ -262,14 +277,22 @@ def _read(folder: Path) -> tuple[Path, Document]:
 def _existing(folder: Path, document: Document, name: str, keys: Keys) -> Path:
     """The path of a file that session.yaml names, relative to it."""
     path = folder / name
-    if path.is_file():
-        return path
-    raise InputError(
-        "this is a folder, not a file" if path.exists() else "there is no such file",
-        where=document.where(*keys),
-        found=name,
-        expected="a file" if path.exists() else wanted_file(path),
-    )
+    try:
+        check_regular(path, name)
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(
+            "there is no such file",
+            where=document.where(*keys),
+            found=name,
+            expected=wanted_file(path),
+        ) from None
+    except InputError as error:
+        raise error.located(document.where(*keys)) from None
+    except OSError as error:  # such as a name that no file can have
+        raise InputError(
+            f"the file cannot be read ({error.strerror})", where=document.where(*keys), found=name
+        ) from None
+    return path
 
 
 def _machine(
@@ -277,7 +300,7 @@ def _machine(
 ) -> tuple[Machine, Path | str]:
     """The machine, and what to load other models of it from."""
     looks_like_path = source.endswith((".yaml", ".yml")) or "/" in source
-    if looks_like_path or (folder / source).is_file():
+    if looks_like_path or len(source) > LONGEST_NAME or (folder / source).is_file():
         path = _existing(folder, document, source, ("mechanism",))
         return load_mechanism(path, label=source, model=model), path
     return load_mechanism(source, label=document.where("mechanism"), model=model), source
@@ -466,6 +489,27 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
                     found=photo.path.name,
                     expected="its own photographs; a station is one camera in one place",
                 )
+
+
+def _check_paths(document: Document, schema: SessionDocument, table: CsvTable) -> None:
+    """Straight paths lead through configurations that the readings' table has."""
+    for name, members in (schema.paths or {}).items():
+        for k, member in enumerate(members):
+            if member not in table.names:
+                guess = closest(member, table.names)
+                raise InputError(
+                    "there is no such configuration",
+                    where=document.where("paths", name, k),
+                    found=member,
+                    expected=guess or f"a name from {table.label}",
+                )
+        if len(set(members)) < SHORTEST_PATH:
+            raise InputError(
+                "too few configurations for a straight path",
+                where=document.where("paths", name),
+                found=str(len(set(members))),
+                expected=f"{SHORTEST_PATH} at least",
+            )
 
 
 def _check_names(document: Document, stations: tuple[Station | PoseTable, ...]) -> None:

@@ -8,18 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from string import Formatter
-from typing import BinaryIO
 
 from pkmcal.errors import InputError
-from pkmcal.files import closest, shown
+from pkmcal.files import check_regular, closest, shown, stated_size
 from pkmcal.wording import listed
 
-_PNG_START = b"\x89PNG\r\n\x1a\n"
-_JPEG_START = b"\xff\xd8"
-# Start-of-frame markers: FFC0 to FFCF without tables (C4), arithmetic tables (CC), JPG (C8).
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-# Markers that carry no length: TEM, restarts, start and end of image.
-_JPEG_BARE = frozenset({0x01, *range(0xD0, 0xDA)})
 _FIELDS = ("configuration", "repeat")
 
 
@@ -49,16 +42,17 @@ def find_photographs(
     """
     parts = _parts(pattern, where)
     wildcard = "".join(glob.escape(text) if field is None else "*" for text, field in parts)
+    known = re.compile(_regex(parts, "|".join(map(re.escape, sorted(names, key=len)[::-1]))))
     files = [
-        Path(name).as_posix()
-        for name in glob.glob(wildcard, root_dir=folder)
-        if (folder / name).is_file()
+        path
+        for path in (Path(name).as_posix() for name in glob.glob(wildcard, root_dir=folder))
+        # A folder or a pipe that has a photograph's name is told; others are nobody's business.
+        if (folder / path).is_file() or known.fullmatch(path)
     ]
     if not files and not needed:
         return ()
     if not files:
         raise _none_found(folder, wildcard, pattern, where)
-    known = re.compile(_regex(parts, "|".join(map(re.escape, sorted(names, key=len)[::-1]))))
     rows = {name: row for row, name in enumerate(names)}
     found: list[Photograph] = []
     strangers: list[str] = []
@@ -80,27 +74,22 @@ def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, 
 
     PNG and JPEG: from their first bytes. Other formats are decoded by OpenCV.
     label : the file's name in messages; the path unless told.
+    Raises InputError for what is no file, no image, or states a size that its bytes cannot fill.
     """
     path = Path(path)
+    label = label or str(path)
     try:
+        check_regular(path, label)
         with path.open("rb") as stream:
-            start = stream.read(24)
-            if start.startswith(_PNG_START) and start[12:16] == b"IHDR":
-                size = _pair(start[16:20], start[20:24])
-            elif start.startswith(_JPEG_START):
-                stream.seek(2)
-                size = _jpeg_size(stream)
-            else:
-                size = _decoded_size(path) if start else (0, 0)
+            size = stated_size(stream) or _decoded_size(path)
+        empty = path.stat().st_size == 0
     except OSError as error:
-        raise InputError(
-            f"the image cannot be read ({error.strerror})", where=label or str(path)
-        ) from None
+        raise InputError(f"the image cannot be read ({error.strerror})", where=label) from None
     if min(size) > 0:
         return size
     raise InputError(
-        "the file is not an image that can be read" if start else "the image file is empty",
-        where=label or str(path),
+        "the image file is empty" if empty else "the file is not an image that can be read",
+        where=label,
         expected="a PNG or JPEG file",
         next_step="Copy it from the camera again, or remove it",
     )
@@ -163,7 +152,11 @@ def _none_found(folder: Path, wildcard: str, pattern: str, where: str) -> InputE
     while "*" in str(place):
         place = place.parent
     found = f"no folder {place}"
-    if place.is_dir():
+    try:
+        standing = place.is_dir()
+    except OSError:  # such as a name that no folder can have
+        standing = False
+    if standing:
         entries = sorted(entry.name for entry in place.iterdir())
         others = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
         found = f"{others} {entries[0]} in {place}" if entries else f"nothing in {place}"
@@ -196,27 +189,6 @@ def _stranger(
         expected=f"one of the table's {len(names)}: {listed(names)}",
         next_step=next_step,
     )
-
-
-def _jpeg_size(stream: BinaryIO) -> tuple[int, int]:
-    """Walk the segments to the start of frame; (0, 0) where there is none."""
-    while byte := stream.read(1):
-        if byte != b"\xff":
-            return 0, 0
-        while (marker := stream.read(1)) == b"\xff":
-            pass  # fill bytes
-        if not marker or marker[0] in _JPEG_BARE:
-            continue
-        length = int.from_bytes(stream.read(2))
-        if marker[0] in _JPEG_FRAMES:
-            frame = stream.read(5)
-            return _pair(frame[3:5], frame[1:3])
-        stream.seek(max(length - 2, 0), 1)
-    return 0, 0
-
-
-def _pair(width: bytes, height: bytes) -> tuple[int, int]:
-    return int.from_bytes(width), int.from_bytes(height)
 
 
 def _decoded_size(path: Path) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError
-from pkmcal.files import Exif, csv_text, staged_folder, with_exif, yaml_text
+from pkmcal.files import Exif, csv_text, entries, staged_folder, with_exif, yaml_text
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import Machine, mechanism_text
 from pkmcal.mechanisms.carriers.contract import PLANAR
@@ -159,7 +159,7 @@ def _shaken(shake: tuple[float, float], rng: np.random.Generator) -> Array:
 
 def _check(folder: Path, drawing: Machine) -> None:
     """Raise InputError for what would waste the work."""
-    if folder.is_dir() and any(folder.iterdir()):
+    if entries(folder):
         raise InputError(
             what="the folder for the simulated session is not empty",
             where=str(folder),

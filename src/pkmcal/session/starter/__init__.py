@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pkmcal.errors import InputError
-from pkmcal.files import staged_folder
+from pkmcal.files import entries, staged_folder
 
 TEMPLATE = Path(__file__).parent / "session"
 TO_FILL = {
@@ -26,7 +26,7 @@ def template_files() -> tuple[str, ...]:
 def write_session(folder: Path | str) -> tuple[str, ...]:
     """Write the starter session into a new or empty folder; returns its files."""
     folder = Path(folder)
-    if folder.is_dir() and any(folder.iterdir()):
+    if entries(folder):
         raise InputError(
             "the folder for the new session is not empty",
             where=str(folder),

@@ -1,0 +1,89 @@
+"""Standard output and standard error, whatever stands at their other end.
+
+What is told must not change what is done, nor the exit code: a reader such as ``head`` may leave,
+and the rest goes nowhere; standard error may go anywhere, or nowhere. Only an answer that cannot be
+given, on a full disk or a closed standard output, is an error, and one that is told once.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, TextIO
+
+from pkmcal.errors import InputError
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
+LEFT = {errno.EPIPE} | ({errno.EINVAL} if os.name == "nt" else set())
+"""What a pipe says whose reader has gone; Windows has a word of its own."""
+
+
+class LostOutput(InputError):
+    """Standard output takes nothing more."""
+
+
+@contextmanager
+def withstanding() -> Generator[None]:
+    """Have streams that bear all this in the place of sys.stdout and sys.stderr.
+
+    Terminals, and streams that a caller has put there, stay. Where a program is started with one of
+    them closed, Python has None there, and the next file that is opened would get its number.
+    """
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = _withstanding(sys.stdout, 1), _withstanding(sys.stderr, 2)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+def _withstanding(stream: TextIO | None, number: int) -> TextIO:
+    told = number == 1
+    if stream is None:
+        while (taken := os.open(os.devnull, os.O_RDONLY)) < number:
+            pass
+        if taken > number:
+            os.close(taken)
+        return _text(_Stream(number, told=told), "utf-8")
+    if isinstance(stream, io.TextIOWrapper):
+        # a terminal that lacks a sign shows ? for it; that is no reason to fail
+        stream.reconfigure(errors="replace")
+        # without PYTHONUNBUFFERED there is a buffer between
+        raw = getattr(stream.buffer, "raw", stream.buffer)
+        if isinstance(raw, io.FileIO) and not stream.isatty():
+            stream.flush()
+            return _text(_Stream(stream.fileno(), told=told), stream.encoding)
+    return stream
+
+
+class _Stream(io.FileIO):
+    """A file that fails once at most; told : whether that is raised, as LostOutput."""
+
+    def __init__(self, number: int, *, told: bool) -> None:
+        super().__init__(number, "w", closefd=False)
+        self._told = told
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        """Write what can be written; after a failure, nothing."""
+        try:
+            return super().write(data)
+        except OSError as error:
+            told, self._told = self._told, False
+            os.dup2(nowhere := os.open(os.devnull, os.O_WRONLY), self.fileno())
+            os.close(nowhere)
+            if told and error.errno not in LEFT:
+                raise LostOutput(
+                    f"standard output cannot be written ({error.strerror})",
+                    next_step="Make room, or send it elsewhere; files that were written are whole",
+                ) from None
+            return memoryview(data).nbytes
+
+
+def _text(raw: _Stream, encoding: str) -> TextIO:
+    return io.TextIOWrapper(io.BufferedWriter(raw), encoding, "replace", line_buffering=True)

@@ -1,0 +1,38 @@
+"""What stands under a file's name: a file, or something that reading would wait for for ever."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+from pkmcal.errors import InputError
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def check_regular(path: Path, label: str) -> None:
+    """Raise `InputError` where `path` is there and is no file, before it is opened.
+
+    label : its name in messages. Raises FileNotFoundError where nothing is there.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        if not path.is_symlink():
+            raise
+        raise InputError(
+            "this is a link to what is not there",
+            where=label,
+            found=str(path.readlink()),
+            expected="a file",
+        ) from None
+    if stat.S_ISREG(mode):
+        return
+    kind = next((kind for is_kind, kind in _KINDS if is_kind(mode)), "something else")
+    raise InputError(f"this is {kind}, not a file", where=label, expected="a file")
