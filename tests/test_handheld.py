@@ -282,18 +282,19 @@ def at_truth(monkeypatch, folder, off=2e-3):
     monkeypatch.setattr("pkmcal.calibration.calibrate.place_by_hand", place)
 
 
-@pytest.fixture
-def breathed(simulated, monkeypatch, tmp_path):
+@pytest.fixture(scope="module")
+def breathed(simulated, tmp_path_factory):
     """The calibration of a machine that is known exactly, so that photographs tell all they can of
     their focal lengths."""
-    folder = tmp_path / "session"
+    folder = tmp_path_factory.mktemp("breathed") / "session"
     shutil.copytree(simulated, folder)
     text = (folder / "mechanism.yaml").read_text()
     (folder / "mechanism.yaml").write_text(
         re.sub(r"(?m)^tolerance:.*$", "tolerance: {center: 1e-5, offset: 1e-5, radius: 1e-5}", text)
     )
-    at_truth(monkeypatch, folder)
-    return calibrate(folder), load_truth(folder, load_mechanism("gough-stewart"))
+    with pytest.MonkeyPatch.context() as patch:
+        at_truth(patch, folder)
+        return calibrate(folder), load_truth(folder, load_mechanism("gough-stewart"))
 
 
 def test_focal_lengths_are_found_within_their_deviations(breathed):

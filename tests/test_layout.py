@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -37,7 +38,10 @@ def imports(path: Path) -> set[Path]:
     return {other for other in found if other is not None}
 
 
-ARROWS = {path: imports(path) for path in SOURCE.rglob("*.py")}
+@cache
+def arrows() -> dict[Path, set[Path]]:
+    """What every file imports; parsed when first asked for, not when tests are collected."""
+    return {path: imports(path) for path in SOURCE.rglob("*.py")}
 
 
 def package(path: Path) -> str:
@@ -45,7 +49,7 @@ def package(path: Path) -> str:
 
 
 def test_the_table_names_every_package():
-    assert {package(path) for path in ARROWS} - FACES == rows().keys()
+    assert {package(path) for path in arrows()} - FACES == rows().keys()
     assert len(list(SOURCE.glob("*.py"))) <= 8
 
 
@@ -53,7 +57,7 @@ def test_packages_import_only_from_rows_above():
     order = rows()
     wrong = [
         f"{path.relative_to(SOURCE)} imports {other.relative_to(SOURCE)}"
-        for path, others in ARROWS.items()
+        for path, others in arrows().items()
         if package(path) not in FACES
         for other in others
         if package(other) != package(path) and order.get(package(other), 99) >= order[package(path)]
@@ -62,7 +66,7 @@ def test_packages_import_only_from_rows_above():
 
 
 def test_no_files_import_each_other_in_a_circle():
-    left = {path: set(others) - {path} for path, others in ARROWS.items()}
+    left = {path: set(others) - {path} for path, others in arrows().items()}
     while ends := [path for path, others in left.items() if not others & left.keys()]:
         for path in ends:
             del left[path]
