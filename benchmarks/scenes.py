@@ -323,7 +323,7 @@ def spoilt(document: dict[str, Any], error: tuple[float, float], rng: np.random.
 
 def run(folder: Path, options: argparse.Namespace) -> Row:
     """One session, calibrated without its truth and scored with it."""
-    from pkmcal import calibrate
+    from pkmcal.calibration import calibrate
     from pkmcal.errors import PkmcalError
     from pkmcal.session.load import load_session
 
