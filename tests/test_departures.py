@@ -12,7 +12,7 @@ import yaml
 from conftest import run
 from pkmcal import calibrate
 from pkmcal.boards.poses import pose_set
-from pkmcal.calibration.departures import FEWEST, LEVEL
+from pkmcal.calibration.departures import FEWEST, LEVEL, _percent
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.results import load
 from pkmcal.geometry.rigid import perturb
@@ -171,6 +171,22 @@ def test_what_no_data_see_is_not_tested():
     assert none.sigma[0] == np.inf
     offsets = np.flatnonzero(drawing.parameters.of_kind("offset"))
     assert some.sigma[0] > drawing.parameters.tolerance[offsets[1]]
+
+
+def test_what_is_seen_beside_what_is_not_keeps_its_deviation():
+    drawing, data, where = measured(6, scale=(1, 5e-3))
+    nothing = np.zeros((*data.joints.shape, 1))
+    six = np.concatenate([plays(data)[0], nothing], axis=-1)  # two numbers, of which one is seen
+    _, tests = score_tests(drawing, data, where, [scales(data)[1], six], False)
+    alone, beside = tests.fitted([0])[0], tests.fitted([0, 1])
+    np.testing.assert_allclose(beside[0].value, alone.value, rtol=0.2)
+    assert np.isfinite(beside[0].sigma).all()
+    assert np.isfinite(beside[1].sigma).tolist() == [True, False]
+
+
+def test_a_ratio_without_a_deviation_is_told_roughly():
+    assert _percent(-0.0042, np.inf) == "some 0.4 %"
+    assert _percent(0.00952, 0.0011) == "0.95 ± 0.11 %"
 
 
 def test_boards_of_another_size_show_where_readings_give_the_scale():

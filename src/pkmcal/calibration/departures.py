@@ -343,6 +343,8 @@ DECLARED: Sequence[Callable[[_At], Iterator[Departure]]] = (
 
 
 def _percent(value: float, sigma: float) -> str:
-    """A ratio in per cent, with its standard deviation."""
+    """A ratio in per cent, with its standard deviation where the data tell one."""
+    if not np.isfinite(sigma):
+        return f"some {100 * abs(value):.1g} %"
     places = max(0, 1 - int(np.floor(np.log10(max(100 * sigma, 1e-6)))))
     return f"{number(100 * abs(value), places)} ± {number(100 * sigma, places)} %"

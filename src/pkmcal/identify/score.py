@@ -30,6 +30,8 @@ SEEN = 1e-10
 """Part of a departure's squared rows that has to be left beside all unknowns for the data to see
 it; less is rounding. Of what a reading tells of a pose, a hundred times sharper than the edges,
 a ten-thousandth is left."""
+HIDDEN = 0.01
+"""Part of a number that lies in directions which the data do not see, from which it is not told."""
 MOST = 4
 """Departures that are looked for one after the other; more are a session with other troubles."""
 
@@ -135,7 +137,7 @@ class Departures:
         back = vt[seen].T / s[seen]
         value = -(back @ (u[:, seen].T @ self._value)) / self._scale[columns]
         sigma = np.sqrt(np.sum(back**2, axis=1)) / self._scale[columns]
-        hidden = np.sum(vt[~seen] ** 2, axis=0) > SEEN
+        hidden = np.sum(vt[~seen] ** 2, axis=0) > HIDDEN
         sigma[hidden] = np.inf
         ends = np.cumsum([len(self._parts[k]) for k in freed])
         return [
