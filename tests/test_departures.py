@@ -134,6 +134,18 @@ def test_two_departures_are_found_one_after_the_other():
     assert other.value[0] == pytest.approx(5e-4, rel=0.3)
 
 
+def test_nothing_is_found_twice():
+    drawing, data, where = measured(7, scale=(1, 6e-3))
+    estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
+    assembled = assemble(estimate.machine, data, default_gauge(drawing))
+    problem, state = assembled.problem, batch_of(estimate.machine, assembled, estimate.state)
+    columns = [columns_of(problem, state, readings=by) for by in scales(data)[1:3]]
+    tests = Departures(problem, state, columns, [0, 1])  # each a family of its own
+    found = [k for k, _ in tests.found(LEVEL)]
+    assert found[0] == 0
+    assert len(found) == len(set(found))
+
+
 def false_alarms(seeds):
     chances = []
     for seed in seeds:

@@ -113,7 +113,8 @@ class Departures:
         tested = np.bincount(self._family, weights=[score.dof > 0 for score in out])
         times = np.count_nonzero(tested) * tested[self._family]
         return [
-            replace(s, adjusted=min(n * s.chance, 1.0)) for s, n in zip(out, times, strict=True)
+            replace(score, adjusted=min(float(n) * score.chance, 1.0)) if score.dof else score
+            for score, n in zip(out, times, strict=True)
         ]
 
     def found(self, alpha: float) -> list[tuple[int, Score]]:
