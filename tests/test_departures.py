@@ -22,7 +22,7 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.score import Departures, columns_of
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import Change, EdgeSet, Measurements, Mount, concatenate
+from pkmcal.measurements import EdgeSet, Effect, Measurements, Mount, concatenate
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.planning.subject import of_machine
 from pkmcal.session.moved import FEWEST
@@ -73,10 +73,10 @@ def score_tests(drawing, data, where, readings, moved, families=None):
     estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(drawing))
     state = batch_of(estimate.machine, assembled, estimate.state)
-    changes = [Change(readings=by) for by in readings]
+    effects = [Effect(readings=by) for by in readings]
     if moved:
-        changes.append(Change(station=0, since=len(data.joints) // 2))
-    return estimate, Departures(assembled, state, changes, families)
+        effects.append(Effect(station=0, since=len(data.joints) // 2))
+    return estimate, Departures(assembled, state, effects, families)
 
 
 def scales(data):
@@ -147,14 +147,14 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(drawing))
     state, problem = batch_of(estimate.machine, assembled, estimate.state), assembled.problem
-    changes = [Change(readings=scales(data)[1]), Change(station=1, since=5)]
-    changes.append(Change(edges=np.stack([data.edges.shift, data.edges.normal[:, :2]], axis=-1)))
-    tests = Departures(assembled, state, changes, [0, 1, 2], singles=True)
+    effects = [Effect(readings=scales(data)[1]), Effect(station=1, since=5)]
+    effects.append(Effect(edges=np.stack([data.edges.shift, data.edges.normal[:, :2]], axis=-1)))
+    tests = Departures(assembled, state, effects, [0, 1, 2], singles=True)
     own, m = problem.linearize(state), data.joints.shape[1]
     shared = own.by_shared[0]
     begin = problem.unknowns.stations.start + 6
     later = np.where((np.arange(14) >= 5)[:, None, None], shared[..., begin : begin + 6], 0.0)
-    throughout = columns_of(assembled, state, [changes[0], changes[2]], singles=True)(slice(0, 14))
+    throughout = columns_of(assembled, state, [effects[0], effects[2]], singles=True)(slice(0, 14))
     single = np.einsum("krm,kl->krlm", throughout[..., 3:], np.eye(14)).reshape(
         *later.shape[:2], -1
     )
@@ -187,7 +187,7 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     for k in [2, 3, 5, 40, 70]:
         assert scores[k].chi2 == pytest.approx(oracle(known, k)[0], rel=1e-5, abs=1e-6)
     monkeypatch.setattr(score, "ROWS", 3 * problem.n_rows)
-    pieces = Departures(assembled, state, changes, [0, 1, 2], singles=True)
+    pieces = Departures(assembled, state, effects, [0, 1, 2], singles=True)
     for one, other in zip(pieces.scores(freed), scores, strict=True):
         assert one.chi2 == pytest.approx(other.chi2, rel=1e-6, abs=1e-9)
 
@@ -267,7 +267,7 @@ def test_boards_of_another_size_show_where_readings_give_the_scale():
     assembled = assemble(estimate.machine, data, default_gauge(machine))
     state = batch_of(estimate.machine, assembled, estimate.state)
     one = size_departure(boards, 0, "board.yaml", 0.0)
-    fit = Departures(assembled, state, [one.change]).fitted([0])[0]
+    fit = Departures(assembled, state, [one.effect]).fitted([0])[0]
     assert abs(fit.value[0] - 0.004) < 4 * fit.sigma[0] + 2e-4
 
 

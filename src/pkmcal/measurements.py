@@ -251,7 +251,7 @@ class Measurements:
 
 
 @dataclass(frozen=True)
-class Change:
+class Effect:
     """What k numbers do to what was measured, to first order: from what was measured to what should
     have been.
 
@@ -280,11 +280,11 @@ class Departure:
     """Something that a session takes for granted and that may be otherwise.
 
     kind : for programs. of : what departs, by name. says : what the data show and what to do next,
-    from the numbers that fit and their standard deviations (k,). change : what it does to what was
+    from the numbers that fit and their standard deviations (k,). effect : what it does to what was
     measured; empty for a single reading, see :class:`pkmcal.identify.score.Departures`.
     """
 
     kind: str
     of: str
     says: Callable[[Array, Array], tuple[str, str]]
-    change: Change = field(default_factory=Change)
+    effect: Effect = field(default_factory=Effect)

@@ -39,7 +39,7 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
-from pkmcal.measurements import Change, Departure, PoseSet, Rejection
+from pkmcal.measurements import Departure, Effect, PoseSet, Rejection
 from pkmcal.observe.repeats import groups_of
 from pkmcal.wording import listed, ratio
 
@@ -482,4 +482,4 @@ def size_departure(poses: PoseSet, mount: int, file: str, gone: float) -> Depart
             f" by {1 + size:.5f}",
         )
 
-    return Departure("board size", file, says, Change(poses=by))
+    return Departure("board size", file, says, Effect(poses=by))

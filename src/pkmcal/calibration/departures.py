@@ -21,7 +21,7 @@ from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import Departures, Freed, Score
 from pkmcal.identify.tool import ToolError, tool_error
-from pkmcal.measurements import Change, Departure, Measurements, Observation
+from pkmcal.measurements import Departure, Effect, Measurements, Observation
 from pkmcal.session import moved, readings
 from pkmcal.session.load import Session
 from pkmcal.wording import amount
@@ -92,7 +92,7 @@ def departures(
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
     assembled, state = as_ended(measurements, estimate)
     tests = Departures(
-        assembled, state, [one.change for one in listed], number.tolist(), singles=True
+        assembled, state, [one.effect for one in listed], number.tolist(), singles=True
     )
     found = tests.found(LEVEL)
     if not found:
@@ -149,11 +149,11 @@ def _lenses(
         also = (number_of[measured.poses.station] == c) & (measured.poses.station < len(cameras))
         for part in camera.departures():
             n = len(camera.parameters)
-            change = Change(
+            effect = Effect(
                 edges=np.where(mine, edges[..., :n] @ part.columns, 0.0),
                 poses=np.where(also[:, None, None], poses[..., :n] @ part.columns, 0.0),
             )
-            yield Departure(part.kind, file, _of_lens(part.says, file), change)
+            yield Departure(part.kind, file, _of_lens(part.says, file), effect)
 
 
 def _of_lens(

@@ -31,7 +31,7 @@ from pkmcal.identify.covariance import NULL
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.measurements import Change
+from pkmcal.measurements import Effect
 from pkmcal.solver import ROWS, Linear, eliminate, inverse_root
 
 SEEN = 1e-10
@@ -78,7 +78,7 @@ class Departures:
         self,
         assembled: Assembled,
         state: BatchState,
-        listed: Sequence[Change],
+        listed: Sequence[Effect],
         families: Sequence[int] | None = None,
         *,
         singles: bool = False,
@@ -297,7 +297,7 @@ def _basis(problem: Problem, state: BatchState) -> Array:
 def _products(
     assembled: Assembled,
     state: BatchState,
-    listed: Sequence[Change],
+    listed: Sequence[Effect],
     basis: Array,
     singles: bool,
 ) -> _Products:
@@ -306,18 +306,18 @@ def _products(
     stations, motors = problem.unknowns.stations, problem.layout.n_readings if singles else 0
     parts: list[_Listed] = []
     n = 6 * problem.unknowns.n_stations
-    for change in listed:
-        if change.station is None:
-            parts.append(_Listed(n + np.arange(change.count), 0))
-            n += change.count
+    for effect in listed:
+        if effect.station is None:
+            parts.append(_Listed(n + np.arange(effect.count), 0))
+            n += effect.count
         else:
-            since = int(np.count_nonzero(seen[: change.since]))
-            parts.append(_Listed(6 * change.station + np.arange(6), since))
+            since = int(np.count_nonzero(seen[: effect.since]))
+            parts.append(_Listed(6 * effect.station + np.arange(6), since))
     begins = sorted({0, *(part.since for part in parts)})
     width = n + basis.shape[1] + 1
     sums: dict[int, Array] = {begin: np.zeros((n, width)) for begin in begins}
     single, among, known = [np.zeros((0, motors, width))], [np.zeros((0, motors, motors))], 0.0
-    throughout = [change for change in listed if change.station is None]
+    throughout = [effect for effect in listed if effect.station is None]
     columns = columns_of(assembled, state, throughout, singles=singles)
     for cut, part, at in _cuts(problem, state):
         linear = part.linearize(at)
@@ -365,23 +365,23 @@ def _eliminated(linear: Linear, columns: Array) -> tuple[Array, Array]:
 
 
 def columns_of(
-    assembled: Assembled, state: BatchState, listed: Sequence[Change], *, singles: bool = False
+    assembled: Assembled, state: BatchState, listed: Sequence[Effect], *, singles: bool = False
 ) -> Callable[[slice], Array]:
-    """Gives the columns (K', r, k) of some configurations, by changes throughout, in their order,
+    """Gives the columns (K', r, k) of some configurations, by effects throughout, in their order,
     then by the single readings.
     """
     problem, places = assembled.problem, assembled.places
-    counts = [change.count for change in listed]
+    counts = [effect.count for effect in listed]
     m, n = problem.layout.n_readings, sum(counts)
     readings = np.zeros((len(problem.blocks.present), m, n + (m if singles else 0)))
     readings[..., n:] = np.eye(m)[:, : readings.shape[-1] - n]
     placed: list[tuple[slice, Array | None, Array | None]] = []
-    for change, end in zip(listed, np.cumsum(counts).tolist(), strict=True):
-        where = slice(end - change.count, end)
-        if change.readings is not None:
-            readings[..., where] = change.readings[assembled.seen]
-        edges = None if change.edges is None else places.edges.filled(change.edges)
-        poses = None if change.poses is None else places.poses.filled(change.poses)
+    for effect, end in zip(listed, np.cumsum(counts).tolist(), strict=True):
+        where = slice(end - effect.count, end)
+        if effect.readings is not None:
+            readings[..., where] = effect.readings[assembled.seen]
+        edges = None if effect.edges is None else places.edges.filled(effect.edges)
+        poses = None if effect.poses is None else places.poses.filled(effect.poses)
         placed.append((where, edges, poses))
 
     def columns(cut: slice) -> Array:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.measurements import Change, Departure
+from pkmcal.measurements import Departure, Effect
 from pkmcal.wording import amount
 
 FEWEST = 3
@@ -36,5 +36,5 @@ def departures(
                 f"Make two stations of it, one up to {b} and one from {a} on",
             )
 
-        change = Change(station=station, since=int(used[k]))
-        yield Departure("station moved", name, says, change)
+        effect = Effect(station=station, since=int(used[k]))
+        yield Departure("station moved", name, says, effect)

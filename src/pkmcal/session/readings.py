@@ -12,7 +12,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
-from pkmcal.measurements import Change, Departure
+from pkmcal.measurements import Departure, Effect
 from pkmcal.wording import amount, listed, ratio
 
 # A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
@@ -182,8 +182,8 @@ def departures(
             )
 
         by_scale, by_way = ((x * one)[..., None] for x in (joints, way))
-        scales.append(Departure("reading scale", name, scale, Change(readings=by_scale)))
-        plays.append(Departure("backlash", name, play, Change(readings=by_way)))
+        scales.append(Departure("reading scale", name, scale, Effect(readings=by_scale)))
+        plays.append(Departure("backlash", name, play, Effect(readings=by_way)))
     return scales, plays
 
 
