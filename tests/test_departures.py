@@ -266,7 +266,7 @@ def test_boards_of_another_size_show_where_readings_give_the_scale():
     estimate = bundle(machine, data, start, scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(machine))
     state = batch_of(estimate.machine, assembled, estimate.state)
-    one = size_departure(boards, 0, "board.yaml", 0.0)
+    one = size_departure(boards, 0, "board.yaml")
     fit = Departures(assembled, state, [one.effect]).fitted([0])[0]
     assert abs(fit.value[0] - 0.004) < 4 * fit.sigma[0] + 2e-4
 

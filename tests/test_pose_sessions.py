@@ -235,6 +235,53 @@ def test_a_target_moved_on_the_platform(folder):
         calibrate(folder)
 
 
+def test_one_wrong_reading_is_outvoted_and_told(folder):
+    made = make(folder, "h4", n=30)
+    joints = made.joints.copy()
+    joints[7, 2] += 0.02
+    write_joints(folder, joints)
+    found = calibrate(folder)
+    assert tool_error(found.machine, made) < 1.5e-4
+    (told,) = [text for text in found.verdict.warnings if "outvoted" in text]
+    assert "The reading of motor3 in configuration 007 is off" in told
+    assert "1.1" in told or "1.2" in told  # degrees: .02 rad
+    assert "less" in told
+    (folder / "joints.csv").unlink()
+    write_joints(folder, made.joints)
+    right = calibrate(folder).verdict
+    assert not [text for text in right.warnings if "outvoted" in text]
+
+
+def test_exchanged_rows_are_outvoted_and_told(folder):
+    made = make(folder, "h4", n=30)
+    write_joints(folder, made.joints[[*range(11), 20, *range(12, 20), 11, *range(21, 30)]])
+    found = calibrate(folder)
+    assert tool_error(found.machine, made) < 1.5e-4
+    (told,) = [text for text in found.verdict.warnings if "outvoted" in text]
+    assert "joints.csv, configuration 011 and 020: what was seen in 011 is what" in told
+    assert "and the other way round" in told
+
+
+def test_a_pose_under_another_name_is_told(folder):
+    made = make(folder, "h4", n=30)
+    seen = seen_poses(made)
+    seen[4] = seen[17]
+    write_poses(folder, seen)
+    found = calibrate(folder)
+    (told,) = [text for text in found.verdict.warnings if "outvoted" in text]
+    assert "configuration 004: what was seen in 004 is what the readings of 017 say" in told
+
+
+@pytest.mark.parametrize("name", ["h4", "delta"])
+def test_a_frozen_reading(folder, name):
+    made = make(folder, name, n=30)
+    joints = made.joints.copy()
+    joints[:, 1] = joints[0, 1]
+    write_joints(folder, joints)
+    with pytest.raises(InputError, match="the readings of motor2 are frozen"):
+        calibrate(folder)
+
+
 @pytest.mark.parametrize("motor", [0, 2])
 def test_the_sign_of_one_encoder(folder, motor):
     made = make(folder, "h4", n=30)

@@ -463,23 +463,22 @@ def one_a_configuration(seen: BoardViews, mount: int) -> tuple[PoseSet, tuple[Re
     return replace(poses, by_intrinsics=by), odd
 
 
-def size_departure(poses: PoseSet, mount: int, file: str, gone: float) -> Departure:
+def size_departure(poses: PoseSet, mount: int, file: str) -> Departure:
     """A board whose squares are not as large as its file says, by more than its tolerance.
 
-    mount : the board's number. gone : how far the estimate has gone already, as far as the
-    tolerance allowed, relative.
+    mount : the board's number. Where the size is an unknown with a tolerance, freeing it takes the
+    unknown back to what the file says: the value that fits is the whole difference.
     """
     by = np.zeros((len(poses), 6, 1))
     mine = poses.mount == mount
     by[mine, 3:, 0] = poses.T_station_target[mine, :3, 3]
 
     def says(value: Array, sigma: Array) -> tuple[str, str]:
-        size = gone + value[0]
         return (
-            f"The board's squares are {ratio(size, sigma[0])}"
-            f" {'larger' if size > 0 else 'smaller'} than {file} says",
+            f"The board's squares are {ratio(value[0], sigma[0])}"
+            f" {'larger' if value[0] > 0 else 'smaller'} than {file} says",
             "Measure them over as many as there are; if a ruler agrees, multiply square and marker"
-            f" by {1 + size:.5f}",
+            f" by {1 + value[0]:.5f}",
         )
 
     return Departure("board size", file, says, Effect(poses=by))

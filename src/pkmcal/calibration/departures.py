@@ -85,7 +85,7 @@ def departures(
     families = [
         *readings.departures(measurements.joints, columns, units),
         list(_lenses(session, observation, measurements)),
-        list(_boards(session, measurements, estimate)),
+        list(_boards(session, measurements)),
         list(_tripods(session, measurements)),
     ]
     listed = [one for family in families for one in family]
@@ -166,14 +166,11 @@ def _of_lens(
     )
 
 
-def _boards(session: Session, measured: Measurements, estimate: Estimate) -> Iterator[Departure]:
+def _boards(session: Session, measured: Measurements) -> Iterator[Departure]:
     """Boards of another size."""
-    unsure = np.cumsum([mount.tolerance > 0 for mount in measured.mounts])
     for m, mount in enumerate(measured.mounts):
         if mount.name == "board":
-            gone = mount.tolerance and mount.tolerance * estimate.state.sizes[unsure[m] - 1]
-            file = session.document["board"]["file"]
-            yield size_departure(measured.poses, m, file, float(gone))
+            yield size_departure(measured.poses, m, session.document["board"]["file"])
 
 
 def _tripods(session: Session, measured: Measurements) -> Iterator[Departure]:

@@ -21,8 +21,10 @@ from pkmcal.session.readings import wrong_reading
 from pkmcal.wording import listed
 
 LEVEL = 0.005
-"""Chance at which any configuration of a right session disagrees, and that at which one reading, or
-another configuration's, is no explanation."""
+"""Chance at which any configuration of a right session disagrees."""
+UNLIKE = 1e-4
+"""Chance below which one reading, or another configuration's, is no explanation; so small because
+the machine's own uncertainty, about as large as that of a pose, is not counted."""
 WORST = 100.0
 """Times its noise that the better half of a session may be off: with more, nothing fits, and no
 configuration stands out."""
@@ -34,10 +36,13 @@ def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -
     which = np.flatnonzero(whole)
     if not which.size:
         return
-    off, noise = _off(measurements, estimate, which)
+    poses, noise = _platforms(measurements, estimate, which)
+    machine, joints, own = estimate.machine, measurements.joints, measurements.poses.configuration
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        off = machine.inverse(poses, joints[own[which]]) - joints[own[which]]
     told = np.isfinite(off).all(axis=1) & np.isfinite(noise).all(axis=(1, 2))
-    which, off, noise = which[told], off[told], noise[told]
-    own, m = measurements.poses.configuration[which], off.shape[1]
+    which, poses, off, noise = which[told], poses[told], off[told], noise[told]
+    own, m = own[which], off.shape[1]
     if len(which) < 2 * m:
         return
     chi2 = _chi2(off, noise)
@@ -47,9 +52,11 @@ def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -
     noise = usual * noise
     odd = _chance(m, chi2 / usual) < LEVEL / len(which)
     odd = np.flatnonzero(odd & (estimate.pose_weights[which] < 0.5))
-    # what the machine did in each odd one is what these rows of the table say, (n, K)
-    others = measurements.joints - measurements.joints[own[odd], None]
-    alike = _chance(m, _chi2(off[odd, None] - others, noise[odd, None])) > LEVEL
+    # rows of the table that say what the machine did in each odd one, (n, K)
+    every = np.broadcast_to(poses[odd, None], (len(odd), len(joints), 4, 4)).reshape(-1, 4, 4)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        rows = machine.inverse(every, np.tile(joints, (len(odd), 1))).reshape(-1, *joints.shape)
+    alike = _chance(m, np.nan_to_num(_chi2(rows - joints, noise[odd, None]), nan=np.inf)) > UNLIKE
     exchanged = alike[:, own[odd]] & alike[:, own[odd]].T
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
     for n, k in enumerate(odd.tolist()):
@@ -61,12 +68,16 @@ def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -
             continue
         sharp = np.linalg.inv(noise[k])
         value, sigma = (sharp @ off[k]) / np.diag(sharp), 1 / np.sqrt(np.diag(sharp))
-        explains = _chance(m - 1, chi2[k] / usual - (value / sigma) ** 2) > LEVEL
+        explains = _chance(m - 1, chi2[k] / usual - (value / sigma) ** 2) > UNLIKE
         if np.count_nonzero(explains) == 1:
             motor = int(np.argmax(explains))
             one = wrong_reading(columns[motor], units[motor], name)
             what, todo = one.says(value[[motor]], sigma[[motor]])
-            yield f"{what}; it was outvoted, and the result does not rest on it. {todo}."
+            as_in = ""
+            if alike[n].any():
+                row = session.configurations[int(np.argmax(alike[n]))]
+                as_in = f", and so is what configuration {row} reads"
+            yield f"{what}{as_in}; it was outvoted, and the result does not rest on it. {todo}."
         elif alike[n].any():
             yield _misnamed(session, name, session.configurations[int(np.argmax(alike[n]))], False)
 
@@ -83,9 +94,11 @@ def _misnamed(session: Session, name: str, other: str, both: bool) -> str:
     )
 
 
-def _off(measurements: Measurements, estimate: Estimate, which: Integers) -> tuple[Array, Array]:
-    """By how much the readings should have been larger, (n, m), by measured poses of the platform,
-    and the covariance (n, m, m) of that; NaN where the machine cannot take a pose.
+def _platforms(
+    measurements: Measurements, estimate: Estimate, which: Integers
+) -> tuple[Array, Array]:
+    """Where measured poses say that the platform was, T_base_platform (n, 4, 4), and the covariance
+    (n, m, m) of the readings that follow from it; NaN where the machine cannot take it.
     """
     poses, state = measurements.poses.select(which), estimate.state
     T_camera_base, T_mount = state.T_camera_base[poses.station], state.T_mount[poses.mount]
@@ -102,17 +115,15 @@ def _off(measurements: Measurements, estimate: Estimate, which: Integers) -> tup
     by[:, :3, :3] = by[:, 3:, 3:] = turn
     by[:, 3:, :3] = skew(arm[..., 0]) @ turn
     by = by @ np.linalg.inv(poses.whiten)
-    with np.errstate(invalid="ignore"):
-        off = estimate.machine.inverse(T_base_platform) - measurements.joints[poses.configuration]
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         root = estimate.machine.inverse_jacobian(T_base_platform) @ by
     statistics = estimate.statistics
     own = (measurements.joint_noise * statistics.reading_scale) ** 2
-    noise = statistics.pose_scale**2 * root @ root.mT + own * np.eye(off.shape[1])
-    return off, noise
+    return T_base_platform, statistics.pose_scale**2 * root @ root.mT + own * np.eye(root.shape[1])
 
 
 def _chi2(off: Array, noise: Array) -> Array:
-    """Squares (n,) of deviations (n, m) in units of their covariance (n or 1, m, m)."""
+    """Squares (...) of deviations (..., m) in units of their covariance (..., m, m)."""
     return np.sum(off * np.linalg.solve(noise, off[..., None])[..., 0], axis=-1)
 
 

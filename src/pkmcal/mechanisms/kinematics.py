@@ -225,20 +225,22 @@ class ForwardResult:
         return singularity_of(self.layout, scaled_rows(self.layout, self.theta, rows))
 
 
-def inverse(layout: LimbLayout, theta: Array, poses: Array) -> Array:
+def inverse(layout: LimbLayout, theta: Array, poses: Array, near: Array | None = None) -> Array:
     """Readings (..., m) at poses T_base_platform (..., 4, 4).
 
     Rods: q = length - offset, [B] eq. 4. Cranks and sliders: the carrier's closed form, [C] eq. 2,
-    nearest to mid-range. NaN out of reach.
+    nearest to mid-range, or to readings ``near`` (..., m). NaN out of reach.
     """
-    return inverse_result(layout, theta, poses)[0]
+    return inverse_result(layout, theta, poses, near)[0]
 
 
-def inverse_result(layout: LimbLayout, theta: Array, poses: Array) -> tuple[Array, Array]:
+def inverse_result(
+    layout: LimbLayout, theta: Array, poses: Array, near: Array | None = None
+) -> tuple[Array, Array]:
     """Readings (..., m) and internal coordinates (..., n) at poses (..., 4, 4)."""
     shape = np.broadcast_shapes(poses.shape[:-2], theta.shape[:-1])
     internal = _upright(layout, theta, poses, shape)
-    legs = _leg_inverse(layout, theta, poses, internal)
+    legs = _leg_inverse(layout, theta, poses, internal, near)
     if not layout.shares_motors:
         driven = np.flatnonzero(layout.actuated >= 0)
         return legs[..., driven[np.argsort(layout.actuated[driven], kind="stable")]], internal
@@ -257,8 +259,12 @@ def _upright(layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, .
     return out
 
 
-def _leg_inverse(layout: LimbLayout, theta: Array, poses: Array, internal: Array) -> Array:
-    """Each leg's own reading (..., L), zero where it has none."""
+def _leg_inverse(
+    layout: LimbLayout, theta: Array, poses: Array, internal: Array, readings: Array | None
+) -> Array:
+    """Each leg's own reading (..., L), zero where it has none; the one nearest to ``readings``
+    (..., m), or to mid-range.
+    """
     at_zero = base_ends(layout, theta, np.zeros(layout.n_readings))
     platform = platform_ends(layout, theta, poses, internal)
     distance = limb_lines(at_zero, platform)[1]
@@ -268,6 +274,8 @@ def _leg_inverse(layout: LimbLayout, theta: Array, poses: Array, internal: Array
         if group.carrier.driven:
             b, rods = platform.b[..., group.legs, :], at_zero.length[..., group.legs]
             near = layout.middle[group.legs]
+            if readings is not None:
+                near = readings[..., layout.actuated[group.legs]]
             out[..., group.legs] = group.carrier.reading(group.of(theta), b, rods, near)
     return out
 

@@ -157,14 +157,14 @@ class Machine:
             )
         return found.T_base_platform[good[0]]
 
-    def inverse(self, T_base_platform: Array) -> Array:
+    def inverse(self, T_base_platform: Array, near: Array | None = None) -> Array:
         """Readings (n, m) at platform poses (n, 4, 4), m or rad.
 
-        Of a crank's or slider's two solutions the one nearest to mid-range; NaN where a limb cannot
-        reach. An articulated platform's hinges turn as they must.
+        Of a crank's or slider's two solutions the one nearest to mid-range, or to readings ``near``
+        (n, m); NaN where a limb cannot reach. An articulated platform's hinges turn as they must.
         """
         poses = _checked(T_base_platform, (4, 4), "T_base_platform")
-        return kinematics.inverse(self.layout, self.values, poses)
+        return kinematics.inverse(self.layout, self.values, poses, near)
 
     def forward(self, joints: Array, start: Array | None = None) -> Array:
         """Platform poses T_base_platform (n, 4, 4) at readings (n, m).
