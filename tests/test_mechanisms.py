@@ -117,10 +117,10 @@ def test_parameter_names_are_paths_in_the_file(machine):
 
 
 def test_every_number_of_the_drawing_is_a_parameter():
-    """A hexapod's file holds 6 (3 + 3 + 1) kinematic numbers and two radii a leg."""
+    """A hexapod's file holds 6 (3 + 3 + 1) kinematic numbers, a scale and two radii a leg."""
     machine = load_mechanism("gough-stewart")
     table = machine.parameters
-    assert len(table) == 6 * (3 + 3 + 1 + 2)
+    assert len(table) == 6 * (3 + 3 + 1 + 1 + 2)
     assert [len(table.of_kind(kind)) for kind in ("center", "offset", "radius")] == [36, 6, 12]
     assert set(table.units) == {"m"}
     assert table.names[:3] == tuple(f"legs[1].base.center.{axis}" for axis in "xyz")

@@ -54,8 +54,8 @@ change by hand a millionth."""
 FORMAT_KEY, FORMAT = "pkmcal_calibration", 1
 PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
 CONVENTIONS = (
-    "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = reading + offset. Legs,"
-    " tubes and sides count from 1. sigma is a standard deviation: of sampling, not of what the"
+    "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = scale * reading + offset."
+    " Legs, tubes and sides count from 1. sigma is a standard deviation: of sampling, not of what the"
     " model leaves out. Rotations of a pose are perturbed from the left, about the axes of its"
     " outer frame."
 )
@@ -580,7 +580,7 @@ def load(source: Path | str) -> SavedCalibration:
     """Read a calibration from its folder or its calibration.json, and check that it is whole."""
     document = _read(Path(source))
     saved = validate(document, _Saved)
-    machine = machine_from_document(saved.mechanism)
+    machine = machine_from_document(_mechanism(saved))
     _check_parameters(document, saved, machine)
     for group in ("stations", "configurations"):
         _check_poses(document, group, getattr(saved, group))
@@ -612,6 +612,15 @@ def load(source: Path | str) -> SavedCalibration:
         T_base_platform=np.array([c.T_base_platform for c in saved.configurations]),
         document=document.data,
     )
+
+
+def _mechanism(saved: _Saved) -> MechanismDocument:
+    """The mechanism; of a file from before readings had scales, one whose scales are exact."""
+    mechanism = saved.mechanism
+    if any(p.name.endswith(".scale") for p in saved.parameters):
+        return mechanism
+    exact = mechanism.tolerance.model_copy(update={"scale": 0.0})
+    return mechanism.model_copy(update={"tolerance": exact})
 
 
 def _read(source: Path) -> Document:

@@ -23,14 +23,22 @@ from pkmcal.mechanisms.closure import LimbLayout, layout_of, limb_ends
 from pkmcal.mechanisms.document import (
     CONSTANT,
     OFFSET,
+    SCALE,
     ActuatedLength,
     MechanismDocument,
     PassiveLength,
 )
 from pkmcal.mechanisms.document_checks import check_drawing
 from pkmcal.mechanisms.joints import AXIS, axes_in_use
-from pkmcal.mechanisms.motors import built_in_fixed, built_in_ties, motor_ranges, motor_units
+from pkmcal.mechanisms.motors import (
+    built_in_fixed,
+    built_in_ties,
+    motor_ranges,
+    motor_units,
+    scale_tolerances,
+)
 from pkmcal.mechanisms.parameters import ParameterTable
+from pkmcal.wording import split_name
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ class Machine:
     def joint_ranges(self) -> Array:
         """Smallest and largest reading by the file, (m, 2) m or rad; NaN where it is silent.
 
-        A rod's ``range`` bounds its length, so the drawing's offset is taken off.
+        A rod's ``range`` bounds its length, so the drawing's offset and scale are taken off.
         """
         return motor_ranges(self.document)
 
@@ -294,6 +302,9 @@ class Machine:
         out = self.document.model_dump(by_alias=True, exclude_none=True, mode="json")
         if not self.document.models:
             del out["models"]
+        for leg, exact in zip(out["legs"], ~self.layout.unsure_scales, strict=True):
+            if exact and leg["scale"] == 1:
+                del leg["scale"]  # of no reading, or of one that is what it says
         values = self.parameters.unit_axes(self.values)
         for name, value in zip(self.parameters.names, values, strict=True):
             _assign(out, name, float(value))
@@ -327,7 +338,7 @@ def machine_from_document(
         labels=tuple(row[4] for row in rows),
         parts=tuple(row[5] for row in rows),
         drawing=np.array([row[3] for row in rows]),
-        tolerance=np.array([getattr(document.tolerance, row[2]) for row in rows]),
+        tolerance=np.array(_tolerances(document, rows)),
     ).with_roles((*document.fixed, *built_in_fixed(document)), ties)
     positions = {name: k for k, name in enumerate(names)}
     return Machine(document, table, layout_of(document, positions), table.drawing.copy())
@@ -335,7 +346,7 @@ def machine_from_document(
 
 def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator of plain rows
     """Rows (name, unit, tolerance's name, drawing value, label, part), leg by leg."""
-    axes = axes_in_use(document)
+    axes, unsure = axes_in_use(document), scale_tolerances(document) > 0
     for j, leg in enumerate(document.legs):
         path = f"legs[{j + 1}]"
         for side, carriers in (("base", base_carriers()), ("platform", platform_carriers())):
@@ -345,8 +356,21 @@ def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator 
         if not isinstance(leg.length, PassiveLength):
             kind = OFFSET if isinstance(leg.length, ActuatedLength) else CONSTANT
             yield from _rows_of(f"{path}.length", leg.length, (kind,))
+        if unsure[j]:
+            yield from _rows_of(path, leg, (SCALE,))
         for t, tube in enumerate(leg.tubes, start=1):
             yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius, f"tube {t} radius", ""
+
+
+def _tolerances(document: MechanismDocument, rows: list[Any]) -> list[float]:
+    """Each row's standard deviation; of a scale the one that its reading has."""
+    scale = scale_tolerances(document)
+    return [
+        scale[(split_name(name)[0] or 0) - 1]
+        if kind == SCALE.tolerance
+        else getattr(document.tolerance, kind)
+        for name, _, kind, *_ in rows
+    ]
 
 
 def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]):  # noqa: ANN202 - as above
