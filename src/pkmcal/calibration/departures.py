@@ -24,6 +24,7 @@ from pkmcal.identify.score import Departures, Freed, Score, columns_of
 from pkmcal.identify.tool import ToolError, tool_error
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA, Measurements, Observation
+from pkmcal.mechanisms.closure import scales
 from pkmcal.session.load import Session
 from pkmcal.wording import amount, number
 
@@ -169,17 +170,26 @@ class _At:
 
 
 def _scales(at: _At) -> Iterator[Departure]:
-    """A reading too large or small by a factor: a wrong lead, or counts a turn."""
+    """A reading too large or small by a factor, beyond its scale's tolerance: a wrong lead, or
+    counts a turn.
+    """
     joints, names = at.measurements.joints, at.session.document["joints"]["columns"]
+    layout, drawing = at.session.machine.layout, at.session.machine.parameters.drawing
+    # as far as the tolerance allowed the estimate has gone already
+    gone = scales(layout, at.assembled.problem.theta(at.state)[0]) / scales(layout, drawing)
     for m, name in enumerate(names):
         by = np.zeros((*joints.shape, 1))
         by[:, m, 0] = joints[:, m]
+        own = float(gone[np.argmax(layout.actuated == m)])
 
-        def words(value: Array, sigma: Array, name: str = name) -> tuple[str, str]:
+        def words(
+            value: Array, sigma: Array, name: str = name, own: float = own
+        ) -> tuple[str, str]:
+            factor = own * (1 + value[0])
             return (
                 f"The readings of {name} have another scale: true ones are"
-                f" {_percent(value[0], sigma[0])} {'larger' if value[0] > 0 else 'smaller'}",
-                f"Multiply this column of joints.csv by {1 + value[0]:.5f} if the encoder's counts"
+                f" {_percent(factor - 1, sigma[0])} {'larger' if factor > 1 else 'smaller'}",
+                f"Multiply this column of joints.csv by {factor:.5f} if the encoder's counts"
                 " or the screw's lead agree, or correct it in the controller",
             )
 

@@ -34,7 +34,13 @@ from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.decided import decided_by
 from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.measurements import BREATHING_SIGMA
-from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document, mechanism_text
+from pkmcal.mechanisms import (
+    Machine,
+    MechanismDocument,
+    machine_from_document,
+    mechanism_text,
+    with_exact_scales,
+)
 from pkmcal.outcome import Verdict
 from pkmcal.session.load import digests
 from pkmcal.wording import listed
@@ -54,10 +60,10 @@ change by hand a millionth."""
 FORMAT_KEY, FORMAT = "pkmcal_calibration", 1
 PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
 CONVENTIONS = (
-    "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = scale * reading + offset."
-    " Legs, tubes and sides count from 1. sigma is a standard deviation: of sampling, not of what the"
-    " model leaves out. Rotations of a pose are perturbed from the left, about the axes of its"
-    " outer frame."
+    "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = scale * reading +"
+    " offset. Legs, tubes and sides count from 1. sigma is a standard deviation: of sampling, not"
+    " of what the model leaves out. Rotations of a pose are perturbed from the left, about the axes"
+    " of its outer frame."
 )
 EDGE_COLUMNS = ("station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt")
 """Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations."""
@@ -619,8 +625,7 @@ def _mechanism(saved: _Saved) -> MechanismDocument:
     mechanism = saved.mechanism
     if any(p.name.endswith(".scale") for p in saved.parameters):
         return mechanism
-    exact = mechanism.tolerance.model_copy(update={"scale": 0.0})
-    return mechanism.model_copy(update={"tolerance": exact})
+    return with_exact_scales(mechanism)
 
 
 def _read(source: Path) -> Document:

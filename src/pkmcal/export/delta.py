@@ -422,7 +422,7 @@ def _number(value: float, digits: int) -> str:
     return text[1:] if float(text) == 0 and text.startswith("-") else text
 
 
-def scales_of(delta: Delta, fit: Fit) -> Array:
+def scales_of(fit: Fit) -> Array:
     """Scales of the readings (3,), in the firmware's order."""
     return np.abs(fit.rate) / (MM if fit.kind == "linear" else DEGREE)
 
@@ -447,7 +447,7 @@ def about(
     ]
     factors = [
         f"Motor {name} goes {factor:.9g} times as far as its reading says."
-        for name, factor in zip(names, scales_of(delta, fit), strict=True)
+        for name, factor in zip(names, scales_of(fit), strict=True)
         if abs(factor - 1) > TOLD
     ]
     sort = "Towers" if fit.kind == "linear" else "Arms' angles above the horizontal"

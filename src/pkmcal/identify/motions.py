@@ -41,7 +41,9 @@ SAME = 1e-3
 LITTLE = 0.01
 """mm (or degrees) by which a size changes with another's 1 mm and is not worth a word."""
 
-Advice = Literal["more", "photograph", "tie", "caliper", "more or caliper", "turn", "drawing"]
+Advice = Literal[
+    "more", "photograph", "tie", "caliper", "more or caliper", "turn", "drawing", "size"
+]  # fmt: skip
 """What helps: see :mod:`pkmcal.identify.sentences`."""
 
 
@@ -163,7 +165,7 @@ def candidates(s: Situation) -> Iterator[Motion]:
         yield from _whole_leg(s, j)
     if s.photographed and any("tubes" in fields for fields in s.fields):
         yield from (_spread(s, group) for group in (*groups(s.seen), s.legs))
-    yield Motion(s.legs, _scale(s), "the size of everything {is}: all lengths can grow alike")
+    yield _everything(s)
     yield from _all_together(s, carried)
     rest = "of the machine's numbers, {combinations}{mostly}"
     yield Motion(s.legs, np.eye(len(s.machine.parameters)), rest)
@@ -604,7 +606,7 @@ def _spread(s: Situation, legs: tuple[int, ...]) -> Motion:
     return Motion(legs, out, text, advice="more or caliper")
 
 
-def _scale(s: Situation) -> Array:
+def _everything(s: Situation) -> Motion:
     """All lengths grow by the same share, (P, 1): what readings in m stand for as well, where all
     their scales are free; else readings cannot, so offsets stay.
     """
@@ -616,7 +618,15 @@ def _scale(s: Situation) -> Array:
     lengths = zip(table.names, table.units, strict=True)
     grows = np.array([u == "m" and (follow or not n.endswith("offset")) for n, u in lengths])
     grows[rows[: rows.size * follow]] = True
-    return np.where(grows, s.machine.values, 0.0)[:, None]
+    columns = np.where(grows, s.machine.values, 0.0)[:, None]
+    if not (rows.size and follow):
+        text = "the size of everything {is}: all lengths can grow alike"
+        return Motion(s.legs, columns, text)
+    text = (
+        "the size of everything is known from the drawing only, by the tolerance of the readings'"
+        " scales: all lengths can grow alike, and the scales with them"
+    )
+    return Motion(s.legs, columns, text, advice="size")
 
 
 def _all_together(s: Situation, carried: list[tuple[Motion, str]]) -> Iterator[Motion]:

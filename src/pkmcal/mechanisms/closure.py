@@ -33,7 +33,7 @@ from pkmcal.mechanisms.document import (
     PassiveLength,
 )
 from pkmcal.mechanisms.joints import AXIS, AngleLayout, angle_layout, angle_rows
-from pkmcal.mechanisms.motors import bodies, middles, motor_columns, scale_tolerances
+from pkmcal.mechanisms.motors import bodies, middles, motor_columns
 
 
 @dataclass(frozen=True)
@@ -735,9 +735,7 @@ def _with_parameters(
     )
 
 
-def _padded_to(
-    n_legs: int, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]
-) -> Array:
+def _padded_to(n_legs: int, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]) -> Array:
     """Carriers' derivatives in the order of the legs, for as many parameters as the most have."""
     if len(groups) == 1:
         return by_parameters[0]

@@ -344,6 +344,12 @@ def machine_from_document(
     return Machine(document, table, layout_of(document, positions), table.drawing.copy())
 
 
+def with_exact_scales(document: MechanismDocument) -> MechanismDocument:
+    """The same drawing with readings that are what they say, or what their scales make of them."""
+    tolerance = document.tolerance.model_copy(update={"scale": 0.0})
+    return document.model_copy(update={"tolerance": tolerance})
+
+
 def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator of plain rows
     """Rows (name, unit, tolerance's name, drawing value, label, part), leg by leg."""
     axes, unsure = axes_in_use(document), scale_tolerances(document) > 0

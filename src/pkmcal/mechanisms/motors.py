@@ -120,9 +120,7 @@ def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
     )
     columns, free = motor_columns(document), scale_tolerances(document) > 0
     motors = [np.flatnonzero(free & (columns == k)) for k in range(columns.max(initial=-1) + 1)]
-    shared += tuple(
-        tuple(f"legs[{j + 1}].scale" for j in legs) for legs in motors if len(legs) > 1
-    )
+    shared += tuple(tuple(f"legs[{j + 1}].scale" for j in legs) for legs in motors if len(legs) > 1)
     if document.motion not in PLANAR:
         return shared
     numbers = range(1, len(document.legs) + 1)

@@ -122,8 +122,7 @@ def _unit(v: Array, otherwise: Array) -> Array:
 
 
 def _guide_ranges(machine: Machine, by_value: Array) -> Array:
-    """Least and largest value of each leg's joint, (L, 2); about home's where the file is silent.
-    """
+    """Least and largest value of each leg's joint, (L, 2); about home's if the file is silent."""
     layout, home = machine.layout, machine.home()
     readings = machine.inverse(home[None])[0]
     ends = limb_ends(layout, machine.values, readings, home)
