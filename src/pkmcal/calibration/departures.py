@@ -175,17 +175,18 @@ def _scales(at: _At) -> Iterator[Departure]:
     """
     joints, names = at.measurements.joints, at.session.document["joints"]["columns"]
     layout, drawing = at.session.machine.layout, at.session.machine.parameters.drawing
-    # as far as the tolerance allowed the estimate has gone already
-    gone = scales(layout, at.assembled.problem.theta(at.state)[0]) / scales(layout, drawing)
+    # a scale that is free beside its tolerance leaves this one to the drawing again, so its value
+    # is all of the difference, as the present scale counts it
+    present = scales(layout, at.assembled.problem.theta(at.state)[0]) / scales(layout, drawing)
     for m, name in enumerate(names):
         by = np.zeros((*joints.shape, 1))
         by[:, m, 0] = joints[:, m]
-        own = float(gone[np.argmax(layout.actuated == m)])
+        own = float(present[np.argmax(layout.actuated == m)])
 
         def words(
             value: Array, sigma: Array, name: str = name, own: float = own
         ) -> tuple[str, str]:
-            factor = own * (1 + value[0])
+            factor = 1 + own * value[0]
             return (
                 f"The readings of {name} have another scale: true ones are"
                 f" {_percent(factor - 1, sigma[0])} {'larger' if factor > 1 else 'smaller'}",

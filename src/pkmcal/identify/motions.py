@@ -637,6 +637,10 @@ def _all_together(s: Situation, carried: list[tuple[Motion, str]]) -> Iterator[M
     for side, centres in zip(("base", "platform"), centre_index(s.machine.layout), strict=True):
         text = f"how the {side} joints lie to each other {{is}} {{ways}}{{mostly}}"
         yield Motion(s.legs, s.one_hot(centres.ravel()), text)
+    scaled = [rows for leg in s.fields for field, rows in leg.items() if field == "scale"]
+    if scaled:
+        text = "the scales of the readings {are} {ways}{mostly}"
+        yield Motion(s.legs, s.one_hot(np.concatenate(scaled)), text)
     axes = [rows for leg in s.fields for field, rows in leg.items() if field.endswith("axis")]
     if axes:
         text = "the directions of the joints' axes {are} {ways}{mostly}"
