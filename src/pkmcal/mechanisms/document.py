@@ -80,7 +80,7 @@ Rod = Annotated[
 
 OFFSET = ParameterKind("offset", "m", "offset", part="zero")
 CONSTANT = ParameterKind("constant", "m", "offset", label="rod length", part="rod")
-SCALE = ParameterKind("scale", "", "scale", 1.0, label="reading scale", part="scale")
+SCALE = ParameterKind("scale", "", "scale", 1.0, label="reading scale", part="lead")
 EXACT_TURNS, LEAD = 0.0, 0.0005
 """Tolerances of a reading's scale where the file gives none: of readings in rad, since an encoder
 counts whole turns and a gear has whole teeth; of readings in m, a ground screw's or a tape's."""

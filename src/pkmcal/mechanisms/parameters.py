@@ -29,7 +29,7 @@ class ParameterTable:
     a ratio; ``kinds`` is the tolerance's name: center, offset, radius,
     axis, arm, angle, scale. labels : what people call them, the leg apart: ``base centre z``.
     parts : what of its leg each changes: its ``base`` or ``platform`` joint, its ``rod``, the
-    ``zero`` or the ``scale`` of its reading, or what its carrier names; empty for a tube's radius,
+    ``zero`` or the ``lead`` of its reading, or what its carrier names; empty for a tube's radius,
     which is no part of the mechanism.
     drawing, tolerance : (P,) drawing values and their standard deviations.
     fixed : names that keep their drawing value.
