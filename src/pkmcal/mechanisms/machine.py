@@ -331,6 +331,9 @@ def machine_from_document(
     rows = list(_parameter_rows(document))
     names = [row[0] for row in rows]
     ties = (*document.tied, *built_in_ties(document))
+    # a scale that is exact is held already
+    exact = not (scale_tolerances(document) > 0).any()
+    held = [entry for entry in document.fixed if not (exact and entry.endswith("].scale"))]
     table = ParameterTable(
         names=tuple(names),
         units=tuple(row[1] for row in rows),
@@ -339,7 +342,7 @@ def machine_from_document(
         parts=tuple(row[5] for row in rows),
         drawing=np.array([row[3] for row in rows]),
         tolerance=np.array(_tolerances(document, rows)),
-    ).with_roles((*document.fixed, *built_in_fixed(document)), ties)
+    ).with_roles((*held, *built_in_fixed(document)), ties)
     positions = {name: k for k, name in enumerate(names)}
     return Machine(document, table, layout_of(document, positions), table.drawing.copy())
 
