@@ -319,7 +319,7 @@ def outcome(fact: str, seen: str, seed: int, keep: Path) -> Outcome:
             named = any(word in str(error) for word in words)
             return Outcome("named" if named else "refused", float("nan"), str(error))
         z, verdict = off_by(result, folder), result.verdict
-    told = " ".join([*verdict.reasons, *verdict.warnings])
+    told = " ".join([*verdict.reasons, *verdict.warnings, *verdict.advice])
     if words and any(word in told for word in words):
         return Outcome("named", z, told)
     if not verdict.usable:

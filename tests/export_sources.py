@@ -11,18 +11,27 @@ from pkmcal.cameras.files import save_camera
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.files import json_text
 from pkmcal.geometry.rigid import inverse, look_at
-from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.mechanisms import load_mechanism, machine_from_document, mechanism_text
 
 CAMERA = Pinhole((640, 480), np.array([600.0, 601.0, 320.5, 239.25, -0.1, 0.05, 1e-3, -2e-3, 0.01]))
 
 
 def built(name, seed=1, share=0.3):
-    """A catalogue machine off its drawing by a share of its tolerances."""
-    machine = load_mechanism(name)
+    """A catalogue machine off its drawing by a share of its tolerances, readings' scales, cranks'
+    too, by as much of a thousandth.
+    """
+    machine = with_scales(load_mechanism(name), 1e-3)
     table = machine.parameters
     sigma = table.tolerances_free()
     z = share * sigma * np.random.default_rng(seed).normal(size=sigma.size)
     return machine.with_values(table.drawing + table.free_matrix() @ z)
+
+
+def with_scales(machine, tolerance):
+    """The same machine with all readings' scales for parameters."""
+    document = machine.document
+    told = document.tolerance.model_copy(update={"scale": tolerance})
+    return machine_from_document(document.model_copy(update={"tolerance": told}))
 
 
 def source_of(machine, **more):

@@ -73,6 +73,7 @@ def built(drawing, rng):
     table = drawing.parameters
     free = table.free_matrix()
     own = np.array([LENGTH if unit == "m" else ANGLE for unit in table.units])
+    own[table.of_kind("scale")] = table.tolerance[table.of_kind("scale")]
     step = rng.normal(size=free.shape[1]) * (np.abs(free).T @ own) / np.abs(free).sum(axis=0)
     return drawing.with_values(table.unit_axes(drawing.values + free @ step))
 

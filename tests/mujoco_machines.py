@@ -169,10 +169,11 @@ class Simulated:
         """Forward kinematics without a spring: Gauss-Newton on MuJoCo's own constraints, the
         driven joints held at readings (m,) that approach the goal; never at our pose.
         """
+        goal = readings / self.model.actuator_gear[:, 0]
         free = np.setdiff1d(np.arange(self.model.nv), self.dofs)
         begin = self.data.qpos[self.qpos].copy()
         for share in np.linspace(0, 1, pieces + 1)[1:]:
-            self.data.qpos[self.qpos] = begin + share * (readings - begin)
+            self.data.qpos[self.qpos] = begin + share * (goal - begin)
             for _ in range(20):
                 value, by = self.closure()
                 step = np.zeros(self.model.nv)

@@ -18,7 +18,7 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.solver import Stop, take
-from test_identify_scene import JOINT_NOISE, guess, make_scene
+from test_identify_scene import JOINT_NOISE, exact, guess, make_scene
 
 
 def estimate(scene, measurements, rng, **options):
@@ -53,7 +53,8 @@ def known_radii(scene):
 @pytest.mark.parametrize("robust", [False, True])
 def test_truth_is_recovered_to_rounding(robust):
     rng = np.random.default_rng(0)
-    scene = make_scene(rng)
+    # without the drawing nothing tells readings' scales from the size of everything
+    scene = make_scene(rng, machine=exact("gough-stewart"))
     scene = replace(scene, edge_shift=np.zeros(1))
     scene = known_radii(scene)
     # edges drawn without shift, since the scene's own shift is now zero
@@ -101,7 +102,7 @@ def test_uncertainty_is_what_repeats_show():
         single.append(error / scale)
     whitened = np.array(whitened)
     n = whitened.shape[1]
-    assert n == 54 + 12 - 12
+    assert n == 60 + 12 - 12
     mean_square = np.sum(whitened**2) / (runs * n)
     assert mean_square == pytest.approx(1, abs=4 * np.sqrt(2 / (runs * n)))
     # no direction is told too surely or too modestly: eigenvalues within what chance leaves
@@ -348,7 +349,8 @@ def test_one_configuration_is_singular_and_two_suffice():
     """Errata, A: one configuration alone leaves directions open."""
     rng = np.random.default_rng(22)
     for configurations, complete in ((1, False), (2, True)):
-        scene = make_scene(rng, configurations=configurations, seen=1.0)
+        machine = exact("gough-stewart")
+        scene = make_scene(rng, configurations=configurations, seen=1.0, machine=machine)
         assembled = assemble(scene.machine, scene.measurements(rng), ThreeCentres())
         state = batch_of(scene.machine, assembled, scene.state())
         found = identifiability(assembled.problem, scene.machine, state)

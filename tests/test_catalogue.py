@@ -73,7 +73,7 @@ def oracle(machine, theta, readings, rot, t):
         line = rot @ b + t - a
         fields = leg.length.model_dump()
         if fields.get("actuated") is True:
-            rod = next(reading) + value[f"legs[{j}].length.offset"]
+            rod = value[f"legs[{j}].scale"] * next(reading) + value[f"legs[{j}].length.offset"]
         elif not fields.get("passive"):
             rod = value[f"legs[{j}].length.constant"]
         if not fields.get("passive"):

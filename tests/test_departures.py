@@ -31,14 +31,17 @@ from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.edges import EdgeNoise
 from pkmcal.simulation.placement import draw_configurations
 from pkmcal.wording import ratio
+from test_identify_scene import exact
 
 NOISE = EdgeNoise(0.1, 0.1)
 
 
 def measured(seed, *, scale=None, turned=None, play=None, machine=None, count=30):
-    """A hexapod's edges and readings, from one place, with a departure."""
+    """A hexapod's edges and readings, from one place, with a departure; of readings that are what
+    they say, unless a machine is given.
+    """
     rng = np.random.default_rng(seed)
-    drawing = machine or load_mechanism("gough-stewart")
+    drawing = machine or exact("gough-stewart")
     table = drawing.parameters
     true = drawing.with_values(
         table.drawing + table.free_matrix() @ (table.tolerances_free() * rng.standard_normal(
@@ -108,6 +111,21 @@ def test_the_scale_that_fits_is_found_and_its_gain_is_that_of_another_estimate()
     moved = again.machine.values - estimate.machine.values
     offsets = drawing.parameters.of_kind("offset")
     np.testing.assert_allclose(moved[offsets], fit.moved[offsets], atol=0.1 * np.abs(moved).max())
+
+
+def test_a_scale_beyond_its_tolerance_is_found_whole():
+    """Freed beside its tolerance it leaves the parameter to the drawing, and is all there is."""
+    drawing = load_mechanism("gough-stewart")
+    drawing, data, where = measured(1, scale=(2, 1e-2), machine=drawing)
+    estimate, tests = score_tests(drawing, data, where, scales(data), False)
+    assert tests.found(LEVEL)[0][0] == 2
+    fit = tests.fitted([2])[0]
+    row = drawing.parameters.index("legs[3].scale")
+    present = estimate.machine.values[row]
+    assert 2e-3 < present - 1 < 1e-2
+    assert fit.moved[row] == pytest.approx(1 - present, abs=1e-3)
+    # beside the true machine's own scale, which is 0.05 % off
+    assert abs(present * fit.value[0] - 1e-2) < 4 * np.hypot(fit.sigma[0], 5e-4)
 
 
 def test_play_and_a_pushed_camera_are_told_from_each_other():

@@ -210,8 +210,11 @@ def test_genhexkins_angles_are_roll_pitch_yaw():
     assert "setp genhexkins.max-error 29" in made.files["pkmcal_kinematics.hal"]
     offset = machine.values[machine.parameters.index("legs[2].length.offset")]
     ini = made.files["pkmcal_kinematics.ini"]
-    word = "TYPE = LINEAR\nHOME_ABSOLUTE_ENCODER = 2\nHOME_OFFSET = "
-    assert f"[JOINT_1]\n{word}{1e3 * offset:.17g}\n" in ini
+    scale = machine.values[machine.parameters.index("legs[2].scale")]
+    word = "TYPE = LINEAR\nHOME_ABSOLUTE_ENCODER = 2\n"
+    word += f"# joint 1 = {1e3 * scale:.17g} * reading + HOME_OFFSET\n"
+    word += f"# Divide its SCALE in the INI file, steps or counts per unit, by {scale:.17g}.\n"
+    assert f"[JOINT_1]\n{word}HOME_OFFSET = {1e3 * offset:.17g}\n" in ini
 
 
 # Machines that are no firmware's

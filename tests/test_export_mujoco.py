@@ -141,7 +141,12 @@ def test_drives_and_sensors_are_the_readings():
     assert np.array_equal(model.actuator_ctrlrange, machine.joint_ranges)
     place = simulated.data.sensor("platform_position").data
     assert np.allclose(place, home.T_base_platform[:3, 3], atol=1e-15)
-    offsets = [home.distance[j] - at_home[j] for j in range(6)]
+    rows = [machine.parameters.index(f"legs[{j + 1}].scale") for j in range(6)]
+    assert np.abs(machine.values[rows] - 1).max() > 1e-4
+    # a joint has what its rod's length is but for the offset, an actuator the reading
+    values = [simulated.data.joint(name).qpos[0] for name in names]
+    assert np.allclose(values, machine.values[rows] * at_home, atol=1e-15)
+    offsets = [home.distance[j] - values[j] for j in range(6)]
     index = [machine.parameters.index(f"legs[{j + 1}].length.offset") for j in range(6)]
     assert np.allclose(offsets, machine.values[index], atol=1e-15)
 

@@ -25,7 +25,9 @@ from pkmcal.mechanisms import (
     Machine,
     catalogue,
     load_mechanism,
+    machine_from_document,
     mechanism_text,
+    with_exact_scales,
 )
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.papers import methods
@@ -91,6 +93,8 @@ def make_scene(
 ) -> Scene:
     """``shared`` : all stations photograph every configuration, else each its own."""
     drawing = name if isinstance(name, Machine) else load_mechanism(name)
+    # the four steps know no scales
+    drawing = machine_from_document(with_exact_scales(drawing.document))
     machine = true_machine(drawing, rng, **errors)
     if joints is None:
         joints, poses = readings_of(machine, rng, configurations)

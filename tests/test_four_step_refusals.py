@@ -22,6 +22,7 @@ from test_four_step_machines import (
     noisy,
     seen_by,
 )
+from test_identify_scene import exact
 
 
 def refused(scene, measurements, *words, **options) -> ResultError:
@@ -147,7 +148,7 @@ def test_a_passive_leg_without_three_others():
 
 def test_a_passive_leg_that_does_not_turn():
     """Heave with a leg in the middle: its joints could lie anywhere along it."""
-    drawing = load_mechanism("6-spu-passive")
+    drawing = exact("6-spu-passive")
     low, high = drawing.joint_ranges.T
     heave = low + (high - low) * np.linspace(0.2, 0.8, 24)[:, None]
     rng = np.random.default_rng(5)
@@ -180,7 +181,7 @@ def test_lengths_that_the_distances_do_not_tell():
 
 
 def test_a_length_that_collapsed_is_told():
-    drawing = load_mechanism("constant-legs")
+    drawing = exact("constant-legs")
     legs = legs_of(drawing)
     q0 = np.where(np.arange(6) == 2, 0.001, legs.rod)[None]
     with pytest.raises(ResultError, match="leg 3 of constant length shrank"):

@@ -19,6 +19,7 @@ from pkmcal.measurements import (
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.kinematics import on_manifold
 from pkmcal.papers.hand_eye import size_of, solve_pairs, start_from_poses
+from test_identify_scene import exact
 
 NOISE = np.repeat([np.radians(0.03), 2e-4], 3)
 BOARD = (Mount("board", "platform"),)
@@ -29,6 +30,7 @@ def true_machine(drawing, rng, shift=0.002, turn=0.035):
     table = drawing.parameters
     kinds = np.array([table.kinds[k] for k in table.first_of_free()])
     sigma = np.where(np.isin(kinds, ["axis", "angle"]), turn, shift) * (kinds != "radius")
+    sigma = np.where(kinds == "scale", table.tolerances_free(), sigma)
     if drawing.name == "3-upu":  # its axes are parallel in pairs, or it does not translate
         sigma = sigma * (kinds != "axis")
     return drawing.with_values(
@@ -87,7 +89,7 @@ def off(state, poses):
 def test_every_machine_with_a_drawing_2_mm_and_2_degrees_off(name, seed):
     """Prediction as good as the drawing allows; a wrong branch would be off by a radian."""
     rng = np.random.default_rng(seed)
-    drawing = load_mechanism(name)
+    drawing = exact(name)
     truth = true_machine(drawing, rng)
     body, joints = platform_poses(truth, rng)
     camera, mount = anywhere(rng, 1.0), anywhere(rng, 0.05)

@@ -26,6 +26,7 @@ from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.papers.four_step import four_step
 from pkmcal.simulation import EdgeNoise, Settings, simulate_edges, true_machine
 from pkmcal.simulation.placement import default_stations
+from test_identify_scene import exact
 from test_joint_machines import JOINT_NOISE, Session, camera
 
 LARGEST = 1.9
@@ -33,7 +34,7 @@ LARGEST = 1.9
 
 
 def hexapod():
-    return load_mechanism("gough-stewart")
+    return exact("gough-stewart")
 
 
 def without_radii(machine):
@@ -80,7 +81,7 @@ def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():
     The seventh: a platform that only translates tells nothing of where its legs stand, only of
     their directions; so distances follow from the tubes' radii.
     """
-    machine = load_mechanism("3-upu")
+    machine = exact("3-upu")
     for radii, lost in ((False, 6), (True, 7)):
         drawn = machine if radii else without_radii(machine)
         session = Session(drawn, settings=Settings(stations=2, configurations=8, tolerance=0.0))

@@ -14,9 +14,15 @@ from pkmcal.identify.gauge import ThreeCentres, centre_index
 from pkmcal.identify.gauge import apply as in_gauge
 from pkmcal.papers.four_step import four_step
 from pkmcal.papers.linear import centres, procrustes_scale, scale_ratio
-from test_identify_scene import guess, make_scene
+from test_identify_scene import exact, guess
+from test_identify_scene import make_scene as scene_of
 
 METHODS = ["plain", "huber", "tukey", "least-median", "robust", "errors-in-variables"]
+
+
+def make_scene(rng, **options):
+    """The papers' methods know no scales of readings."""
+    return scene_of(rng, **{"machine": exact("gough-stewart"), **options})
 
 
 def true_radii(scene):

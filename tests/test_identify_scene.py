@@ -18,8 +18,13 @@ from pkmcal.identify.gauge import ThreeCentres
 from pkmcal.identify.rows import EdgeData
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import EdgeSet, Measurements
-from pkmcal.mechanisms import Machine, load_mechanism
-from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.mechanisms import (
+    Machine,
+    load_mechanism,
+    machine_from_document,
+    with_exact_scales,
+)
+from pkmcal.mechanisms.closure import limb_ends, scales
 
 FOCAL = 889.0
 JOINT_NOISE = 3e-6
@@ -120,6 +125,11 @@ def stations(n: int, distance: float = 0.9) -> np.ndarray:
     )
 
 
+def exact(name):
+    """A built-in machine whose readings are what they say."""
+    return machine_from_document(with_exact_scales(load_mechanism(name).document))
+
+
 def make_scene(
     rng,
     runs: int = 1,
@@ -141,6 +151,7 @@ def make_scene(
     poses = perturb(machine.home(), np.concatenate([turn, move], axis=-1))
     ends = limb_ends(machine.layout, theta[:, None], np.zeros((configurations, 6)), poses)
     length = np.linalg.norm(ends.b - ends.a, axis=-1)
+    scale_of = scales(machine.layout, theta[:, None])
     index = _index(rng, machine, configurations, n_stations, seen)
     normal, middle = _edges(machine, theta, stations(n_stations), ends, index)
     n = index.shape[1]
@@ -154,7 +165,7 @@ def make_scene(
         theta,
         stations(n_stations),
         poses,
-        length - theta[:, None, machine.layout.rod],
+        (length - theta[:, None, machine.layout.rod]) / scale_of,
         0.3 * tolerance * rng.normal(size=runs),
         index,
         normal,

@@ -159,7 +159,7 @@ def test_readings_are_the_distance_of_the_joints_less_the_offset(machine):
     for T in workspace(machine, 5, 2):
         lengths = joint_distances(changed, T)
         expected = [
-            length - leg["length"]["offset"]
+            (length - leg["length"]["offset"]) / leg["scale"]
             for length, leg in zip(lengths, changed.to_document()["legs"], strict=True)
             if leg["length"].get("actuated")
         ]

@@ -86,7 +86,11 @@ def test_heights_do_not_tell_rods_from_radius_and_it_is_said(by_heights):
 def test_what_looks_as_flat_is_what_the_sentence_says(by_heights):
     """Rods and radius changed as told: the heights stay, x and y stretch as told."""
     _, found = by_heights
-    text = next(s.text for s in found.findings.unidentified if "of all legs alike" in s.text)
+    text = next(
+        s.text
+        for s in found.findings.unidentified
+        if "and the rod length, of all legs alike" in s.text
+    )
     numbers = re.search(
         r"with \+1 mm of the rod length and \+(\S+) mm of the base radius, the bed "
         r"looks as flat, and x and y (stretch|shrink) by (\S+)%",

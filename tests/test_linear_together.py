@@ -19,8 +19,9 @@ from pkmcal.papers import linear
 from pkmcal.papers.linear_together import base_together
 from pkmcal.papers.methods import linear_estimate
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
+from test_identify_scene import exact
 
-DRAWING = pkmcal.load_mechanism("gough-stewart")
+DRAWING = exact("gough-stewart")
 STATION = look_at(
     np.array([0.01, -0.02, 0.06]), np.array([0.01, -0.02, 0.4]), np.array([0, -1.0, 0])
 )

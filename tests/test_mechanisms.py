@@ -117,15 +117,17 @@ def test_parameter_names_are_paths_in_the_file(machine):
 
 
 def test_every_number_of_the_drawing_is_a_parameter():
-    """A hexapod's file holds 6 (3 + 3 + 1) kinematic numbers and two radii a leg."""
+    """A hexapod's file holds 6 (3 + 3 + 1) kinematic numbers, a scale and two radii a leg."""
     machine = load_mechanism("gough-stewart")
     table = machine.parameters
-    assert len(table) == 6 * (3 + 3 + 1 + 2)
-    assert [len(table.of_kind(kind)) for kind in ("center", "offset", "radius")] == [36, 6, 12]
-    assert set(table.units) == {"m"}
+    assert len(table) == 6 * (3 + 3 + 1 + 1 + 2)
+    kinds = ("center", "offset", "radius", "scale")
+    assert [len(table.of_kind(kind)) for kind in kinds] == [36, 6, 12, 6]
+    assert [table.units[k] for k in table.of_kind("scale")] == [""] * 6
+    assert set(table.units) == {"m", ""}
     assert table.names[:3] == tuple(f"legs[1].base.center.{axis}" for axis in "xyz")
-    tolerances = [table.tolerance[table.of_kind(k)] for k in ("center", "offset", "radius")]
-    assert [t.tolist() for t in tolerances] == [[0.002] * 36, [0.002] * 6, [0.0001] * 12]
+    tolerances = [table.tolerance[table.of_kind(k)].tolist() for k in kinds]
+    assert tolerances == [[0.002] * 36, [0.002] * 6, [0.0001] * 12, [0.0005] * 6]
 
 
 # A small machine with everything in it
@@ -173,6 +175,7 @@ def test_a_missing_tolerance_has_its_documented_value():
         "center": 0.002,
         "offset": 0.002,
         "radius": 0.0001,
+        "scale": 0.0005,
     }
 
 

@@ -130,7 +130,7 @@ def test_whole_poses_calibrate_any_machine(folder, name):
     s = result.estimate.statistics
     # of n numbers that are noise, the root mean square has the deviation 1 / sqrt(2 n)
     assert s.pose_scale < 1 + 4 / np.sqrt(2 * s.dof_poses)
-    assert s.n_poses == 6 * 24
+    assert s.n_poses > 6 * 24 - 0.01  # none is let go, though one may be four deviations off
     before, after = tool_error(made.drawing, made), tool_error(result.machine, made)
     assert after < 0.1 * before
     assert after < 6e-5

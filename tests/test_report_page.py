@@ -158,7 +158,7 @@ def test_page_runs_in_a_browser(page, tmp_path, width):
     assert any(a.get("id") == "plot-space" and a.get("data-drawn") == "yes" for _, a in tags)
     assert any(tag == "canvas" for tag, _ in tags)
     changes = [abs(float(v.split()[2])) for v in re.findall(r'data-values="([^"]+)"', document)]
-    assert len(changes) == 54
+    assert len(changes) == 60
     assert changes == sorted(changes, reverse=True)
     assert sum(a.get("class") == "shot" for tag, a in tags if tag == "svg") == 12 + 1
     dialog = document[document.index('<dialog id="large"') :]

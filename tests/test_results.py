@@ -70,7 +70,7 @@ def test_the_file_holds_everything(folder, calibrated):
         "frame",
         "fixed",
     }
-    assert {row["unit"] for row in data["parameters"]} == {"m"}
+    assert {row["unit"] for row in data["parameters"]} == {"m", ""}
     assert len(data["residuals"]["edges"]) == len(calibrated.observation.edges)
     assert len(data["residuals"]["edges"][0]) == len(data["residuals"]["columns"])
     assert sum(group["count"] for group in data["rejected"]) == len(calibrated.observation.rejected)

@@ -28,13 +28,14 @@ from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth, true_machine
 from pose_sessions import JOINT_NOISE, T_CAMERA_BASE, measured, papers_case, papers_poses
+from test_identify_scene import exact
 
 STATIONS = 3
 
 
 def legs_case(seed, true=None):
     """A hexapod's edges from three stations, eight configurations each."""
-    drawing, camera = load_mechanism("gough-stewart"), demo_camera()
+    drawing, camera = exact("gough-stewart"), demo_camera()
     settings = Settings(stations=STATIONS, configurations=8)
     truth = draw_truth(drawing, (camera,) * STATIONS, settings, seed)
     true = true or truth.machine

@@ -20,7 +20,7 @@ from pkmcal.mechanisms import kinematics, load_mechanism
 from pkmcal.mechanisms.carriers.contract import NamedMotion, base_carriers, platform_carriers
 from pkmcal.mechanisms.carriers.slider import Slider
 from pkmcal.mechanisms.closure import limb_ends
-from test_identify_scene import Scene, _edges, _index, stations
+from test_identify_scene import Scene, _edges, _index, exact, stations
 
 
 def moved(machine, rng, n, turn=0.2, shift=0.04):
@@ -37,10 +37,12 @@ def heaved(machine, n=8):
     return poses
 
 
-def make(name, *, poses=None, n=12, n_stations=3, errors=1.0, seed=3) -> Scene:
-    """A machine with errors, seen whole by cameras around it."""
+def make(name, *, poses=None, n=12, n_stations=3, errors=1.0, seed=3, machine=None) -> Scene:
+    """A machine with errors, of exact readings unless another is given, seen whole by cameras
+    around it.
+    """
     rng = np.random.default_rng(seed)
-    machine = load_mechanism(name)
+    machine = machine or exact(name)
     table = machine.parameters
     draw = table.tolerances_free() * rng.normal(size=table.free_matrix().shape[1])
     theta = table.drawing + errors * table.free_matrix() @ draw
@@ -91,6 +93,21 @@ def test_a_whole_session_leaves_nothing_open(name):
     told, _, sentences = told_of(make(name))
     assert told.unidentified == ()
     assert sentences == ()
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "3-rpr", "3-rps"])
+def test_legs_alone_leave_the_size_to_the_tolerance_of_the_scales(name):
+    """Cameras measure angles; what tells lengths is readings, each unsure by its scale."""
+    machine = load_mechanism(name)
+    told, _, sentences = told_of(make(name, machine=machine))
+    assert len(told.unidentified) == 1
+    (size,) = sentences
+    assert size.text.startswith("The size of everything is known from the drawing only, by the")
+    scales = {f"legs[{j + 1}].scale" for j in range(machine.n_legs)}
+    assert set(size.parameters) == scales
+    # all scales as one, each known to 0.05 %: 0.05 % / sqrt(legs) of the joints' way
+    assert not size.matters
+    assert 0 < size.moves_platform < 0.0005 / np.sqrt(machine.n_legs) * 0.3
 
 
 @pytest.mark.parametrize(

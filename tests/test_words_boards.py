@@ -183,7 +183,7 @@ def test_sizes_are_columns_of_the_machine():
         size.label: size.columns
         for size in sizes(Situation(machine, np.ones((1, 3), bool), machine.home()[None]))
     }
-    assert list(found) == ["base radius", "base height", "rod length"]
+    assert list(found) == ["base radius", "base height", "rod length", "reading scale"]
     centres = machine.values + 1e-3 * found["base radius"].sum(axis=1)
     moved = np.linalg.norm(machine.with_values(centres).base_centers()[:, :2], axis=1)
     np.testing.assert_allclose(

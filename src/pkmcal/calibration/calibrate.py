@@ -23,6 +23,7 @@ from pkmcal.calibration.doubts import (
     noise_told,
     richer_models,
     scale_doubt,
+    scales_told,
     sizes_told,
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
@@ -263,7 +264,10 @@ def _judge(
             *noise_told(session, found.estimate, bool(departed)),
             *lens_told(found.turns.cameras),
         ),
-        hints=sizes_told(session, found.turns.measurements, found.estimate),
+        hints=(
+            *sizes_told(session, found.turns.measurements, found.estimate),
+            *scales_told(session, found.estimate, tuple(x.of for x in departed)),
+        ),
     )
     clock.lap("identify")
     return Calibration(

@@ -22,6 +22,7 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.score import Departures, Freed, Score
 from pkmcal.identify.tool import ToolError, tool_error
 from pkmcal.measurements import Departure, Effect, Measurements, Observation
+from pkmcal.mechanisms.closure import scales
 from pkmcal.session import moved, readings
 from pkmcal.session.load import Session
 from pkmcal.wording import amount
@@ -82,8 +83,13 @@ def departures(
 ) -> tuple[Departed, ...]:
     """What the data show that the model does not have, the surest first."""
     columns, units = session.document["joints"]["columns"], session.machine.joint_units
+    layout = estimate.machine.layout
+    present = scales(layout, estimate.machine.values) / scales(
+        layout, session.machine.parameters.drawing
+    )
+    first = [int(np.argmax(layout.actuated == m)) for m in range(len(columns))]
     families = [
-        *readings.departures(measurements.joints, columns, units),
+        *readings.departures(measurements.joints, columns, units, present[first]),
         list(_lenses(session, observation, measurements)),
         list(_boards(session, measurements)),
         list(_tripods(session, measurements)),

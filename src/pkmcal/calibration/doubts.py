@@ -55,6 +55,8 @@ ENOUGH = 4.0
 """Standard deviations that it may leave: a drawing's own errors are in them."""
 OPEN = 0.7
 """Part of its tolerance from which a board's size is known from its file: the data say less."""
+SURELY = 3.0
+"""Standard deviations by which a reading's scale is told to be another than the drawing's."""
 HOPELESS = 50.0
 """Factor on the poses' noise beyond which, after a first search, a mistake put right is none, and a
 richer model no help: what is believed ends below ENOUGH."""
@@ -494,6 +496,30 @@ def sizes_told(session: Session, measurements: Measurements, estimate: Estimate)
                 f" {file} says; that is taken into account."
             )
     return tuple(out)
+
+
+def scales_told(session: Session, estimate: Estimate, named: tuple[str, ...]) -> tuple[str, ...]:
+    """A sentence on readings whose scale is surely not the drawing's, beside those that are named
+    already.
+    """
+    layout, table = session.machine.layout, session.machine.parameters
+    unsure = np.flatnonzero(layout.unsure_scales)
+    out: dict[str, str] = {}
+    for leg in unsure:
+        k, column = layout.scale[leg], int(layout.actuated[leg])
+        name = session.document["joints"]["columns"][column]
+        share = estimate.machine.values[k] / table.drawing[k] - 1
+        sigma = float(np.sqrt(estimate.covariance[k, k]))
+        if abs(share) > SURELY * sigma > 0 and name not in named:
+            more = "larger" if share > 0 else "smaller"
+            out[name] = f"{100 * abs(share):.3f} ± {100 * sigma:.3f} % {more} ({name})"
+    if not out:
+        return ()
+    return (
+        "Readings have another scale than the drawing says: true ones are"
+        f" {listed([*out.values()])}. That is in the calibrated machine, under scale, and in what"
+        " is exported of it.",
+    )
 
 
 def _within(value: float, limits: tuple[float, float | None]) -> bool:

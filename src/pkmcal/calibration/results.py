@@ -34,7 +34,13 @@ from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.decided import decided_by
 from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.measurements import BREATHING_SIGMA
-from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document, mechanism_text
+from pkmcal.mechanisms import (
+    Machine,
+    MechanismDocument,
+    machine_from_document,
+    mechanism_text,
+    with_exact_scales,
+)
 from pkmcal.outcome import Verdict
 from pkmcal.session.load import digests
 from pkmcal.wording import listed
@@ -54,10 +60,10 @@ change by hand a millionth."""
 FORMAT_KEY, FORMAT = "pkmcal_calibration", 1
 PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
 CONVENTIONS = (
-    "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = reading + offset. Legs,"
-    " tubes and sides count from 1. sigma is a standard deviation: of sampling, not of what the"
-    " model leaves out. Rotations of a pose are perturbed from the left, about the axes of its"
-    " outer frame."
+    "SI: m and rad. T_a_b maps coordinates of frame b to frame a. length = scale * reading +"
+    " offset. Legs, tubes and sides count from 1. sigma is a standard deviation: of sampling, not"
+    " of what the model leaves out. Rotations of a pose are perturbed from the left, about the axes"
+    " of its outer frame."
 )
 EDGE_COLUMNS = ("station", "configuration", "leg", "tube", "side", "weight", "shift", "tilt")
 """Of a row in residuals.edges, names as numbers from 1; shift and tilt in standard deviations."""
@@ -580,7 +586,7 @@ def load(source: Path | str) -> SavedCalibration:
     """Read a calibration from its folder or its calibration.json, and check that it is whole."""
     document = _read(Path(source))
     saved = validate(document, _Saved)
-    machine = machine_from_document(saved.mechanism)
+    machine = machine_from_document(_mechanism(saved))
     _check_parameters(document, saved, machine)
     for group in ("stations", "configurations"):
         _check_poses(document, group, getattr(saved, group))
@@ -612,6 +618,14 @@ def load(source: Path | str) -> SavedCalibration:
         T_base_platform=np.array([c.T_base_platform for c in saved.configurations]),
         document=document.data,
     )
+
+
+def _mechanism(saved: _Saved) -> MechanismDocument:
+    """The mechanism; of a file from before readings had scales, one whose scales are exact."""
+    mechanism = saved.mechanism
+    if any(p.name.endswith(".scale") for p in saved.parameters):
+        return mechanism
+    return with_exact_scales(mechanism)
 
 
 def _read(source: Path) -> Document:

@@ -74,7 +74,7 @@ class Source:
             if kinds and table.kinds[k] not in kinds:
                 continue
             sigma = self.sigma_of(name)
-            unit = "" if table.units[k] == "1" else f" {table.units[k]}"
+            unit = f" {table.units[k]}" if table.units[k] in ("m", "rad") else ""
             told = "" if sigma is None else f", sigma {sigma:.3g}{unit}" if sigma else ", held"
             out.append(f"{name} = {values[k]:.9g}{unit}{told}")
         return out

@@ -31,6 +31,7 @@ from pkmcal.mechanisms.closure import (
     closure,
     limb_ends,
     rod_lengths,
+    rod_rates,
 )
 from pkmcal.mechanisms.kinematics import forward, inverse_result
 from pkmcal.mechanisms.velocities import by_motors
@@ -223,7 +224,7 @@ def _by_image(seen: SeenMachine, u: Array, readings: Array) -> Legs:
     by_pose = np.zeros((*b.shape, 6))
     by_pose[..., :3] = -skew(b - pivot[..., None, :])
     by_pose[..., 3:] = np.eye(3)
-    by_reading = -dot(u, base.by_reading) - layout.rod_reads
+    by_reading = -dot(u, base.by_reading) - rod_rates(layout, theta)
     return Legs(
         a, b, u, length, pivot, np.broadcast_to(base.by_reading, u.shape), by_pose,
         np.zeros((*b.shape, 0)), along(u, by_pose), np.zeros((*length.shape, 0)),
@@ -244,7 +245,7 @@ def _of_closure(seen: SeenMachine, c: Closure, u: Array, pivot: Array) -> Legs:
         rows[..., :n, :] = along(own, ends.b_by_pose[..., keep, :, :])
         hinges[..., :n, :] = along(own, ends.b_by_internal[..., keep, :, :])
         moved = dot(own, np.broadcast_to(ends.a_by_reading, u.shape)[..., keep, :])
-        by_reading[..., :n] = -moved - layout.rod_reads[keep]
+        by_reading[..., :n] = -moved - rod_rates(layout, seen.theta)[..., keep]
     return Legs(
         a=np.broadcast_to(ends.a, u.shape),
         b=np.broadcast_to(ends.b, u.shape),

@@ -37,7 +37,8 @@ CONVENTIONS = (
     "pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.",
     "twist: omega_x, omega_y, omega_z (rad/s), tau_x, tau_y, tau_z (m/s): R changes by omega x R,"
     " t by tau, both along the base frame's axes.",
-    "length of a rod = reading + offset. Readings in the order of the machine's columns.",
+    "length of a rod = scale * reading + offset; a slide's way and a crank's turn are scale *"
+    " reading. Readings in the order of the machine's columns.",
     "C99, math.h alone; no memory is allotted, nothing but the arguments is written, so that all"
     " functions can run at once in several threads. Do not compile with -ffast-math.",
 )
@@ -198,8 +199,10 @@ def _rods(machine: Machine, rods: Limbs) -> str:
     out: list[str] = []
     for k, leg in enumerate(rods.leg):
         driven = rods.drive[k] != CONSTANT
+        middle = rods.scale[k] * machine.layout.middle[leg - 1]
         numbers: dict[str, Any] = {
-            "middle": machine.layout.middle[leg - 1] if rods.drive[k] in (SLIDE, TURN) else 0.0,
+            "scale": rods.scale[k] if driven else 0.0,
+            "middle": middle if rods.drive[k] in (SLIDE, TURN) else 0.0,
             "length": rods.length[k],
             "base": rods.base[k],
             "arm": rods.arm[k],
@@ -349,7 +352,7 @@ def closure(text: str, poses: Array, joints: Array, hinges: Array) -> Array:
     lines: list[Array] = []
     out: list[Array] = []
     for rod in _records(text, "RODS", "drive"):
-        q = joints[:, int(rod.get("joint", 0)), None]
+        q = rod.get("scale", 0.0) * joints[:, int(rod.get("joint", 0)), None]
         phi = hinges[:, int(rod["hinge"]) - 1, None] if "hinge" in rod else np.zeros(1)
         a, longer = rod["base"], np.zeros(1)
         match rod["drive"]:

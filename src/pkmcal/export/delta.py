@@ -42,6 +42,8 @@ FOLLOWS = 0.05
 """mm at the tool beyond which a person is warned: a good kit's repeatability."""
 REFUSED = 5.0
 """mm at the tool beyond which the parameters describe another machine."""
+TOLD = 1e-9
+"""Difference of a scale from 1 that is told: beyond the digits of the files."""
 ROUNDING = 2e-6
 """m at the tool: settings have 0.1 µm and 0.00001 degrees, and weak poses enlarge that by eight."""
 _ROW = re.compile(r"firmware_from_base row [123]: ([^\n]*)")
@@ -107,7 +109,8 @@ def delta_of(machine: Machine, program: str) -> Delta:
             next_step="Add the ranges: the firmware's end switches are put at their upper ends",
         )
     linear = rods.drive[0] == SLIDE
-    rate, zero = _towers(rods) if linear else _arms(rods, ranges.mean(axis=1))
+    rate, zero = _towers(rods) if linear else _arms(rods, rods.scale * ranges.mean(axis=1))
+    rate = rods.scale * rate
     if np.isnan(zero).any():
         what = "towers that lean" if linear else "arms that do not swing outwards"
         raise _no_delta(machine, program, what)
@@ -140,14 +143,14 @@ def _no_delta(machine: Machine, program: str, found: str) -> InputError:
 
 
 def _towers(rods: Limbs) -> tuple[Array, Array]:
-    """Rate (mm/m) and zero (mm) of ideal towers; NaN where they lean."""
+    """Rate (mm/m of their way) and zero (mm) of ideal towers; NaN where they lean."""
     up = rods.axis[:, 2]
     return np.sign(up) * MM, np.where(np.abs(up) > UPRIGHT, MM * rods.base[:, 2], np.nan)
 
 
 def _arms(rods: Limbs, middle: Array) -> tuple[Array, Array]:
-    """Rate (degree/rad) and zero (degrees) of ideal arms, as they are in the middle of their range
-    (3,) rad; NaN where they are none.
+    """Rate (degree/rad of their turn) and zero (degrees) of ideal arms, as they are in the middle
+    of their way (3,) rad; NaN where they are none.
     """
     radial = (rods.base - rods.base.mean(axis=0)) * [1, 1, 0]
     radial = radial / np.linalg.norm(radial, axis=1, keepdims=True)
@@ -419,10 +422,18 @@ def _number(value: float, digits: int) -> str:
     return text[1:] if float(text) == 0 and text.startswith("-") else text
 
 
-def about(source: Source, delta: Delta, fit: Fit, names: str, program: str) -> list[str]:
+def scales_of(fit: Fit) -> Array:
+    """Scales of the readings (3,), in the firmware's order."""
+    return np.abs(fit.rate) / (MM if fit.kind == "linear" else DEGREE)
+
+
+def about(
+    source: Source, delta: Delta, fit: Fit, names: str, program: str, correcting: str
+) -> list[str]:
     """Header lines: conventions, which leg is which motor, the frame, and the error that is left.
 
-    names : the motors' letters, in the firmware's order.
+    names : the motors' letters, in the firmware's order. correcting : what to do about a motor
+    whose reading has a scale.
     """
     unit, word = ("mm", "m") if fit.kind == "linear" else ("degrees", "rad")
     motors = [
@@ -434,11 +445,18 @@ def about(source: Source, delta: Delta, fit: Fit, names: str, program: str) -> l
         f"firmware_from_base row {k + 1}: {' '.join(f'{v:.12g}' for v in np.round(row, 12) + 0.0)}"
         for k, row in enumerate(_in_mm(fit.T_firmware_base)[:3])
     ]
+    factors = [
+        f"Motor {name} goes {factor:.9g} times as far as its reading says."
+        for name, factor in zip(names, scales_of(fit), strict=True)
+        if abs(factor - 1) > TOLD
+    ]
     sort = "Towers" if fit.kind == "linear" else "Arms' angles above the horizontal"
     return [
         *source.header(),
         f"For {program}. Units: mm and degrees. {sort}; the rod's length is a value of its own.",
         *motors,
+        *factors,
+        *([correcting] if factors else []),
         "The firmware's frame: p_firmware = firmware_from_base p_base, mm. The point that moves is"
         " the platform frame's origin; a tool's length below it is not in these values.",
         *rows,

@@ -57,7 +57,8 @@ class Klipper(Exporter):
     def files(self, source: Source) -> dict[str, str]:
         """One file of configuration; pins, speeds and the like are the printer's own."""
         delta, fit = _fit(source)
-        lines = about(source, delta, fit, STEPPERS, PROGRAM)
+        word = "Multiply its rotation_distance" if fit.kind == "linear" else "Divide its gear_ratio"
+        lines = about(source, delta, fit, STEPPERS, PROGRAM, f"{word} by that.")
         lines.append("Put these values into the sections of the printer's own configuration.")
         sections = _linear(delta, fit) if fit.kind == "linear" else _rotary(delta, fit)
         body = "".join(

@@ -16,7 +16,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import Chain
-from pkmcal.mechanisms.closure import CarrierGroup
+from pkmcal.mechanisms.closure import CarrierGroup, scales
 
 CONSTANT, TELESCOPE, SLIDE, TURN = "constant", "telescope", "slide", "turn"
 FIXED, FLOAT = "fixed", "float"
@@ -28,7 +28,8 @@ class Limbs:
 
     leg : (L,) its number in the mechanism file, from 1.
     drive : what its reading moves: the rod's length, or its end along or about an axis; nothing.
-    joint : (L,) column of the reading, -1 without. length : (L,) the rod's, of a telescope at
+    joint : (L,) column of the reading, -1 without. scale : (L,) what the motor moves is scale *
+    reading. length : (L,) the rod's, of a telescope at
     reading zero; NaN for a passive rod.
     base : (L, 3) base frame, the fixed end, a sliding end at reading zero, or on a turning end's
     axis the foot of its arm. axis : (L, 3) unit. arm : (L, 3) from the foot to the end at reading
@@ -43,6 +44,7 @@ class Limbs:
     leg: Integers
     drive: tuple[str, ...]
     joint: Integers
+    scale: Array
     length: Array
     base: Array
     axis: Array
@@ -58,7 +60,7 @@ class Limbs:
 
     @property
     def rate(self) -> Array:
-        """How the end on the base moves with its reading where that is zero, (L, 3)."""
+        """How the end on the base moves with what its motor moves where that is zero, (L, 3)."""
         slides = np.array([drive == SLIDE for drive in self.drive])
         return np.where(slides[:, None], self.axis, cross(self.axis, self.arm))
 
@@ -94,6 +96,7 @@ def limbs_of(machine: Machine) -> Limbs:
         leg=np.arange(machine.n_legs) + 1,
         drive=tuple(np.where(layout.actuated >= 0, driven, CONSTANT).tolist()),
         joint=layout.actuated,
+        scale=scales(layout, machine.values),
         length=np.where(layout.rod >= 0, values[rods], np.nan),
         base=base + along,
         axis=axis,

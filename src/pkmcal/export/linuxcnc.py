@@ -26,6 +26,7 @@ from pkmcal.export.contract import Difference, Exporter, commented, exact, large
 from pkmcal.export.delta import (
     DEGREE,
     MM,
+    TOLD,
     Delta,
     Fit,
     Freedoms,
@@ -47,6 +48,7 @@ PROGRAM = "LinuxCNC"
 LINEAR = Freedoms((90.0, 210.0, 330.0), angles=False, rods=False)
 ROTARY = Freedoms((-90.0, 30.0, 150.0), angles=False, rods=False, arms=False, flat=True)
 STRUTS = 6
+HEXAPOD = ("center", "offset", "scale")
 MAX_ERROR = 500.0
 """genhexkins' own limit on the sum of the struts' errors, beyond which it gives up."""
 ROUNDING = 1e-12
@@ -54,6 +56,8 @@ ROUNDING = 1e-12
 _STRUT = re.compile(r"^setp genhexkins\.(base|platform)\.(\d)\.([xyz]) (\S+)$", re.M)
 _PIN = re.compile(r"^setp \w+deltakins\.(\w+) (\S+)$", re.M)
 _OFFSET = re.compile(r"^HOME_OFFSET = (\S+)$", re.M)
+_RATE = re.compile(r"^# joint \d = (\S+) \* reading", re.M)
+CORRECTING = "Divide its SCALE in the INI file, steps or counts per unit, by that."
 
 
 @final
@@ -83,7 +87,8 @@ class LinuxCnc(Exporter):
             # motors count upwards, LinuxCNC's joints downwards
             return [tool_difference(hal, delta, fit, lambda p: -rotary_joints(pins, p), -offsets)]
         poses, readings = samples(machine)
-        off = largest((genhexkins(hal, world(poses)) - offsets) / MM, readings)
+        rates = np.array([float(word) for word in _RATE.findall(files[INI])])
+        off = largest((genhexkins(hal, world(poses)) - offsets) / rates, readings)
         return [
             Difference(f"readings at {len(poses)} poses by genhexkins' formulas", off, ROUNDING)
         ]
@@ -133,20 +138,22 @@ def _hexapod_header(source: Source) -> tuple[str, ...]:
         " platform frame.",
         "XYZ is the platform frame's origin in the base frame; A, B, C are roll, pitch and yaw,"
         " R = Rz(C) Ry(B) Rx(A).",
-        "Joint N is the strut's length = 1000 * (reading + offset); the offset is HOME_OFFSET.",
+        "Joint N is the strut's length = 1000 * (scale * reading + offset); 1000 * offset is"
+        " HOME_OFFSET, and the scale belongs to the joint's own SCALE, steps or counts a mm.",
     )
 
 
 def _limits(machine: Machine, struts: Limbs) -> Array:
     """Smallest and largest strut lengths (6, 2) mm."""
-    return MM * (machine.joint_ranges[struts.joint] + struts.length[:, None])
+    ways = struts.scale[:, None] * machine.joint_ranges[struts.joint]
+    return MM * (ways + struts.length[:, None])
 
 
 def _hal(source: Source, struts: Limbs) -> str:
     limits = _limits(source.machine, struts)
     limit = max(MAX_ERROR, STRUTS * float(np.nanmax(limits, initial=0.0)))
     lines = [
-        commented((*_hexapod_header(source), "", *source.sigma_lines(("center", "offset"))), "#"),
+        commented((*_hexapod_header(source), "", *source.sigma_lines(HEXAPOD)), "#"),
         "loadrt genhexkins\n",
     ]
     for n, leg in enumerate(struts.leg):
@@ -176,8 +183,9 @@ def _ini(source: Source, struts: Limbs) -> str:
         commented(
             (
                 *_hexapod_header(source),
-                "HOME_OFFSET holds for absolute encoders that read 1000 * reading. With a home"
-                " switch, set HOME_ABSOLUTE_ENCODER = 0 and add 1000 * the reading at the switch.",
+                "HOME_OFFSET holds for absolute encoders that read 1000 * scale * reading. With a"
+                " home switch, set HOME_ABSOLUTE_ENCODER = 0 and add 1000 * scale * the reading at"
+                " the switch.",
             ),
             "#",
         ),
@@ -187,7 +195,11 @@ def _ini(source: Source, struts: Limbs) -> str:
         f"HOME = {' '.join(f'{v:.6f}' for v in home + 0.0)}",
     ]
     for n, (low, high) in enumerate(_limits(source.machine, struts).tolist()):
+        scale = float(struts.scale[n])
         lines.append(f"\n[JOINT_{n}]\nTYPE = LINEAR\nHOME_ABSOLUTE_ENCODER = 2")
+        lines.append(f"# joint {n} = {exact(MM * scale)} * reading + HOME_OFFSET")
+        if abs(scale - 1) > TOLD:
+            lines.append(f"# {CORRECTING.replace('that', exact(scale))}")
         lines.append(f"HOME_OFFSET = {exact(float(MM * struts.length[n]))}")
         if np.isfinite(low) and np.isfinite(high):
             lines.append(f"MIN_LIMIT = {low:.4f}\nMAX_LIMIT = {high:.4f}")
@@ -229,7 +241,7 @@ def _fit(source: Source) -> tuple[Delta, Fit]:
 
 
 def _delta_hal(source: Source, delta: Delta, fit: Fit) -> str:
-    lines = about(source, delta, fit, "012", PROGRAM)
+    lines = about(source, delta, fit, "012", PROGRAM, CORRECTING)
     lines = [line for line in lines if not line.startswith("End switches")]
     if fit.kind == "linear":
         pins = [

@@ -77,7 +77,7 @@ def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
         read_again = np.array([places[f"leg{j + 1}_{site}"] for j in range(machine.n_legs)])
         gap = largest(read_again, ends.a if site == "base" else ends.b)
         out.append(Difference(f"{what} in the keyframe", gap, ROUNDING))
-    readings = largest(model.key[model.actuated], model.ctrl)
+    readings = largest(model.gear * model.key[model.actuated], model.ctrl)
     return [*out, Difference("readings in the keyframe", readings, ROUNDING)]
 
 
@@ -88,7 +88,7 @@ def _forward(model: ReadModel, machine: Machine) -> tuple[float, float, int]:
     poses, readings = samples(machine, POSES)
     drives = np.isin(np.arange(model.key.size), model.actuated)
     x = np.tile(model.key, (len(poses), 1))
-    x[:, model.actuated] = readings
+    x[:, model.actuated] = readings / model.gear
     # the legs follow the platform to where the machine's is; then the loops alone hold it
     x = model.closed(model.closed(x, drives, poses), drives)
     away: Array = pose_difference(model.places(x)["platform"], poses)

@@ -50,9 +50,10 @@ COLOURS = {
 CONVENTIONS = (
     "Units: m, rad, kg, s. MuJoCo's world is the machine's base frame; the body 'platform' has the"
     " platform frame, so its xpos and xmat are T_base_platform.",
-    "Joints and actuators leg1, leg2, … (motor1, … where a motor moves several rods) have the"
-    " machine's readings as their values: a rod's length is its reading + offset, a crank's angle"
-    " its reading + angle. Set data.ctrl to readings.",
+    "Actuators leg1, leg2, … (motor1, … where a motor moves several rods) have the machine's"
+    " readings as their values, and sensors of these names tell them: set data.ctrl to readings."
+    " Joints of these names have scale * reading: a rod's length is that + offset, a crank's angle"
+    " that + angle. An actuator's gear is 1 / scale; without one the scale is 1.",
     "The keyframe 'home' is closed by pkmcal's kinematics, and is the model as drawn (qpos0)."
     " Loops are closed by the equality constraints named after the legs.",
     "PLACEHOLDERS: masses, inertias, damping and the actuators' gains. Photographs weigh nothing,"
@@ -146,6 +147,15 @@ class HomeState:
         """``leg1`` where the reading moves one leg, as columns of joints.csv; else ``motor1``."""
         legs = self.motor_legs(column)
         return f"leg{legs[0] + 1}" if len(legs) == 1 else f"motor{column + 1}"
+
+    def scale(self, column: int) -> float:
+        """What the motor moves is scale * reading."""
+        return float(self.limbs.scale[self.motor_legs(column)[0]])
+
+    def values(self, column: int) -> Array:
+        """What a motor has moved at home and at both ends of its range, (3,) m or rad."""
+        reading = self.readings[column]
+        return self.scale(column) * np.append(reading, self.machine.joint_ranges[column])
 
     def lever(self, column: int) -> float:
         """What makes a motor's stiffness that of a slide: 1, or a turning arm, m."""
@@ -400,18 +410,18 @@ def _carrier(
 
 
 def _motor(world: Element, home: HomeState, column: int, at: Array, axis: Array) -> Element:
-    """A crank or carriage; its joint's value is the machine's reading."""
+    """A crank or carriage, by what its motor has moved."""
     name, thick = home.reading_name(column), home.size / 40
     turns = home.limbs.drive[home.motor_legs(column)[0]] == TURN
     kind, word = ("hinge", "crank") if turns else ("slide", "carriage")
     size = home.lever(column) if turns else home.size / 10
     out = _body(world, f"{name}_{word}", at, LIGHT, np.zeros(3), 2 * size)
     _driven(out, home, column, kind, axis)
-    limits = home.machine.joint_ranges[column]
+    now, *limits = home.values(column)
     if turns:
         _cylinder(world, at - 1.2 * thick * axis, at + 1.2 * thick * axis, thick, "base")
     elif np.isfinite(limits).all():
-        low, high = (at + (q - float(home.readings[column])) * axis for q in limits)
+        low, high = (at + (q - now) * axis for q in limits)
         _cylinder(world, low, high, 0.4 * thick, "base")
     return out
 
@@ -438,8 +448,8 @@ def _tip(rod: Element, home: HomeState, j: int) -> tuple[Element, Array]:
     u, length, column = home.u[j], float(home.distance[j]), home.column(j)
     reach = length  # m, that the leg may have
     if home.limbs.drive[j] == TELESCOPE:
-        high = float(home.machine.joint_ranges[column, 1])
-        reach = high + length - float(home.readings[column]) if np.isfinite(high) else length
+        now, _, high = home.values(column).tolist()
+        reach = high + length - now if np.isfinite(high) else length
     tubes = _tubes(home, j, reach)
     names: list[str | None] = [f"leg{j + 1}_tube{k + 1}" for k in range(len(home.leg(j).tubes))]
     names += [None] * (len(tubes) - len(names))
@@ -528,10 +538,12 @@ def _drives(root: Element, home: HomeState) -> None:
         name, limits = home.reading_name(column), home.machine.joint_ranges[column]
         stiffness = numbers(STIFF * home.lever(column) ** 2)
         drive = SubElement(actuator, "position", name=name, joint=name, kp=stiffness)
+        if home.scale(column) != 1:
+            drive.set("gear", numbers(1 / home.scale(column)))
         if np.isfinite(limits).all():
             drive.set("ctrllimited", "true")
             drive.set("ctrlrange", numbers(limits))
-        SubElement(sensor, "jointpos", name=name, joint=name)
+        SubElement(sensor, "actuatorpos", name=name, actuator=name)
     for kind, name in (("framepos", "platform_position"), ("framequat", "platform_quaternion")):
         SubElement(sensor, kind, name=name, objtype="xbody", objname="platform")
 
@@ -592,12 +604,12 @@ def _joint(parent: Element, name: str, kind: str, axis: Array, ref: float = 0.0)
 
 
 def _driven(parent: Element, home: HomeState, column: int, kind: str, axis: Array) -> None:
-    """A motor's joint, whose value is the reading; its damping is N s/m or N m s."""
-    reading, limits = float(home.readings[column]), home.machine.joint_ranges[column]
-    out = _joint(parent, home.reading_name(column), kind, axis, reading)
+    """A motor's joint, whose value is scale * reading; its damping is N s/m or N m s."""
+    now, *limits = home.values(column).tolist()
+    out = _joint(parent, home.reading_name(column), kind, axis, now)
     if np.isfinite(limits).all():
         out.set("limited", "true")
-        out.set("range", numbers(limits))
+        out.set("range", numbers(*limits))
     out.set("damping", numbers(DAMPED * home.lever(column) ** 2))
 
 

@@ -75,7 +75,8 @@ class ReadModel:
     from its body's drawn orientation, and the shift. drawn, key : the states as drawn, and in the
     keyframe. couplings : (joint, joint, ratio) by freedoms. sites, radii : points (body, (3,)) and
     cylinders' radii (m) by name. actuated : freedoms of the actuators' joints, in order;
-    ctrl : (m,) their values in the keyframe.
+    gear : (m,) what a joint's value is multiplied by for the actuator's; ctrl : (m,) the
+    actuators' values in the keyframe.
     """
 
     bodies: tuple[ReadBody, ...]
@@ -85,6 +86,7 @@ class ReadModel:
     sites: dict[str, tuple[int, Array]]
     radii: dict[str, float]
     actuated: Integers
+    gear: Array
     ctrl: Array
     key: Array
 
@@ -170,6 +172,7 @@ def read(text: str) -> ReadModel:
         sites,
         radii,
         np.array([joints[n.attrib["joint"]].dof for n in drives], dtype=int),
+        np.array([_vector(n, "gear", "1")[0] for n in drives]),
         np.zeros(0) if key is None else _vector(key, "ctrl"),
         drawn if key is None else _of_qpos(bodies, drawn, _vector(key, "qpos")),
     )

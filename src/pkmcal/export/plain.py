@@ -17,7 +17,8 @@ MECHANISM, MACHINE = "mechanism.yaml", "machine.json"
 FORMAT = 1
 CONVENTIONS = (
     "Units: m and rad; axes are unit vectors.",
-    "T_a_b maps coordinates of frame b to frame a. length = reading + offset. Legs count from 1.",
+    "T_a_b maps coordinates of frame b to frame a. length = scale * reading + offset, and so of"
+    " what else a reading moves; a scale that does not stand here is 1. Legs count from 1.",
     "sigma is a standard deviation: of sampling, not of what the model leaves out. 0 (held): by the"
     " choice of frames, or by the mechanism file.",
 )

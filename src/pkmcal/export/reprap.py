@@ -57,7 +57,9 @@ class RepRap(Exporter):
     def files(self, source: Source) -> dict[str, str]:
         """One file of G-code."""
         delta, fit = _fit(source)
-        lines = about(source, delta, fit, "XYZ", PROGRAM)
+        way = "mm" if fit.kind == "linear" else "degree"
+        correcting = f"Divide its steps per {way} (M92) by that."
+        lines = about(source, delta, fit, "XYZ", PROGRAM, correcting)
         commands = _linear(delta, fit) if fit.kind == "linear" else _rotary(delta, fit)
         return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
 

@@ -24,8 +24,8 @@ from pkmcal.geometry.rigid import cross, skew
 from pkmcal.identify.gauge import centre_index, generators
 from pkmcal.identify.tool import pose_by_parameters
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.wording import SCALES, decimals, joined, named, number, split_name
+from pkmcal.mechanisms.closure import joint_values, limb_ends
+from pkmcal.wording import SCALES, decimals, joined, named, number, split_name, with_unit
 
 AXES = "xyz"
 MOST_GROUPS = 120
@@ -41,7 +41,9 @@ SAME = 1e-3
 LITTLE = 0.01
 """mm (or degrees) by which a size changes with another's 1 mm and is not worth a word."""
 
-Advice = Literal["more", "photograph", "tie", "caliper", "more or caliper", "turn", "drawing"]
+Advice = Literal[
+    "more", "photograph", "tie", "caliper", "more or caliper", "turn", "drawing", "size"
+]  # fmt: skip
 """What helps: see :mod:`pkmcal.identify.sentences`."""
 
 
@@ -163,7 +165,7 @@ def candidates(s: Situation) -> Iterator[Motion]:
         yield from _whole_leg(s, j)
     if s.photographed and any("tubes" in fields for fields in s.fields):
         yield from (_spread(s, group) for group in (*groups(s.seen), s.legs))
-    yield Motion(s.legs, _scale(s), "the size of everything {is}: all lengths can grow alike")
+    yield _everything(s)
     yield from _all_together(s, carried)
     rest = "of the machine's numbers, {combinations}{mostly}"
     yield Motion(s.legs, np.eye(len(s.machine.parameters)), rest)
@@ -327,7 +329,7 @@ def _carriers(s: Situation, leg: int) -> Iterator[tuple[Motion, str]]:
     layout, poses = s.machine.layout, s.T_base_platform
     readings = np.full(len(poses), np.nan)
     if layout.actuated[leg] >= 0:
-        readings = s.readings[:, layout.actuated[leg]]
+        readings = joint_values(layout, s.machine.values, s.readings)[:, leg]
     for group in (*layout.base, *layout.platform):
         for i in np.flatnonzero(group.legs == leg):
             own = group.of(s.machine.values)[i]
@@ -340,7 +342,7 @@ def _carriers(s: Situation, leg: int) -> Iterator[tuple[Motion, str]]:
 
 
 def _whole_leg(s: Situation, leg: int) -> Iterator[Motion]:
-    own = s.rows(leg, "base", "platform", "length")
+    own = s.rows(leg, "base", "platform", "length", "scale")
     one = "of the values of {legs}, {combinations}{mostly}"
     yield Motion((leg,), s.one_hot(own), one)
     if "tubes" in s.fields[leg] and s.photographed:
@@ -442,9 +444,11 @@ def changes(
     """``+1 mm of the rod length``, ``+0.2 mm of the radius``: a change (m,) told by its numbers.
 
     labels : name and unit of each. The largest length becomes a millimetre, or, where there is
-    none, the largest angle a tenth of a degree; also returns the factor by which.
+    none, the largest angle a tenth of a degree, or scale a tenth of a per cent; also returns the
+    factor by which.
     """
-    scale = np.array([SCALES.get(unit, SCALES["rad"])[0] for _, unit in labels])
+    told = [{**SCALES, "": (100.0, "%")}.get(unit, SCALES["rad"]) for _, unit in labels]
+    scale = np.array([factor for factor, _ in told])
     length = np.array([unit == "m" for _, unit in labels]) & (np.abs(values) > 0)
     first = int(np.argmax(np.where(length, np.abs(values), 0 if length.any() else np.abs(values))))
     one = 1.0 if length.any() else 0.1
@@ -455,8 +459,9 @@ def changes(
     said: list[str] = []
     for k in order:
         places = decimals(abs(shown[k])) if k != first else int(one < 1)
-        unit = " mm" if labels[k][1] == "m" else "°"
-        said.append(f"{number(shown[k], places, signed=True)}{unit} of {labels[k][0]}")
+        said.append(
+            f"{with_unit(number(shown[k], places, signed=True), told[k][1])} of {labels[k][0]}"
+        )
     if len(said) > most:
         said = [*said[: most - 1], f"{len(said) - most + 1} smaller changes"]
     return said, factor
@@ -601,13 +606,27 @@ def _spread(s: Situation, legs: tuple[int, ...]) -> Motion:
     return Motion(legs, out, text, advice="more or caliper")
 
 
-def _scale(s: Situation) -> Array:
-    """All lengths grow by the same share, (P, 1); readings cannot, so offsets stay."""
-    table = s.machine.parameters
-    grows = [
-        u == "m" and not n.endswith("offset") for n, u in zip(table.names, table.units, strict=True)
-    ]
-    return np.where(grows, s.machine.values, 0.0)[:, None]
+def _everything(s: Situation) -> Motion:
+    """All lengths grow by the same share, (P, 1): what readings in m stand for as well, where all
+    their scales are free; else readings cannot, so offsets stay.
+    """
+    table, layout = s.machine.parameters, s.machine.layout
+    free = np.append(np.any(table.free_matrix(), axis=1), False)
+    units = np.array([*s.machine.joint_units, ""])  # the last is that of legs without a reading
+    rows = layout.scale[units[layout.actuated] == "m"]
+    follow = bool(free[rows].all())
+    lengths = zip(table.names, table.units, strict=True)
+    grows = np.array([u == "m" and (follow or not n.endswith("offset")) for n, u in lengths])
+    grows[rows[: rows.size * follow]] = True
+    columns = np.where(grows, s.machine.values, 0.0)[:, None]
+    if not (rows.size and follow):
+        text = "the size of everything {is}: all lengths can grow alike"
+        return Motion(s.legs, columns, text)
+    text = (
+        "the size of everything is known from the drawing only, by the tolerance of the readings'"
+        " scales: all lengths can grow alike, and the scales with them"
+    )
+    return Motion(s.legs, columns, text, advice="size")
 
 
 def _all_together(s: Situation, carried: list[tuple[Motion, str]]) -> Iterator[Motion]:
@@ -618,6 +637,10 @@ def _all_together(s: Situation, carried: list[tuple[Motion, str]]) -> Iterator[M
     for side, centres in zip(("base", "platform"), centre_index(s.machine.layout), strict=True):
         text = f"how the {side} joints lie to each other {{is}} {{ways}}{{mostly}}"
         yield Motion(s.legs, s.one_hot(centres.ravel()), text)
+    scaled = [rows for leg in s.fields for field, rows in leg.items() if field == "scale"]
+    if scaled:
+        text = "the scales of the readings {are} {ways}{mostly}"
+        yield Motion(s.legs, s.one_hot(np.concatenate(scaled)), text)
     axes = [rows for leg in s.fields for field, rows in leg.items() if field.endswith("axis")]
     if axes:
         text = "the directions of the joints' axes {are} {ways}{mostly}"

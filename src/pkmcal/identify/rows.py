@@ -319,11 +319,12 @@ def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> 
     """Standard deviation (..., E) of each closure where every motor moves one rod.
 
     A crank in line with its rod does not move it, so no closure is sharper than a perfect one; a
-    rod that is read always moves with its reading.
+    rod that is read always moves with its reading, whose noise is one of lengths: told by its
+    scale, it would be the same but for a thousandth, and change with an unknown.
     """
     rod = np.append(layout.rod_reads[layout.closing], np.zeros(len(layout.angles), dtype=bool))
     sigma = np.abs(by_reading) * joint_noise
-    sigma = np.where(rod, sigma, np.maximum(sigma, PERFECT))
+    sigma = np.where(rod, joint_noise, np.maximum(sigma, PERFECT))
     return np.where(layout.row_motor >= 0, sigma, PERFECT)
 
 

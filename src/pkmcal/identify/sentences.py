@@ -180,6 +180,8 @@ def advice_on(
         "caliper": f"{caliper} and give a small tolerance.radius",
         "more or caliper": f"{more}; or measure the tubes with a caliper",
         "turn": f"{take} configurations that turn these joints further, to both sides",
+        "size": "Let a board be seen with the legs (observe: [legs, board]), whose squares tell the"
+        " size, or check the readings over a long way against a measure",
         "drawing": "Legs look the same however these axes lie: leave them to the drawing",
     }[found.motion.advice]
     decide = f"{held} if the drawing is sure of that"

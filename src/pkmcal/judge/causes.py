@@ -146,7 +146,7 @@ def joint_of(machine: Machine, side: Side, leg: int) -> Cause:
 def _of_names(machine: Machine, part: str, legs: tuple[int, ...]) -> Cause:
     """The parameters of some legs' part, each changed by itself; two rods of an arm as well.
 
-    A motor's zero is one number, however many rods hang on it.
+    A motor's zero is one number, and its reading's scale, however many rods hang on it.
     """
     table = machine.parameters
     rows = [
@@ -156,7 +156,7 @@ def _of_names(machine: Machine, part: str, legs: tuple[int, ...]) -> Cause:
     ]
     tolerance = table.tolerance[rows]
     columns = np.eye(len(table))[:, rows]
-    if part == "zero" and len(legs) > 1 and len(rows) > 1:
+    if part in ("zero", "lead") and len(legs) > 1 and len(rows) > 1:
         columns, tolerance = columns.sum(axis=1, keepdims=True), tolerance[:1]
     units = {table.units[k] for k in rows}
     return Cause(part, legs, columns, tolerance, units.pop() if len(units) == 1 else "m")

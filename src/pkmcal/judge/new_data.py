@@ -70,20 +70,27 @@ def look(
 
 
 def _check_machine(saved: SavedCalibration, session: Session) -> None:
-    """Raise `InputError` where the session is another machine's."""
+    """Raise `InputError` where the session is another machine's.
+
+    Readings' scales tell no machine from another: the one may have them exact, as calibrations of
+    earlier versions have, and the other not.
+    """
     machine, drawn = saved.machine, session.machine
-    if machine.parameters.names != drawn.parameters.names:
+    rows, own = (np.flatnonzero(np.array(m.parameters.kinds) != "scale") for m in (machine, drawn))
+    told, wanted = machine.parameters.names, drawn.parameters.names
+    if [told[k] for k in rows] != [wanted[k] for k in own]:
         raise _another(
             f"{machine.name}, {machine.n_legs} legs, {len(machine.parameters)} parameters",
             f"{drawn.name}, {drawn.n_legs} legs, {len(drawn.parameters)} parameters",
         )
     table = drawn.parameters
-    values = table.unit_axes(drawn.values)
-    off = [np.abs(values - v) / table.tolerance for v in (saved.drawing, machine.values)]
+    values = table.unit_axes(drawn.values)[own]
+    before = saved.drawing[rows], machine.values[rows]
+    off = [np.abs(values - v) / table.tolerance[own] for v in before]
     if min(o.max(initial=0.0) for o in off) > FAR:
         k = int(np.argmax(off[0]))
         raise _another(
-            f"{table.names[k]} {saved.drawing[k]:.6g} in its drawing",
+            f"{wanted[own[k]]} {before[0][k]:.6g} in its drawing",
             f"{values[k]:.6g} in the session's, {off[0][k]:.0f} tolerances off",
         )
 

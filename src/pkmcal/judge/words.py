@@ -251,6 +251,8 @@ def said(suspect: Suspect, names: Names = Names(), short: bool = False) -> str:
         joint = f"the {cause.part} joint{'s' if len(cause.legs) > 1 else ''} of {who}"
         together = " together" if len(cause.legs) > 1 else ""
         return f"{joint}{together}{_vector(suspect, short)}"
+    if cause.part == "lead":
+        return f"the scale of {who}'s reading by {_ratio(value[0], sigma[0])}"
     parts = {"zero": f"the zero of {who}'s reading", "rod": f"the rod length of {who}"}
     what = parts.get(cause.part, f"the {cause.part} of {who}")
     if len(value) > 1:
@@ -355,6 +357,8 @@ def _cause_in_words(suspect: Suspect) -> str:
     cause = suspect.cause
     if cause.part == "zero":
         return ", as after a slipped coupling or encoder, or a homing switch that moved"
+    if cause.part == "lead":
+        return ", as with another screw, belt or encoder"
     if cause.part in ("base", "platform") and len(cause.legs) > 1:
         return ", as with a mount that both share"
     if cause.part in ("base", "platform"):

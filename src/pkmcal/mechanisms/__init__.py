@@ -8,7 +8,7 @@ from pathlib import Path
 from pkmcal.errors import InputError
 from pkmcal.files import closest, read_yaml, validate, yaml_text
 from pkmcal.mechanisms.document import MechanismDocument, Model
-from pkmcal.mechanisms.machine import Machine, machine_from_document
+from pkmcal.mechanisms.machine import Machine, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.wording import listed
 
@@ -20,6 +20,7 @@ __all__ = [
     "load_mechanism",
     "machine_from_document",
     "mechanism_text",
+    "with_exact_scales",
 ]
 
 

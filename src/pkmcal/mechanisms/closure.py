@@ -73,6 +73,8 @@ class LimbLayout:
     actuated : (L,) the reading's column, -1 for a leg without; middle : (L,) its mid-range.
     internal : (L,) the column of the platform carrier's internal coordinate, -1 without.
     rod_reads : (L,) whether the reading is the rod's own length (and not the carrier's motion).
+    scale : (L,) position of each reading's scale, P where it is exact; there ``exact_scale`` (L,)
+    has the value, which is 1 for a leg without a reading.
     base_axis, platform_axis : (L, 3) positions of the axes' parameters, -1 where none is one.
     angles : the axes' equations. turning : positions (n, 3) of all directions among the
     parameters that turn with the base frame, and with the platform frame.
@@ -89,6 +91,8 @@ class LimbLayout:
     middle: Array
     internal: Integers
     rod_reads: Booleans
+    scale: Integers
+    exact_scale: Array
     base_axis: Integers
     platform_axis: Integers
     angles: AngleLayout
@@ -153,9 +157,30 @@ class LimbLayout:
         return self.n_equations > self.own_motion.shape[1]
 
     @cached_property
+    def unsure_scales(self) -> Booleans:
+        """(L,) readings whose scale is a parameter."""
+        return self.scale < self.n_parameters
+
+    @cached_property
+    def scales_move_a(self) -> bool:
+        """Whether a scale that is a parameter moves a limb's end A, and not a rod."""
+        return bool((self.unsure_scales & ~self.rod_reads).any())
+
+    @cached_property
+    def scales_move_rods(self) -> bool:
+        """Whether one changes a rod's length."""
+        return bool((self.unsure_scales & self.rod_reads).any())
+
+    @cached_property
     def a_index(self) -> Integers:
-        """(L, n) parameters that each limb's end A depends on, P where there are fewer."""
-        return self._ends_index(self.base)
+        """(L, n) parameters that each limb's end A depends on, P where there are fewer; the last is
+        the reading's scale, where one moves A.
+        """
+        index = self._ends_index(self.base)
+        if not self.scales_move_a:
+            return index
+        scale = np.where(self.rod_reads, self.n_parameters, self.scale)
+        return np.concatenate([index, scale[:, None]], axis=1)
 
     @cached_property
     def b_index(self) -> Integers:
@@ -167,7 +192,10 @@ class LimbLayout:
         """(E, n) parameters that each row of the closure depends on, P where there are fewer."""
         none, keep, leg = self.n_parameters, self.closing, self.angles.leg
         rod = np.where(keep, self.rod, none)[:, None]
-        lengths = np.concatenate([self.a_index, self.b_index, rod], axis=1)[keep]
+        parts = [self.a_index, self.b_index, rod]
+        if self.scales_move_rods:
+            parts.append(np.where(self.rod_reads, self.scale, none)[:, None])
+        lengths = np.concatenate(parts, axis=1)[keep]
         angles = np.concatenate(
             [
                 self.a_index[leg],
@@ -234,6 +262,10 @@ def layout_of(document: MechanismDocument, positions: dict[str, int]) -> LimbLay
         middle=middles(document),
         internal=_internal(document),
         rod_reads=reads,
+        scale=np.array(
+            [positions.get(f"legs[{j + 1}].scale", len(positions)) for j in range(len(legs))]
+        ),
+        exact_scale=np.array([leg.scale for leg in legs]),
         base_axis=base_axis,
         platform_axis=platform_axis,
         angles=angle_layout(document, base_axis, platform_axis),
@@ -347,10 +379,10 @@ def pose_rows(
 
 def base_ends(layout: LimbLayout, theta: Array, readings: Array) -> BaseEnds:
     """The base side at readings (..., m), m or rad."""
-    q = leg_readings(layout, readings)
+    q = joint_values(layout, theta, readings)
     placed = [g.carrier.place(g.of(theta), q[..., g.legs]) for g in layout.base]
-    a, by_reading = (_gathered(layout.base, side) for side in zip(*placed, strict=True))
-    return BaseEnds(a, by_reading, _lengths(layout, theta, q))
+    a, by_value = (_gathered(layout.base, side) for side in zip(*placed, strict=True))
+    return BaseEnds(a, by_value * scales(layout, theta)[..., None], _lengths(layout, theta, q))
 
 
 def platform_ends(
@@ -440,9 +472,9 @@ def _with_angles(
     )
 
 
-def by_readings(layout: LimbLayout, base: BaseEnds, rows: Rows) -> Array:
+def by_readings(layout: LimbLayout, theta: Array, base: BaseEnds, rows: Rows) -> Array:
     """Derivatives (..., E) of the rows by their legs' own readings, zero where there is none."""
-    by = -dot(rows.u, base.by_reading) - layout.rod_reads
+    by = -dot(rows.u, base.by_reading) - rod_rates(layout, theta)
     by = by if layout.all_close else by[..., layout.closing]
     if not len(layout.angles):
         return by
@@ -468,22 +500,42 @@ def _by_internal(w: Array, by_internal: Array) -> Array:
     return out
 
 
-def leg_readings(layout: LimbLayout, readings: Array) -> Array:
+def joint_values(layout: LimbLayout, theta: Array, readings: Array) -> Array:
+    """What the legs' motors have moved, (..., L) m or rad, at readings (..., m): scale * reading,
+    zero for legs without one.
+    """
+    return scales(layout, theta) * _leg_readings(layout, readings)
+
+
+def scales(layout: LimbLayout, theta: Array) -> Array:
+    """The scale of each leg's reading, (..., L), or (L,) where all are exact."""
+    if not layout.unsure_scales.any():
+        return layout.exact_scale
+    known = theta[..., np.where(layout.unsure_scales, layout.scale, 0)]
+    return np.where(layout.unsure_scales, known, layout.exact_scale)
+
+
+def rod_rates(layout: LimbLayout, theta: Array) -> Array:
+    """How much longer each rod becomes by its leg's reading, (..., L): the scale, or zero."""
+    return np.where(layout.rod_reads, scales(layout, theta), 0.0)
+
+
+def _leg_readings(layout: LimbLayout, readings: Array) -> Array:
     """Readings (..., m) spread over the legs (..., L), zero for legs without one."""
     return np.where(layout.actuated >= 0, readings[..., np.maximum(layout.actuated, 0)], 0.0)
 
 
 def rod_lengths(layout: LimbLayout, theta: Array, readings: Array) -> Array:
-    """Length of every rod (..., L), m: reading + offset, or the constant; [B] eq. 4.
+    """Length of every rod (..., L), m: scale * reading + offset, or the constant; [B] eq. 4.
 
     NaN for passive rods, whose length nobody knows.
     """
-    return _lengths(layout, theta, leg_readings(layout, readings))
+    return _lengths(layout, theta, joint_values(layout, theta, readings))
 
 
-def _lengths(layout: LimbLayout, theta: Array, leg_reading: Array) -> Array:
+def _lengths(layout: LimbLayout, theta: Array, joint_value: Array) -> Array:
     own = np.where(layout.closing, theta[..., layout.rod], np.nan)
-    return own + np.where(layout.rod_reads, leg_reading, 0.0)
+    return own + np.where(layout.rod_reads, joint_value, 0.0)
 
 
 def _gathered(groups: tuple[CarrierGroup, ...], points: tuple[Array, ...]) -> Array:
@@ -507,15 +559,15 @@ def stacked(first: Array, second: Array) -> Array:
     return out
 
 
-def skeletons(layout: LimbLayout, theta: Array, leg_reading: Array) -> tuple[Array, ...]:
+def skeletons(layout: LimbLayout, theta: Array, joint_value: Array) -> tuple[Array, ...]:
     """What carries each leg's end on the base, for pictures: L arrays (..., k, 3), m, base frame.
 
     From where a motor holds an arm to the end A, which is the last point; A alone where there is
-    no arm. leg_reading : (..., L).
+    no arm. joint_value : (..., L), see :func:`joint_values`.
     """
     out: dict[int, Array] = {}
     for g in layout.base:
-        points = g.carrier.skeleton(g.of(theta), leg_reading[..., g.legs])
+        points = g.carrier.skeleton(g.of(theta), joint_value[..., g.legs])
         out |= {int(j): points[..., k, :, :] for k, j in enumerate(g.legs)}
     return tuple(out[j] for j in range(layout.n_legs))
 
@@ -594,7 +646,7 @@ class Closure:
     @cached_property
     def by_reading(self) -> Array:
         """(..., E) by the leg's own reading, zero where it has none."""
-        return by_readings(self.layout, self.base, self.rows)
+        return by_readings(self.layout, self.theta, self.base, self.rows)
 
     @cached_property
     def ends(self) -> LimbEnds:
@@ -618,7 +670,7 @@ class Closure:
     def by_theta(self) -> Array:
         """(..., E, n) derivatives by them."""
         layout = self.layout
-        lengths = _by_length(layout, self.rows.u, self.ends)
+        lengths = _by_length(layout, self.rows.u, self.ends, self.readings)
         if not len(layout.angles):
             return lengths
         line = (self.ends.b - self.ends.a)[..., layout.angles.leg, :]
@@ -655,7 +707,7 @@ def _with_parameters(
     platform: PlatformEnds,
 ) -> LimbEnds:
     """The ends with their derivatives by the parameters."""
-    q, at_legs = leg_readings(layout, readings), poses[..., None, :, :]
+    q, at_legs = joint_values(layout, theta, readings), poses[..., None, :, :]
     a_by = [g.carrier.by_parameters(g.of(theta), q[..., g.legs]) for g in layout.base]
     b_by = [
         g.carrier.by_parameters(g.of(theta), at_legs, own_internal(layout, g, internal))
@@ -665,13 +717,17 @@ def _with_parameters(
     a, by_reading = (
         np.broadcast_to(x, (*shape, layout.n_legs, 3)) for x in (base.a, base.by_reading)
     )
+    by_a = _padded_to(layout.n_legs, layout.base, a_by)
+    if layout.scales_move_a:
+        raw = _leg_readings(layout, readings) / scales(layout, theta)
+        by_a = _side_by_side((by_a, (by_reading * raw[..., None])[..., None]))
     return LimbEnds(
         a,
         platform.b,
         layout.a_index,
         layout.b_index,
-        _padded_to(layout.a_index.shape, layout.base, a_by),
-        _padded_to(layout.b_index.shape, layout.platform, b_by),
+        by_a,
+        _padded_to(layout.n_legs, layout.platform, b_by),
         by_reading,
         platform.arm,
         layout.n_parameters,
@@ -679,14 +735,12 @@ def _with_parameters(
     )
 
 
-def _padded_to(
-    shape: tuple[int, ...], groups: tuple[CarrierGroup, ...], by_parameters: list[Array]
-) -> Array:
-    """Carriers' derivatives in the order of the legs, for n parameters each; shape is (L, n)."""
+def _padded_to(n_legs: int, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]) -> Array:
+    """Carriers' derivatives in the order of the legs, for as many parameters as the most have."""
     if len(groups) == 1:
         return by_parameters[0]
     lead = np.broadcast_shapes(*(by.shape[:-3] for by in by_parameters))
-    out = np.zeros((*lead, shape[0], 3, shape[1]))
+    out = np.zeros((*lead, n_legs, 3, max(by.shape[-1] for by in by_parameters)))
     for group, by in zip(groups, by_parameters, strict=True):
         out[..., group.legs, :, : by.shape[-1]] = by
     return out
@@ -706,9 +760,12 @@ def closure(
     return Closure(layout, theta, readings, poses, internal, base, platform, rows)
 
 
-def _by_length(layout: LimbLayout, u: Array, ends: LimbEnds) -> Array:
+def _by_length(layout: LimbLayout, u: Array, ends: LimbEnds, readings: Array) -> Array:
     """Derivatives (..., E, n) of |B - A| - length of the legs that close, by their parameters."""
     parts = (-along(u, ends.a_by), along(u, ends.b_by), np.full((1, 1), -1.0))
+    if layout.scales_move_rods:
+        grown = np.where(layout.rod_reads, _leg_readings(layout, readings), 0.0)
+        parts = (*parts, -grown[..., None])
     by_theta = _side_by_side(parts)
     return by_theta if layout.all_close else by_theta[..., layout.closing, :]
 

@@ -35,7 +35,9 @@ def _increasing(value: tuple[float, float]) -> tuple[float, float]:
 
 
 class ActuatedLength(Schema):
-    """``length: {actuated: true, offset: 0.0, range: [min, max]}``; length = reading + offset."""
+    """``length: {actuated: true, offset: 0.0, range: [min, max]}``; length = reading's true value +
+    offset.
+    """
 
     actuated: Literal[True]
     offset: float = 0.0
@@ -78,6 +80,10 @@ Rod = Annotated[
 
 OFFSET = ParameterKind("offset", "m", "offset", part="zero")
 CONSTANT = ParameterKind("constant", "m", "offset", label="rod length", part="rod")
+SCALE = ParameterKind("scale", "", "scale", 1.0, label="reading scale", part="lead")
+EXACT_TURNS, LEAD = 0.0, 0.0005
+"""Tolerances of a reading's scale where the file gives none: of readings in rad, since an encoder
+counts whole turns and a gear has whole teeth; of readings in m, a ground screw's or a tape's."""
 
 
 Motion = Literal["spatial", "planar", "translation", "schoenflies", "planar-translation"]
@@ -144,16 +150,22 @@ class Tube(Schema):
 
 
 class Leg(Schema):
-    """One limb: its carriers, its rod, and what a camera sees of it."""
+    """One limb: its carriers, its rod, its reading's scale, and what a camera sees of it."""
 
     base: BaseNode
     platform: PlatformNode
     length: Rod
+    scale: Annotated[
+        float,
+        Field(gt=0.5, lt=2, description="the reading's true value over the reading, such as 1.0"),
+    ] = 1.0
     tubes: tuple[Tube, ...] = ()
 
 
 class Tolerance(Schema):
-    """Standard deviations of the drawing's values, metres; of axes and angles, radians."""
+    """Standard deviations of the drawing's values, metres; of axes and angles, radians; of scales,
+    parts of one, where 0 is exact.
+    """
 
     center: Annotated[float, Field(gt=0)] = 0.002
     offset: Annotated[float, Field(gt=0)] = 0.002
@@ -161,6 +173,7 @@ class Tolerance(Schema):
     axis: Annotated[float, Field(gt=0, lt=1)] = 0.005
     arm: Annotated[float, Field(gt=0)] = 0.001
     angle: Annotated[float, Field(gt=0, lt=1)] = 0.02
+    scale: Annotated[float, Field(ge=0, lt=0.1)] | None = None
 
 
 class Home(Schema):

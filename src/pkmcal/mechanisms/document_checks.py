@@ -60,6 +60,7 @@ def check_drawing(document: MechanismDocument, where: Where | None = None) -> No
                 expected="length: {actuated: false, constant: the rod's length in metres}",
             )
     _check_motors(document, place)
+    _check_scales(document, place)
     for side, legs, fields in sharing(document):
         for field in fields:
             _check_equal(document, side, legs, field, place)
@@ -117,6 +118,27 @@ def _check_motors(document: MechanismDocument, place: Where) -> None:
             where=place("legs"),
             expected="motors numbered from 1 in the order of the readings' columns",
         )
+
+
+def _check_scales(document: MechanismDocument, place: Where) -> None:
+    """A scale belongs to a reading, and a reading has one, however many legs it moves."""
+    columns = motor_columns(document)
+    for j, leg in enumerate(document.legs):
+        first = document.legs[int(np.argmax(columns == columns[j]))]
+        if columns[j] < 0 and leg.scale != 1:
+            raise InputError(
+                f"leg {j + 1} has no reading, but a scale of one",
+                where=place("legs", j, "scale"),
+                found=str(leg.scale),
+                expected="scale on legs whose length, crank or slider a motor moves",
+            )
+        if columns[j] >= 0 and abs(leg.scale - first.scale) > SAME:
+            raise InputError(
+                f"leg {j + 1} has another scale than the other legs on its motor",
+                where=place("legs", j, "scale"),
+                found=str(leg.scale),
+                expected=str(first.scale),
+            )
 
 
 def _check_equal(

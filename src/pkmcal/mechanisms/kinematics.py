@@ -30,6 +30,7 @@ from pkmcal.mechanisms.closure import (
     pose_rows,
     rod_lengths,
     rows_between,
+    scales,
 )
 
 MAX_STEPS = 60
@@ -228,8 +229,9 @@ class ForwardResult:
 def inverse(layout: LimbLayout, theta: Array, poses: Array, near: Array | None = None) -> Array:
     """Readings (..., m) at poses T_base_platform (..., 4, 4).
 
-    Rods: q = length - offset, [B] eq. 4. Cranks and sliders: the carrier's closed form, [C] eq. 2,
-    nearest to mid-range, or to readings ``near`` (..., m). NaN out of reach.
+    Rods: q = (length - offset) / scale, [B] eq. 4. Cranks and sliders: the carrier's closed form,
+    [C] eq. 2, over the scale, nearest to mid-range, or to readings ``near`` (..., m). NaN out of
+    reach.
     """
     return inverse_result(layout, theta, poses, near)[0]
 
@@ -269,15 +271,16 @@ def _leg_inverse(
     platform = platform_ends(layout, theta, poses, internal)
     distance = limb_lines(at_zero, platform)[1]
     # linear in the reading of a rod on a fixed centre
-    out = np.where(layout.rod_reads, distance - at_zero.length, 0.0)
+    out, scale = np.where(layout.rod_reads, distance - at_zero.length, 0.0), scales(layout, theta)
     for group in layout.base:
         if group.carrier.driven:
             b, rods = platform.b[..., group.legs, :], at_zero.length[..., group.legs]
             near = layout.middle[group.legs]
             if readings is not None:
                 near = readings[..., layout.actuated[group.legs]]
+            near = scale[..., group.legs] * near
             out[..., group.legs] = group.carrier.reading(group.of(theta), b, rods, near)
-    return out
+    return out / scale
 
 
 def _settled(
@@ -308,7 +311,7 @@ def rows_and_drives(
     """The closure's rows, and their derivatives (..., E) by their legs' own readings."""
     base = base_ends(layout, theta, readings)
     rows = rows_between(layout, theta, base, platform_ends(layout, theta, poses, internal), poses)
-    return rows, by_readings(layout, base, rows)
+    return rows, by_readings(layout, theta, base, rows)
 
 
 def forward(

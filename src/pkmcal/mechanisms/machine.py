@@ -23,14 +23,22 @@ from pkmcal.mechanisms.closure import LimbLayout, layout_of, limb_ends
 from pkmcal.mechanisms.document import (
     CONSTANT,
     OFFSET,
+    SCALE,
     ActuatedLength,
     MechanismDocument,
     PassiveLength,
 )
 from pkmcal.mechanisms.document_checks import check_drawing
 from pkmcal.mechanisms.joints import AXIS, axes_in_use
-from pkmcal.mechanisms.motors import built_in_fixed, built_in_ties, motor_ranges, motor_units
+from pkmcal.mechanisms.motors import (
+    built_in_fixed,
+    built_in_ties,
+    motor_ranges,
+    motor_units,
+    scale_tolerances,
+)
 from pkmcal.mechanisms.parameters import ParameterTable
+from pkmcal.wording import split_name
 
 
 @dataclass(frozen=True)
@@ -89,7 +97,7 @@ class Machine:
     def joint_ranges(self) -> Array:
         """Smallest and largest reading by the file, (m, 2) m or rad; NaN where it is silent.
 
-        A rod's ``range`` bounds its length, so the drawing's offset is taken off.
+        A rod's ``range`` bounds its length, so the drawing's offset and scale are taken off.
         """
         return motor_ranges(self.document)
 
@@ -294,6 +302,9 @@ class Machine:
         out = self.document.model_dump(by_alias=True, exclude_none=True, mode="json")
         if not self.document.models:
             del out["models"]
+        for leg, exact in zip(out["legs"], ~self.layout.unsure_scales, strict=True):
+            if exact and leg["scale"] == 1:
+                del leg["scale"]  # of no reading, or of one that is what it says
         values = self.parameters.unit_axes(self.values)
         for name, value in zip(self.parameters.names, values, strict=True):
             _assign(out, name, float(value))
@@ -320,6 +331,9 @@ def machine_from_document(
     rows = list(_parameter_rows(document))
     names = [row[0] for row in rows]
     ties = (*document.tied, *built_in_ties(document))
+    # a scale that is exact is held already
+    exact = not (scale_tolerances(document) > 0).any()
+    held = [entry for entry in document.fixed if not (exact and entry.endswith("].scale"))]
     table = ParameterTable(
         names=tuple(names),
         units=tuple(row[1] for row in rows),
@@ -327,15 +341,21 @@ def machine_from_document(
         labels=tuple(row[4] for row in rows),
         parts=tuple(row[5] for row in rows),
         drawing=np.array([row[3] for row in rows]),
-        tolerance=np.array([getattr(document.tolerance, row[2]) for row in rows]),
-    ).with_roles((*document.fixed, *built_in_fixed(document)), ties)
+        tolerance=np.array(_tolerances(document, rows)),
+    ).with_roles((*held, *built_in_fixed(document)), ties)
     positions = {name: k for k, name in enumerate(names)}
     return Machine(document, table, layout_of(document, positions), table.drawing.copy())
 
 
+def with_exact_scales(document: MechanismDocument) -> MechanismDocument:
+    """The same drawing with readings that are what they say, or what their scales make of them."""
+    tolerance = document.tolerance.model_copy(update={"scale": 0.0})
+    return document.model_copy(update={"tolerance": tolerance})
+
+
 def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator of plain rows
     """Rows (name, unit, tolerance's name, drawing value, label, part), leg by leg."""
-    axes = axes_in_use(document)
+    axes, unsure = axes_in_use(document), scale_tolerances(document) > 0
     for j, leg in enumerate(document.legs):
         path = f"legs[{j + 1}]"
         for side, carriers in (("base", base_carriers()), ("platform", platform_carriers())):
@@ -345,8 +365,21 @@ def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator 
         if not isinstance(leg.length, PassiveLength):
             kind = OFFSET if isinstance(leg.length, ActuatedLength) else CONSTANT
             yield from _rows_of(f"{path}.length", leg.length, (kind,))
+        if unsure[j]:
+            yield from _rows_of(path, leg, (SCALE,))
         for t, tube in enumerate(leg.tubes, start=1):
             yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius, f"tube {t} radius", ""
+
+
+def _tolerances(document: MechanismDocument, rows: list[Any]) -> list[float]:
+    """Each row's standard deviation; of a scale the one that its reading has."""
+    scale = scale_tolerances(document)
+    return [
+        scale[(split_name(name)[0] or 0) - 1]
+        if kind == SCALE.tolerance
+        else getattr(document.tolerance, kind)
+        for name, _, kind, *_ in rows
+    ]
 
 
 def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]):  # noqa: ANN202 - as above

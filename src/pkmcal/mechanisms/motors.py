@@ -9,7 +9,13 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.mechanisms.carriers.contract import PLANAR, base_carriers, platform_carriers
-from pkmcal.mechanisms.document import ActuatedLength, Leg, MechanismDocument
+from pkmcal.mechanisms.document import (
+    EXACT_TURNS,
+    LEAD,
+    ActuatedLength,
+    Leg,
+    MechanismDocument,
+)
 
 
 def motor_columns(document: MechanismDocument) -> Integers:
@@ -33,13 +39,14 @@ def is_driven(leg: Leg) -> bool:
 def reading_range(leg: Leg) -> tuple[float, float]:
     """Smallest and largest reading by the file, m or rad; NaN where it is silent.
 
-    A rod's ``range`` bounds its length, so the drawing's offset is taken off.
+    A rod's ``range`` bounds its length, so the drawing's offset is taken off, and what is left is
+    told as the drawing's scale has it.
     """
     none = (np.nan, np.nan)
     length: Any = leg.length
     if isinstance(length, ActuatedLength):
         low, high = length.range or none
-        return low - length.offset, high - length.offset
+        return (low - length.offset) / leg.scale, (high - length.offset) / leg.scale
     return getattr(leg.base, "range", None) or none
 
 
@@ -63,6 +70,16 @@ def motor_units(document: MechanismDocument) -> tuple[str, ...]:
         if column >= 0 and carrier.driven:
             out[column] = carrier.unit
     return tuple(out)
+
+
+def scale_tolerances(document: MechanismDocument) -> Array:
+    """Standard deviation of each leg's reading's scale, (L,): the file's for all, or what the
+    reading's unit says; 0 where it is exact, and for a leg without a reading.
+    """
+    told, columns = document.tolerance.scale, motor_columns(document)
+    usual = [LEAD if unit == "m" else EXACT_TURNS for unit in motor_units(document)]
+    by_motor = np.append(usual if told is None else np.full(len(usual), told), 0.0)
+    return by_motor[columns]
 
 
 def bodies(document: MechanismDocument) -> Integers:
@@ -91,7 +108,8 @@ Group = tuple[str, ...]
 def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
     """Entries that change together.
 
-    Legs on one motor turn about one axis, legs on one body of the platform hang on one hinge. A
+    Legs on one motor turn about one axis and have one reading, whose scale is one; legs on one body
+    of the platform hang on one hinge. A
     leg of a planar machine stays in its plane, so both of its ends have one height.
     """
     shared = tuple(
@@ -100,6 +118,9 @@ def built_in_ties(document: MechanismDocument) -> tuple[Group, ...]:
         for field in fields
         if all(getattr(getattr(document.legs[j], side), field) is not None for j in legs)
     )
+    columns, free = motor_columns(document), scale_tolerances(document) > 0
+    motors = [np.flatnonzero(free & (columns == k)) for k in range(columns.max(initial=-1) + 1)]
+    shared += tuple(tuple(f"legs[{j + 1}].scale" for j in legs) for legs in motors if len(legs) > 1)
     if document.motion not in PLANAR:
         return shared
     numbers = range(1, len(document.legs) + 1)

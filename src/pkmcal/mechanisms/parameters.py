@@ -25,11 +25,12 @@ PARALLEL = 1e-9
 class ParameterTable:
     """Every parameter of a machine, in one order.
 
-    names, units, kinds : P entries; ``kinds`` is the tolerance's name: center, offset, radius,
-    axis, arm, angle. labels : what people call them, the leg apart: ``base centre z``.
+    names, units, kinds : P entries; units are m, rad, 1 of a direction's components and nothing of
+    a ratio; ``kinds`` is the tolerance's name: center, offset, radius,
+    axis, arm, angle, scale. labels : what people call them, the leg apart: ``base centre z``.
     parts : what of its leg each changes: its ``base`` or ``platform`` joint, its ``rod``, the
-    ``zero`` of its reading, or what its carrier names; empty for a tube's radius, which is no part
-    of the mechanism.
+    ``zero`` or the ``lead`` of its reading, or what its carrier names; empty for a tube's radius,
+    which is no part of the mechanism.
     drawing, tolerance : (P,) drawing values and their standard deviations.
     fixed : names that keep their drawing value.
     tied : groups of names that change by the same amount. opposed : for each group, the names that

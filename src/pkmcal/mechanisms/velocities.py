@@ -94,7 +94,7 @@ def _moving(layout: LimbLayout, theta: Array, poses: Array) -> _Moving:
     base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
     rows = rows_between(layout, theta, base, platform, poses)
-    return _Moving(base, rows, by_readings(layout, base, rows))
+    return _Moving(base, rows, by_readings(layout, theta, base, rows))
 
 
 def _of_shared(layout: LimbLayout, theta: Array, c: _Moving) -> Array:

@@ -17,7 +17,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import leg_readings
+from pkmcal.mechanisms.closure import joint_values
 from pkmcal.papers import linear
 
 ONE_DIRECTION = 1e-6
@@ -216,7 +216,7 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
         seen.reshape(full[1:]),
         u.reshape(*full, 3),
         point.reshape(*full, 3),
-        leg_readings(machine.layout, measurements.joints[configuration])[None],
+        joint_values(machine.layout, machine.values, measurements.joints[configuration])[None],
         information.reshape(*full, 3, 3),
     )
 

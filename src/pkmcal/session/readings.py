@@ -155,10 +155,14 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
 
 
 def departures(
-    joints: Array, columns: Sequence[str], units: Sequence[str]
+    joints: Array, columns: Sequence[str], units: Sequence[str], present: Array
 ) -> tuple[list[Departure], list[Departure]]:
-    """What may be otherwise with readings (K, m): of each its scale, and its play, by which it
-    differs with the way from which its motor came, in the order of the table. units : (m,).
+    """What may be otherwise with readings (K, m): of each its scale, beyond its tolerance, and its
+    play, by which it differs with the way from which its motor came, in the order of the table.
+
+    units : (m,). present : (m,) the scales of the estimate, over the drawing's. A scale that is
+    free beside its tolerance leaves that one to the drawing again, so the value that fits is all of
+    the difference, as the present scale counts it.
     """
     way = np.sign(np.diff(joints, axis=0, prepend=joints[:1])) / 2
     scales: list[Departure] = []
@@ -166,11 +170,14 @@ def departures(
     for m, (name, unit) in enumerate(zip(columns, units, strict=True)):
         one = np.eye(len(columns))[m]
 
-        def scale(value: Array, sigma: Array, name: str = name) -> tuple[str, str]:
+        def scale(
+            value: Array, sigma: Array, name: str = name, own: float = float(present[m])
+        ) -> tuple[str, str]:
+            factor = 1 + own * value[0]
             return (
                 f"The readings of {name} have another scale: true ones are"
-                f" {ratio(value[0], sigma[0])} {'larger' if value[0] > 0 else 'smaller'}",
-                f"Multiply this column of joints.csv by {1 + value[0]:.5f} if the encoder's counts"
+                f" {ratio(factor - 1, sigma[0])} {'larger' if factor > 1 else 'smaller'}",
+                f"Multiply this column of joints.csv by {factor:.5f} if the encoder's counts"
                 " or the screw's lead agree, or correct it in the controller",
             )
 

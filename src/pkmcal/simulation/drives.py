@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine, machine_from_document
-from pkmcal.mechanisms.closure import leg_readings, limb_ends, skeletons
+from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
 from pkmcal.mechanisms.document import Tube
 from pkmcal.mechanisms.motors import bodies
 
@@ -78,32 +78,32 @@ def drives_of(machine: Machine) -> Drives:
         driven[g.legs] = g.carrier.driven
     several = np.array([len(chain) > 1 for chain in chains])
     arms, guides = driven & several, driven & ~several
-    a, by_reading = _placed(machine, zero)
+    a, by_value = _placed(machine, zero)
     foot = np.array([chain[0] for chain in chains])
     arm = np.where(arms, np.sqrt(dot(a - foot, a - foot)), 0.0)
-    turned = cross(by_reading, _placed(machine, zero + np.pi / 2)[1])
+    turned = cross(by_value, _placed(machine, zero + np.pi / 2)[1])
     axis = np.where(arms[:, None], _unit(turned, a - foot), 0.0)
     ways = [np.stack([p, p]) for p in foot]
-    low, high = _guide_ranges(machine, by_reading).T
+    low, high = _guide_ranges(machine, by_value).T
     for j in np.flatnonzero(guides):
         steps = np.linspace(low[j], high[j], PIECES + 1)[:, None]
-        readings = np.where(np.arange(machine.n_legs) == j, steps, 0.0)
-        way, along = (x[:, j] for x in _placed(machine, readings))
+        values = np.where(np.arange(machine.n_legs) == j, steps, 0.0)
+        way, along = (x[:, j] for x in _placed(machine, values))
         ways[j] = way if _is_bent(way) else way[[0, -1]]
         foot[j] = way[PIECES // 2] if _is_bent(way) else ways[j].mean(axis=0)
-        axis[j] = _unit(along[PIECES // 2], by_reading[j])
+        axis[j] = _unit(along[PIECES // 2], by_value[j])
     away = _away(machine, foot, axis, guides)
     return Drives(arms, guides, foot, axis, arm, tuple(ways), away)
 
 
-def _placed(machine: Machine, leg_reading: Array) -> tuple[Array, Array]:
-    """Legs' ends on the base and their derivatives, (..., L, 3) each, at readings (..., L)."""
-    shape = (*leg_reading.shape, 3)
-    a, by_reading = np.empty(shape), np.empty(shape)
+def _placed(machine: Machine, joint_value: Array) -> tuple[Array, Array]:
+    """Legs' ends on the base and their derivatives, (..., L, 3) each, by joint values (..., L)."""
+    shape = (*joint_value.shape, 3)
+    a, by_value = np.empty(shape), np.empty(shape)
     for g in machine.layout.base:
-        own = g.of(machine.values), leg_reading[..., g.legs]
-        a[..., g.legs, :], by_reading[..., g.legs, :] = g.carrier.place(*own)
-    return a, by_reading
+        own = g.of(machine.values), joint_value[..., g.legs]
+        a[..., g.legs, :], by_value[..., g.legs, :] = g.carrier.place(*own)
+    return a, by_value
 
 
 def _is_bent(way: Array) -> bool:
@@ -121,16 +121,16 @@ def _unit(v: Array, otherwise: Array) -> Array:
     return v / np.where(np.abs(size - 1) < 1e-12, 1.0, np.maximum(size, 1e-300))
 
 
-def _guide_ranges(machine: Machine, by_reading: Array) -> Array:
-    """Least and largest reading of each leg, (L, 2); about home's where the file is silent."""
+def _guide_ranges(machine: Machine, by_value: Array) -> Array:
+    """Least and largest value of each leg's joint, (L, 2); about home's if the file is silent."""
     layout, home = machine.layout, machine.home()
     readings = machine.inverse(home[None])[0]
     ends = limb_ends(layout, machine.values, readings, home)
-    speed = np.linalg.norm(by_reading, axis=1)
+    speed = np.linalg.norm(by_value, axis=1)
     spare = NO_RANGE * np.linalg.norm(ends.b - ends.a, axis=1) / np.where(speed > 0, speed, 1.0)
-    middle = leg_readings(layout, readings)
-    ranges = machine.joint_ranges
-    told = np.stack([leg_readings(layout, ranges[:, k]) for k in (0, 1)], axis=-1)
+    theta, ranges = machine.values, machine.joint_ranges
+    middle = joint_values(layout, theta, readings)
+    told = np.stack([joint_values(layout, theta, ranges[:, k]) for k in (0, 1)], axis=-1)
     guess = np.stack([middle - spare, middle + spare], axis=-1)
     return np.where(np.isfinite(told).all(axis=1, keepdims=True), told, guess)
 

@@ -15,7 +15,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import apply, cross, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import PLANAR
-from pkmcal.mechanisms.closure import leg_readings, limb_ends, skeletons
+from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
 from pkmcal.simulation.drives import Drives, drives_of, reaches, side_bars
 from pkmcal.simulation.render import Scene, ScenePart
 from pkmcal.simulation.shapes import Ball, Box, Cylinder, Wall
@@ -148,7 +148,8 @@ def machine_parts(
     ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
     balls = _ball_radii(machine)
     bars = side_bars(machine)
-    chains = skeletons(machine.layout, machine.values, leg_readings(machine.layout, joints))
+    moved = joint_values(machine.layout, machine.values, joints)
+    chains = skeletons(machine.layout, machine.values, moved)
     parts = _base(discs, balls[:, 0], finish)
     parts += _platform(discs, bars, np.array(ends.b), balls[:, 1], T_base_platform, finish)
     for j in range(machine.n_legs):

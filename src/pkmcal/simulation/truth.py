@@ -292,7 +292,7 @@ def truth_document(truth: Truth) -> dict[str, Any]:
     names = truth.machine.parameters.names
     return {
         "pkmcal_truth": 1,
-        "convention": "length = reading + offset; x_camera = T_camera_base x_base; "
+        "convention": "length = scale * reading + offset; x_camera = T_camera_base x_base; "
         "x_base = T_base_platform x_platform; m",
         "seed": truth.seed,
         "mechanism": truth.machine.name,
@@ -332,7 +332,12 @@ def load_truth(folder: Path | str, drawing: Machine) -> Truth:
     data = json.loads(read_text(path))
     if data.get("pkmcal_truth") != 1:
         raise InputError("not the truth of a simulated session", where=str(path))
-    values = [data["parameters"][name] for name in drawing.parameters.names]
+    known = data["parameters"]
+    # a truth from before readings had scales has readings that are what they say
+    values = [
+        known[name] if name in known or not name.endswith(".scale") else 1.0
+        for name in drawing.parameters.names
+    ]
     stations, configurations = tuple(data["stations"]), tuple(data["configurations"])
     joints = np.array([c["joints"] for c in data["configurations"].values()])
     T_camera_base = np.array([s["T_camera_base"] for s in data["stations"].values()])

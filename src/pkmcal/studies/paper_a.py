@@ -21,7 +21,7 @@ from pkmcal.identify.covariance import information
 from pkmcal.identify.gauge import ThreeCentres, centre_index, generators, projector
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.mechanisms import Machine, load_mechanism, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.axis_measurements import AxisNoise, from_coordinates
 from pkmcal.papers.four_step import Form, FourSteps, solve
@@ -212,8 +212,10 @@ def mean_error(study: StudyResult[HexapodByAxes], method: str) -> Array:
 
 @cache
 def study_machine() -> Machine:
-    """The catalogue's Gough-Stewart platform with its radii held: axes do not need them."""
-    machine = load_mechanism("gough-stewart")
+    """The catalogue's Gough-Stewart platform with its radii held: axes do not need them. Its
+    readings are what they say, as in the paper.
+    """
+    machine = machine_from_document(with_exact_scales(load_mechanism("gough-stewart").document))
     table = machine.parameters
     radii = [n for n, k in zip(table.names, table.kinds, strict=True) if k == "radius"]
     return replace(machine, parameters=table.with_roles(fixed=tuple(radii)))

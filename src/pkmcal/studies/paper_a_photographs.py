@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pkmcal.check.repeats import LegScatter, study_repeats
-from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms import load_mechanism, machine_from_document, with_exact_scales
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.simulation import Settings, simulate_session
 from pkmcal.simulation.demo import MECHANISM, camera_of_size
@@ -39,7 +39,7 @@ def measured_noise(seed: int, told: Callable[[str, float], None]) -> MeasuredNoi
 
     with tempfile.TemporaryDirectory(prefix="pkmcal-") as name:
         folder = Path(name) / "session"
-        machine = load_mechanism(MECHANISM)
+        machine = machine_from_document(with_exact_scales(load_mechanism(MECHANISM).document))
         simulate_session(
             folder, machine, camera_of_size(SIZE), SETTINGS, seed=seed, progress=rendered
         )

@@ -6,7 +6,8 @@
  * pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.
  * twist: omega_x, omega_y, omega_z (rad/s), tau_x, tau_y, tau_z (m/s): R changes by omega x R, t
  * by tau, both along the base frame's axes.
- * length of a rod = reading + offset. Readings in the order of the machine's columns.
+ * length of a rod = scale * reading + offset; a slide's way and a crank's turn are scale * reading.
+ * Readings in the order of the machine's columns.
  * C99, math.h alone; no memory is allotted, nothing but the arguments is written, so that all
  * functions can run at once in several threads. Do not compile with -ffast-math.
  *
@@ -19,6 +20,7 @@
  * legs[1].platform.center.y = 0.158 m
  * legs[1].platform.center.z = 0 m
  * legs[1].length.offset = 0 m
+ * legs[1].scale = 1
  * legs[1].tubes[1].radius = 0.014 m
  * legs[1].tubes[2].radius = 0.009 m
  * legs[2].base.center.x = 0.2693 m
@@ -28,6 +30,7 @@
  * legs[2].platform.center.y = -0.158 m
  * legs[2].platform.center.z = 0 m
  * legs[2].length.offset = 0 m
+ * legs[2].scale = 1
  * legs[2].tubes[1].radius = 0.014 m
  * legs[2].tubes[2].radius = 0.009 m
  * legs[3].base.center.x = -0.152 m
@@ -37,6 +40,7 @@
  * legs[3].platform.center.y = 0.02 m
  * legs[3].platform.center.z = 0 m
  * legs[3].length.offset = 0 m
+ * legs[3].scale = 1
  * legs[3].tubes[1].radius = 0.014 m
  * legs[3].tubes[2].radius = 0.009 m
  * legs[4].base.center.x = -0.1173 m
@@ -46,6 +50,7 @@
  * legs[4].platform.center.y = 0.178 m
  * legs[4].platform.center.z = 0 m
  * legs[4].length.offset = 0 m
+ * legs[4].scale = 1
  * legs[4].tubes[1].radius = 0.014 m
  * legs[4].tubes[2].radius = 0.009 m
  * legs[5].base.center.x = -0.1173 m
@@ -55,6 +60,7 @@
  * legs[5].platform.center.y = -0.178 m
  * legs[5].platform.center.z = 0 m
  * legs[5].length.offset = 0 m
+ * legs[5].scale = 1
  * legs[5].tubes[1].radius = 0.014 m
  * legs[5].tubes[2].radius = 0.009 m
  * legs[6].base.center.x = -0.152 m
@@ -64,6 +70,7 @@
  * legs[6].platform.center.y = -0.02 m
  * legs[6].platform.center.z = 0 m
  * legs[6].length.offset = 0 m
+ * legs[6].scale = 1
  * legs[6].tubes[1].radius = 0.014 m
  * legs[6].tubes[2].radius = 0.009 m
  */
@@ -75,8 +82,8 @@
  * where the rod has none. */
 enum { CONSTANT, TELESCOPE, SLIDE, TURN };
 
-/* A rod between a on the base and b on the platform, with q its reading and phi the turn of the bar
- * that it ends on, if it ends on one:
+/* A rod between a on the base and b on the platform, with q = scale * reading what its motor has
+ * moved, and phi the turn of the bar that it ends on, if it ends on one:
  *   a = base, base + q rate (SLIDE), or base + cos(q) arm + sin(q) rate (TURN), base frame;
  *   b = t + R (platform + cos(phi) swing + sin(phi) swing_rate) + floating;
  *   |b - a| = length, or length + q (TELESCOPE).
@@ -84,7 +91,8 @@ enum { CONSTANT, TELESCOPE, SLIDE, TURN };
 typedef struct {
     int drive;
     int joint;            /* column of the reading */
-    double middle;        /* m or rad, mid-range reading of a SLIDE or TURN */
+    double scale;         /* of the reading */
+    double middle;        /* m or rad, q at mid-range, of a SLIDE or TURN */
     double length;        /* m */
     double base[3];       /* m, joint centre, its place at reading 0, or the foot of its arm */
     double arm[3];        /* m, from the foot to the end at reading 0, square to the axis */
@@ -124,6 +132,7 @@ static const rod_data RODS[PKMCAL_RODS] = {
     {
         .drive = TELESCOPE,
         .joint = 0,
+        .scale = 1.0,
         .length = 0.0,
         .base = {0.26929999999999998, 0.02, 0.0},
         .platform = {0.1143, 0.158, 0.0},
@@ -132,6 +141,7 @@ static const rod_data RODS[PKMCAL_RODS] = {
     {
         .drive = TELESCOPE,
         .joint = 1,
+        .scale = 1.0,
         .length = 0.0,
         .base = {0.26929999999999998, -0.02, 0.0},
         .platform = {0.1143, -0.158, 0.0},
@@ -140,6 +150,7 @@ static const rod_data RODS[PKMCAL_RODS] = {
     {
         .drive = TELESCOPE,
         .joint = 2,
+        .scale = 1.0,
         .length = 0.0,
         .base = {-0.152, 0.22320000000000001, 0.0},
         .platform = {-0.19400000000000001, 0.02, 0.0},
@@ -148,6 +159,7 @@ static const rod_data RODS[PKMCAL_RODS] = {
     {
         .drive = TELESCOPE,
         .joint = 3,
+        .scale = 1.0,
         .length = 0.0,
         .base = {-0.1173, 0.2432, 0.0},
         .platform = {0.079600000000000004, 0.17799999999999999, 0.0},
@@ -156,6 +168,7 @@ static const rod_data RODS[PKMCAL_RODS] = {
     {
         .drive = TELESCOPE,
         .joint = 4,
+        .scale = 1.0,
         .length = 0.0,
         .base = {-0.1173, -0.2432, 0.0},
         .platform = {0.079600000000000004, -0.17799999999999999, 0.0},
@@ -164,6 +177,7 @@ static const rod_data RODS[PKMCAL_RODS] = {
     {
         .drive = TELESCOPE,
         .joint = 5,
+        .scale = 1.0,
         .length = 0.0,
         .base = {-0.152, -0.22320000000000001, 0.0},
         .platform = {-0.19400000000000001, -0.02, 0.0},
@@ -297,16 +311,22 @@ static double solve(int n, double m[][MOST_UNKNOWNS], double v[])
 
 /* ---- a rod's ends and length ---- */
 
+/* What the rod's motor has moved, m or rad. */
+static double joint_value(const rod_data *rod, const double joints[PKMCAL_JOINTS])
+{
+    return rod->scale * joints[rod->joint];
+}
+
 /* The rod's end on the base, m, base frame. */
 static void base_end(const rod_data *rod, const double joints[PKMCAL_JOINTS], double a[3])
 {
     double by_arm = 0.0, by_rate = 0.0;
     int i;
     if (rod->drive == SLIDE) {
-        by_rate = joints[rod->joint];
+        by_rate = joint_value(rod, joints);
     } else if (rod->drive == TURN) {
-        by_arm = cos(joints[rod->joint]);
-        by_rate = sin(joints[rod->joint]);
+        by_arm = cos(joint_value(rod, joints));
+        by_rate = sin(joint_value(rod, joints));
     }
     for (i = 0; i < 3; ++i) {
         a[i] = rod->base[i] + by_arm * rod->arm[i] + by_rate * rod->rate[i];
@@ -316,7 +336,7 @@ static void base_end(const rod_data *rod, const double joints[PKMCAL_JOINTS], do
 /* The rod's length, m. */
 static double rod_length(const rod_data *rod, const double joints[PKMCAL_JOINTS])
 {
-    return rod->drive == TELESCOPE ? rod->length + joints[rod->joint] : rod->length;
+    return rod->drive == TELESCOPE ? rod->length + joint_value(rod, joints) : rod->length;
 }
 
 /* The rod's end on the platform: b the point, arm what turns with the platform, m, base frame. */
@@ -357,12 +377,13 @@ static double reading_gain(const rod_data *rod, const double joints[PKMCAL_JOINT
 {
     switch (rod->drive) {
     case TELESCOPE:
-        return 1.0;
+        return rod->scale;
     case SLIDE:
-        return dot(u, rod->rate);
+        return rod->scale * dot(u, rod->rate);
     case TURN:
-        return cos(joints[rod->joint]) * dot(u, rod->rate)
-               - sin(joints[rod->joint]) * dot(u, rod->arm);
+        return rod->scale
+               * (cos(joint_value(rod, joints)) * dot(u, rod->rate)
+                  - sin(joint_value(rod, joints)) * dot(u, rod->arm));
     default:
         return 0.0;
     }
@@ -396,21 +417,21 @@ static double nearest(double angle, double near)
 /* The reading at which the rod ends in b: [B] eq. 4; [C] eq. 2 as the errata's Model 31. */
 static pkmcal_status rod_reading(const rod_data *rod, const double b[3], double *reading)
 {
-    double d[3], along, across, square, half, straight, first, second;
+    double d[3], along, across, square, half, straight, first, second, q;
     int i;
     for (i = 0; i < 3; ++i) {
         d[i] = b[i] - rod->base[i];
     }
     along = dot(d, rod->rate);
     if (rod->drive == TELESCOPE) {
-        *reading = sqrt(dot(d, d)) - rod->length;
+        q = sqrt(dot(d, d)) - rod->length;
     } else if (rod->drive == SLIDE) {
         square = rod->length * rod->length - dot(d, d) + along * along;
         if (!(square >= 0.0)) {
             return PKMCAL_OUT_OF_REACH;
         }
         half = sqrt(square);
-        *reading = along >= rod->middle ? along - half : along + half;
+        q = along >= rod->middle ? along - half : along + half;
     } else {
         across = dot(d, rod->arm);
         square = dot(d, d) + dot(rod->arm, rod->arm) - rod->length * rod->length;
@@ -422,8 +443,9 @@ static pkmcal_status rod_reading(const rod_data *rod, const double b[3], double 
         straight = atan2(along, across);
         first = nearest(straight + half, rod->middle);
         second = nearest(straight - half, rod->middle);
-        *reading = fabs(first - rod->middle) <= fabs(second - rod->middle) ? first : second;
+        q = fabs(first - rod->middle) <= fabs(second - rod->middle) ? first : second;
     }
+    *reading = q / rod->scale;
     return PKMCAL_OK;
 }
 
