@@ -172,7 +172,7 @@ def check_tubes(machine: Machine) -> None:
         return
     raise InputError(
         "no leg of the drawing has visible cylinders, so a camera sees none",
-        where="mechanism.yaml, legs",
+        where=f"the drawing of {machine.name}, legs",
         expected="tubes: [{radius: 0.014, from: 0.05, to: 0.25}] on the legs",
         next_step="Measure the legs' radii with calipers, or plan with --board or --tracker",
     )
@@ -391,7 +391,7 @@ def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:
     """T_platform_target (4, 4) of a calibration."""
     targets: list[dict[str, Any]] = [] if saved is None else saved.document.get("targets", [])
     for target in targets:
-        if target["name"] == name and "T_platform_target" in target:
+        if target["name"] == name and target.get("T_platform_target"):
             return np.array(target["T_platform_target"])
     return None
 
