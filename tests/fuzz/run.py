@@ -11,7 +11,9 @@ import signal
 import sys
 import warnings
 from collections import Counter
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
 
 from fuzz.cases import Case, make
@@ -296,6 +298,7 @@ def warm() -> None:
     # Of the time of a refusal the half would go into Typer's reading of all the commands' options.
     command = typer.main.get_command(cli.app)
     typer.main.get_command = lambda _: command
-    cli.main(["--version"])
+    with redirect_stdout(StringIO()):
+        cli.main(["--version"])
     gc.collect()
     gc.freeze()  # or a case would copy what the collector touches
