@@ -49,7 +49,8 @@ def test_a_sessions_board_photographs(boards, tmp_path):
         (folder / "images" / path.name).write_bytes(path.read_bytes())
     (folder / "board.yaml").write_text(BOARD)
     (folder / "session.yaml").write_text(
-        "pkmcal: 1\nmechanism: m.yaml\njoints: {file: j.csv, noise: 1e-5}\nboard: board.yaml\nstations:\n"
+        "pkmcal: 1\nmechanism: m.yaml\njoints: {file: j.csv, noise: 1e-5}\nboard: board.yaml\n"
+        "stations:\n"
         "  top: {camera: c.yaml, images: 'images/{configuration}.png', observe: board}\n"
     )
     done = run("camera", folder, "-o", tmp_path / "out", "--model", "pinhole", "--json")
