@@ -49,7 +49,8 @@ def test_a_sessions_board_photographs(boards, tmp_path):
         (folder / "images" / path.name).write_bytes(path.read_bytes())
     (folder / "board.yaml").write_text(BOARD)
     (folder / "session.yaml").write_text(
-        "pkmcal: 1\nmechanism: m.yaml\njoints: {file: j.csv}\nboard: board.yaml\nstations:\n"
+        "pkmcal: 1\nmechanism: m.yaml\njoints: {file: j.csv, noise: 1e-5}\nboard: board.yaml\n"
+        "stations:\n"
         "  top: {camera: c.yaml, images: 'images/{configuration}.png', observe: board}\n"
     )
     done = run("camera", folder, "-o", tmp_path / "out", "--model", "pinhole", "--json")
@@ -59,6 +60,21 @@ def test_a_sessions_board_photographs(boards, tmp_path):
     refused = run("camera", folder, "-o", tmp_path / "out2")
     assert refused.code == 2
     assert "no station of this session observes a board" in refused.err
+    for said, instead, sentence in (
+        ("board: board.yaml", "board: [1, 2]", "session.yaml, line 4, board"),
+        (
+            "board: board.yaml",
+            "board: b.yaml",
+            "session.yaml, line 4, board: there is no such file",
+        ),
+        ("observe: legs", "observe: ledge", "session.yaml, line 6, stations.top.observe"),
+    ):
+        (folder / "session.yaml").write_text(
+            text.replace(said, instead).replace("observe: legs", "observe: board")
+        )
+        refused = run("camera", folder, "-o", tmp_path / "out2")
+        assert refused.code == 2
+        assert sentence in refused.err
 
 
 def test_faults_are_sentences(boards, tmp_path):

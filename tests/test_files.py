@@ -15,6 +15,7 @@ from pkmcal.files import (
     closest,
     field_path,
     parse_yaml,
+    read_csv,
     read_json,
     read_yaml,
     shown,
@@ -328,3 +329,19 @@ def test_words_for_messages():
     assert listed([str(n) for n in range(20)]) == "0, 1, 2, 3, 4 and 15 more"
     assert shown(None) == "nothing"
     assert len(shown("x" * 500)) == 60
+
+
+@pytest.mark.parametrize("text", ["1e300", "-2e15", "9" * 300])
+def test_numbers_that_no_quantity_has(tmp_path, text):
+    (tmp_path / "a.csv").write_text(f"configuration,x\na,{text}\n")
+    with pytest.raises(InputError, match=r"^a\.csv, line 2, column x: this number is too large"):
+        read_csv(tmp_path / "a.csv")
+    (tmp_path / "a.yaml").write_text(f"values:\n  - 1\n  - {text}\n")
+    with pytest.raises(
+        InputError, match=r"^a\.yaml, line 3, values\[2\]: this number is too large"
+    ):
+        validate(read_yaml(tmp_path / "a.yaml"), Numbers)
+
+
+class Numbers(Schema):
+    values: tuple[float, ...]

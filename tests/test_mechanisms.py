@@ -387,9 +387,9 @@ def test_carriers_broadcast(side, carrier):
         (
             "motion: planar",
             "motion: planar\nfixed: ['legs[3].base.centre.z']",
-            "m.yaml: there is no parameter 'legs[3].base.centre.z'; expected a name such as "
-            "'legs[3].base.center.z'. Write the parameter as its path in the mechanism file, "
-            "legs from 1.",
+            "m.yaml, line 3, fixed[1]: there is no parameter 'legs[3].base.centre.z'; expected a "
+            "name such as 'legs[3].base.center.z'. Write the parameter as its path in the "
+            "mechanism file, legs from 1.",
         ),
         (
             "name: small\n",

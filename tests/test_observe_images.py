@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import subprocess
+import sys
 import zlib
 
 import cv2
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 
 from pkmcal.errors import InputError
+from pkmcal.observe.complaints import listening
 from pkmcal.observe.images import decode, decode_all
 
 SIZE = (64, 48)
@@ -101,6 +105,73 @@ PNG, JPEG = encoded(".png"), encoded(".jpg")
 )
 def test_files_that_cannot_be_decoded(tmp_path, data, found):
     assert sentence(tmp_path, data) == CUT.format(found=found)
+
+
+def with_chunk(kind, body, data=PNG):
+    return data[:33] + chunk(kind, body) + data[33:]
+
+
+def test_what_decoders_say_is_told_in_a_sentence_of_ours_alone(tmp_path, capfd):
+    rows = zlib.decompress(png_rows(PNG))
+    odd, cut = (
+        png_of(64, 48).replace(chunk(b"IDAT", zlib.compress(b"0" * 100)), chunk(b"IDAT", held))
+        for held in (zlib.compress(b"\x09" + rows[1:]), zlib.compress(rows[:100]))
+    )
+    at = len(JPEG) * 2 // 3
+    short = JPEG[:at] + b"\xff\xd9"
+    for data, found in (
+        (odd, "a PNG file that is damaged (bad adaptive filter value)"),
+        (cut, "a PNG file that is damaged (Not enough image data)"),
+        (short, "a JPEG file that is damaged (premature end of data segment)"),
+    ):
+        assert sentence(tmp_path, data) == CUT.format(found=found)
+    assert capfd.readouterr() == ("", "")
+
+
+def png_rows(data):
+    at = data.index(b"IDAT")
+    return data[at + 4 : at + 4 + int.from_bytes(data[at - 4 : at])]
+
+
+def test_what_is_wrong_beside_the_picture_is_nobodys_business(tmp_path, capfd):
+    for data in (
+        with_chunk(b"iCCP", b"name\0\0garbage"),
+        with_chunk(b"zTXt", b"k\0\0garbage"),
+        with_chunk(b"gAMA", b"\0"),
+    ):
+        np.testing.assert_array_equal(decoded(tmp_path, data), GREY)
+    padded = JPEG[:-2] + b"\0\0\0" + JPEG[-2:]  # as webcams write it
+    np.testing.assert_array_equal(decoded(tmp_path, padded), decoded(tmp_path, JPEG))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_others_write_meanwhile_is_passed_on(capfd):
+    def decode_and_speak():
+        os.write(2, b"half a bar\nlibpng warning: x\nlibpng error: y\nand a half")
+        return 3
+
+    assert listening(decode_and_speak) == (3, "y")
+    assert capfd.readouterr().err == "half a bar\nand a half"
+
+
+def test_nobody_is_blamed_for_what_another_thread_decodes(tmp_path, capfd):
+    paths = [tmp_path / f"{k}.jpg" for k in range(12)]
+    for k, path in enumerate(paths):
+        path.write_bytes(JPEG if k != 7 else JPEG[: len(JPEG) * 2 // 3] + b"\xff\xd9")
+    with pytest.raises(InputError, match=r"^7\.jpg: the photograph cannot be decoded"):
+        decode_all(paths, SIZE, [path.name for path in paths], workers=6)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_closed_standard_error_is_no_hindrance(tmp_path):
+    (tmp_path / "a.png").write_bytes(PNG)
+    code = (
+        "import sys; from pathlib import Path; from pkmcal.observe.images import decode;"
+        " print(decode(Path(sys.argv[1]), (64, 48), 'a').shape)"
+    )
+    command = f'"{sys.executable}" -c "{code}" "{tmp_path / "a.png"}" 2>&-'
+    done = subprocess.run(command, shell=True, capture_output=True, text=True)
+    assert done.stdout == "(48, 64)\n"
 
 
 def test_a_whole_jpeg_with_a_preview_is_read(tmp_path):

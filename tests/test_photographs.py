@@ -18,11 +18,53 @@ def image(path, width, height):
     assert cv2.imwrite(str(path), np.full((height, width), 128, np.uint8))
 
 
-@pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "tiff"])
-def test_sizes_are_those_of_the_decoded_image(tmp_path, suffix):
+@pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "tiff", "pgm"])
+def test_sizes_are_those_of_the_decoded_image(tmp_path, suffix, monkeypatch):
     path = tmp_path / f"a.{suffix}"
     image(path, 37, 21)
+    monkeypatch.setattr(cv2, "imread", lambda *_: pytest.fail("decoded"))
     assert photograph_header(path) == (37, 21)
+    assert decode(path, (37, 21), path.name).shape == (21, 37)
+
+
+def test_sizes_of_headers_that_opencv_does_not_write(tmp_path):
+    def size(data):
+        (tmp_path / "a").write_bytes(data + b"\0" * 2000)
+        return photograph_header(tmp_path / "a")
+
+    assert size(b"P5 # a remark\n# and one more\n 37\n#x\n21 255\n") == (37, 21)
+    assert size(b"BM" + b"\0" * 12 + struct.pack("<IHHHH", 12, 37, 21, 1, 8)) == (37, 21)
+    downwards = struct.pack("<IiiHHI", 40, 37, -21, 1, 24, 0)
+    assert size(b"BM" + b"\0" * 12 + downwards) == (37, 21)
+    for start, order in ((b"II*\0", "<"), (b"MM\0*", ">")):
+        entries = struct.pack(order + "HHIHH", 256, 3, 1, 37, 0)
+        entries += struct.pack(order + "HHII", 257, 4, 1, 21)
+        ifd = struct.pack(order + "IH", 8, 2) + entries
+        assert size(start + ifd) == (37, 21)
+
+
+@pytest.mark.parametrize("suffix", ["bmp", "tiff", "pgm"])
+def test_no_more_memory_is_taken_than_a_file_can_fill(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    image(path, 37, 21)
+    data = path.read_bytes()
+    if suffix == "bmp":
+        spoilt = data[:18] + 2 * struct.pack("<I", 30_000) + data[26:]
+    elif suffix == "pgm":
+        spoilt = data.replace(b"37 21", b"99999 99999")
+    else:
+        width = struct.pack("<HHII", 256, 4, 1, 2**31)
+        spoilt = data.replace(struct.pack("<HHIHH", 256, 3, 1, 37, 0), width)
+    assert spoilt != data
+    path.write_bytes(spoilt)
+    with pytest.raises(InputError, match="not an image that can be read"):
+        photograph_header(path)
+
+
+def test_other_formats_are_not_read(tmp_path):
+    image(tmp_path / "a.webp", 37, 21)
+    with pytest.raises(InputError, match="not an image that can be read"):
+        photograph_header(tmp_path / "a.webp")
 
 
 def test_a_jpeg_turned_by_its_camera_keeps_the_sensors_size(tmp_path):

@@ -98,6 +98,7 @@ cells = st.text(st.characters(exclude_categories=["Cs", "Cc", "Zs", "Zl", "Zp"])
 def test_csv_written_reads_back_the_same(tmp_path_factory, columns, names, random):
     values = np.array([[random.gauss(0, 10.0 ** random.randint(-9, 9)) for _ in columns]
                        for _ in names])  # fmt: skip
+    values = np.clip(values, -1e15, 1e15)  # what a quantity can be
     path = tmp_path_factory.mktemp("csv") / "t.csv"
     write_text(path, csv_text(columns, names, values))
     table = read_csv(path)

@@ -13,6 +13,8 @@ from typing import Any, ClassVar, Self
 LONGEST_NAME = 255
 """Characters of a name; file systems take no longer ones."""
 _LONG_NAME = re.compile(rf"[^\s/\\]{{{LONGEST_NAME + 1},}}")
+_UNWRITTEN = re.compile("[\0-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""What would move a terminal's cursor, turn the direction of writing, or cannot be written."""
 LONGEST_FOUND = 500
 """Characters of what was found: enough to recognise it by."""
 
@@ -102,7 +104,10 @@ class GeometryError(PkmcalError):
 
 
 def _brief(text: str, most: int | None = None) -> str:
-    """Text without what is too long to be a name, of which both ends are enough to recognise it."""
+    """Text without what is too long to be a name, of which both ends are enough to recognise it;
+    signs that are none to read are spelt out.
+    """
+    text = _UNWRITTEN.sub(lambda sign: repr(sign[0])[1:-1], text)
     text = _LONG_NAME.sub(lambda name: f"{name[0][:40]}…{name[0][-20:]}", text)
     return text if most is None or len(text) <= most else f"{text[: most - 1]}…"
 

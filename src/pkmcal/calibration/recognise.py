@@ -42,7 +42,7 @@ def check_observable(session: Session) -> None:
     if seen and not any(leg.tubes for leg in session.machine.document.legs):
         raise InputError(
             "no leg of the drawing has visible cylinders",
-            where="mechanism.yaml, legs",
+            where=f"{session.document['mechanism']}, legs",
             expected="tubes: [{radius: 0.014, from: 0.05, to: 0.25}] on the legs",
             next_step="Measure the legs' radii with calipers",
         )

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
@@ -37,7 +37,7 @@ from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import (
     Machine,
     MechanismDocument,
-    machine_from_document,
+    checked_machine,
     mechanism_text,
     with_exact_scales,
 )
@@ -77,6 +77,7 @@ OPEN = 1.0
 Row3 = tuple[float, float, float]
 Row4 = tuple[float, float, float, float]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
+Factor = Annotated[float, Field(gt=0)]
 
 
 def check_output(folder: Path | str) -> list[str]:
@@ -563,9 +564,40 @@ class _StationCovariance(_Part):
 
 class _Configuration(_Part):
     name: str
+    photographs: tuple[str, ...] = ()
     used: bool
     joints: tuple[float, ...]
     T_base_platform: Matrix4
+
+
+class _Camera(_Part):
+    file: str
+    edge_shift: float
+
+
+class _Target(_Part):
+    name: str
+    T_platform_target: Matrix4 | None = None
+
+
+class _Residuals(_Part):
+    edges: list[Any] | None = None
+
+
+class _Statistics(_Part):
+    noise_scale: Factor = 1.0
+    pose_scale: Factor = 1.0
+    reading_scale: Factor = 1.0
+
+
+class _Readings(_Part):
+    noise: Factor | None = None
+    columns: tuple[str, ...] = ()
+
+
+class _Session(_Part):
+    folder: str = ""
+    joints: _Readings | None = None
 
 
 class _Saved(_Part):
@@ -580,16 +612,26 @@ class _Saved(_Part):
     station_covariance: _StationCovariance | None = None
     configurations: tuple[_Configuration, ...]
     mechanism: MechanismDocument
+    # read where they are wanted, and absent from some older files
+    cameras: tuple[_Camera, ...] = ()
+    targets: tuple[_Target, ...] = ()
+    residuals: _Residuals | None = None
+    statistics: _Statistics | None = None
+    session: _Session | None = None
 
 
 def load(source: Path | str) -> SavedCalibration:
     """Read a calibration from its folder or its calibration.json, and check that it is whole."""
     document = _read(Path(source))
     saved = validate(document, _Saved)
-    machine = machine_from_document(_mechanism(saved))
+    machine = checked_machine(_mechanism(saved), document, "mechanism")
     _check_parameters(document, saved, machine)
-    for group in ("stations", "configurations"):
-        _check_poses(document, group, getattr(saved, group))
+    for group, key in (
+        ("stations", "T_base_camera"),
+        ("configurations", "T_base_platform"),
+        ("targets", "T_platform_target"),
+    ):
+        _check_poses(document, group, key, getattr(saved, group))
     placed, joint = _covariance(document, saved)
     return SavedCalibration(
         path=document.path,
@@ -715,10 +757,11 @@ def _check_covariance(document: Document, key: str, matrix: Array) -> None:
         )
 
 
-def _check_poses(document: Document, group: str, items: tuple[Any, ...]) -> None:
-    key = "T_base_camera" if group == "stations" else "T_base_platform"
+def _check_poses(document: Document, group: str, key: str, items: tuple[Any, ...]) -> None:
     for k, item in enumerate(items):
-        matrix = np.array(getattr(item, key))
+        if (rows := getattr(item, key)) is None:
+            continue
+        matrix = np.array(rows)
         rot = matrix[:3, :3]
         rigid = np.allclose(rot @ rot.T, np.eye(3), atol=1e-6) and np.linalg.det(rot) > 0
         if not rigid or not np.array_equal(matrix[3], [0, 0, 0, 1]):

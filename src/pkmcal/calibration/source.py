@@ -138,7 +138,7 @@ def _session_folder(saved: SavedCalibration, session: Path | None) -> Path | Non
             )
         return session
     above = saved.path.resolve().parent.parent
-    name = str(saved.document.get("session", {}).get("folder", ""))
+    name = str((saved.document.get("session") or {}).get("folder", ""))
     for folder in (above, above / name):
         if folder.name == name and (folder / SESSION_FILE).is_file():
             return folder

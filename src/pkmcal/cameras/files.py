@@ -23,6 +23,7 @@ from pkmcal.files import (
     write_text,
     yaml_text,
 )
+from pkmcal.wording import count as count_of
 from pkmcal.wording import listed
 
 
@@ -171,7 +172,7 @@ def _from_opencv(text: str, label: str) -> Camera:
         flag = storage.getNode("fisheye_model")
         fisheye = (not flag.empty() and flag.real() != 0) or "fisheye" in _word(storage)
         storage.release()
-    except cv2.error:
+    except (cv2.error, SystemError):  # the latter where its constructor meets what is no YAML
         raise InputError(
             "not valid as OpenCV writes it",
             where=label,
@@ -181,6 +182,15 @@ def _from_opencv(text: str, label: str) -> Camera:
         if found[key] is None:
             raise InputError(
                 f"the camera's {key} is missing", where=label, expected=_OPENCV_NAMES[key][0]
+            )
+    for key, count in (("matrix", 9), ("width", 1), ("height", 1), ("xi", 1)):
+        values = found[key]
+        if values is not None and (len(values) != count or not np.all(np.isfinite(values))):
+            raise InputError(
+                f"the camera's {key} is not what it should be",
+                where=f"{label}, {_OPENCV_NAMES[key][0]}",
+                found=shown(values.tolist()),
+                expected=count_of(count, "finite number"),
             )
     size = (round(float(found["width"][0])), round(float(found["height"][0])))
     k = found["distortion"] if found["distortion"] is not None else np.zeros(0)
@@ -227,8 +237,9 @@ def _opencv_text(camera: Camera, xml: bool) -> str:
 
 def _from_ros(document: Document) -> Camera:
     word = document.data.get("distortion_model", "plumb_bob")
-    if word not in _ROS:
-        raise _not_ours(document.where("distortion_model"), word, _ROS)
+    if not isinstance(word, str) or word not in _ROS:
+        found = word if isinstance(word, str) else shown(word)
+        raise _not_ours(document.where("distortion_model"), found, _ROS)
     size = _size(document, ("image_width",), ("image_height",))
     matrix = _numbers(document, ("camera_matrix", "data"), (9,))
     k = np.zeros(0)
@@ -326,10 +337,10 @@ def _made(
     m = np.asarray(matrix, dtype=float).reshape(3, 3)
     faults = (
         (m[0, 1] != 0, "skew, which no model here has", f"{m[0, 1]:g}"),
+        (not np.all(np.isfinite([*m.ravel(), *k])), "numbers that are not finite", "nan or inf"),
         (np.any(k[most:] != 0), f"distortion beyond the model's {most} terms", f"{len(k)} terms"),
         (min(m[0, 0], m[1, 1]) <= 0, "a focal length that is not positive", f"{m[0, 0]:g}"),
         (xi is not None and xi < 0, "a negative xi; it should be 0 or more", f"{xi}"),
-        (not np.all(np.isfinite([*m.ravel(), *k])), "numbers that are not finite", "nan or inf"),
         (
             min(m[0, 0], m[1, 1]) < LEAST_FOCAL * size[0],
             "a focal length that looks like millimetres; it is wanted in pixels",
@@ -341,14 +352,14 @@ def _made(
             raise InputError(f"the camera has {what}", where=where, found=found)
     fields: dict[str, Any] = {
         "model": model,
-        "image_size": size,
-        "focal": (float(m[0, 0]), float(m[1, 1])),
-        "center": (float(m[0, 2]), float(m[1, 2])),
-        "distortion": tuple(k[:most].tolist()),
+        "image_size": list(size),
+        "focal": [float(m[0, 0]), float(m[1, 1])],
+        "center": [float(m[0, 2]), float(m[1, 2])],
+        "distortion": k[:most].tolist(),
     }
     if xi is not None:
         fields["xi"] = xi
-    return kind.from_document(kind.schema(**fields))
+    return camera_from_document(Document(Path(where), where, fields, {}))
 
 
 def _named(camera: Camera) -> dict[str, float]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -90,27 +91,29 @@ def camera(
 def of_session(folder: Path) -> tuple[list[Path], Path]:
     """A session's photographs of its board, all of one camera, and the board's file."""
     from pkmcal.errors import InputError
-    from pkmcal.files import read_yaml
+    from pkmcal.files import read_yaml, validate, wanted_file
+    from pkmcal.session.schema import SessionDocument
     from pkmcal.wording import listed
 
     session = read_yaml(folder / "session.yaml")
-    stations: dict[str, Any] = session.data.get("stations") or {}
-    board = session.data.get("board")
-    board = board.get("file") if isinstance(board, dict) else board
-    seen = {
-        name: s
-        for name, s in stations.items()
-        for observed in [s.get("observe")]  # a word or a list of them
-        if observed == "board" or (isinstance(observed, list) and "board" in observed)
-    }
-    if not seen or not board:
+    schema = validate(session, SessionDocument)
+    seen = [schema.cameras[name] for name in schema.observers("board")]
+    if not seen or schema.board is None:
         raise InputError(
             "no station of this session observes a board",
             where=session.where("stations"),
             expected="observe: board on a station, and board: board.yaml",
             next_step="Name the board's photographs instead: pkmcal camera IMAGES... --board FILE",
         )
-    cameras = sorted({str(s.get("camera")) for s in seen.values()})
+    board = folder / schema.board.file
+    if not board.exists():
+        raise InputError(
+            "there is no such file",
+            where=session.where("board"),
+            found=schema.board.file,
+            expected=wanted_file(board),
+        )
+    cameras = sorted({station.camera for station in seen})
     if len(cameras) > 1:
         raise InputError(
             "the session's boards are seen by several cameras",
@@ -119,12 +122,12 @@ def of_session(folder: Path) -> tuple[list[Path], Path]:
             expected="one camera at a time",
             next_step="Name one camera's photographs: pkmcal camera IMAGES... --board FILE",
         )
-    patterns = [str(s["images"]) for s in seen.values()]
+    patterns = [glob.escape(station.images) for station in seen]
     wild = [p.replace("{configuration}", "*").replace("{repeat}", "*") for p in patterns]
-    paths = sorted({path for pattern in wild for path in folder.glob(pattern)})
+    paths = sorted({folder / name for text in wild for name in glob.glob(text, root_dir=folder)})
     if not paths:
         raise InputError("no photographs found", where=session.where("stations"), found=wild[0])
-    return paths, folder / str(board)
+    return paths, board
 
 
 def photographs(images: list[Path]) -> list[Path]:

@@ -246,17 +246,21 @@ def _of_machine(
     machine = load_mechanism(name, label=None)
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
     number = 1 if board or places or view_angle(eye) > PANORAMIC else 3
-    return of_machine(
-        machine,
-        [eye] * number,
-        machine.joint_names,
-        board=board_for(machine, "platform") if board else None,
-        tracker=None if tracker is None else _tracker(tracker),
-        joint_noise=joint_noise,
-        edge=edge_noise,
-        corner=corner_noise,
-        seed=seed,
-    )
+    noise = None if tracker is None else _tracker(tracker)
+    try:
+        return of_machine(
+            machine,
+            [eye] * number,
+            machine.joint_names,
+            board=board_for(machine, "platform") if board else None,
+            tracker=noise,
+            joint_noise=joint_noise,
+            edge=edge_noise,
+            corner=corner_noise,
+            seed=seed,
+        )
+    except InputError as error:
+        raise error.located(name) from None
 
 
 def _tracker(text: str) -> tuple[float, float | None]:

@@ -167,7 +167,7 @@ class VisualServo:
                 next_step="give the session's folder as session",
             )
         file = next(s.camera for s in saved.stations if s.name == station)
-        shifts = {c["file"]: float(c["edge_shift"]) for c in saved.document["cameras"]}
+        shifts = {c["file"]: float(c["edge_shift"]) for c in saved.document.get("cameras", [])}
         options.setdefault("edge_shift", shifts.get(file, 0.0))
         T_camera_base = inverse(source.T_base_camera[station])
         return cls(source.machine, source.cameras[station], T_camera_base, goal, **options)

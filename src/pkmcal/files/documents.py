@@ -101,6 +101,9 @@ MOST_CHARACTERS = 10_000_000
 DEEPEST = 50
 """Levels of lists and mappings in one another. A machine has six; programs that read JSON give up
 at two hundred or so."""
+LARGEST = 1e15
+"""Of a number that a person writes, whatever its unit; what is computed with larger ones, to the
+fourth power and further, would overflow."""
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")
 """Zero, which no file's name may hold, and halves of characters, which cannot be written."""
 

@@ -1,9 +1,12 @@
-"""Sizes of photographs, read from the headers of PNG (RFC 2083) and JPEG (ITU T.81) files."""
+"""Sizes of photographs, read from the headers of PNG (RFC 2083), JPEG (ITU T.81), TIFF (revision
+6.0), BMP and PGM files.
+"""
 
 from __future__ import annotations
 
+import re
 import zlib
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START = b"\xff\xd8"
@@ -13,43 +16,58 @@ _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_BARE = frozenset({0x01, *range(0xD0, 0xDA)})
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """By PNG's kinds of colour."""
+_TIFF_STARTS: dict[bytes, Literal["little", "big"]] = {b"II*\0": "little", b"MM\0*": "big"}
+_TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_SHORT = 256, 257, 3
+_PNM = re.compile(rb"P[2356]\s+(?:#.*\s+)*(\d{1,9})\s+(?:#.*\s+)*(\d{1,9})\s")
+_LONGEST_PNM = 1000
+"""Bytes in which a PGM file's size stands, remarks before it included."""
 DEFLATED = 1032
-"""Bytes that one byte of PNG's compression can stand for at most (RFC 1951: 258 in two bits)."""
+"""Bytes that one byte of PNG's compression can stand for at most (RFC 1951: 258 in two bits); those
+of TIFF reach less."""
 JPEG_BLOCK = 64
 """Pixels of a block, for which a JPEG file has one bit at least."""
+BMP_RUN = 255
+"""Pixels of one run in a BMP file, which has two bytes."""
+
+_Stated = tuple[int, int, float]
+"""Width, height, and pixels that one byte of such a file can stand for at most."""
 
 
-def stated_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """(width, height) in pixels as a PNG or JPEG file's header has it, None for another format.
+def stated_size(stream: BinaryIO) -> tuple[int, int]:
+    """(width, height) in pixels as a photograph's header has it.
 
-    (0, 0) where the header is spoilt, or states more than a file of this length can hold: memory is
-    taken by what the header says.
+    (0, 0) where the file is of no format that is known here, its header is spoilt, or it states
+    more than a file of this length can hold: memory is taken by what the header says.
     """
-    start = stream.read(33)
-    if not start:
-        return 0, 0
+    start = stream.read(_LONGEST_PNM)
     length = stream.seek(0, 2)
     if start.startswith(_PNG_START):
-        header, check = start[12:29], start[29:33]
-        if not header.startswith(b"IHDR") or zlib.crc32(header) != int.from_bytes(check):
-            return 0, 0
-        size = _pair(header[4:8], header[8:12])
-        bits = header[12] * _PNG_CHANNELS.get(header[13], 1)
-        held = size[0] * size[1] * bits <= 8 * DEFLATED * length
+        width, height, most = _png(start)
     elif start.startswith(_JPEG_START):
-        stream.seek(2)
-        size = _jpeg_size(stream)
-        held = size[0] * size[1] <= 8 * JPEG_BLOCK * length
+        width, height, most = _jpeg(stream)
+    elif start.startswith(b"BM"):
+        width, height, most = _bmp(start)
+    elif start[:4] in _TIFF_STARTS:
+        width, height, most = _tiff(stream, _TIFF_STARTS[start[:4]])
+    elif found := _PNM.match(start):
+        width, height, most = int(found[1]), int(found[2]), 1.0
     else:
-        return None
-    return size if held else (0, 0)
+        return 0, 0
+    return (width, height) if 0 < width * height <= most * length else (0, 0)
 
 
-def _jpeg_size(stream: BinaryIO) -> tuple[int, int]:
-    """Walk the segments to the start of frame; (0, 0) where there is none."""
-    while byte := stream.read(1):
-        if byte != b"\xff":
-            return 0, 0
+def _png(start: bytes) -> _Stated:
+    header, check = start[12:29], start[29:33]
+    if not header.startswith(b"IHDR") or zlib.crc32(header) != int.from_bytes(check):
+        return 0, 0, 0.0
+    bits = header[12] * _PNG_CHANNELS.get(header[13], 1)
+    return *_pair(header[4:8], header[8:12]), 8 * DEFLATED / max(bits, 1)
+
+
+def _jpeg(stream: BinaryIO) -> _Stated:
+    """Walk the segments to the start of frame."""
+    stream.seek(2)
+    while stream.read(1) == b"\xff":
         while (marker := stream.read(1)) == b"\xff":
             pass  # fill bytes
         if not marker or marker[0] in _JPEG_BARE:
@@ -57,9 +75,37 @@ def _jpeg_size(stream: BinaryIO) -> tuple[int, int]:
         length = int.from_bytes(stream.read(2))
         if marker[0] in _JPEG_FRAMES:
             frame = stream.read(5)
-            return _pair(frame[3:5], frame[1:3])
+            return *_pair(frame[3:5], frame[1:3]), 8.0 * JPEG_BLOCK
         stream.seek(max(length - 2, 0), 1)
-    return 0, 0
+    return 0, 0, 0.0
+
+
+def _bmp(start: bytes) -> _Stated:
+    def number(at: int, size: int) -> int:
+        # rows that run downwards are told by a negative height
+        return abs(int.from_bytes(start[at : at + size], "little", signed=size == 4))
+
+    if number(14, 4) == 12:  # the header of OS/2
+        return number(18, 2), number(20, 2), 8.0
+    return number(18, 4), number(22, 4), BMP_RUN / 2 if number(30, 4) else 8.0
+
+
+def _tiff(stream: BinaryIO, order: Literal["little", "big"]) -> _Stated:
+    """Of the first picture, from its directory."""
+
+    def number(data: bytes) -> int:
+        return int.from_bytes(data, order)
+
+    stream.seek(4)
+    stream.seek(number(stream.read(4)))
+    found: dict[int, int] = {}
+    for _ in range(number(stream.read(2))):
+        entry = stream.read(12)
+        if len(entry) < 12:
+            break
+        size = 2 if number(entry[2:4]) == _TIFF_SHORT else 4
+        found[number(entry[:2])] = number(entry[8 : 8 + size])
+    return found.get(_TIFF_WIDTH, 0), found.get(_TIFF_HEIGHT, 0), 8.0 * DEFLATED
 
 
 def _pair(width: bytes, height: bytes) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from pkmcal.errors import InputError
-from pkmcal.files.documents import Document, Keys, closest, field_path, shown
+from pkmcal.files.documents import LARGEST, Document, Keys, closest, field_path, shown
 from pkmcal.wording import listed
 
 __all__ = ["Schema", "field_path", "validate"]
@@ -38,7 +38,9 @@ def validate(document: Document, model: type[Model]) -> Model:
     """
     try:
         # By way of JSON, because there a list may become a tuple while types stay exact.
-        return model.model_validate_json(json.dumps(document.data))
+        found = model.model_validate_json(json.dumps(document.data))
+        _check_numbers(document, found.model_dump(by_alias=True))
+        return found
     except ValidationError as error:
         faults = [_fault(document, model, details) for details in error.errors()]
     # A required key that is misspelt is one mistake, not one unknown and one missing key.
@@ -58,6 +60,24 @@ def validate(document: Document, model: type[Model]) -> Model:
         expected=first.expected,
         next_step=f"Then look at {places}",
     )
+
+
+def _check_numbers(document: Document, fields: dict[str, Any]) -> None:
+    """Raise `InputError` for a number that is too large, in any of the fields that are used."""
+    todo: list[tuple[Keys, Any]] = [((), fields)]
+    while todo:
+        keys, value = todo.pop()
+        if isinstance(value, Mapping):
+            todo += [((*keys, str(key)), item) for key, item in value.items()]
+        elif isinstance(value, list | tuple):
+            todo += [((*keys, k), item) for k, item in enumerate(value)]
+        elif isinstance(value, int | float) and abs(value) > LARGEST:
+            raise InputError(
+                "this number is too large for any quantity",
+                where=document.where(*keys),
+                found=shown(value),
+                expected=f"at most {LARGEST:g}",
+            )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import LONGEST_NAME, InputError
-from pkmcal.files.documents import closest, read_text, shown
+from pkmcal.files.documents import LARGEST, closest, read_text, shown
 from pkmcal.wording import listed
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -181,9 +181,11 @@ def _number(cell: str, where: str) -> float:
             next_step="Leave the whole row out if the reading was not taken",
         )
     value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
-    if math.isfinite(value):
+    if abs(value) <= LARGEST:
         return value
-    if _NOT_FINITE.fullmatch(cell) or math.isinf(value):
+    if math.isfinite(value):
+        what, expected = "this number is too large for any quantity", f"at most {LARGEST:g}"
+    elif _NOT_FINITE.fullmatch(cell) or math.isinf(value):
         what, expected = "this is not a finite number", "a number"
     elif _NUMBER.fullmatch(cell.replace(",", ".")):
         what, expected = "this number has a decimal comma", cell.replace(",", ".")

@@ -6,7 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 from pkmcal.errors import InputError
-from pkmcal.files import closest, read_yaml, validate, yaml_text
+from pkmcal.files import Document, closest, read_yaml, validate, yaml_text
 from pkmcal.mechanisms.document import MechanismDocument, Model
 from pkmcal.mechanisms.machine import Machine, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.parameters import ParameterTable
@@ -17,6 +17,7 @@ __all__ = [
     "MechanismDocument",
     "ParameterTable",
     "catalogue",
+    "checked_machine",
     "load_mechanism",
     "machine_from_document",
     "mechanism_text",
@@ -51,18 +52,44 @@ def load_mechanism(
         )
     document = read_yaml(path, label)
     checked = validate(document, MechanismDocument)
-    try:
-        if model is not None:
+    if model is not None:
+        try:
             chosen = _model(checked, model)
-            if chosen.mechanism is not None:
-                return load_mechanism(_beside(path, chosen.mechanism))
-            checked = checked.model_copy(update={"fixed": chosen.fixed, "tied": chosen.tied})
-        return machine_from_document(checked, document.where)
-    except InputError as error:  # a name under fixed or tied that is no parameter's
-        where = error.where or ""
-        raise (
-            error if where.startswith(document.label) else error.located(document.label)
-        ) from None
+        except InputError as error:
+            raise error.located(document.label) from None
+        if chosen.mechanism is not None:
+            return load_mechanism(_beside(path, chosen.mechanism))
+        checked = checked.model_copy(update={"fixed": chosen.fixed, "tied": chosen.tied})
+    return checked_machine(checked, document)
+
+
+def checked_machine(checked: MechanismDocument, document: Document, *keys: str) -> Machine:
+    """The machine of a file's fields, which stand under `keys` in it.
+
+    Raises InputError with file and field for a drawing that cannot be a machine's.
+    """
+    try:
+        machine = machine_from_document(checked, lambda *inner: document.where(*keys, *inner))
+        machine.check_home()
+    except InputError as error:
+        if (error.where or "").startswith(document.label):
+            raise
+        raise error.located(document.where(*keys, *_role(checked, str(error)))) from None
+    return machine
+
+
+def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
+    """The entry under ``fixed`` or ``tied`` that a sentence is about, if it names one."""
+    entries: list[tuple[tuple[str | int, ...], str]] = [
+        (("fixed", k), name) for k, name in enumerate(checked.fixed)
+    ]
+    entries += [
+        (("tied", g, k), name)
+        for g, group in enumerate(checked.tied)
+        for k, name in enumerate(group)
+    ]
+    named = (keys for keys, name in entries if name and name.removeprefix("-") in sentence)
+    return next(named, ())
 
 
 def _model(document: MechanismDocument, name: str) -> Model:

@@ -140,19 +140,22 @@ class Machine:
         """A start for forward kinematics: the file's home, or the platform above the base."""
         return self._home.copy()
 
-    @cached_property
-    def _home(self) -> Array:
-        if self.document.home is not None:
-            h = self.document.home
-            return pose(rotation(np.array(h.rotation_vector)), np.array(h.position))
-        ranges = self.joint_ranges
-        middle = np.where(np.isfinite(ranges).all(axis=1), ranges.mean(axis=1), np.nan)
-        if np.isnan(middle).any():
+    def check_home(self) -> None:
+        """Raise InputError where the file says nothing of a pose to start from."""
+        if self.document.home is None and not np.isfinite(self.joint_ranges).all():
             raise InputError(
                 what=f"mechanism {self.name!r} gives neither a home pose nor every leg's range",
                 expected="length.range on each actuated leg, or home: {position: [x, y, z]}",
                 next_step="add one of them, so that the right assembly can be chosen",
             )
+
+    @cached_property
+    def _home(self) -> Array:
+        if self.document.home is not None:
+            h = self.document.home
+            return pose(rotation(np.array(h.rotation_vector)), np.array(h.position))
+        self.check_home()
+        middle = self.joint_ranges.mean(axis=1)
         starts = kinematics.home_candidates(self.layout, self.values, middle)
         found = kinematics.forward(self.layout, self.values, middle, starts)
         good = np.flatnonzero(found.converged)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 from pkmcal.arrays import Integers
 from pkmcal.errors import InputError
 from pkmcal.files import check_regular, read_exif, stated_size
+from pkmcal.observe.complaints import listening
 
 PNG_START = 8
 """Bytes before a PNG file's first chunk: length, kind, body and checksum of kind and body."""
@@ -41,17 +43,20 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         raise _broken(label, "a JPEG file that ends early")
     # before decoding, which takes the memory that the header asks for
     size = stated_size(BytesIO(data))
-    if size and min(size) == 0:
+    if min(size) == 0:
         raise _broken(label, "no readable image")
-    if size and tuple(image_size) not in (size, size[::-1]):
+    if tuple(image_size) not in (size, size[::-1]):
         raise _other_size(label, size, image_size)
     # a turned picture would no longer be its camera's: flags that ask for turning are ignored where
     # the size is the camera's
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except cv2.error:  # a size beyond what OpenCV takes on: a spoilt header
-        image = None
+    image: Any = None
+    fault = ""
+    with suppress(cv2.error):  # a size beyond what OpenCV takes on: a spoilt header
+        image, fault = listening(lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags))
+    if fault:
+        kind = "PNG" if data[:4] == b"\x89PNG" else "JPEG"
+        raise _broken(label, f"a {kind} file that is damaged ({fault})")
     if image is None:
         raise _broken(label, "no readable image")
     if image.shape == tuple(image_size) and image_size[0] != image_size[1]:

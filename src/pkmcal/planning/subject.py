@@ -158,7 +158,7 @@ def _seen(
             instruments.append(LegsFrom(s, camera, T, pools))
     mounts = (Mount(BOARD, "platform", board.tolerance),) if board is not None else ()
     if board is None:
-        check_tubes(machine)
+        check_tubes(machine, "legs")
     numbers = np.array([list(dict.fromkeys(map(id, cameras))).index(id(c)) for c in cameras])
     T_mount = None if T_platform_board is None else T_platform_board[None]
     return Rig(
@@ -166,13 +166,13 @@ def _seen(
     )
 
 
-def check_tubes(machine: Machine) -> None:
-    """Raise `InputError` for a machine whose legs have no edges."""
+def check_tubes(machine: Machine, where: str) -> None:
+    """Raise `InputError` for a machine whose legs have no edges; where : their place in a file."""
     if len(tubes_of(machine)):
         return
     raise InputError(
         "no leg of the drawing has visible cylinders, so a camera sees none",
-        where="mechanism.yaml, legs",
+        where=where,
         expected="tubes: [{radius: 0.014, from: 0.05, to: 0.25}] on the legs",
         next_step="Measure the legs' radii with calipers, or plan with --board or --tracker",
     )
@@ -246,7 +246,7 @@ def of_session(
     shading = SHADING_SIGMA
     legs = [s for s, station in enumerate(session.stations) if "legs" in station.observe]
     if legs:
-        check_tubes(session.machine)
+        check_tubes(session.machine, f"{session.document['mechanism']}, legs")
         pools, shading, told = _edge_noise(session, legs, seen, T_camera_base, noise.edge)
         words.append(told)
         for s, pool in zip(legs, pools, strict=True):
@@ -391,7 +391,7 @@ def _saved_target(saved: SavedCalibration | None, name: str) -> Array | None:
     """T_platform_target (4, 4) of a calibration."""
     targets: list[dict[str, Any]] = [] if saved is None else saved.document.get("targets", [])
     for target in targets:
-        if target["name"] == name and "T_platform_target" in target:
+        if target["name"] == name and target.get("T_platform_target"):
             return np.array(target["T_platform_target"])
     return None
 

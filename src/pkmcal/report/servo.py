@@ -369,7 +369,7 @@ def _outcome_document(o: Trials) -> dict[str, Any]:
         "overshoot_median": _over(o.overshoot, o, np.median),
         "overshoot_largest": _over(o.overshoot, o, np.max),
         "error_rise_largest": _over(o.rise, o, np.max),
-        "settling_median": float(np.nanmedian(o.settling)) if o.reached else None,
+        "settling_median": _settled(o),
         "runs": [
             {"end": end.word, "way": way, "overshoot": over, "settling": settling}
             for end, way, over, settling in zip(
@@ -390,9 +390,15 @@ def _percent(values: Any, o: Trials, of: Callable[[Any], Any] = np.max) -> str:
     return "–" if value is None else brief(100 * value) if value > 5e-4 else "0"
 
 
-def _seconds(o: Trials) -> str:
+def _settled(o: Trials) -> float | None:
+    """Median time (s) of the runs that came to rest at the goal, of which there may be none."""
     known = o.settling[np.isfinite(o.settling)]
-    return f"{np.median(known):.1f}" if known.size else "–"
+    return float(np.median(known)) if known.size else None
+
+
+def _seconds(o: Trials) -> str:
+    time = _settled(o)
+    return "–" if time is None else f"{time:.1f}"
 
 
 def _last(o: Trials) -> str:

@@ -72,7 +72,7 @@ def find_photographs(
 def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, int]:
     """Return an image's (width, height) in pixels as stored, before any EXIF rotation.
 
-    PNG and JPEG: from their first bytes. Other formats are decoded by OpenCV.
+    From its first bytes; of PNG, JPEG, TIFF, BMP and PGM files.
     label : the file's name in messages; the path unless told.
     Raises InputError for what is no file, no image, or states a size that its bytes cannot fill.
     """
@@ -81,7 +81,7 @@ def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, 
     try:
         check_regular(path, label)
         with path.open("rb") as stream:
-            size = stated_size(stream) or _decoded_size(path)
+            size = stated_size(stream)
         empty = path.stat().st_size == 0
     except OSError as error:
         raise InputError(f"the image cannot be read ({error.strerror})", where=label) from None
@@ -189,11 +189,3 @@ def _stranger(
         expected=f"one of the table's {len(names)}: {listed(names)}",
         next_step=next_step,
     )
-
-
-def _decoded_size(path: Path) -> tuple[int, int]:
-    import cv2
-
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    # The stubs say that imread always returns an image; for a file it cannot read it does not.
-    return (0, 0) if image is None else (image.shape[1], image.shape[0])  # pyright: ignore[reportUnnecessaryComparison]

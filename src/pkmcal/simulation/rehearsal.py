@@ -14,7 +14,7 @@ from pkmcal.cameras.files import camera_from_document
 from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, read_json, validate
 from pkmcal.geometry.rigid import inverse
-from pkmcal.mechanisms import Machine, MechanismDocument, machine_from_document
+from pkmcal.mechanisms import Machine, MechanismDocument, checked_machine
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.simulation.truth import Asked
 
@@ -32,9 +32,12 @@ class _Configuration(_Part):
     joints: tuple[float, ...]
 
 
+_Row = tuple[float, float, float, float]
+
+
 class _Station(_Part):
     name: str
-    T_base_camera: tuple[tuple[float, ...], ...]
+    T_base_camera: tuple[_Row, _Row, _Row, _Row]
     camera: dict[str, Any]
 
 
@@ -74,7 +77,7 @@ def rehearsal_of(plan: Path | str) -> Rehearsal:
         for name in one.stations
         if name in number
     ]
-    machine = machine_from_document(found.mechanism)
+    machine = checked_machine(found.mechanism, document, "mechanism")
     if any(len(one.joints) != machine.n_joints for one in found.configurations):
         raise InputError(
             "the plan's readings are not those of its machine",

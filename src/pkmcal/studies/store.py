@@ -61,7 +61,7 @@ class Store:
                 if before.get("digest") != own["digest"]:
                     raise InputError(
                         "the folder holds the batches of another study",
-                        where=str(folder),
+                        where=f"{path}, digest",
                         found=_in_words(before),
                         expected=_in_words(own),
                         next_step="Name another folder with -o, or remove this one",

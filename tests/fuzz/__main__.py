@@ -1,0 +1,71 @@
+"""Runs cases and prints their summary; exit code 1 where pkmcal did something wrong."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+# Threads would be lost in a fork, and slow on one core; OpenCV is told as the command line does.
+# Libraries read these when they are imported.
+os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "80"}
+os.environ["OPENCV_LOG_LEVEL"] = "SILENT"
+
+from fuzz.run import Summary, run, warm
+
+MAKE = "import sys; from pathlib import Path; from fuzz.bases import make; make(Path(sys.argv[1]))"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="fuzz", description=__doc__)
+    parser.add_argument("count", nargs="?", type=int, default=300, help="of cases")
+    parser.add_argument("--first", type=int, default=0, help="number of the first")
+    parser.add_argument("--only", type=int, nargs="+", help="these cases; their folders are kept")
+    parser.add_argument("--bases", type=Path, help="made by an earlier run, to go on with")
+    given = parser.parse_args()
+    if hasattr(os, "sched_setaffinity"):  # one core, so that a study has one worker: this process
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    place = Path(tempfile.mkdtemp(prefix="pkmcal-fuzz-")).resolve()
+    try:
+        summary = fuzz(given, place)
+    finally:
+        if not given.only:
+            shutil.rmtree(place, ignore_errors=True)
+    if given.only:
+        print(f"kept in {place}")
+    print(summary.text())
+    return 1 if summary.wrong else 0
+
+
+def fuzz(given, place: Path) -> Summary:
+    """The cases that were asked for, or those until Ctrl-C."""
+    bases = given.bases or place / "bases"
+    if not bases.exists():
+        made = [sys.executable, "-c", MAKE, str(bases)]
+        subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
+    warm()
+    summary = Summary()
+    with suppress(KeyboardInterrupt):
+        for number in given.only or range(given.first, given.first + given.count):
+            result = run(number, bases, place, keep=bool(given.only))
+            summary.add(result)
+            if result.faults or given.only:
+                show(result)
+    return summary
+
+
+def show(result) -> None:
+    """A case, what is wrong with what it did, and the beginning of what it said."""
+    print(f"{result.case}\n  exit {result.code}: {'; '.join(result.faults) or 'good'}")
+    for text in (result.err, result.out):
+        print("".join(f"    {line[:400]}\n" for line in text.splitlines()[:6]), end="")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,231 @@
+"""Whole sessions and results, small and quick, from which malformed ones are made."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fuzz import pictures
+from pkmcal.cameras import load_camera
+from pkmcal.cameras.files import FORMATS, foreign_text
+from pkmcal.commands.cli import main
+from pkmcal.files import Exif, csv_text, with_exif, yaml_text
+from pkmcal.geometry.rigid import look_at, pose, rotation
+from pkmcal.mechanisms import catalogue, load_mechanism, mechanism_text
+from pkmcal.simulation import Settings
+from pkmcal.simulation.demo import camera_of_size
+from rendered import rendered
+
+SIZE = (160, 120)
+CAMERA = {"model": "pinhole", "image_size": list(SIZE), "focal": [141.0, 141.2],
+          "center": [80.4, 59.5], "distortion": [-0.11, 0.09, 0.0004, -0.0003, 0.0]}  # fmt: skip
+MIRROR = {"model": "unified", "image_size": list(SIZE), "focal": [90.0, 90.0],
+          "center": [79.5, 59.5], "xi": 0.9, "distortion": [0.01, 0.0, 0.0, 0.0]}  # fmt: skip
+FISHEYE = {"model": "fisheye", "image_size": list(SIZE), "focal": [60.0, 60.0],
+           "center": [79.5, 59.5], "distortion": [0.01, 0.0, 0.0, 0.0]}  # fmt: skip
+BOARD = {"type": "chessboard", "corners": [6, 5], "square": 0.026, "tolerance": 0.001}
+CHARUCO = {"type": "charuco", "squares": [7, 5], "square": 0.03, "marker": 0.022,
+           "dictionary": "DICT_4X4_50"}  # fmt: skip
+GRID = {"type": "aruco_grid", "markers": [4, 3], "marker": 0.03, "gap": 0.01,
+        "dictionary": "DICT_4X4_50", "first_id": 0}  # fmt: skip
+
+
+def make(folder: Path) -> None:
+    """All bases into a new folder."""
+    folder.mkdir(parents=True)
+    drawing = load_mechanism("3-rpr")
+    camera = camera_of_size(SIZE)
+    rendered(folder / "legs", drawing, camera, Settings(stations=1, configurations=4))
+    rendered(folder / "hand", drawing, camera, Settings(configurations=3, handheld=True))
+    for name in ("legs", "hand"):
+        (folder / name / "truth.json").unlink()
+    more(folder / "legs" / "session.yaml", EVERYTHING)
+    by_exif(folder / "hand")
+    measured(folder / "tracker", seed=1, count=14)
+    measured(folder / "later", seed=2, count=5)
+    boards(folder / "board")
+    for name, text in machines():
+        (folder / "machines").mkdir(exist_ok=True)
+        (folder / "machines" / f"{name}.yaml").write_text(text)
+    cameras(folder / "cameras")
+    pictures_of(folder / "pictures", (folder / "legs/images/station1/0000.png").read_bytes())
+    results(folder)
+
+
+EVERYTHING = """\
+paths: {line: ["0000", "0001", "0002"]}
+workspace: {x: [-0.05, 0.05], y: [-0.05, 0.05], turn: 0.2}
+"""
+
+
+def more(path: Path, text: str) -> None:
+    path.write_text(path.read_text() + text)
+
+
+def by_exif(folder: Path) -> None:
+    """Photographs that tell the focal length, for camera: exif."""
+    path = folder / "session.yaml"
+    path.write_text(path.read_text().replace("cameras/camera.yaml", "exif"))
+    for photo in (folder / "images").rglob("*.jpg"):
+        plain = cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        photo.write_bytes(with_exif(cv2.imencode(".jpg", plain)[1].tobytes(), Exif(1, 32.0)))
+
+
+def measured(folder: Path, seed: int, count: int) -> None:
+    """A hexapod seen by a laser tracker."""
+    rng, drawing = np.random.default_rng(seed), load_mechanism("gough-stewart")
+    built = np.random.default_rng(0).normal(size=len(drawing.values))
+    truth = drawing.with_values(drawing.values + 0.5 * drawing.parameters.tolerance * built)
+    T = drawing.home() @ pose(
+        rotation(rng.uniform(-0.15, 0.15, (count, 3))), rng.uniform(-0.03, 0.03, (count, 3))
+    )
+    joints = truth.inverse(T)
+    T_tracker_base = look_at(np.array([2.0, 0.5, 0.4]), np.array([0, 0, 0.3]), np.eye(3)[2])
+    seen = (
+        T_tracker_base @ T @ pose(rotation(np.array([0.1, 0.2, 0.3])), np.array([0.02, 0.01, 0.05]))
+    )
+    turns = np.stack([cv2.Rodrigues(R)[0].ravel() for R in seen[:, :3, :3]])
+    turns += 1e-4 * rng.normal(size=turns.shape)
+    points = seen[:, :3, 3] + 2e-5 * rng.normal(size=(count, 3))
+    names = [f"{seed}{k:02d}" for k in range(count)]
+    folder.mkdir()
+    (folder / "joints.csv").write_text(csv_text([f"leg{k}" for k in range(1, 7)], names, joints))
+    columns = ["x", "y", "z", "rx", "ry", "rz"]
+    (folder / "poses.csv").write_text(csv_text(columns, names, np.hstack([points, turns])))
+    (folder / "mechanism.yaml").write_text(mechanism_text(drawing))
+    station = {"poses": "poses.csv", "noise": {"position": 2e-5, "rotation": 1e-4}}
+    session = {"pkmcal": 1, "mechanism": "mechanism.yaml",
+               "joints": {"file": "joints.csv", "noise": 3e-6},
+               "stations": {"tracker": {"tracker": station}}}  # fmt: skip
+    (folder / "session.yaml").write_text(yaml_text(session))
+
+
+def boards(folder: Path) -> None:
+    """Photographs of a chessboard on a platform, a session of them, and a camera to be found."""
+    rng = np.random.default_rng(3)
+    columns, rows = (n + 1 for n in BOARD["corners"])
+    side = 40
+    y, x = np.mgrid[: (rows + 2) * side, : (columns + 2) * side] // side
+    inside = (x > 0) & (y > 0) & (x <= columns) & (y <= rows)
+    drawn = np.where(inside & ((x + y) % 2 == 0), 20, 235).astype(np.uint8)
+    size = (2 * SIZE[0], 2 * SIZE[1])
+    K = np.array([[282.0, 0, 160.3], [0, 282.4, 119.5], [0, 0, 1]])
+    (folder / "images").mkdir(parents=True)
+    names = [f"b{k}" for k in range(7)]
+    for name in names:
+        T = pose(
+            rotation(rng.uniform(-0.45, 0.45, 3)),
+            np.array([0, 0, 0.34]) + rng.uniform(-0.02, 0.02, 3),
+        )
+        # the drawing's pixels to metres about its middle, and these to the photograph's
+        metres = BOARD["square"] / side
+        middle = np.array([[metres, 0, -metres * drawn.shape[1] / 2],
+                           [0, metres, -metres * drawn.shape[0] / 2], [0, 0, 1]])  # fmt: skip
+        H = K @ T[:3][:, [0, 1, 3]] @ middle
+        seen = cv2.warpPerspective(drawn, H, size, flags=cv2.INTER_AREA, borderValue=130)
+        noisy = cv2.GaussianBlur(seen, (0, 0), 0.7) + rng.normal(0, 1.0, seen.shape)
+        picture = np.clip(noisy, 0, 255).astype(np.uint8)
+        assert cv2.imwrite(str(folder / "images" / f"{name}.png"), picture)
+    drawing = load_mechanism("gough-stewart")
+    T = drawing.home() @ pose(rotation(rng.uniform(-0.2, 0.2, (7, 3))), np.zeros((7, 3)))
+    joints = drawing.inverse(T)
+    (folder / "joints.csv").write_text(csv_text([f"leg{k}" for k in range(1, 7)], names, joints))
+    (folder / "board.yaml").write_text(yaml_text(BOARD))
+    camera = {**CAMERA, "image_size": list(size), "focal": [282.0, 282.4],
+              "center": [160.3, 119.5], "distortion": [0.0]}  # fmt: skip
+    (folder / "cameras").mkdir()
+    (folder / "cameras" / "camera.yaml").write_text(yaml_text(camera))
+    session = {"pkmcal": 1, "mechanism": "gough-stewart",
+               "joints": {"file": "joints.csv", "noise": 3e-6},
+               "stations": {"bench": {"camera": "cameras/camera.yaml",
+                                      "images": "images/{configuration}.png", "observe": "board"}},
+               "board": {"file": "board.yaml", "fixed_to": "platform"}}  # fmt: skip
+    (folder / "session.yaml").write_text(yaml_text(session))
+
+
+def machines():
+    for name in catalogue():
+        yield name, mechanism_text(load_mechanism(name))
+
+
+def cameras(folder: Path) -> None:
+    """Camera files of every model and of every other program."""
+    folder.mkdir()
+    covariance = np.diag([0.1, 0.1, 0.2, 0.2, 1e-4, 1e-4, 1e-8, 1e-8, 1e-4]).tolist()
+    for name, fields in (
+        ("pinhole", {**CAMERA, "covariance": covariance}), ("unified", MIRROR),
+        ("fisheye", FISHEYE),
+    ):  # fmt: skip
+        path = folder / f"{name}.yaml"
+        path.write_text(yaml_text(fields))
+        camera = load_camera(path)
+        for form in FORMATS:
+            if form == "ros" and name == "unified":
+                continue
+            (folder / f"{name}.{form}.yaml").write_text(foreign_text(camera, path, form))
+    xml = foreign_text(load_camera(folder / "pinhole.yaml"), folder / "a.xml", "opencv")
+    (folder / "pinhole.opencv.xml").write_text(xml)
+
+
+def pictures_of(folder: Path, whole: bytes) -> None:
+    """The same photograph in other kinds of file, and other photographs of its name."""
+    folder.mkdir()
+    grey = cv2.imdecode(np.frombuffer(whole, np.uint8), cv2.IMREAD_GRAYSCALE)
+    colour = cv2.applyColorMap(grey, cv2.COLORMAP_JET)
+    noise = np.random.default_rng(0).integers(0, 255, grey.shape, dtype=np.uint8)
+
+    def put(name, image, *options):
+        ok, data = cv2.imencode(name[name.index(".") :], image, options)
+        assert ok, name
+        (folder / name).write_bytes(data.tobytes())
+
+    for kind in ("png", "jpg", "bmp", "tiff", "pgm", "webp", "jp2", "hdr", "pfm", "ras", "gif"):
+        image = colour.astype(np.float32) if kind in ("hdr", "pfm") else colour
+        if kind == "pgm":
+            image = grey
+        try:
+            put(f"colour.{kind}", image)
+        except cv2.error:  # a kind that this build of OpenCV does not write
+            continue
+    put("deep.png", grey.astype(np.uint16) * 257)
+    put("deep.tiff", grey.astype(np.float32))
+    put("alpha.png", np.dstack([colour, noise]))
+    put("noise.png", noise)
+    put("black.png", np.zeros_like(grey))
+    put("one.png", grey[:1, :1])
+    put("one.jpg", grey[:1, :1])
+    put("half.png", cv2.resize(grey, None, fx=0.5, fy=0.5))
+    put("turned.png", np.ascontiguousarray(grey.T))
+    put("wide.png", np.zeros((2, 8000), np.uint8))
+    put("progressive.jpg", grey, cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    put("restarts.jpg", grey, cv2.IMWRITE_JPEG_RST_INTERVAL, 4)
+    put("grey.jpg", grey)
+    (folder / "cmyk.jpg").write_bytes(pictures.cmyk((folder / "grey.jpg").read_bytes()))
+    (folder / "palette.png").write_bytes(pictures.palette(*SIZE))
+    (folder / "animated.png").write_bytes(pictures.animated(whole))
+
+
+def results(folder: Path) -> None:
+    """What commands wrote of these sessions; the calibration may be used."""
+    at = os.getcwd()  # noqa: PTH109
+    os.chdir(folder)
+    try:
+        for words in (
+            "calibrate tracker -o calibration",
+            "plan legs -n 2 -o plan",
+            "study 3-rpr --vary configurations=3 --runs 2 -o study",
+            "validate calibration later -o validation",
+            "watch calibration later -o watch",
+            "check tracker -o check",
+            "export calibration --to json -o export",
+            "camera board -o camera",
+            "servo calibration --camera cameras/pinhole.yaml --runs 1 --duration 1 -o servo",
+        ):
+            code = main(words.split())
+            assert code in (0, 1), words
+            assert code == 0 or not words.startswith("calibrate"), "the calibration is refused"
+    finally:
+        os.chdir(at)

@@ -1,0 +1,304 @@
+"""Cases run, each in a process of its own that is forked from a warm one, and judged."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import sys
+import warnings
+from collections import Counter
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from io import StringIO
+from pathlib import Path
+
+from fuzz.cases import Case, make
+
+SECONDS = 60
+"""After which a case is killed; the aim is ten."""
+ADDRESSES = 6 << 30
+"""Bytes of address space, libraries and threads' stacks included; the aim is 1 GB of memory."""
+LONGEST = 2000
+"""Characters of an error."""
+INTERNALS = re.compile(
+    r"Traceback|<class|object at 0x|NoneType|Value error,|defect of pkmcal|Warning: |RuntimeWarning"
+    r"|libpng|libjpeg|JPEG data|OpenCV\(|\[ ?WARN|\[ERROR|cv::|np\.(float|int)|array\(|dtype|ufunc"
+    r"|pydantic|Errno|validation error|\bstr\b|KeyError|IndexError|TypeError|ValueError|imdecode"
+)
+"""What no person should be shown."""
+PLACE = re.compile(
+    r"\bline \d+|\bcolumn |\.(yaml|json|csv|xml), [\w\[\]{}.-]+|[\w-]+\.(png|jpg)\b|mechanism '"
+)
+"""Where a fault is: by its line, its column, a file's field, or a photograph's name; or what kind
+of machine it is that a command does not take."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one case came to.
+
+    code : exit code, negative for a signal. seconds : of the processor. kilobytes : of memory.
+    faults : sentences about what pkmcal did wrong. refused : whether an error was told. has_file,
+    has_field : whether that tells where, as far as there is a place.
+    """
+
+    case: Case
+    code: int
+    seconds: float
+    kilobytes: int
+    out: str
+    err: str
+    faults: tuple[str, ...]
+    refused: bool = False
+    has_file: bool = True
+    has_field: bool = True
+
+
+def run(number: int, bases: Path, scratch: Path, keep: bool = False) -> Result:
+    """Make a case, run its command, judge what it left."""
+    place = scratch / f"case-{number}"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True)
+    try:
+        case = make(number, bases, place)
+        before = listing(place)
+        code, seconds, kilobytes = _forked(case, place, scratch)
+        out, err = ((scratch / name).read_bytes().decode("utf-8", "replace") for name in ("1", "2"))
+        return judged(case, code, seconds, kilobytes, out, err, before, listing(place))
+    finally:
+        if not keep:
+            shutil.rmtree(place, ignore_errors=True)
+
+
+def _forked(case: Case, place: Path, scratch: Path) -> tuple[int, float, int]:
+    """Exit code, seconds and kilobytes of the case's command, in a process of its own."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    child = os.fork()
+    if child:
+        _, status, used = os.wait4(child, 0)
+        spent = used.ru_utime + used.ru_stime
+        return os.waitstatus_to_exitcode(status), spent, used.ru_maxrss
+    code = 99
+    try:
+        for number in (1, 2):
+            file = os.open(scratch / str(number), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(file, number)
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        os.chdir(place)
+        resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, ADDRESSES))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(SECONDS)
+        # as at a terminal, but every time and not once a place
+        warnings.resetwarnings()
+        warnings.simplefilter("always")
+        for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
+            warnings.simplefilter("ignore", kind)
+        code = _command(case.words)
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def _command(words: tuple[str, ...]) -> int:
+    from pkmcal.commands.cli import main
+
+    if words[0] != "read-camera":
+        return main(words)
+    from pkmcal.cameras.files import read_camera
+    from pkmcal.errors import PkmcalError
+
+    try:
+        read_camera(words[1])
+    except PkmcalError as error:
+        sys.stderr.write(f"Error: {error}\n")
+        return error.exit_code
+    return 0
+
+
+def listing(place: Path) -> dict[str, tuple[int, ...]]:
+    """What stands in a folder, so that whatever is written, moved or removed is seen."""
+    out = {}
+    for folder, folders, files in os.walk(place):
+        for name in (*folders, *files):
+            path = Path(folder, name)
+            stat = path.lstat()
+            changes = (stat.st_mode, stat.st_ino)
+            if name in files:
+                changes += (stat.st_size, stat.st_mtime_ns)
+            out[str(path.relative_to(place))] = changes
+    return out
+
+
+def judged(case, code, seconds, kilobytes, out, err, before, after) -> Result:
+    """The rules of docs/commands.md."""
+    faults = []
+    if code not in (0, 1, 2):
+        faults.append(f"exit code {code}")
+    if kilobytes > 1 << 20:
+        faults.append(f"{kilobytes >> 10} MB")
+    found = INTERNALS.search(out + err)
+    if found:
+        faults.append(f"internals: {found[0]}")
+    errors = _errors(case, code, out, err, faults)
+    for sentence in errors:
+        if len(sentence) > LONGEST:
+            faults.append(f"an error of {len(sentence)} characters")
+        if re.search(r"[\x00-\x08\x0b-\x1f\x7f\u202e]", sentence):
+            faults.append("control characters in an error")
+    faults += _written(case, code, before, after)
+    refused = bool(errors) and code == 2
+    has_file, has_field = True, True
+    if refused and case.spoilt:
+        text = " ".join(errors)
+        has_file = any(name in text for name in _files_of(case))
+        places = [words for _, _, words in case.spoilt]
+        if len(places) == 1 and places[0] and "mine.txt" not in text:
+            said = text.lower()
+            has_field = bool(PLACE.search(text)) or any(
+                word.strip() and word.strip().lower()[:30] in said for word in places[0]
+            )
+        if not has_file:
+            faults.append("no file named")
+        if not has_field:
+            faults.append("no field, line or column named")
+    return Result(
+        case, code, seconds, kilobytes, out, err, tuple(faults), refused, has_file, has_field
+    )
+
+
+def _errors(case, code, out, err, faults) -> list[str]:
+    """The sentences of what is wrong with the input, however they were told."""
+    lines = err.splitlines()
+    if len(lines) > 1 or (lines and not lines[0].startswith("Error: ")):
+        faults.append(f"on standard error: {err[:200]!r}")
+    if "--json" in case.words:
+        if lines:
+            faults.append("standard error in spite of --json")
+        return _in_json(code, out, faults)
+    if code != 2:
+        return []
+    if case.words[0] == "check" and not lines:
+        points = re.split(r"\n(?=[✗!·→] |\n)", out)
+        return [" ".join(p.split()) for p in points if p.startswith("✗")][1:]
+    if not lines:
+        faults.append("exit code 2 without an error")
+    return [line.removeprefix("Error: ") for line in lines]
+
+
+def _in_json(code, out, faults) -> list[str]:
+    try:
+        told = json.loads(out, parse_constant=_refuse)
+    except ValueError as error:
+        faults.append(f"no JSON: {error}")
+        return []
+    if told.get("exit_code", code) != code:
+        faults.append(f"exit code {code}, but {told['exit_code']} in the JSON")
+    if "message" in told:
+        return [told["message"]]
+    return [found["text"] for found in told.get("findings", ()) if found.get("level") == "wrong"]
+
+
+def _refuse(constant):
+    raise ValueError(constant)
+
+
+def _files_of(case: Case) -> set[str]:
+    """Names of the spoilt files, and of those that a fault in them may be told of."""
+    names = {"mine.txt"}  # of the output folder, which is looked at first
+    for file, _, _ in case.spoilt:
+        path = Path(file)
+        names |= {path.name, path.stem}
+        if path.parts[0] in ("legs", "hand", "tracker", "later", "board"):
+            names |= {"session.yaml", "joints.csv", "images/", "mechanism.yaml", "cameras/"}
+            names |= {"poses.csv", "board.yaml"}
+    return names
+
+
+def _written(case: Case, code: int, before, after) -> list[str]:
+    """Faults of what was written: outside the output, in part, or over a result in spite of 2."""
+    changed = {name for name in {*before, *after} if before.get(name) != after.get(name)}
+    outside = sorted(n for n in changed if n != case.out and not n.startswith(f"{case.out}/"))
+    faults = []
+    if outside:
+        faults.append(f"written outside the output: {outside[:5]}")
+    left = [name for name in after if name.endswith(".part") or ".pkmcal-replacing" in name]
+    if left:
+        faults.append(f"left over: {left[:3]}")
+    # A study keeps what it has finished, and its lock, whatever comes after.
+    inside = {n for n in changed if n.startswith(f"{case.out}/") and "batches" not in n}
+    if code == 2 and inside and case.words[0] != "check":
+        faults.append(f"refused, but written: {sorted(inside)[:5]}")
+    return faults
+
+
+@dataclass
+class Summary:
+    """Of many results."""
+
+    codes: Counter = field(default_factory=Counter)
+    commands: Counter = field(default_factory=Counter)
+    spent: Counter = field(default_factory=Counter)
+    slowest: list = field(default_factory=list)
+    largest: list = field(default_factory=list)
+    wrong: list = field(default_factory=list)
+    refused: int = 0
+    seconds: float = 0.0
+
+    def add(self, result: Result) -> None:
+        self.codes[result.code] += 1
+        self.commands[result.case.words[0]] += 1
+        self.spent[" ".join(result.case.words[:2])] += result.seconds
+        self.refused += result.refused
+        self.seconds += result.seconds
+        self.slowest = sorted([*self.slowest, (result.seconds, str(result.case))])[-3:]
+        self.largest = sorted([*self.largest, (result.kilobytes >> 10, str(result.case))])[-3:]
+        if result.faults:
+            self.wrong.append(result)
+
+    def text(self) -> str:
+        count = sum(self.codes.values())
+        codes = ", ".join(f"{code}: {n}" for code, n in sorted(self.codes.items()))
+        commands = ", ".join(f"{name} {n}" for name, n in self.commands.most_common())
+        without = [sum(not getattr(r, of) for r in self.wrong) for of in ("has_file", "has_field")]
+        lines = [
+            f"{count} cases in {self.seconds:.0f} s ({commands})",
+            f"exit codes {codes}; {self.refused} refused with an error",
+            f"without file {without[0]}, without field {without[1]}; with faults {len(self.wrong)}",
+            ", ".join(f"{name} {n:.0f} s" for name, n in self.spent.most_common(8)),
+            *(f"longest {seconds:.1f} s  {case}" for seconds, case in self.slowest[::-1]),
+            *(f"largest {size} MB  {case}" for size, case in self.largest[::-1]),
+        ]
+        return "\n".join(lines)
+
+
+def warm() -> None:
+    """Import and make what commands need, once for all cases, without starting a thread."""
+    import gc
+    import importlib
+    import pkgutil
+
+    import typer.main
+
+    import pkmcal
+    from pkmcal.commands import cli
+
+    for module in pkgutil.walk_packages(pkmcal.__path__, "pkmcal."):
+        if not module.name.endswith("__main__") and "cluster" not in module.name:
+            importlib.import_module(module.name)
+    for name in ("cv2", "scipy.optimize", "scipy.linalg", "scipy.stats", "plotly.offline", "jinja2",
+                 "rich.table", "rich.markup", "rich.text"):  # fmt: skip
+        importlib.import_module(name)
+    # Of the time of a refusal the half would go into Typer's reading of all the commands' options.
+    command = typer.main.get_command(cli.app)
+    typer.main.get_command = lambda _: command
+    with redirect_stdout(StringIO()):
+        cli.main(["--version"])
+    gc.collect()
+    gc.freeze()  # or a case would copy what the collector touches
