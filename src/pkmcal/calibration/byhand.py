@@ -77,11 +77,12 @@ def found_alone(
     tubes = tubes_of(session.machine)
 
     def search(k: int) -> Alone:
-        p, tables = at[k], distance_tables(at[k].images)
+        p, image = at[k], at[k].images[0]
+        tables = distance_tables([image])
         view = StationView(
             session.machine, p.camera, tubes, p.configuration, session.joints, poses, tables
         )
-        return find_alone(view, p.images[0])
+        return find_alone(view, image)
 
     with ThreadPoolExecutor(WORKERS) as pool:
         return dict(zip(by_hand, pool.map(search, by_hand), strict=True))
