@@ -218,9 +218,9 @@ class Problem:
         those of the edges (n, 2g, K, G), the closures (K, E, n) and the boards (K, 6 G, na).
         """
         rows, count = self.closure_rows, self.unknowns.count
-        out = memory.empty("by shared", (len(boards[some]), self._rows_each, self._width))
+        out = memory.empty("by shared", (len(boards[some]), self.n_rows, self._width))
         out.fill(0.0)
-        flat, before = out.reshape(-1), (some.start or 0) * self._rows_each * self._width
+        flat, before = out.reshape(-1), (some.start or 0) * self.n_rows * self._width
         if edges.size:
             flat[self._edge_places[:, :, some] - before] = edges[:, :, some]
         flat[self._closure_places[some] - before] = closures[some]
@@ -230,7 +230,7 @@ class Problem:
         return out[..., :count]
 
     @cached_property
-    def _rows_each(self) -> int:
+    def n_rows(self) -> int:
         """Rows of a configuration, r."""
         return self.closure_rows.stop + self.pose_blocks.present.shape[1] * 6
 
@@ -247,7 +247,7 @@ class Problem:
         if u.n_breathing:
             columns.append(_columns(u.breathing, blocks.station, 1))
         (k, g), n = blocks.leg.shape, 2 * blocks.side.shape[-1]
-        row = self._rows_each * np.arange(k)[:, None] + n * np.arange(g)
+        row = self.n_rows * np.arange(k)[:, None] + n * np.arange(g)
         row = row + np.arange(n)[:, None, None]
         return row * self._width + np.moveaxis(np.concatenate(columns, axis=-1), -1, 0)[:, None]
 
@@ -259,7 +259,7 @@ class Problem:
         rows, index = self.closure_rows, self.layout.closure_index
         if self.layout.shares_motors:
             index = np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
-        row = self._rows_each * np.arange(len(self.blocks.leg))[:, None] + np.arange(
+        row = self.n_rows * np.arange(len(self.blocks.leg))[:, None] + np.arange(
             rows.start, rows.stop
         )
         return row[..., None] * self._width + self._column[index]
