@@ -322,7 +322,8 @@ def condensed(rows: Array, value: Array) -> tuple[Array, Array]:
     """Rows (B, n, m) and residuals (B, n) as m + 1 with the same normal matrix, gradient and sum of
     squares: the triangle of their QR decomposition.
     """
-    triangle = np.linalg.qr(np.concatenate([rows, value[..., None]], axis=-1), mode="r")
+    both = np.concatenate([rows, value[..., None]], axis=-1)
+    triangle: Array = np.asarray(np.linalg.qr(both, mode="r"))
     return triangle[..., :-1], triangle[..., -1]
 
 

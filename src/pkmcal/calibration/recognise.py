@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +32,8 @@ stations: a search looks at eight, and of thirty that are asked whether the mach
 surer by one standard deviation says so by 5 of them together. Their tables take 200 to 400 MB."""
 FEWEST_AT_A_STATION = 8
 """However many stations there are: what a search looks at."""
+Progress = Callable[[str, float], None]
+"""Called with a sentence about the present step and the share that is done, 0 to 1."""
 WORKERS = 2
 """Threads beside one another: decoding and array work release Python's lock."""
 NEARLY = 2.0
@@ -311,17 +313,23 @@ def station_poses(
     boards: Boards,
     rng: np.random.Generator,
     by_hand: bool = False,
+    told: Progress | None = None,
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of all stations, each by the first that tells it: what is known
     before any leg is looked for, the search for the legs, and what measured poses tell.
 
-    by_hand : leave photographs by hand (NaN) where nothing tells them yet. Raises `InputError`, or
+    by_hand : leave photographs by hand (NaN) where nothing tells them yet. told : called with the
+    step in words and the share done. Raises `InputError`, or
     `ResultError`, where nothing tells one of the others.
     """
     known = known_stations(session, boards)
     if photographs:
         rngs = rng.spawn(len(photographs) + 1)
+        told = told or (lambda _text, _share: None)
+        count = sum(len(p.images) for p in photographs)
+        told(f"Recognising the machine in {count} photographs", 0.2)
         found = recognise(session, photographs, platform_poses(session), rngs[1:], boards, known)
+        told("Comparing with what is often mixed up", 0.3)
         error = mistake_in(session, photographs, found, rngs[0])
         if error is not None:
             raise error

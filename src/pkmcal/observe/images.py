@@ -132,7 +132,7 @@ class Pictures(Sequence[Integers]):
         labels: Sequence[str],
         kept: dict[int, Integers] | None = None,
     ) -> None:
-        self._paths, self._labels, self._size = tuple(paths), tuple(labels), tuple(image_size)
+        self._paths, self._labels, self._size = tuple(paths), tuple(labels), image_size
         self._kept = {} if kept is None else kept
 
     @classmethod

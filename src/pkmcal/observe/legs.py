@@ -14,7 +14,7 @@ forgotten with it, and a few hundred numbers of its edges remain.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -84,6 +84,10 @@ _HIDDEN = "hidden behind another leg or outside the photograph"
 _NO_PLACE = "not found: no place, or two places, where all its edges fit"
 
 
+Done = Callable[[int], None]
+"""Called with how many photographs more were looked at."""
+
+
 @dataclass(frozen=True)
 class LegPlaces:
     """Where legs were found in photographs, arrays (K, L).
@@ -123,7 +127,7 @@ def sample(images: Iterable[Any], pixel: Array, cubic: bool = True) -> Array:
 
 
 def search_legs(
-    images: list[Integers],
+    images: Sequence[Integers],
     tubes: TubeList,
     points: EdgePoints,
     clear: Booleans,
@@ -156,7 +160,7 @@ def search_legs(
 
 
 def gradient_strength(
-    images: list[Integers], points: EdgePoints, reach: float
+    images: Sequence[Integers], points: EdgePoints, reach: float
 ) -> tuple[Array, Array]:
     """Strength 0..1 of grey-level edges across the predicted ones, (K, E, n, offsets).
 
@@ -269,15 +273,18 @@ def search(
     T_camera_base: Array,
     poses: Array,
     reach: float = REACH,
+    done: Done | None = None,
 ) -> StationEdges:
     """Every leg to about a pixel, each moved as a whole; edges have sigmas of a pixel.
 
     poses : T_base_platform (K, 4, 4) of the photographs.
     """
-    looks = [
-        _searched(window, machine, T_camera_base, poses[part], reach)
-        for part, window in photographs.windows()
-    ]
+    looks: list[StationEdges] = []
+    for part, window in photographs.windows():
+        looks.append(_searched(window, machine, T_camera_base, poses[part], reach))
+        if done is not None:
+            done(len(window.images))
+        del window  # before the next one is decoded
     return _joined(looks, float("nan"), reach)
 
 
@@ -309,6 +316,7 @@ def measure(
     poses: Array,
     blur: float | None = None,
     refine_camera: bool = False,
+    done: Done | None = None,
 ) -> StationEdges:
     """Every edge to sub-pixel, by the shading-aware model of :mod:`pkmcal.observe.profiles`.
 
@@ -330,6 +338,8 @@ def measure(
         look, away = _measured(window, seen, blur, refine_camera)
         looks.append(look)
         moved.append(away)
+        if done is not None:
+            done(len(window.images))
         del seen, window  # before the next one is decoded
     away = np.concatenate(moved)
     return _joined(looks, blur, float(np.median(away)) if len(away) else 0.0)

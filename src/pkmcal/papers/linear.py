@@ -148,10 +148,9 @@ def least_median(
     cost = np.empty(a.shape[:-1])
     # a residual of every edge for every triple: of thousands of photographs, leg after leg
     each = max(RESIDUALS // (triples * max(present.shape[-1], 1)), 1)
-    every = a, n, np.broadcast_to(radius, present.shape), present, half
-    a_of, n_of, radius_of, present_of, half_of = (
-        x.reshape(-1, *x.shape[present.ndim - 1 :]) for x in every
-    )
+    every = a, n, np.broadcast_to(radius, present.shape), present
+    a_of, n_of, radius_of, present_of = (x.reshape(-1, *x.shape[present.ndim - 1 :]) for x in every)
+    half_of = half.reshape(-1, 1)
     flat = cost.reshape(-1, triples)
     for first in range(0, len(flat), each):
         some = slice(first, first + each)
