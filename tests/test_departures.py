@@ -11,23 +11,26 @@ import yaml
 
 from conftest import run
 from pkmcal import calibrate
-from pkmcal.boards.poses import pose_set
-from pkmcal.calibration.departures import FEWEST, LEVEL, _percent
+from pkmcal.boards.poses import pose_set, size_departure
+from pkmcal.calibration.departures import LEVEL
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.results import load
 from pkmcal.geometry.rigid import perturb
+from pkmcal.identify import score
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.identify.score import Departures, columns_of
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import EdgeSet, Measurements, Mount, concatenate
+from pkmcal.measurements import EdgeSet, Effect, Measurements, Mount, concatenate
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.planning.subject import of_machine
+from pkmcal.session.moved import FEWEST
 from pkmcal.simulation import simulate_edges
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.edges import EdgeNoise
 from pkmcal.simulation.placement import draw_configurations
+from pkmcal.wording import ratio
 
 NOISE = EdgeNoise(0.1, 0.1)
 
@@ -63,21 +66,17 @@ def measured(seed, *, scale=None, turned=None, play=None, machine=None, count=30
     return drawing, data, where
 
 
-def score_tests(drawing, data, where, readings, moved):
+def score_tests(drawing, data, where, readings, moved, families=None):
     """Score tests of an estimate of the data: by changes of the readings (K, m, 1), and of the
     first camera's place from the middle on.
     """
     estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(drawing))
     state = batch_of(estimate.machine, assembled, estimate.state)
-    problem = assembled.problem
-    columns = [columns_of(problem, state, readings=by) for by in readings]
+    effects = [Effect(readings=by) for by in readings]
     if moved:
-        begin = problem.unknowns.stations.start
-        by = problem.linearize(state).by_shared[0, :, :, begin : begin + 6]
-        later = np.arange(len(by)) >= len(by) // 2
-        columns.append(np.where(later[:, None, None], by, 0.0))
-    return estimate, Departures(problem, state, columns)
+        effects.append(Effect(station=0, since=len(data.joints) // 2))
+    return estimate, Departures(assembled, state, effects, families)
 
 
 def scales(data):
@@ -136,14 +135,61 @@ def test_two_departures_are_found_one_after_the_other():
 
 def test_nothing_is_found_twice():
     drawing, data, where = measured(7, scale=(1, 6e-3))
-    estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
-    assembled = assemble(estimate.machine, data, default_gauge(drawing))
-    problem, state = assembled.problem, batch_of(estimate.machine, assembled, estimate.state)
-    columns = [columns_of(problem, state, readings=by) for by in scales(data)[1:3]]
-    tests = Departures(problem, state, columns, [0, 1])  # each a family of its own
+    _, tests = score_tests(drawing, data, where, scales(data)[1:3], False, [0, 1])
     found = [k for k, _ in tests.found(LEVEL)]
     assert found[0] == 0
     assert len(found) == len(set(found))
+
+
+def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
+    """Against dense algebra, all columns of all rows at once; and in pieces as in one."""
+    drawing, data, where = measured(8, scale=(1, 2e-3), count=14)
+    estimate = bundle(drawing, data, start_state(drawing, data, where), scale_noise=False)
+    assembled = assemble(estimate.machine, data, default_gauge(drawing))
+    state, problem = batch_of(estimate.machine, assembled, estimate.state), assembled.problem
+    effects = [Effect(readings=scales(data)[1]), Effect(station=1, since=5)]
+    effects.append(Effect(edges=np.stack([data.edges.shift, data.edges.normal[:, :2]], axis=-1)))
+    tests = Departures(assembled, state, effects, [0, 1, 2], singles=True)
+    own, m = problem.linearize(state), data.joints.shape[1]
+    shared = own.by_shared[0]
+    begin = problem.unknowns.stations.start + 6
+    later = np.where((np.arange(14) >= 5)[:, None, None], shared[..., begin : begin + 6], 0.0)
+    throughout = columns_of(assembled, state, [effects[0], effects[2]], singles=True)(slice(0, 14))
+    single = np.einsum("krm,kl->krlm", throughout[..., 3:], np.eye(14)).reshape(
+        *later.shape[:2], -1
+    )
+    extra = [throughout[..., :1], later, throughout[..., 1:3], single]
+    extra = np.concatenate(extra, axis=-1).reshape(-1, 9 + 14 * m)
+    both = np.zeros((14, shared.shape[1], 14, own.by_own.shape[-1]))
+    both[np.arange(14), :, np.arange(14)] = own.by_own[0]
+    whole = [shared.reshape(len(extra), -1), both.reshape(len(extra), -1)]
+    J, r = np.concatenate(whole, axis=1), np.append(own.value[0].ravel(), own.shared_value[0])
+    J = np.concatenate([J, np.pad(own.shared_by, ((0, 0), (0, J.shape[1] - shared.shape[-1])))])
+    G = np.pad(extra, ((0, len(J) - len(extra)), (0, 0)))
+    parts = [np.arange(1), np.arange(1, 7), np.arange(7, 9)]
+    parts += [np.array([9 + k]) for k in range(14 * m)]
+
+    def oracle(J, k):
+        q = np.linalg.svd(J / np.maximum(np.linalg.norm(J, axis=0), 1e-30), full_matrices=False)[0]
+        H = G[:, parts[k]] - q @ (q.T @ G[:, parts[k]])
+        value = np.linalg.lstsq(H, -r, rcond=None)[0]
+        return float(-value @ H.T @ r), value
+
+    scores = tests.scores()
+    assert len(scores) == len(parts)
+    for k in [0, 1, 2, 3, 40, 70]:
+        chi2, value = oracle(J, k)
+        assert scores[k].chi2 == pytest.approx(chi2, rel=1e-5, abs=1e-6)
+        np.testing.assert_allclose(tests.fitted([k])[0].value, value, rtol=1e-4, atol=1e-9)
+    freed = [0, 1, 4]
+    known = np.concatenate([J, *(G[:, parts[k]] for k in freed)], axis=1)
+    scores = tests.scores(freed)
+    for k in [2, 3, 5, 40, 70]:
+        assert scores[k].chi2 == pytest.approx(oracle(known, k)[0], rel=1e-5, abs=1e-6)
+    monkeypatch.setattr(score, "ROWS", 3 * problem.n_rows)
+    pieces = Departures(assembled, state, effects, [0, 1, 2], singles=True)
+    for one, other in zip(pieces.scores(freed), scores, strict=True):
+        assert one.chi2 == pytest.approx(other.chi2, rel=1e-6, abs=1e-9)
 
 
 def false_alarms(seeds):
@@ -197,8 +243,8 @@ def test_what_is_seen_beside_what_is_not_keeps_its_deviation():
 
 
 def test_a_ratio_without_a_deviation_is_told_roughly():
-    assert _percent(-0.0042, np.inf) == "some 0.4 %"
-    assert _percent(0.00952, 0.0011) == "0.95 ± 0.11 %"
+    assert ratio(-0.0042, np.inf) == "some 0.4 %"
+    assert ratio(0.00952, 0.0011) == "0.95 ± 0.11 %"
 
 
 def test_boards_of_another_size_show_where_readings_give_the_scale():
@@ -220,11 +266,8 @@ def test_boards_of_another_size_show_where_readings_give_the_scale():
     estimate = bundle(machine, data, start, scale_noise=False)
     assembled = assemble(estimate.machine, data, default_gauge(machine))
     state = batch_of(estimate.machine, assembled, estimate.state)
-    by = np.zeros((24, 6, 1))
-    by[:, 3:, 0] = seen[:, :3, 3]
-    columns = columns_of(assembled.problem, state, poses=assembled.places.poses.filled(by))
-    tests = Departures(assembled.problem, state, [columns])
-    fit = tests.fitted([0])[0]
+    one = size_departure(boards, 0, "board.yaml", 0.0)
+    fit = Departures(assembled, state, [one.effect]).fitted([0])[0]
     assert abs(fit.value[0] - 0.004) < 4 * fit.sigma[0] + 2e-4
 
 

@@ -12,7 +12,6 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration import byhand
 from pkmcal.calibration.byhand import Placed, misplaced, without_misplaced
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.gather import focal_part
 from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.results import document_of
 from pkmcal.check.check import check_session
@@ -312,7 +311,7 @@ def test_normals_turn_with_the_focal_length_as_stated(looked):
     session, photographs, _, truth = looked
     p, excess = photographs[EASIEST], 1e-3
     T, pose = truth.T_camera_base[EASIEST], truth.T_base_platform[[EASIEST]]
-    wider = replace(p.camera, parameters=p.camera.parameters + excess * focal_part(p.camera))
+    wider = replace(p.camera, parameters=p.camera.parameters + excess * p.camera.focal_part)
     first, other = (
         legs.measure(replace(p, camera=camera), session.machine, T, pose, 0.7, refine_camera=True)
         for camera in (p.camera, wider)
@@ -327,7 +326,7 @@ def test_normals_turn_with_the_focal_length_as_stated(looked):
     mine = np.flatnonzero(np.array(same) >= 0)
     turned = other.edges.normal[np.array(same)[mine]] - first.edges.normal[mine]
     turned = np.einsum("nji,nj->ni", first.edges.basis[mine], turned)[:, 0]
-    stated = (first.edges.by_intrinsics[mine] @ focal_part(p.camera))[:, 0] * excess
+    stated = (first.edges.by_intrinsics[mine] @ p.camera.focal_part)[:, 0] * excess
     assert np.abs(stated).max() > 1e-4
     slope = (turned @ stated) / (stated @ stated)
     assert slope == pytest.approx(1.0, abs=0.1)

@@ -107,3 +107,11 @@ def listed(names: Sequence[str], longest: int = 6) -> str:
 def percent(share: float) -> str:
     """A share as whole percent, never rounded up to a certainty it has not."""
     return f"{math.floor(100 * min(max(share, 0.0), 1.0))} %"
+
+
+def ratio(value: float, sigma: float) -> str:
+    """The size of a ratio in per cent, with its standard deviation where that is known."""
+    if not math.isfinite(sigma):
+        return f"some {100 * abs(value):.1g} %"
+    places = max(0, 1 - math.floor(math.log10(max(100 * sigma, 1e-6))))
+    return f"{number(100 * abs(value), places)} ± {number(100 * sigma, places)} %"

@@ -39,9 +39,9 @@ from pkmcal.boards.fit import (
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, perturb, pose_difference, skew
-from pkmcal.measurements import PoseSet, Rejection
+from pkmcal.measurements import Departure, Effect, PoseSet, Rejection
 from pkmcal.observe.repeats import groups_of
-from pkmcal.wording import listed
+from pkmcal.wording import listed, ratio
 
 UNEXPLAINED = 0.004
 """Share of the image's width that corners lie off their prediction, rms, from which the board file
@@ -461,3 +461,25 @@ def one_a_configuration(seen: BoardViews, mount: int) -> tuple[PoseSet, tuple[Re
     poses = pose_set(seen.station, rows[found.first], mount, found.pose, found.covariance)
     by = groups_of(rows[found.used]).mean(seen.poses.by_intrinsics[kept[found.used]])
     return replace(poses, by_intrinsics=by), odd
+
+
+def size_departure(poses: PoseSet, mount: int, file: str, gone: float) -> Departure:
+    """A board whose squares are not as large as its file says, by more than its tolerance.
+
+    mount : the board's number. gone : how far the estimate has gone already, as far as the
+    tolerance allowed, relative.
+    """
+    by = np.zeros((len(poses), 6, 1))
+    mine = poses.mount == mount
+    by[mine, 3:, 0] = poses.T_station_target[mine, :3, 3]
+
+    def says(value: Array, sigma: Array) -> tuple[str, str]:
+        size = gone + value[0]
+        return (
+            f"The board's squares are {ratio(size, sigma[0])}"
+            f" {'larger' if size > 0 else 'smaller'} than {file} says",
+            "Measure them over as many as there are; if a ruler agrees, multiply square and marker"
+            f" by {1 + size:.5f}",
+        )
+
+    return Departure("board size", file, says, Effect(poses=by))

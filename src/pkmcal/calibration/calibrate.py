@@ -26,6 +26,7 @@ from pkmcal.calibration.doubts import (
     sizes_told,
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
+from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
     Progress,
     boards_of,
@@ -261,6 +262,7 @@ def _judge(
         ),
         cautions=(
             *(one.sentence for one in departed if not one.against),
+            *outvoted(session, found.turns.measurements, found.estimate),
             *noise_told(session, found.estimate, bool(departed)),
             *lens_told(found.turns.cameras),
         ),

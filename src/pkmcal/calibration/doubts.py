@@ -335,15 +335,18 @@ def check_poses(
     estimate: Estimate,
     richer: tuple[RicherModel, ...] = (),
 ) -> None:
-    """Raise `InputError` where one of the usual mistakes explains why poses do not fit.
+    """Raise `InputError` where one of the usual mistakes explains why poses do not fit, or where a
+    reading never changes.
 
     richer : models that were tried; where one of them fits, it is the model that is at fault.
     """
     if not in_doubt(estimate) or any(model.scale < BAD for model in richer):
         return
+    if error := frozen_in(session):
+        raise error
     doubt = find_doubt(session.machine, measurements, estimate)
     if doubt is not None:
-        raise frozen_in(session) or _error(session, doubt, estimate.statistics.pose_scale)
+        raise _error(session, doubt, estimate.statistics.pose_scale)
 
 
 def as_stated(machine: Machine, measurements: Measurements, estimate: Estimate) -> Estimate:

@@ -70,7 +70,7 @@ class CameraRefinement:
     def at_station(self, number: int) -> Camera:
         """The camera of a station, with its own focal lengths where these breathe."""
         camera = self.camera(self.of_station[number])
-        excess = BREATHING_SIGMA * self.breath[number] * focal_part(camera)
+        excess = BREATHING_SIGMA * self.breath[number] * camera.focal_part
         return replace(camera, parameters=camera.parameters + excess)
 
     def of(self, stations: Integers) -> CameraRefinement:
@@ -104,14 +104,6 @@ class CameraRefinement:
         covariance = estimate.intrinsics_covariance[self.files.index(file)]
         n = len(camera.parameters)
         return replace(camera, covariance=covariance[:n, :n])
-
-
-def focal_part(camera: Camera) -> Array:
-    """The camera's parameters (n,) with all but the focal lengths zero: their change when the
-    lengths grow by their own size.
-    """
-    focal = [name.startswith("focal.") for name in camera.parameter_names]
-    return np.where(focal, camera.parameters, 0.0)
 
 
 def edges_by_camera(observation: Observation, cameras: Sequence[Camera]) -> Array:
@@ -248,6 +240,6 @@ def by_focal(by: Array, station: Integers, cameras: Sequence[Camera | None]) -> 
     focal = np.zeros((int(station.max(initial=-1)) + 1, by.shape[-1]))
     for k, camera in enumerate(cameras[: len(focal)]):
         if camera is not None and by.shape[-1]:
-            part = focal_part(camera)
+            part = camera.focal_part
             focal[k, : len(part)] = part
     return (by @ focal[station][..., None])[..., 0]

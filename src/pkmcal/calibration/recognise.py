@@ -110,7 +110,7 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
         _check_turns(session, found.T_base_platform, near)
         return found.T_base_platform
     bad = [session.configurations[k] for k in np.flatnonzero(~near)]
-    _check_signs(session, bad)
+    _check_columns(session, bad)
     raise InputError(
         "the drawing's machine cannot take these readings: its legs do not meet the platform",
         where=f"{session.document['joints']['file']}, configuration {listed(bad)}",
@@ -120,8 +120,12 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     )
 
 
-def _check_signs(session: Session, bad: list[str]) -> None:
-    """Raise `InputError` where one motor's readings with the other sign would close all loops."""
+def _check_columns(session: Session, bad: list[str]) -> None:
+    """Raise `InputError` where one motor's readings never change, so that the loops do not close,
+    or would close them all with the other sign.
+    """
+    if error := frozen_in(session):
+        raise error
     machine = session.machine
     now = _taken(session, session.joints)
     for column, name in enumerate(session.document["joints"]["columns"]):
@@ -154,7 +158,7 @@ def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
     bad = np.flatnonzero((np.abs(turn) > most) & usable)
     if not bad.size:
         return
-    _check_signs(session, [session.configurations[k] for k in bad])
+    _check_columns(session, [session.configurations[k] for k in bad])
     worst = bad[np.argmax(np.abs(turn[bad]))]
     raise InputError(
         f"the readings turn the platform beyond {np.rad2deg(most):.0f} degrees, where {in_the_way}",

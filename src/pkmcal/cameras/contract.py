@@ -144,17 +144,24 @@ class Camera(ABC):
         k[: len(document.distortion)] = document.distortion
         return cls(document.image_size, np.concatenate([document.focal, document.center, own, k]))
 
+    @property
+    def focal_part(self) -> Array:
+        """(n,) the parameters with all but the focal lengths zero: their change when the lengths
+        grow by their own size.
+        """
+        focal = [name.startswith("focal.") for name in self.parameter_names]
+        return np.where(focal, self.parameters, 0.0)
+
     def departures(self) -> tuple[LensDeparture, ...]:
         """What is wrong first, where anything is: focus, the picture cut otherwise, a lens whose
         distortion was left out.
         """
         eye, lens = np.eye(len(self.parameters)), 4 + len(self.own)
-        focal = np.where(np.arange(len(self.parameters)) < 2, self.parameters, 0.0)
         name, before = self.parameter_names[lens], float(self.parameters[lens])
         return (
             LensDeparture(
                 "focal length",
-                focal[:, None],
+                self.focal_part[:, None],
                 USUAL_FOCAL,
                 lambda v, s: (
                     f"focal lengths fit that are {abs(v[0]):.2%} ± {s[0]:.2%}"

@@ -302,23 +302,31 @@ def bundle(
     return _estimate(machine, measurements, start, assembled, result, gauge)
 
 
+def as_ended(measurements: Measurements, estimate: Estimate) -> tuple[Assembled, BatchState]:
+    """The problem of an estimate at its end, with its weights, noise scales and the lines' shading
+    as it found them, and its state there, but for the shading: as far as anything is from its best
+    value a linear step tells.
+    """
+    machine, measurements = estimate.machine, estimate.as_found(measurements)
+    shading = estimate.line_shading if len(estimate.line_shading) else SHADING_SIGMA
+    assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
+    statistics = estimate.statistics
+    weights = Kinds(
+        estimate.edge_weights / statistics.noise_scale**2,
+        estimate.pose_weights / statistics.pose_scale**2,
+    )
+    assembled = replace(assembled, problem=assembled.trusting(weights))
+    return assembled, batch_of(machine, assembled, estimate.state)
+
+
 def what_data_tell(measurements: Measurements, estimate: Estimate) -> Identifiability:
     """Which combinations of parameters the data fix, at the estimate and with its edge weights.
 
     For words such as "these two values cannot be told apart": names and weights of what is
     unidentified, and of what the drawing knows better than the data.
     """
-    machine, measurements = estimate.machine, estimate.as_found(measurements)
-    shading = estimate.line_shading if len(estimate.line_shading) else SHADING_SIGMA
-    assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
-    problem = assembled.trusting(
-        Kinds(
-            estimate.edge_weights / estimate.statistics.noise_scale**2,
-            estimate.pose_weights / estimate.statistics.pose_scale**2,
-        )
-    )
-    state = batch_of(machine, assembled, estimate.state)
-    return identifiability(problem, machine, state)
+    assembled, state = as_ended(measurements, estimate)
+    return identifiability(assembled.problem, estimate.machine, state)
 
 
 def _estimate(

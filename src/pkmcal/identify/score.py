@@ -10,21 +10,29 @@ in standard deviations, what J leaves of G is ``H = (I - J J^+) G``, and
 are what a further estimate with the departure free would find to first order (Rao 1948), without
 making it: the value that fits, the gain in chi2, and what it does to the unknowns. Under the model
 chi2 has as many degrees of freedom as the data see of the departure.
+
+The rows are gone through twice, some configurations at a time: for an orthonormal basis of what the
+shared unknowns can do, then for the products of all columns with each other, with the basis and
+with r. These few numbers are all that is kept, however many configurations there are, and
+``H^T H = G^T G - (Q^T G)^T (Q^T G)`` has some fourteen digits, of which SEEN asks for ten.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
+from pkmcal.identify.assembly import Assembled
 from pkmcal.identify.covariance import NULL
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
-from pkmcal.solver import eliminate, inverse_root, stacked
+from pkmcal.measurements import Effect
+from pkmcal.solver import ROWS, Linear, eliminate, inverse_root
 
 SEEN = 1e-10
 """Part of a departure's squared rows that has to be left beside all unknowns for the data to see
@@ -60,71 +68,69 @@ class Freed:
 
 
 class Departures:
-    """Columns of departures beside the estimate's own, at its minimum (the problem's first run)."""
+    """Score tests beside an estimate's own unknowns, at its minimum (the problem's first run).
+
+    Departures are numbered: the listed ones in their order, then, with ``singles``, every reading
+    of every configuration in the problem by itself, one configuration after the other.
+    """
 
     def __init__(
         self,
-        problem: Problem,
+        assembled: Assembled,
         state: BatchState,
-        columns: Sequence[Array],
+        listed: Sequence[Effect],
         families: Sequence[int] | None = None,
+        *,
+        singles: bool = False,
     ) -> None:
-        """Of departures by their rows' derivatives (K', r, k), by configuration.
+        """As the module says.
 
-        families : of which each is; among many departures of one kind the single one has to gain
-        more, and those of other kinds do not pay for it. One family if absent.
+        families : of which each listed one is; among many departures of one kind the single one
+        has to gain more, and those of other kinds do not pay for it. One family if absent; single
+        readings are one of their own.
         """
-        self._family = np.zeros(len(columns), dtype=int) if families is None else np.array(families)
-        linear, ends = problem.linearize(state), np.cumsum([part.shape[-1] for part in columns])
-        self._parts: list[Integers] = [
-            np.arange(end - part.shape[-1], end) for part, end in zip(columns, ends, strict=True)
-        ]
-        # rows that are weighted away or hold nothing say nothing of departures either
-        extra = np.where(linear.usable[0][..., None], np.concatenate(columns, axis=-1), 0.0)
-        wide = linear._replace(
-            by_shared=np.concatenate([linear.by_shared, extra[None]], axis=-1),
-            shared_by=np.pad(linear.shared_by, ((0, 0), (0, extra.shape[-1]))),
-        )
-        rows, value = (part[0] for part in stacked(wide, eliminate(wide, np.zeros(1))))
-        n, machine = problem.unknowns.count, problem.unknowns.machine
-        half = inverse_root(rows[None, :, :n], NULL, loose=False)[0]
-        basis, by = rows[:, :n] @ half, rows[:, n:]
-        along = basis.T @ by
-        self._scale = np.sqrt(np.maximum(np.sum(by**2, axis=0), 1e-300))
-        self._left = (by - basis @ along) / self._scale
-        self._value = value - basis @ (basis.T @ value)
-        self._moves = -(problem.free @ half[machine] @ along)
+        problem = assembled.problem
+        basis = _basis(problem, state)
+        self._made = _products(assembled, state, listed, basis, singles)
+        family = np.zeros(len(listed), dtype=int) if families is None else np.array(families)
+        rest = np.full(self._made.single[..., 0].size, family.max(initial=-1) + 1)
+        self._family = np.append(family, rest).astype(int)
+        self._moves = -(problem.free @ basis[problem.unknowns.machine])
 
     def scores(self, freed: Sequence[int] = ()) -> list[Score]:
         """Of all departures, in their order, with some of them free already: these gain nothing."""
         from scipy.special import chdtrc
 
-        left, value = self._left, self._value
-        if freed:
-            u, s, _ = np.linalg.svd(left[:, self._columns(freed)], full_matrices=False)
-            known = u[:, s**2 > SEEN]
-            left, value = (x - known @ (known.T @ x) for x in (left, value))
-        out: list[Score] = []
-        for k, part in enumerate(self._parts):
-            u, s, _ = np.linalg.svd(left[:, part], full_matrices=False)
-            along = u[:, (s**2 > SEEN) & (k not in freed)].T @ value
-            chi2, dof = float(along @ along), len(along)
-            out.append(Score(chi2, dof, float(chdtrc(dof, chi2)) if dof else 1.0))
-        tested = np.bincount(self._family, weights=[score.dof > 0 for score in out])
-        times = np.count_nonzero(tested) * tested[self._family]
-        return [
-            replace(score, adjusted=min(float(n) * score.chance, 1.0)) if score.dof else score
-            for score, n in zip(out, times, strict=True)
-        ]
+        made, chi2, dof = self._made, np.zeros(len(self._family)), np.zeros(len(self._family))
+        free = _Left.of(made, freed)
+        for k in range(len(made.listed)):
+            alone = _Left.of(made, [k])
+            across = made.left(k, freed)
+            found = _Left(
+                alone.scale,
+                alone.squared - across @ free.inverse @ across.T,
+                alone.value - across @ free.inverse @ free.value,
+            )
+            chi2[k], dof[k] = found.gain
+        chi2[len(made.listed) :], dof[len(made.listed) :] = made.gains_of_singles(freed, free)
+        dof[list(freed)] = 0
+        tests = np.bincount(self._family, weights=dof > 0)
+        times = np.count_nonzero(tests) * tests[self._family]
+        chance = np.where(dof > 0, chdtrc(np.maximum(dof, 1), chi2), 1.0)
+        adjusted = np.where(dof > 0, np.minimum(times * chance, 1.0), 1.0)
+        every = zip(*(x.tolist() for x in (chi2, dof.astype(int), chance, adjusted)), strict=True)
+        return [Score(*one) for one in every]
 
-    def found(self, alpha: float) -> list[tuple[int, Score]]:
+    def found(self, alpha: float, freed: Sequence[int] = ()) -> list[tuple[int, Score]]:
         """Those that the data show at a level ``alpha`` of all tests together (Bonferroni), one
-        after the other, the least by chance first, by their numbers; each beside those before it.
+        after the other, the least by chance first, by their numbers; each beside those before it,
+        and beside those that are free already.
         """
         out: list[tuple[int, Score]] = []
-        while len(out) < min(MOST, len(self._parts)):
-            scores = self.scores([k for k, _ in out])
-            best = min(range(len(scores)), key=lambda k: scores[k].adjusted)
+        while len(out) < min(MOST, len(self._family)):
+            scores = self.scores([*freed, *(k for k, _ in out)])
+            # chances below the smallest number are all zero
+            best = min(range(len(scores)), key=lambda k: (scores[k].adjusted, -scores[k].chi2))
             if scores[best].adjusted > alpha:
                 break
             out.append((best, scores[best]))
@@ -132,56 +138,270 @@ class Departures:
 
     def fitted(self, freed: Sequence[int]) -> list[Freed]:
         """What some departures come to, all free together."""
-        columns = self._columns(freed)
-        u, s, vt = np.linalg.svd(self._left[:, columns], full_matrices=False)
-        seen = s**2 > SEEN
-        back = vt[seen].T / s[seen]
-        value = -(back @ (u[:, seen].T @ self._value)) / self._scale[columns]
-        sigma = np.sqrt(np.sum(back**2, axis=1)) / self._scale[columns]
-        hidden = np.sum(vt[~seen] ** 2, axis=0) > HIDDEN
-        sigma[hidden] = np.inf
-        ends = np.cumsum([len(self._parts[k]) for k in freed])
+        made, free = self._made, _Left.of(self._made, freed)
+        value, sigma = -free.inverse @ free.value, np.sqrt(np.diag(free.inverse))
+        sigma[free.hidden > HIDDEN] = np.inf
+        cuts = np.cumsum([made.count(k) for k in freed])[:-1]
         return [
-            Freed(v, s, self._moves[:, self._parts[k]] @ v)
-            for k, v, s in zip(
-                freed, np.split(value, ends[:-1]), np.split(sigma, ends[:-1]), strict=True
-            )
+            Freed(v, s, self._moves @ (made.with_basis(k).T @ v))
+            for k, v, s in zip(freed, np.split(value, cuts), np.split(sigma, cuts), strict=True)
         ]
 
-    def _columns(self, freed: Sequence[int]) -> Integers:
-        return np.concatenate([self._parts[k] for k in freed])
+
+class _Listed(NamedTuple):
+    """A listed departure's columns, and from which configuration in the problem on."""
+
+    columns: Integers
+    since: int
+
+
+@dataclass(frozen=True)
+class _Products:
+    """Products of all columns with each other, their configurations' own unknowns eliminated.
+
+    n : columns of the stations and of the listed departures, which come first; then the basis, then
+    the residuals, w in all. after : by first configuration, products (n, w) of these columns with
+    all from it on. single : (K', m, w) of the single readings' columns with all, among : (K', m, m)
+    with each other. known : (nb,) of the basis with the residuals, rows of the prior included.
+    """
+
+    listed: tuple[_Listed, ...]
+    n: int
+    after: dict[int, Array]
+    single: Array
+    among: Array
+    known: Array
+
+    def count(self, k: int) -> int:
+        """Numbers of a departure."""
+        return len(self.listed[k].columns) if k < len(self.listed) else 1
+
+    def with_all(self, k: int) -> Array:
+        """Products of a departure's columns with all, (k, w)."""
+        if k < len(self.listed):
+            columns, since = self.listed[k]
+            return self.after[since][columns]
+        row, motor = divmod(k - len(self.listed), self.single.shape[1])
+        return self.single[row, motor : motor + 1]
+
+    def with_basis(self, k: int) -> Array:
+        """The same with the basis, (k, nb)."""
+        return self.with_all(k)[:, self.n : -1]
+
+    def with_residuals(self, freed: Sequence[int]) -> Array:
+        """Of the columns of some, as the basis leaves them, with the residuals."""
+        parts = [np.zeros(0)]
+        parts += [self.with_all(k)[:, -1] - self.with_basis(k) @ self.known for k in freed]
+        return np.concatenate(parts)
+
+    def between(self, k: int, other: int) -> Array:
+        """Products of the columns of two departures, (k, k')."""
+        if k >= len(self.listed):
+            row, motor = divmod(k - len(self.listed), self.single.shape[1])
+            return self.singles_with(other)[row, motor : motor + 1]
+        if other >= len(self.listed):
+            return self.between(other, k).T
+        one, two = self.listed[k], self.listed[other]
+        return self.after[max(one.since, two.since)][np.ix_(one.columns, two.columns)]
+
+    def left(self, k: int, freed: Sequence[int]) -> Array:
+        """The same with all of some, of what the basis leaves of both."""
+        parts = [np.zeros((self.count(k), 0))]
+        parts += [self.between(k, f) - self.with_basis(k) @ self.with_basis(f).T for f in freed]
+        return np.concatenate(parts, axis=1)
+
+    def singles_with(self, other: int) -> Array:
+        """Products of the single readings' columns with a departure's, (K', m, k)."""
+        if other < len(self.listed):
+            columns, since = self.listed[other]
+            out = self.single[..., columns].copy()
+            out[:since] = 0.0
+            return out
+        row, motor = divmod(other - len(self.listed), self.single.shape[1])
+        out = np.zeros((*self.single.shape[:2], 1))
+        out[row, :, 0] = self.among[row, :, motor]
+        return out
+
+    def gains_of_singles(self, freed: Sequence[int], free: _Left) -> tuple[Array, Array]:
+        """What each single reading gains beside those that are free, and whether it is seen,
+        (K' m,) each.
+        """
+        basis, squared = self.single[..., self.n : -1], np.einsum("kmm->km", self.among)
+        left = squared - np.sum(basis**2, axis=-1)
+        value = self.single[..., -1] - basis @ self.known
+        parts = [np.zeros((*squared.shape, 0))]
+        parts += [self.singles_with(f) - basis @ self.with_basis(f).T for f in freed]
+        across = np.concatenate(parts, axis=-1)
+        left = left - np.einsum("kmf,fg,kmg->km", across, free.inverse, across)
+        value = value - across @ (free.inverse @ free.value)
+        seen = left > SEEN * squared
+        return np.where(seen, value**2 / np.where(seen, left, 1.0), 0.0).ravel(), seen.ravel()
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What all else leaves of some columns: scale (c,) their lengths before, squared (c, c)
+    products with each other, value (c,) with the residuals.
+    """
+
+    scale: Array
+    squared: Array
+    value: Array
+
+    @classmethod
+    def of(cls, made: _Products, freed: Sequence[int]) -> _Left:
+        """What the basis leaves of some departures."""
+        lengths = [np.zeros(0), *(np.sqrt(np.diag(made.between(k, k))) for k in freed)]
+        squared = [np.zeros((0, 0)), *(made.left(k, freed) for k in freed)][len(freed) > 0 :]
+        scale = np.maximum(np.concatenate(lengths), 1e-150)
+        return cls(scale, np.concatenate(squared), made.with_residuals(freed))
+
+    def _directions(self) -> tuple[Array, Array]:
+        """Parts of the squared columns that are left in each direction, and the directions."""
+        return np.linalg.eigh(self.squared / self.scale[:, None] / self.scale)
+
+    @property
+    def inverse(self) -> Array:
+        """Of the products (c, c), in the directions that are seen."""
+        part, ways = self._directions()
+        seen = part > SEEN
+        back = ways[:, seen] / np.sqrt(part[seen]) / self.scale[:, None]
+        return back @ back.T
+
+    @property
+    def gain(self) -> tuple[float, int]:
+        """chi2 that they gain together, and by how many numbers."""
+        seen = self._directions()[0] > SEEN
+        return float(self.value @ self.inverse @ self.value), int(seen.sum())
+
+    @property
+    def hidden(self) -> Array:
+        """(c,) part of each that lies in directions which are not seen."""
+        part, ways = self._directions()
+        return np.sum(ways[:, part <= SEEN] ** 2, axis=1)
+
+
+def _basis(problem: Problem, state: BatchState) -> Array:
+    """B (na, nb): the rows by the shared unknowns times it are orthonormal."""
+    count = problem.unknowns.count
+    root: Array = np.zeros((0, count))
+    for cut, part, at in _cuts(problem, state):
+        linear = part.linearize(at)
+        rows = eliminate(linear, np.zeros(1)).rows[0].reshape(-1, count)
+        before = root if cut.start else linear.shared_by
+        root = np.asarray(np.linalg.qr(np.concatenate([before, rows]), mode="r"))
+    half = inverse_root(root[None], NULL, loose=False)[0]
+    return half[:, np.any(half != 0, axis=0)]
+
+
+def _products(
+    assembled: Assembled,
+    state: BatchState,
+    listed: Sequence[Effect],
+    basis: Array,
+    singles: bool,
+) -> _Products:
+    """Of the departures' columns."""
+    problem, seen = assembled.problem, assembled.seen
+    stations, motors = problem.unknowns.stations, problem.layout.n_readings if singles else 0
+    parts: list[_Listed] = []
+    n = 6 * problem.unknowns.n_stations
+    for effect in listed:
+        if effect.station is None:
+            parts.append(_Listed(n + np.arange(effect.count), 0))
+            n += effect.count
+        else:
+            since = int(np.count_nonzero(seen[: effect.since]))
+            parts.append(_Listed(6 * effect.station + np.arange(6), since))
+    begins = sorted({0, *(part.since for part in parts)})
+    width = n + basis.shape[1] + 1
+    sums: dict[int, Array] = {begin: np.zeros((n, width)) for begin in begins}
+    single, among, known = [np.zeros((0, motors, width))], [np.zeros((0, motors, motors))], 0.0
+    throughout = [effect for effect in listed if effect.station is None]
+    columns = columns_of(assembled, state, throughout, singles=singles)
+    for cut, part, at in _cuts(problem, state):
+        linear = part.linearize(at)
+        rows, value = _eliminated(linear, columns(cut))
+        count = problem.unknowns.count
+        if not cut.start:
+            known = (linear.shared_by @ basis).T @ linear.shared_value[0]
+        split = rows.shape[-1] - motors
+        own = [rows[..., stations], rows[..., count:split], rows[..., :count] @ basis]
+        wide = np.concatenate([*own, value[..., None]], axis=-1)
+        for begin in begins:
+            flat = wide[max(begin - cut.start, 0) :].reshape(-1, width)
+            sums[begin] += flat[:, :n].T @ flat
+        known = known + np.einsum("kri,kr->i", own[-1], value)
+        if singles:
+            by_single = rows[..., split:]
+            single.append(by_single.mT @ wide)
+            among.append(by_single.mT @ by_single)
+    return _Products(
+        tuple(parts), n, sums, np.concatenate(single), np.concatenate(among), np.asarray(known)
+    )
+
+
+def _cuts(problem: Problem, state: BatchState) -> Iterator[tuple[slice, Problem, BatchState]]:
+    """Some configurations at a time, with their problem and state."""
+    count = len(problem.blocks.present)
+    each = max(1, ROWS // max(1, problem.n_rows))
+    for first in range(0, count, each):
+        cut = slice(first, min(first + each, count))
+        yield cut, problem.among(cut), problem.state_among(state, cut)
+
+
+def _eliminated(linear: Linear, columns: Array) -> tuple[Array, Array]:
+    """Rows (K', r, na + k) with columns (K', r, k) beside the unknowns' and residuals (K', r), of
+    which the configurations' own unknowns are eliminated. Rows that are weighted away or hold
+    nothing say nothing of departures either.
+    """
+    extra = np.where(linear.usable[0][..., None], columns, 0.0)
+    wide = linear._replace(
+        by_shared=np.concatenate([linear.by_shared, extra[None]], axis=-1),
+        shared_by=np.pad(linear.shared_by, ((0, 0), (0, extra.shape[-1]))),
+    )
+    reduced = eliminate(wide, np.zeros(1))
+    return reduced.rows[0], reduced.value[0]
 
 
 def columns_of(
-    problem: Problem,
-    state: BatchState,
-    *,
-    edges: Array | None = None,
-    readings: Array | None = None,
-    poses: Array | None = None,
-) -> Array:
-    """Columns (K', r, k) of a departure by what it does to the measurements, k numbers.
-
-    edges : (K', G, 2, k) change of the measured normals in their bases. readings : (K', m, k).
-    poses : (K', G', 6, k) left perturbation of the measured poses. The changes lead from what was
-    measured to what should have been.
+    assembled: Assembled, state: BatchState, listed: Sequence[Effect], *, singles: bool = False
+) -> Callable[[slice], Array]:
+    """Gives the columns (K', r, k) of some configurations, by effects throughout, in their order,
+    then by the single readings.
     """
-    parts = [part for part in (edges, readings, poses) if part is not None]
-    k, n = parts[0].shape[-1], len(problem.blocks.present)
-    data, boards, closures = problem.data, problem.pose_data, problem.closure_rows
-    n_rows = closures.stop + 6 * problem.pose_blocks.present.shape[1]
-    out = np.zeros((n, n_rows, k))
-    if edges is not None:
-        weighed = data.weighed[0]
-        out[:, : closures.start] = -(weighed @ edges).reshape(n, closures.start, k)
-    if readings is not None:
-        c, layout = problem.closure(state), problem.layout
+    problem, places = assembled.problem, assembled.places
+    counts = [effect.count for effect in listed]
+    m, n = problem.layout.n_readings, sum(counts)
+    readings = np.zeros((len(problem.blocks.present), m, n + (m if singles else 0)))
+    readings[..., n:] = np.eye(m)[:, : readings.shape[-1] - n]
+    placed: list[tuple[slice, Array | None, Array | None]] = []
+    for effect, end in zip(listed, np.cumsum(counts).tolist(), strict=True):
+        where = slice(end - effect.count, end)
+        if effect.readings is not None:
+            readings[..., where] = effect.readings[assembled.seen]
+        edges = None if effect.edges is None else places.edges.filled(effect.edges)
+        poses = None if effect.poses is None else places.poses.filled(effect.poses)
+        placed.append((where, edges, poses))
+
+    def columns(cut: slice) -> Array:
+        part = problem.among(cut)
+        c, layout = part.closure(part.state_among(state, cut)), part.layout
+        out = np.zeros((len(part.blocks.present), part.n_rows, readings.shape[-1]))
         row = np.where(layout.row_motor >= 0, layout.row_motor, 0)
-        by = np.where(layout.row_motor >= 0, c.by_reading[0], 0.0)[..., None] * readings[:, row]
-        out[:, closures] = by_noise(
-            layout, problem.joint_noise[:1, None, None], c.by_reading, by[None]
-        )[0]
-    if poses is not None:
-        weighed = (np.sqrt(boards.weight)[..., None, None] * boards.whiten)[0]
-        out[:, closures.stop :] = -(weighed @ poses).reshape(n, n_rows - closures.stop, k)
-    return out
+        by = np.where(layout.row_motor >= 0, c.by_reading[0], 0.0)[..., None]
+        by = by * readings[cut][:, row]
+        noise = part.joint_noise[:1, None, None]
+        out[:, part.closure_rows] = by_noise(layout, noise, c.by_reading, by[None])[0]
+        of_edges = part.data.weighed[0]
+        of_poses = (np.sqrt(part.pose_data.weight)[..., None, None] * part.pose_data.whiten)[0]
+        before, after = out[:, : part.closure_rows.start], out[:, part.closure_rows.stop :]
+        for where, edges, poses in placed:
+            shape = (len(out), -1, where.stop - where.start)
+            if edges is not None:
+                before[..., where] = -(of_edges @ edges[cut]).reshape(shape)
+            if poses is not None:
+                after[..., where] = -(of_poses @ poses[cut]).reshape(shape)
+        return out
+
+    return columns

@@ -12,7 +12,8 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
-from pkmcal.wording import listed
+from pkmcal.measurements import Departure, Effect
+from pkmcal.wording import amount, listed, ratio
 
 # A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
 # is out by less than this part of the stroke is told, and one that is further out is refused.
@@ -151,6 +152,54 @@ def frozen(joints: Array, noise: float, columns: Sequence[str], file: str) -> In
         next_step="Look at the encoder, its cable and the program that logs it. If this motor was"
         " really held, something else is wrong",
     )
+
+
+def departures(
+    joints: Array, columns: Sequence[str], units: Sequence[str]
+) -> tuple[list[Departure], list[Departure]]:
+    """What may be otherwise with readings (K, m): of each its scale, and its play, by which it
+    differs with the way from which its motor came, in the order of the table. units : (m,).
+    """
+    way = np.sign(np.diff(joints, axis=0, prepend=joints[:1])) / 2
+    scales: list[Departure] = []
+    plays: list[Departure] = []
+    for m, (name, unit) in enumerate(zip(columns, units, strict=True)):
+        one = np.eye(len(columns))[m]
+
+        def scale(value: Array, sigma: Array, name: str = name) -> tuple[str, str]:
+            return (
+                f"The readings of {name} have another scale: true ones are"
+                f" {ratio(value[0], sigma[0])} {'larger' if value[0] > 0 else 'smaller'}",
+                f"Multiply this column of joints.csv by {1 + value[0]:.5f} if the encoder's counts"
+                " or the screw's lead agree, or correct it in the controller",
+            )
+
+        def play(value: Array, _s: Array, name: str = name, unit: str = unit) -> tuple[str, str]:
+            return (
+                f"The readings of {name} have a play of {amount(abs(value[0]), unit)}: they differ"
+                " by the way from which the motor came",
+                "Come to every configuration from the same side, or take the play out",
+            )
+
+        by_scale, by_way = ((x * one)[..., None] for x in (joints, way))
+        scales.append(Departure("reading scale", name, scale, Effect(readings=by_scale)))
+        plays.append(Departure("backlash", name, play, Effect(readings=by_way)))
+    return scales, plays
+
+
+def wrong_reading(column: str, unit: str, configuration: str) -> Departure:
+    """A single reading that is wrong."""
+
+    def says(value: Array, sigma: Array) -> tuple[str, str]:
+        return (
+            f"The reading of {column} in configuration {configuration} is off: what was seen tells"
+            f" {amount(abs(value[0]), unit)} {'more' if value[0] > 0 else 'less'}, to"
+            f" {amount(sigma[0], unit)}",
+            "Look it up where readings are logged, and whether this photograph bears the right"
+            " name, or leave the configuration out",
+        )
+
+    return Departure("reading", f"{column}, {configuration}", says)
 
 
 def _check_movement(table: CsvTable, noise: float) -> list[str]:

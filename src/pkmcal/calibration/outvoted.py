@@ -1,0 +1,122 @@
+"""Measured poses that the estimate let go, and what explains them: a reading, or a wrong name.
+
+A pose that was measured tells what all motors should have read, whatever they did read. Where a
+configuration disagrees and all of its readings but one agree, that reading is wrong; where its pose
+agrees with the readings of another configuration, names were mixed up. Either is outvoted by the
+other configurations, so the result is right; but whoever took the photographs wants to know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.geometry.rigid import inverse, skew
+from pkmcal.identify.estimate import Estimate
+from pkmcal.measurements import Measurements
+from pkmcal.session.load import Session
+from pkmcal.session.readings import wrong_reading
+from pkmcal.wording import listed
+
+LEVEL = 0.005
+"""Chance at which any configuration of a right session disagrees, and that at which one reading, or
+another configuration's, is no explanation."""
+WORST = 100.0
+"""Times its noise that the better half of a session may be off: with more, nothing fits, and no
+configuration stands out."""
+
+
+def outvoted(session: Session, measurements: Measurements, estimate: Estimate) -> Iterator[str]:
+    """A sentence for each configuration that stands against the others and is explained."""
+    whole = (measurements.poses.rows == 6) & measurements.on_platform[measurements.poses.mount]
+    which = np.flatnonzero(whole)
+    if not which.size:
+        return
+    off, noise = _off(measurements, estimate, which)
+    told = np.isfinite(off).all(axis=1) & np.isfinite(noise).all(axis=(1, 2))
+    which, off, noise = which[told], off[told], noise[told]
+    own, m = measurements.poses.configuration[which], off.shape[1]
+    if len(which) < 2 * m:
+        return
+    chi2 = _chi2(off, noise)
+    usual = max(float(np.median(chi2)) / m, 1.0)  # what the model leaves out, all poses have
+    if usual > WORST**2:
+        return
+    noise = usual * noise
+    odd = _chance(m, chi2 / usual) < LEVEL / len(which)
+    odd = np.flatnonzero(odd & (estimate.pose_weights[which] < 0.5))
+    # what the machine did in each odd one is what these rows of the table say, (n, K)
+    others = measurements.joints - measurements.joints[own[odd], None]
+    alike = _chance(m, _chi2(off[odd, None] - others, noise[odd, None])) > LEVEL
+    exchanged = alike[:, own[odd]] & alike[:, own[odd]].T
+    columns, units = session.document["joints"]["columns"], session.machine.joint_units
+    for n, k in enumerate(odd.tolist()):
+        name = session.configurations[own[k]]
+        if exchanged[n].any():
+            if exchanged[n, n:].any():  # told once, at the first of the two
+                other = session.configurations[own[odd[n + int(np.argmax(exchanged[n, n:]))]]]
+                yield _misnamed(session, name, other, True)
+            continue
+        sharp = np.linalg.inv(noise[k])
+        value, sigma = (sharp @ off[k]) / np.diag(sharp), 1 / np.sqrt(np.diag(sharp))
+        explains = _chance(m - 1, chi2[k] / usual - (value / sigma) ** 2) > LEVEL
+        if np.count_nonzero(explains) == 1:
+            motor = int(np.argmax(explains))
+            one = wrong_reading(columns[motor], units[motor], name)
+            what, todo = one.says(value[[motor]], sigma[[motor]])
+            yield f"{what}; it was outvoted, and the result does not rest on it. {todo}."
+        elif alike[n].any():
+            yield _misnamed(session, name, session.configurations[int(np.argmax(alike[n]))], False)
+
+
+def _misnamed(session: Session, name: str, other: str, both: bool) -> str:
+    file = session.document["joints"]["file"]
+    where = f"{file}, configuration {listed([name, other] if both else [name])}"
+    shows = f"what was seen in {name} is what the readings of {other} say" + (
+        ", and the other way round" if both else ""
+    )
+    return (
+        f"{where}: {shows}; {'both were' if both else 'it was'} outvoted, and the result does not"
+        " rest on it. Look whether photographs, or rows of the table, bear each other's names."
+    )
+
+
+def _off(measurements: Measurements, estimate: Estimate, which: Integers) -> tuple[Array, Array]:
+    """By how much the readings should have been larger, (n, m), by measured poses of the platform,
+    and the covariance (n, m, m) of that; NaN where the machine cannot take a pose.
+    """
+    poses, state = measurements.poses.select(which), estimate.state
+    T_camera_base, T_mount = state.T_camera_base[poses.station], state.T_mount[poses.mount]
+    tolerance = np.array([mount.tolerance for mount in measurements.mounts])
+    size = np.zeros(len(tolerance))
+    size[tolerance > 0] = state.sizes
+    T_station_target = poses.T_station_target.copy()
+    T_station_target[:, :3, 3] *= (1 + (tolerance * size)[poses.mount])[:, None]
+    T_base_platform = inverse(T_camera_base) @ T_station_target @ inverse(T_mount)
+    # a turn and shift of the target, as one of the platform in the base's frame
+    turn = T_camera_base[:, :3, :3].mT
+    arm = T_base_platform[:, :3, :3] @ T_mount[:, :3, 3:]
+    by = np.zeros((len(which), 6, 6))
+    by[:, :3, :3] = by[:, 3:, 3:] = turn
+    by[:, 3:, :3] = skew(arm[..., 0]) @ turn
+    by = by @ np.linalg.inv(poses.whiten)
+    with np.errstate(invalid="ignore"):
+        off = estimate.machine.inverse(T_base_platform) - measurements.joints[poses.configuration]
+        root = estimate.machine.inverse_jacobian(T_base_platform) @ by
+    statistics = estimate.statistics
+    own = (measurements.joint_noise * statistics.reading_scale) ** 2
+    noise = statistics.pose_scale**2 * root @ root.mT + own * np.eye(off.shape[1])
+    return off, noise
+
+
+def _chi2(off: Array, noise: Array) -> Array:
+    """Squares (n,) of deviations (n, m) in units of their covariance (n or 1, m, m)."""
+    return np.sum(off * np.linalg.solve(noise, off[..., None])[..., 0], axis=-1)
+
+
+def _chance(dof: int, chi2: Array) -> Array:
+    from scipy.special import chdtrc
+
+    return chdtrc(dof, chi2)

@@ -1,0 +1,40 @@
+"""Cameras and trackers that did not stand still while they measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.measurements import Departure, Effect
+from pkmcal.wording import amount
+
+FEWEST = 3
+"""Configurations on either side of a movement: fewer are outliers."""
+MOMENTS = 12
+"""Times at most, spread over a station's configurations, at which it may have moved."""
+
+
+def departures(
+    station: int, name: str, used: Integers, configurations: Sequence[str], what: str = "camera"
+) -> Iterator[Departure]:
+    """That a station stands elsewhere from some configuration on.
+
+    station, name : its number and name. used : configurations of which it measured something, in
+    their order. what : stands there.
+    """
+    times = min(MOMENTS, len(used) - 2 * FEWEST + 1)
+    for k in np.unique(np.linspace(FEWEST, len(used) - FEWEST, max(times, 0)).astype(int)).tolist():
+        before, after = (configurations[int(used[k + d])] for d in (-1, 0))
+
+        def says(value: Array, _s: Array, b: str = before, a: str = after) -> tuple[str, str]:
+            turn, shift = np.linalg.norm(value[:3]), np.linalg.norm(value[3:])
+            return (
+                f"The {what} of {name} stood elsewhere after configuration {b}, by some"
+                f" {amount(float(shift), 'm')} and {amount(float(turn), 'rad')}",
+                f"Make two stations of it, one up to {b} and one from {a} on",
+            )
+
+        effect = Effect(station=station, since=int(used[k]))
+        yield Departure("station moved", name, says, effect)
