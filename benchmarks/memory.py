@@ -7,7 +7,7 @@ Thirty configurations of a hexapod are simulated, seen from each of a few places
 many configurations with other names: hard links to the photographs, and readings that scatter
 about the true ones as the session states, so the session stays right. (What the renderer's shading
 does to thirty configurations' edges is the same in every repeat; of hundreds it may be told as a
-lens that is another, and the result refused. Nothing is measured by that.) ``pkmcal calibrate``, with
+lens that is another, and the result refused; costs are the same.) ``pkmcal calibrate``, with
 all that it writes, runs on each size in a process of its own: processor seconds, seconds by the
 clock and the greatest memory, beside those of a process that only imports what it needs, and the
 exponents with which they grow. ``--parts`` prints the same by step in place of that: memory when a
