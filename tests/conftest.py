@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from pkmcal.commands import console
 from pkmcal.commands.cli import main
 from rendered import once
 
@@ -36,6 +37,12 @@ def run(*words) -> Run:
     with redirect_stdout(out), redirect_stderr(err):
         code = main([str(word) for word in words])
     return Run(code, out.getvalue(), err.getvalue())
+
+
+@pytest.fixture(autouse=True)
+def unhurried(monkeypatch):
+    """No line about the progress on stderr, which tests compare, however slow the machine is."""
+    monkeypatch.setattr(console, "EVERY", 3600.0)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from pkmcal.check import check
 from pkmcal.check.check import (
     JointCheck,
     Level,
@@ -119,6 +120,15 @@ def test_a_station_whose_photographs_are_all_broken(session):
     found = check_session(session)
     assert len(texts(found, Level.WRONG)) == 4
     assert not any(station.recognised for station in found.stations)
+
+
+def test_of_many_broken_photographs_some_are_named(session, monkeypatch):
+    monkeypatch.setattr(check, "NAMED", 1)
+    for path in (session / "images" / "station1").iterdir():
+        path.write_bytes(path.read_bytes()[:-300])
+    first, others = texts(check_session(session), Level.WRONG)
+    assert "cannot be decoded" in first
+    assert "stations.station1: photographs cannot be decoded; found 3 more of this" in others
 
 
 def test_a_station_without_a_pose_is_found_anywhere(session):

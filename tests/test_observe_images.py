@@ -14,7 +14,7 @@ import pytest
 
 from pkmcal.errors import InputError
 from pkmcal.observe.complaints import listening
-from pkmcal.observe.images import decode, decode_all
+from pkmcal.observe.images import Pictures, Selected, decode
 
 SIZE = (64, 48)
 GREY = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
@@ -159,7 +159,7 @@ def test_nobody_is_blamed_for_what_another_thread_decodes(tmp_path, capfd):
     for k, path in enumerate(paths):
         path.write_bytes(JPEG if k != 7 else JPEG[: len(JPEG) * 2 // 3] + b"\xff\xd9")
     with pytest.raises(InputError, match=r"^7\.jpg: the photograph cannot be decoded"):
-        decode_all(paths, SIZE, [path.name for path in paths], workers=6)
+        Pictures.read(paths, SIZE, [path.name for path in paths], most=12)
     assert capfd.readouterr() == ("", "")
 
 
@@ -192,13 +192,35 @@ def test_a_photograph_that_is_not_there(tmp_path):
     assert str(caught.value) == "images/front/b.png: cannot be read (No such file or directory)."
 
 
-def test_several_keep_their_order_and_the_first_fault_is_told(tmp_path):
-    paths = [tmp_path / f"{k}.png" for k in range(4)]
+def several(tmp_path, count=4):
+    paths = [tmp_path / f"{k}.png" for k in range(count)]
     for k, path in enumerate(paths):
         path.write_bytes(encoded(".png", np.full((48, 64), 10 * k, np.uint8)))
-    labels = [path.name for path in paths]
-    images = decode_all(paths, SIZE, labels)
+    return paths, [path.name for path in paths]
+
+
+def test_several_keep_their_order_and_the_first_fault_is_told(tmp_path):
+    paths, labels = several(tmp_path)
+    images = Pictures.read(paths, SIZE, labels, 2)
     assert [int(image[0, 0]) for image in images] == [0, 10, 20, 30]
+    assert [int(image[0, 0]) for image in images[-1:0:-2]] == [30, 10]
     paths[1].write_bytes(b"")
     with pytest.raises(InputError, match=r"^1\.png: the photograph cannot be decoded"):
-        decode_all(paths, SIZE, labels)
+        Pictures.read(paths, SIZE, labels, 0)
+
+
+def test_so_many_stay_decoded_and_the_others_are_decoded_again(tmp_path):
+    paths, labels = several(tmp_path)
+    images = Pictures.read(paths, SIZE, labels, 2)
+    assert [images[k] is images[k] for k in range(4)] == [True, True, False, False]
+
+
+def test_of_some_photographs_no_other_is_decoded(tmp_path):
+    paths, labels = several(tmp_path)
+    images = Pictures(paths, SIZE, labels)
+    for path in paths[:3]:
+        path.write_bytes(b"")
+    some = Selected(images, np.array([2, 3, 0]))
+    assert [int(some[1][0, 0]), int(some[1:2][0][0, 0]), len(some)] == [30, 30, 3]
+    with pytest.raises(InputError, match=r"^0\.png"):
+        _ = some[-1]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pkmcal.errors import InputError
-from pkmcal.files import csv_text, read_csv, write_text
+from pkmcal.files import csv_text, documents, read_csv, write_text
 
 HEADER = "configuration,leg1,leg2\n"
 
@@ -105,3 +105,58 @@ def test_csv_written_reads_back_the_same(tmp_path_factory, columns, names, rando
     assert table.columns == tuple(columns)
     assert table.names == tuple(names)
     np.testing.assert_array_equal(table.values, values)
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.sampled_from(["a,1", '"b\nb",2', "", "ü,3", " c , 4 ", "\ufeffd,5"]), max_size=8),
+    st.sampled_from(["\n", "\r\n", "\r"]),
+    st.integers(1, 40),
+)
+def test_a_text_in_blocks_is_the_text(tmp_path_factory, lines, end, block):
+    path = tmp_path_factory.mktemp("text") / "t.txt"
+    text = "\ufeff" + end.join(["header", *lines, ""])
+    path.write_bytes(text.encode())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(documents, "BLOCK", block)
+        found = list(documents.text_blocks(path))
+    whole = text[1:].replace("\r\n", "\n").replace("\r", "\n")
+    assert "".join(found) == whole
+    assert all(part.endswith("\n") for part in found[:-1])
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (b"x,1,2,3\n", "line {}: the row has another number of cells"),
+        (b"x,1,\n", "line {}, column leg2: the cell is empty"),
+        (b"x,1,2 000\n", "line {}, column leg2: this is not a number"),
+        (b"x,1,2e308\n", "line {}, column leg2: this is not a finite number"),
+        (b"000000,1,2\n", "line {0}: the configuration 000000 stands twice, on lines 2 and {0}"),
+        (b"x,1,\xff\n", "line {}: the file is not UTF-8 text"),
+        (b"x,1,\0\n", "line {}: the file is not text"),
+        (b'x,1,"2\n', "line {}: not valid CSV"),
+    ],
+)
+def test_a_bad_line_of_a_large_table_is_named(tmp_path, line, said):
+    """Of one that is read in many blocks."""
+    rows = [b"%06d,0.%06d,1e-3\n" % (k, k) for k in range(150_000)]
+    rows.insert(120_000, line)
+    path = write(tmp_path, HEADER.encode() + b"".join(rows))
+    assert path.stat().st_size > 2 * documents.BLOCK
+    assert fault(read_csv, path).startswith("t.csv, " + said.format(120_002))
+
+
+def test_a_large_table(tmp_path):
+    names = [f"{k:06d}" for k in range(100_000)]
+    values = np.random.default_rng(0).normal(size=(len(names), 2))
+    path = write(tmp_path, csv_text(["leg1", "leg2"], names, values))
+    assert path.stat().st_size > 2 * documents.BLOCK
+    table = read_csv(path)
+    assert (table.names, table.lines) == (tuple(names), tuple(range(2, len(names) + 2)))
+    np.testing.assert_array_equal(table.values, values)
+
+
+def test_numbers_whose_sum_is_none_are_numbers(tmp_path):
+    path = write(tmp_path, HEADER + "1,1e308,1.5e308\n")
+    np.testing.assert_array_equal(read_csv(path).values, [[1e308, 1.5e308]])

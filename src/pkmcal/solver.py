@@ -318,10 +318,25 @@ def stacked(linear: Linear, reduced: Reduced) -> tuple[Array, Array]:
     return rows, np.concatenate(value, axis=1)
 
 
-def reduced_normal(linear: Linear, reduced: Reduced) -> Array:
-    """Normal matrix of the shared unknowns, (B, na, na)."""
+def condensed(rows: Array, value: Array) -> tuple[Array, Array]:
+    """Rows (B, n, m) and residuals (B, n) as m + 1 with the same normal matrix, gradient and sum of
+    squares: the triangle of their QR decomposition.
+    """
+    both = np.concatenate([rows, value[..., None]], axis=-1)
+    triangle: Array = np.asarray(np.linalg.qr(both, mode="r"))
+    return triangle[..., :-1], triangle[..., -1]
+
+
+def divisions(count: int, rows: int) -> list[slice]:
+    """Configurations, of so many rows each, that are worked on together; see ROWS."""
+    each = max(1, ROWS // max(1, rows))
+    return [slice(first, min(first + each, count)) for first in range(0, count, each)]
+
+
+def reduced_normal(reduced: Reduced) -> Array:
+    """Normal matrix of the shared unknowns by the configurations' rows, (B, na, na)."""
     rows = _flat(reduced.rows)
-    return rows.mT @ rows + linear.shared_by.T @ linear.shared_by
+    return rows.mT @ rows
 
 
 class _Part(NamedTuple):
@@ -464,10 +479,9 @@ class _Divided(NamedTuple):
     def of(cls, problem: LeastSquares, values: Values) -> _Divided:
         """The problem whose residuals are like these, divided where it can be."""
         n_runs, count, rows = values.value.shape
-        each = max(1, ROWS // max(1, n_runs * rows))
-        if not isinstance(problem, Divisible) or count <= each:
+        cuts = divisions(count, n_runs * rows)
+        if not isinstance(problem, Divisible) or len(cuts) < 2:
             return cls(problem, [(slice(0, count), problem)], Memory())
-        cuts = [slice(first, min(first + each, count)) for first in range(0, count, each)]
         return cls(problem, [(cut, problem.among(cut)) for cut in cuts], Memory())
 
     def select(self, runs: Integers) -> _Divided:

@@ -16,7 +16,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.recognise import WORKERS
+from pkmcal.calibration.recognise import WORKERS, Progress
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import dot, pose_difference
 from pkmcal.identify.estimate import Estimate
@@ -55,21 +55,26 @@ def place_by_hand(
     poses: Array,
     boards: Boards,
     known: Array,
+    told: Progress | None = None,
 ) -> Placed:
     """Find the places of the photographs by hand; those that are not found are left out and told.
 
     photographs : of all stations that observe legs. poses : T_base_platform (K, 4, 4) by the
     drawing. known : T_camera_base (S, 4, 4) of the stations that are placed already, NaN for the
-    others. Raises `InputError` where no photograph by hand is placed.
+    others. told : called with the step in words and the share done. Raises `InputError` where no
+    photograph by hand is placed.
     """
-    found = found_alone(session, photographs, poses)
+    found = found_alone(session, photographs, poses, told)
     believed = _believed(found, boards, known)
     lost = {k: why_lost(one) for k, one in found.items() if np.isnan(believed[k]).any()}
     return _without(session, photographs, boards, believed, lost)
 
 
 def found_alone(
-    session: Session, photographs: list[legs.Photographs], poses: Array
+    session: Session,
+    photographs: list[legs.Photographs],
+    poses: Array,
+    told: Progress | None = None,
 ) -> dict[int, Alone]:
     """The places that each photograph by hand could show, by its station's number."""
     at = {p.station: p for p in photographs}
@@ -77,14 +82,20 @@ def found_alone(
     tubes = tubes_of(session.machine)
 
     def search(k: int) -> Alone:
-        p, tables = at[k], distance_tables(at[k].images)
+        p, image = at[k], at[k].images[0]
+        tables = distance_tables([image])
         view = StationView(
             session.machine, p.camera, tubes, p.configuration, session.joints, poses, tables
         )
-        return find_alone(view, p.images[0])
+        return find_alone(view, image)
 
+    found: dict[int, Alone] = {}
     with ThreadPoolExecutor(WORKERS) as pool:
-        return dict(zip(by_hand, pool.map(search, by_hand), strict=True))
+        for k, one in zip(by_hand, pool.map(search, by_hand), strict=True):
+            found[k] = one
+            if told is not None:
+                told(f"Placing photographs by hand: {len(found)} of {len(by_hand)}", 0.25)
+    return found
 
 
 def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:

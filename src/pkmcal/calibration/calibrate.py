@@ -29,6 +29,7 @@ from pkmcal.calibration.doubts import (
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
+    Progress,
     boards_of,
     check_observable,
     legs_stations,
@@ -36,7 +37,7 @@ from pkmcal.calibration.recognise import (
     read_photographs,
     station_poses,
 )
-from pkmcal.calibration.turns import Progress, Turns, identify_poses, take_turns
+from pkmcal.calibration.turns import Turns, identify_poses, take_turns
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Estimate
@@ -182,18 +183,19 @@ def _observe(session: Session, seed: int, clock: _Clock) -> tuple[Session, _Seen
     clock.told("Reading photographs", 0.0)
     photographs = read_photographs(session)
     clock.lap("decode")
-    clock.told("Recognising the machine", 0.2)
+    if any("board" in station.observe for station in session.stations):
+        clock.told("Looking for the board", 0.1)
     boards = boards_of(session, photographs)
     rng = np.random.default_rng(seed)
     if any(station.handheld for station in session.stations):
         fixed = [p for p in photographs if not session.stations[p.station].handheld]
-        known = station_poses(session, fixed, boards, rng, by_hand=True)
+        known = station_poses(session, fixed, boards, rng, by_hand=True, told=clock.told)
         poses = platform_poses(session)
         session, photographs, boards, known = place_by_hand(
-            session, photographs, poses, boards, known
+            session, photographs, poses, boards, known, clock.told
         )
     else:
-        known = station_poses(session, photographs, boards, rng)
+        known = station_poses(session, photographs, boards, rng, told=clock.told)
     clock.lap("observe")
     return session, _Seen(photographs, boards, known)
 
@@ -213,6 +215,7 @@ def _identify(
     else:
         turns = identify_poses(session, seen.boards, seen.T_camera_base, cameras, clock.told)
     clock.lap("identify")
+    clock.told("Looking for mistakes that explain the data", 0.88)
     stated = as_stated(session.machine, turns.measurements, turns.estimate)
     richer = richer_models(session, turns.measurements, stated)
     check_poses(session, turns.measurements, stated, richer)

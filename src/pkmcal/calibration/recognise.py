@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from pkmcal.calibration.gather import measurements_of
 from pkmcal.errors import GeometryError, InputError, ResultError
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import SeenStation, mistake
-from pkmcal.observe.images import decode, decode_all
+from pkmcal.observe.images import KEPT, Pictures, fitting
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import FoundStation, StationView, find_station
 from pkmcal.observe.tables import distance_tables
@@ -27,6 +26,14 @@ from pkmcal.session.poses import check_lengths
 from pkmcal.session.readings import frozen
 from pkmcal.wording import listed
 
+MOST_AT_A_STATION, MOST_IN_ALL = 64, 128
+"""Photographs in which the machine is looked for, spread over a station's and shared among the
+stations: a search looks at eight, and of thirty that are asked whether the machine is there, each
+surer by one standard deviation says so by 5 of them together. Their tables take 200 to 400 MB."""
+FEWEST_AT_A_STATION = 8
+"""However many stations there are: what a search looks at."""
+Progress = Callable[[str, float], None]
+"""Called with a sentence about the present step and the share that is done, 0 to 1."""
 WORKERS = 2
 """Threads beside one another: decoding and array work release Python's lock."""
 NEARLY = 2.0
@@ -49,18 +56,31 @@ def check_observable(session: Session) -> None:
 
 
 def read_photographs(session: Session) -> list[legs.Photographs]:
-    """The photographs of stations that observe legs, decoded and prepared for the search."""
+    """The photographs of stations that observe legs, each of which can be decoded; the first that
+    fit into KEPT bytes stay so.
+    """
 
-    def read(number: int) -> legs.Photographs:
+    def read(number: int, most: int) -> legs.Photographs:
         station = session.stations[number]
-        paths = [p.path for p in station.photographs]
-        labels = [label_of(session.folder, path) for path in paths]
-        images = decode_all(paths, station.camera.image_size, labels)
+        paths, labels = photograph_files(session, station)
+        images = Pictures.read(paths, station.camera.image_size, labels, most)
         rows = np.array([p.configuration for p in station.photographs])
         return legs.Photographs(number, station.camera, rows, session.joints[rows], images)
 
+    numbers, room, kept = legs_stations(session), KEPT, list[int]()
+    for number in numbers:
+        station = session.stations[number]
+        size = station.camera.image_size
+        kept.append(min(fitting(size, room), len(station.photographs)))
+        room -= kept[-1] * size[0] * size[1]
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(read, legs_stations(session)))
+        return list(pool.map(read, numbers, kept))
+
+
+def photograph_files(session: Session, station: Station) -> tuple[list[Path], list[str]]:
+    """Paths of a station's photographs, and what they are called in messages."""
+    paths = [photo.path for photo in station.photographs]
+    return paths, [label_of(session.folder, path) for path in paths]
 
 
 def legs_stations(session: Session) -> list[int]:
@@ -153,10 +173,14 @@ def _check_turns(session: Session, poses: Array, usable: Booleans) -> None:
 
 @dataclass(frozen=True)
 class Recognition:
-    """Where the search for each station's pose ended."""
+    """Where the search for each station's pose ended.
+
+    seen : numbers of the photographs that were looked at, by station; views : of these.
+    """
 
     views: tuple[StationView, ...]
     found: tuple[FoundStation, ...]
+    seen: tuple[Integers, ...]
 
     @property
     def complete(self) -> bool:
@@ -177,17 +201,22 @@ def recognise(
     poses : T_base_platform (K, 4, 4) of the configurations. rngs : one for each of ``photographs``.
     boards : on the base, give stations without a pose by hand a start, from the stations that were
     found. starts : (S, 4, 4) of all stations where more is known than by hand, NaN where nothing.
-    A station that is not found from there is looked for anywhere.
+    A station that is not found from there is looked for anywhere. Of stations of many photographs
+    some are looked at, spread over all.
     """
     boards = boards or Boards()
     machine, tubes = session.machine, tubes_of(session.machine)
+
+    most = min(MOST_AT_A_STATION, MOST_IN_ALL // max(len(photographs), 1))
+    seen = tuple(p.spread(max(most, FEWEST_AT_A_STATION)) for p in photographs)
 
     def view(p: legs.Photographs) -> StationView:
         tables = distance_tables(p.images)
         return StationView(machine, p.camera, tubes, p.configuration, session.joints, poses, tables)
 
     with ThreadPoolExecutor(WORKERS) as pool:
-        views = tuple(pool.map(view, photographs))
+        few = (p.select(numbers) for p, numbers in zip(photographs, seen, strict=True))
+        views = tuple(pool.map(view, few))
     at = [p.station for p in photographs]
     known = [station.T_camera_base for station in session.stations]
     if starts is not None:
@@ -201,7 +230,7 @@ def recognise(
         good[s] = pose.T_camera_base if pose and pose.good else None
     ahead = boards.joined(good)
     found = _searched(views, [ahead[s] for s in at], found, rngs)
-    return Recognition(views, tuple(_anywhere(views, found, rngs)))
+    return Recognition(views, tuple(_anywhere(views, found, rngs)), seen)
 
 
 Search = FoundStation | None
@@ -261,14 +290,14 @@ def mistake_in(
         [
             SeenStation(
                 station.name,
-                [label_of(session.folder, p.path) for p in station.photographs],
+                [label_of(session.folder, station.photographs[k].path) for k in seen],
                 session.configurations,
                 view,
                 station.T_camera_base,
                 found,
             )
-            for station, view, found in zip(
-                stations, recognition.views, recognition.found, strict=True
+            for station, view, found, seen in zip(
+                stations, recognition.views, recognition.found, recognition.seen, strict=True
             )
         ],
         rng,
@@ -288,17 +317,23 @@ def station_poses(
     boards: Boards,
     rng: np.random.Generator,
     by_hand: bool = False,
+    told: Progress | None = None,
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of all stations, each by the first that tells it: what is known
     before any leg is looked for, the search for the legs, and what measured poses tell.
 
-    by_hand : leave photographs by hand (NaN) where nothing tells them yet. Raises `InputError`, or
+    by_hand : leave photographs by hand (NaN) where nothing tells them yet. told : called with the
+    step in words and the share done. Raises `InputError`, or
     `ResultError`, where nothing tells one of the others.
     """
     known = known_stations(session, boards)
     if photographs:
         rngs = rng.spawn(len(photographs) + 1)
+        told = told or (lambda _text, _share: None)
+        count = sum(len(p.images) for p in photographs)
+        told(f"Recognising the machine in {count} photographs", 0.2)
         found = recognise(session, photographs, platform_poses(session), rngs[1:], boards, known)
+        told("Comparing with what is often mixed up", 0.3)
         error = mistake_in(session, photographs, found, rngs[0])
         if error is not None:
             raise error
@@ -372,26 +407,6 @@ def board_images(
     images: dict[int, Sequence[Integers]] = {p.station: p.images for p in photographs}
     for number, station in enumerate(session.stations):
         if number not in images:
-            images[number] = Pictures(session.folder, station)
+            paths, labels = photograph_files(session, station)
+            images[number] = Pictures(paths, station.camera.image_size, labels)
     return images
-
-
-class Pictures(Sequence[Integers]):
-    """A station's photographs, each decoded when it is looked at and not kept."""
-
-    def __init__(self, folder: Path, station: Station) -> None:
-        self._folder, self._station = folder, station
-
-    def __len__(self) -> int:
-        return len(self._station.photographs)
-
-    @overload
-    def __getitem__(self, index: int) -> Integers: ...
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[Integers]: ...
-    def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
-        """One photograph, grey levels (height, width)."""
-        if isinstance(index, slice):
-            return [self[k] for k in range(len(self))[index]]
-        path = self._station.photographs[index].path
-        return decode(path, self._station.camera.image_size, label_of(self._folder, path))

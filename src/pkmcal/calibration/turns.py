@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
-from pkmcal.calibration.recognise import WORKERS
+from pkmcal.calibration.recognise import WORKERS, Progress
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
@@ -39,8 +40,6 @@ the first look corrects a pixel, the second what shading leaves, and profiles re
 far."""
 FEWEST_EDGES = 24
 """Edges without which there is nothing to identify: one photograph of a hexapod shows as many."""
-Progress = Callable[[str, float], None]
-"""Called with a sentence about the present step and the share that is done, 0 to 1."""
 _OUTLIER = "disagrees with all other edges: another thing's edge, or a highlight's"
 _OFF = (
     "the board lies {:.0f} standard deviations from where all other poses put it: it, or the"
@@ -71,27 +70,31 @@ def take_turns(
 
     T_camera_base : (S, 4, 4) of all stations. lap : called with the name of a step that is done.
     """
-    told("Finding the legs", 0.35)
+    total = sum(len(p.images) for p in photographs)
     machine = session.machine
     # the nearest poses, where the drawing does not quite close: recognition has seen to it
     poses = machine.forward_result(session.joints).T_base_platform
     seen = machine, T_camera_base, poses
-    estimate = _whole_legs(session, photographs, boards, seen, legs.REACH, lap)
+    text, searched = "Finding the legs", partial(_whole_legs, session, photographs, boards, lap)
+    estimate = searched(seen, legs.REACH, _counted(told, text, total, 0.35))
     start = estimate.state
     seen = estimate.machine, start.T_camera_base, start.T_base_platform
-    estimate = _whole_legs(session, photographs, boards, seen, legs.AGAIN, lap, start)
+    text = "Finding the legs again"
+    estimate = searched(seen, legs.AGAIN, _counted(told, text, total, 0.4), start)
     blur: dict[int, float | None] = {p.station: None for p in photographs}
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
     for turn in range(ROUNDS):
-        told("Measuring edges and identifying", 0.45 + 0.5 * turn / ROUNDS)
+        share = 0.45 + 0.5 * turn / ROUNDS
+        done = _counted(told, "Measuring edges", total, share)
         cameras = cameras.moved(estimate)
         photographs = [replace(p, camera=cameras.at_station(p.station)) for p in photographs]
-        look = partial(_measure, estimate=estimate, blur=blur, refine=cameras.active)
+        look = partial(_measure, estimate=estimate, blur=blur, refine=cameras.active, done=done)
         looks = _each(photographs, look)
         blur = {p.station: look.blur for p, look in zip(photographs, looks, strict=True)}
         measurements = measurements_of(session, boards, _edges(looks), cameras)
         lap("observe")
+        told("Identifying", share + 0.05)
         known = _at_cameras(estimate.state, cameras)
         start = better_start(machine, measurements, known) if turn == 0 else known
         estimate = bundle(machine, measurements, start)
@@ -100,6 +103,19 @@ def take_turns(
             break
     observation = observation_of(session, looks, boards, measurements, estimate)
     return Turns(observation, measurements, estimate, cameras)
+
+
+def _counted(told: Progress, text: str, total: int, share: float) -> legs.Done:
+    """A callback of photographs looked at, told with how many there are of them."""
+    lock, seen = Lock(), [0]
+    told(text, share)
+
+    def done(more: int) -> None:
+        with lock:  # stations are looked at beside one another
+            seen[0] += more
+            told(f"{text}: {seen[0]} of {total} photographs", share)
+
+    return done
 
 
 def _at_cameras(state: State, cameras: CameraRefinement) -> State:
@@ -174,9 +190,10 @@ def _whole_legs(
     session: Session,
     photographs: list[legs.Photographs],
     boards: Boards,
+    lap: Callable[[str], None],
     seen: tuple[Machine, Array, Array],
     reach: float,
-    lap: Callable[[str], None],
+    done: legs.Done,
     start: State | None = None,
 ) -> Estimate:
     """The estimate from legs that are looked for within ``reach`` px of where they should be.
@@ -186,7 +203,7 @@ def _whole_legs(
     machine, stations, poses = seen
 
     def search(p: legs.Photographs) -> legs.StationEdges:
-        return legs.search(p, machine, stations[p.station], poses[p.configuration], reach)
+        return legs.search(p, machine, stations[p.station], poses[p.configuration], reach, done)
 
     measurements = measurements_of(session, boards, _edges(_each(photographs, search)))
     lap("observe")
@@ -197,7 +214,11 @@ def _whole_legs(
 
 
 def _measure(
-    photographs: legs.Photographs, estimate: Estimate, blur: dict[int, float | None], refine: bool
+    photographs: legs.Photographs,
+    estimate: Estimate,
+    blur: dict[int, float | None],
+    refine: bool,
+    done: legs.Done,
 ) -> legs.StationEdges:
     state = estimate.state
     return legs.measure(
@@ -207,6 +228,7 @@ def _measure(
         state.T_base_platform[photographs.configuration],
         blur[photographs.station],
         refine_camera=refine,
+        done=done,
     )
 
 

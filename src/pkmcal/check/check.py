@@ -45,7 +45,7 @@ from pkmcal.identify.verdict import POOR
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
 from pkmcal.mechanisms.region import poses_in
 from pkmcal.observe import legs
-from pkmcal.observe.images import decode
+from pkmcal.observe.images import KEPT, Pictures, decode
 from pkmcal.observe.quality import Quality, quality, unrecognised_quality
 from pkmcal.observe.stations import FoundStation
 from pkmcal.outcome import (
@@ -66,6 +66,8 @@ from pkmcal.session.photographs import label_of
 from pkmcal.session.starter import untouched_files
 from pkmcal.wording import listed
 
+NAMED = 10
+"""Broken photographs of a station that are named one by one; the others are counted."""
 OVEREXPOSED = 0.25
 """Share of saturated pixels on the legs beyond which edges are lost: a highlight takes a tenth."""
 TOO_DARK = 0.5
@@ -263,27 +265,48 @@ def _decoded(session: Session) -> tuple[list[legs.Photographs | None], list[Find
     """Each station's photographs of legs; those that cannot be decoded are findings."""
     out: list[legs.Photographs | None] = []
     findings: list[Finding] = []
+    room = KEPT
     for number, station in enumerate(session.stations):
         if "legs" not in station.observe:  # decoded one by one where the board is looked for
             out.append(None)
             continue
         rows: list[int] = []
-        images: list[Integers] = []
+        files: list[tuple[Path, str]] = []
+        kept: dict[int, Integers] = {}
+        broken = 0
         for photo in station.photographs:
             label = label_of(session.folder, photo.path)
             try:
-                images.append(decode(photo.path, station.camera.image_size, label))
-                rows.append(photo.configuration)
+                image = decode(photo.path, station.camera.image_size, label)
             except InputError as error:
-                findings.append(wrong(error, station.name))
+                broken += 1
+                if broken <= NAMED:
+                    findings.append(wrong(error, station.name))
+                continue
+            if image.size <= room:
+                kept[len(rows)], room = image, room - image.size
+            rows.append(photo.configuration)
+            files.append((photo.path, label))
+        if broken > NAMED:
+            findings.append(wrong(_more_broken(session, number, broken - NAMED), station.name))
         at = np.array(rows, dtype=int)
-        whole = (
-            legs.Photographs(number, station.camera, at, session.joints[at], images)
-            if images
-            else None
-        )
-        out.append(whole)
+        images = Pictures([p for p, _ in files], station.camera.image_size,
+                          [label for _, label in files], kept)  # fmt: skip
+        whole = legs.Photographs(number, station.camera, at, session.joints[at], images)
+        out.append(whole if rows else None)
     return out, findings
+
+
+def _more_broken(session: Session, number: int, count: int) -> InputError:
+    """The error about all photographs of a station that cannot be decoded but those named."""
+    name = session.stations[number].name
+    return InputError(
+        "photographs cannot be decoded",
+        where=f"session.yaml, stations.{name}",
+        found=f"{count} more of this station",
+        expected="whole PNG or JPEG files",
+        next_step="Copy them again from the camera, or remove them",
+    )
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ def calibrate(
     loaded = load_session(session, model)
     folder = out or loaded.folder / "calibration"
     over = check_output(folder)
-    with console.progress(quiet) as told:
+    with console.progress(quiet or as_json) as told:
         found = run(
             loaded,
             method=method.value,

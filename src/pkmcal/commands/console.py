@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import textwrap
+import threading
+import time
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,6 +30,8 @@ MARKS = {
 }
 STYLES = {"paper": "yellow", "prototype": "dim", "ours": ""}
 """Of a table's rows, by whose figures they are."""
+EVERY = 10.0
+"""Seconds from one line about the progress to the next, where there is no terminal."""
 WIDEST_NAME = 32
 """Letters of a row's name up to which it stays on one line."""
 
@@ -121,10 +125,16 @@ def escaped(text: str) -> str:
 
 @contextmanager
 def progress(quiet: bool = False) -> Generator[Progress]:
-    """A bar on stderr for as long as the block runs; nothing where that is no terminal."""
-    console = err()
-    if quiet or not console.is_terminal:
+    """A bar on stderr for as long as the block runs; where that is no terminal, such as a log or a
+    pipe, a plain line every EVERY seconds.
+    """
+    if quiet:
         yield lambda _text, _share: None
+        return
+    console = err()
+    if not console.is_terminal:
+        with _lines() as told:
+            yield told
         return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -133,6 +143,31 @@ def progress(quiet: bool = False) -> Generator[Progress]:
     with Bar(*columns, console=console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda text, share: bar.update(task, description=text, completed=share)
+
+
+@contextmanager
+def _lines() -> Generator[Progress]:
+    """Lines about what is being done, as long as the block runs; none of what ends before."""
+    begin, over, step = time.monotonic(), threading.Event(), [("", 0.0)]
+
+    def told(text: str, share: float) -> None:
+        step[0] = text, share
+
+    def tell() -> None:
+        while not over.wait(EVERY):
+            text, share = step[0]
+            if text:
+                passed = f"{share:.0%}, {time.monotonic() - begin:.0f} s"
+                sys.stderr.write(f"{text} ({passed})\n")
+
+    # by itself, for a step may take minutes in which nothing else is told
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield told
+    finally:
+        over.set()
+        thread.join()
 
 
 def counted(told: Progress, upto: float = 1.0) -> Callable[[int, int], None]:

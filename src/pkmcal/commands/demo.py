@@ -50,7 +50,7 @@ def demo(
     session, result = out / SESSION, out / CALIBRATION
     _make_room(out)
     check_output(result)
-    with console.progress() as told:
+    with console.progress(as_json) as told:
         simulate_session(
             session,
             load_mechanism(MECHANISM),

@@ -133,7 +133,7 @@ def simulate(
         settings = replace(settings, stations=planned.places, asked=planned.asked)
         if planned.board:
             settings = replace(settings, board=planned.board, board_on="platform")
-    with console.progress() as told:
+    with console.progress(as_json) as told:
         truth = simulate_session(
             folder, machine, cameras, settings, seed=seed, progress=console.counted(told)
         )

@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,8 @@ from pkmcal.files.writing import settle
 LONGEST_SHOWN = 60
 """Characters of a found value that a message quotes: enough to recognise it, short enough for
 one line."""
+BLOCK = 2**20
+"""Bytes of a text that are in memory at a time where it is read line by line."""
 
 
 def read_text(path: Path, label: str | None = None) -> str:
@@ -28,11 +30,34 @@ def read_text(path: Path, label: str | None = None) -> str:
 
     label : the file's name in messages; the path's last part unless told.
     """
-    label = label or path.name
+    return "".join(text_blocks(path, label))
+
+
+def text_blocks(path: Path, label: str | None = None) -> Iterator[str]:
+    """The same in blocks of whole lines, some BLOCK bytes each: of a table of many megabytes no
+    more has to be in memory.
+    """
+    label, lines, mark = label or path.name, 0, "\ufeff"
+    for raw in _raw_blocks(path, label):
+        yield _decoded(raw, label, lines).removeprefix(mark)
+        lines, mark = lines + raw.count(b"\n"), ""
+
+
+def _raw_blocks(path: Path, label: str) -> Iterator[bytes]:
+    """A file's bytes, cut behind line ends of any kind."""
     try:
         settle(path.parent)
         check_regular(path, label)
-        raw = path.read_bytes()
+        with path.open("rb") as stream:
+            rest: list[bytes] = []
+            while block := stream.read(BLOCK):
+                # a carriage return at the end may be half of a line end
+                end = max(block.rfind(b"\n"), block.rfind(b"\r", 0, -1)) + 1
+                if end:
+                    yield b"".join([*rest, block[:end]])
+                    rest = []
+                rest.append(block[end:])
+            yield b"".join(rest)
     except FileNotFoundError:
         raise InputError(
             "the file does not exist", where=label, expected=wanted_file(path)
@@ -40,10 +65,14 @@ def read_text(path: Path, label: str | None = None) -> str:
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(f"the file cannot be read ({reason})", where=label) from None
+
+
+def _decoded(raw: bytes, label: str, before: int) -> str:
+    """A block's text with Unix line ends; before : lines of the file before it."""
     try:
-        text = raw.decode("utf-8-sig")
+        text = raw.decode("utf-8")
     except UnicodeDecodeError as error:
-        line = raw.count(b"\n", 0, error.start) + 1
+        line = before + raw.count(b"\n", 0, error.start) + 1
         raise InputError(
             "the file is not UTF-8 text",
             where=f"{label}, line {line}",
@@ -52,7 +81,7 @@ def read_text(path: Path, label: str | None = None) -> str:
             next_step="Save it as UTF-8 in the editor",
         ) from None
     if "\0" in text:
-        line = text.count("\n", 0, text.index("\0")) + 1
+        line = before + text.count("\n", 0, text.index("\0")) + 1
         raise InputError(
             "the file is not text",
             where=f"{label}, line {line}",

@@ -6,7 +6,8 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable, Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,10 +15,11 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import LONGEST_NAME, InputError
-from pkmcal.files.documents import LARGEST, closest, read_text, shown
+from pkmcal.files.documents import LARGEST, closest, shown, text_blocks
 from pkmcal.wording import listed
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_PLAIN = re.compile(r"[-+.0-9eE]*", re.ASCII)
 _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)|#.*", re.IGNORECASE)
 """Words for "no number" that programs write into cells; spreadsheets write #N/A or #VALUE!."""
 
@@ -59,21 +61,31 @@ def read_csv(
     """
     path = Path(path)
     label = label or path.name
-    rows = _rows(read_text(path, label), label)
-    if not rows:
+    rows = _rows(_lines(path, label), label)
+    header_line, header = next(rows, (0, None))
+    if header is None:
         raise InputError("the file is empty", where=label, expected=f"a header: {key},…")
-    (header_line, header), body = rows[0], rows[1:]
-    where = f"{label}, line {header_line}"
-    _check_header(header, key, columns, where)
-    if not body:
+    _check_header(header, key, columns, f"{label}, line {header_line}")
+    lines: dict[str, int] = {}
+    values = array("d")
+    for line, cells in rows:
+        numbers = _quickly(cells) if len(cells) == len(header) else None
+        values.extend(
+            _numbers(cells, header, f"{label}, line {line}") if numbers is None else numbers
+        )
+        name = cells[0]
+        if len(name) > LONGEST_NAME:
+            _check_length([name], f"{label}, line {line}")
+        if (first := lines.setdefault(name, line)) != line:
+            raise InputError(
+                f"the {key} {name} stands twice, on lines {first} and {line}",
+                where=f"{label}, line {line}",
+                next_step="Give each row its own name, or remove one of the two",
+            )
+    if not lines:
         raise InputError("there are no rows under the header", where=label)
-    values = [_numbers(cells, header, f"{label}, line {line}") for line, cells in body]
-    lines = tuple(line for line, _ in body)
-    names = tuple(cells[0] for _, cells in body)
-    for name, line in zip(names, lines, strict=True):
-        _check_length([name], f"{label}, line {line}")
-    _check_names(names, lines, key, label)
-    return CsvTable(label, tuple(header[1:]), names, np.array(values, dtype=float), lines)
+    each = np.array(values).reshape(len(lines), len(header) - 1)
+    return CsvTable(label, tuple(header[1:]), tuple(lines), each, tuple(lines.values()))
 
 
 def csv_text(
@@ -88,24 +100,28 @@ def csv_text(
     return stream.getvalue()
 
 
-def _rows(text: str, label: str) -> list[tuple[int, list[str]]]:
+def _lines(path: Path, label: str) -> Iterator[str]:
+    """The file's lines, with their ends."""
+    for block in text_blocks(path, label):
+        yield from io.StringIO(block)
+
+
+def _rows(lines: Iterable[str], label: str) -> Iterator[tuple[int, list[str]]]:
     """Non-empty rows as (line, cells without surrounding blanks)."""
-    reader = csv.reader(io.StringIO(text), strict=True)
-    rows: list[tuple[int, list[str]]] = []
+    reader = csv.reader(lines, strict=True)
     before = 0
     try:
         for cells in reader:
             stripped = [cell.strip() for cell in cells]
             if any(stripped):
-                rows.append((before + 1, stripped))
+                yield before + 1, stripped
             before = reader.line_num
     except csv.Error as error:
         raise InputError(
             f"not valid CSV ({error})",
-            where=f"{label}, line {reader.line_num}",
+            where=f"{label}, line {before + 1}",  # where a quote that never ends begins
             next_step="Check the quotes on this line",
         ) from None
-    return rows
 
 
 def _check_header(header: list[str], key: str, columns: Sequence[str] | None, where: str) -> None:
@@ -153,6 +169,19 @@ def _check_columns(found: Sequence[str], known: Sequence[str], where: str) -> No
         raise InputError(
             f"column {listed(missing)} is missing", where=where, found=listed(found, 12)
         )
+
+
+def _quickly(cells: list[str]) -> list[float] | None:
+    """The row's numbers, (m,), where all is plain; None where each cell has to be looked at. Of
+    these characters Python takes nothing for a number that :func:`_number` does not.
+    """
+    if not (cells[0] and _PLAIN.fullmatch("".join(cells[1:]))):
+        return None
+    try:
+        numbers = list(map(float, cells[1:]))
+    except ValueError:
+        return None
+    return numbers if math.isfinite(sum(numbers)) else None
 
 
 def _numbers(cells: list[str], header: list[str], where: str) -> list[float]:
@@ -203,18 +232,6 @@ def _check_length(names: Sequence[str], where: str) -> None:
                 found=f"{shown(name)} of {len(name)} characters",
                 expected=f"at most {LONGEST_NAME}, as file systems take",
             )
-
-
-def _check_names(names: tuple[str, ...], lines: tuple[int, ...], key: str, label: str) -> None:
-    first: dict[str, int] = {}
-    for name, line in zip(names, lines, strict=True):
-        if name in first:
-            raise InputError(
-                f"the {key} {name} stands twice, on lines {first[name]} and {line}",
-                where=f"{label}, line {line}",
-                next_step="Give each row its own name, or remove one of the two",
-            )
-        first[name] = line
 
 
 def _repeated(names: Iterable[str]) -> list[str]:

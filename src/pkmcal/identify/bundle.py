@@ -351,7 +351,8 @@ def _estimate(
     residuals = Kinds(*(at.taken(rows[0] / scale[0]) for at, rows, scale in measured))
     weighted = zip(assembled.places, result.weight, strict=True)
     weights = Kinds(*(at.taken(weight[0]) for at, weight in weighted))
-    closures = result.info.linear.value[..., problem.closure_rows]
+    value = result.info.value
+    closures = value[..., problem.closure_rows]
     joints = np.zeros(measurements.joints.shape)  # where no pose was fitted
     joints[assembled.seen] = problem.joint_rows(closures, found)[0]
     return Estimate(
@@ -364,7 +365,7 @@ def _estimate(
         joint_residuals=joints,
         data_share=data_share(machine, state.theta, full, gauge),
         configurations=assembled.seen,
-        statistics=_statistics(result, assembled),
+        statistics=_statistics(result, assembled, value),
         gauge=gauge.name,
         intrinsics_covariance=factor @ optics[:, 1:, 1:] @ factor.mT,
         pose_residuals=residuals.poses,
@@ -388,18 +389,19 @@ def _with_unseen_poses(
     return replace(state, T_base_platform=poses, internal=internal)
 
 
-def _statistics(result: BatchResult, assembled: Assembled) -> Statistics:
-    problem, linear = result.problem, result.info.linear
+def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Statistics:
+    """What the residuals (1, K, r) and their number say of the fit."""
+    problem, some = result.problem, next(result.info.pieces()).linear
     kinds = np.array(assembled.priors)
     rows = problem.kinds.edges.rows, problem.closure_rows, problem.kinds.poses.rows
-    chi2 = [float(np.sum(linear.value[0, :, part] ** 2)) for part in rows]
+    chi2 = [float(np.sum(value[0, :, part] ** 2)) for part in rows]
     drawn = ~np.isin(kinds, ("gauge", "mount"))
-    chi2_drawing = float(np.sum(linear.shared_value[0, drawn] ** 2))
+    chi2_drawing = float(np.sum(some.shared_value[0, drawn] ** 2))
     n_edges, n_poses = (float(number[0]) for number in counts(problem, result.weight))
-    n_joints = linear.value[0, :, rows[1]].size
+    n_joints = value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
-    unknowns = linear.by_shared.shape[-1] - int(np.sum(kinds == "gauge"))
-    unknowns += linear.by_own.shape[1] * linear.by_own.shape[-1]
+    unknowns = problem.unknowns.count - int(np.sum(kinds == "gauge"))
+    unknowns += value.shape[1] * some.by_own.shape[-1]
     found = components(result.info, result.weight)
     freedom = found.freedom[0].tolist()
     return Statistics(

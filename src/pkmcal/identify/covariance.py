@@ -7,6 +7,7 @@ of the model (joint clearance, bending, a wrong lens).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -33,6 +34,8 @@ from pkmcal.solver import (
     Linear,
     Reduced,
     column_space,
+    condensed,
+    divisions,
     eliminate,
     inverse_root,
     normal_inverse,
@@ -50,7 +53,9 @@ UNKNOWN = 1e-13
 class Information:
     """What a problem says at a state: its rows, and what the shared unknowns' covariance is.
 
-    normal : (B, na, na) the reduced normal matrix, where it is known already.
+    normal : (B, na, na) the reduced normal matrix, where it is known already. The rows of two
+    thousand configurations take a gigabyte, so what passes through all of them takes them in
+    ``pieces``.
     """
 
     problem: Problem
@@ -67,6 +72,39 @@ class Information:
         """The same with the configurations' own unknowns eliminated."""
         return eliminate(self.linear, np.zeros(len(self.state.z)))
 
+    def pieces(self) -> Iterator[Information]:
+        """What some configurations say after the other, so many as the solver works on at once; the
+        rows on shared unknowns only are in each. One piece is this itself.
+        """
+        cuts = divisions(self.state.T_base_platform.shape[1], self.problem.n_rows)
+        if len(cuts) < 2:
+            yield self
+            return
+        for cut in cuts:
+            yield Information(self.problem.among(cut), self.problem.state_among(self.state, cut))
+
+    @property
+    def rows(self) -> tuple[Array, Array]:
+        """All rows on the shared unknowns, the own ones eliminated: Jacobian (B, n, na) and
+        residuals (B, n), those on shared unknowns only last; of several pieces, each condensed.
+        """
+        parts: list[tuple[Array, Array]] = []
+        for piece in self.pieces():
+            rows, value = stacked(piece.linear, piece.reduced)
+            if piece is self:
+                return rows, value
+            own = rows.shape[1] - len(self.problem.prior)
+            if not parts:
+                parts = [(rows[:, own:], value[:, own:])]
+            parts.insert(-1, condensed(rows[:, :own], value[:, :own]))
+        rows, values = zip(*parts, strict=True)
+        return np.concatenate(rows, axis=1), np.concatenate(values, axis=1)
+
+    @property
+    def value(self) -> Array:
+        """Residuals (B, K, r), zero where nothing can be predicted or nothing is there."""
+        return np.concatenate([piece.linear.value for piece in self.pieces()], axis=1)
+
     @cached_property
     def covariance(self) -> Array:
         """Covariance (B, na, na) of the shared unknowns before any gauge is applied; a direction
@@ -81,7 +119,7 @@ class Information:
                 part = Information(self.problem.select(rest), take(self.state, rest))
                 inverse[rest] = part.covariance if rest.size else 0.0
                 return inverse
-        half = inverse_root(stacked(self.linear, self.reduced)[0], NULL, loose=True)
+        half = inverse_root(self.rows[0], NULL, loose=True)
         return half @ half.mT
 
 
@@ -97,7 +135,8 @@ def reduced_rows(
     silent: tuple[Name, ...] | None = None,
 ) -> tuple[Array, Array]:
     """What the data say of some unknowns whatever the others are: rows A (n, m) by the named ones,
-    in the order of their columns, and residuals y (n,); the problem's first run.
+    in the order of their columns, and residuals y (n,); the problem's first run. Of very many
+    configurations, fewer rows with the same normal matrix, gradient and sum of squares.
 
     Each configuration's own unknowns are eliminated and what all other shared unknowns can take up
     is projected out, so ``y + A x`` is left of the residuals where the kept ones move by x (their
@@ -111,10 +150,9 @@ def reduced_rows(
 
     Frames stay in: their rows are zero along :func:`~pkmcal.identify.gauge.move_generators`.
     """
-    linear = problem.linearize(state)
-    rows, value = (part[0] for part in stacked(linear, eliminate(linear, np.zeros(len(state.z)))))
+    rows, value = (part[0] for part in Information(problem, state).rows)
     kept = problem.unknowns.columns(*keep)
-    told = linear.shared_by[:, kept if silent is None else problem.unknowns.columns(*silent)]
+    told = problem.prior[:, kept if silent is None else problem.unknowns.columns(*silent)]
     used = np.append(np.ones(len(rows) - len(told), dtype=bool), ~told.any(axis=1))
     rows, value = rows[used], value[used]
     q = column_space(np.delete(rows, kept, axis=1))

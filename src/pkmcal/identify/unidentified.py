@@ -333,4 +333,4 @@ def _moves(part: Found, space: _Open, effect: Array) -> tuple[float, bool]:
     # the estimate's information is the drawing's, one, and the data's
     data = mixed @ (np.linalg.inv(space.covariance) - np.eye(len(space.rows))) @ mixed.T
     known = float(np.sqrt(max(np.linalg.eigvalsh(data)[-1], 0.0)))
-    return float(np.sqrt(np.trace(moved @ covariance @ moved.T))), known >= HARDLY
+    return float(np.sqrt(np.sum((moved @ covariance) * moved))), known >= HARDLY

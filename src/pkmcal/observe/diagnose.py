@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +43,8 @@ ASSIGNED = 3
 """Rounds of names for photographs, and of the pose that these tell."""
 SEARCHED = 3
 """Hypotheses about the readings, likeliest first, that are searched in full."""
+PAIRS = 15
+"""Pairs of stations that are searched for the other's pose: of six stations, all."""
 
 
 class SeenStation(NamedTuple):
@@ -126,7 +128,7 @@ def _swapped_stations(stations: list[SeenStation], rng: np.random.Generator) -> 
     """Two stations each recognised near the other's pose, and better than mirrored at its own: a
     symmetric machine's mirror image looks much as the machine does from the other side.
     """
-    for one, other in combinations(stations, 2):
+    for one, other in islice(combinations(stations, 2), PAIRS):
         if one.by_hand is None or other.by_hand is None:
             continue
         swapped = (one._replace(by_hand=other.by_hand), other._replace(by_hand=one.by_hand))

@@ -1,13 +1,19 @@
-"""Photographs from disk to grey-level arrays; files that are not what they should be are named."""
+"""Photographs from disk to grey-level arrays; files that are not what they should be are named.
+
+Six thousand photographs do not fit into memory, and an ordinary session's should not be decoded at
+every look: so the first that fit into KEPT bytes are kept, and the others decoded when they are
+looked at and forgotten again. What looks at many does so in windows (`pkmcal.observe.legs`).
+"""
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -16,6 +22,9 @@ from pkmcal.errors import InputError
 from pkmcal.files import check_regular, read_exif, stated_size
 from pkmcal.observe.complaints import listening
 
+KEPT = 128 * 2**20
+"""Bytes of decoded photographs that are kept: 160 of 1024x768, 10 of a telephone's."""
+THREADS = 2
 PNG_START = 8
 """Bytes before a PNG file's first chunk: length, kind, body and checksum of kind and body."""
 JPEG_END = b"\xff\xd9"
@@ -115,9 +124,77 @@ def _broken(label: str, found: str) -> InputError:
     )
 
 
-def decode_all(
-    paths: list[Path], image_size: tuple[int, int], labels: list[str], workers: int = 2
-) -> list[Integers]:
-    """Several photographs; decoding runs beside Python on a few threads."""
-    with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(lambda p, n: decode(p, image_size, n), paths, labels))
+class Pictures(Sequence[Integers]):
+    """Photographs of one camera as grey levels (height, width), each decoded when it is looked at.
+
+    paths, labels : of all of them. kept : those that stay decoded, by their number.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        image_size: tuple[int, int],
+        labels: Sequence[str],
+        kept: dict[int, Integers] | None = None,
+    ) -> None:
+        self._paths, self._labels, self._size = tuple(paths), tuple(labels), image_size
+        self._kept = {} if kept is None else kept
+
+    @classmethod
+    def read(
+        cls, paths: Sequence[Path], image_size: tuple[int, int], labels: Sequence[str], most: int
+    ) -> Pictures:
+        """The photographs, each decoded once, of which the first ``most`` stay so; decoding runs
+        beside Python on a few threads. Raises InputError for the first that cannot be decoded.
+        """
+        out = cls(paths, image_size, labels)
+
+        def look(number: int) -> Integers | None:
+            image = out[number]  # a fault is told here, before any work
+            return image if number < most else None
+
+        with ThreadPoolExecutor(THREADS) as pool:
+            found = list(pool.map(look, range(len(out))))
+        out._kept = {number: image for number, image in enumerate(found) if image is not None}
+        return out
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @overload
+    def __getitem__(self, index: int) -> Integers: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Integers]: ...
+    def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
+        """One photograph; Raises InputError as :func:`decode`. Of a slice, those that it picks."""
+        if isinstance(index, slice):
+            return Selected(self, range(len(self))[index])
+        number = range(len(self))[index]
+        if number in self._kept:
+            return self._kept[number]
+        return decode(self._paths[number], self._size, self._labels[number])
+
+
+class Selected(Sequence[Integers]):
+    """Some of a sequence of photographs, none of which is looked at before it is asked for."""
+
+    def __init__(self, images: Sequence[Integers], numbers: Sequence[int] | Integers) -> None:
+        self._images, self._numbers = images, [int(number) for number in numbers]
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    @overload
+    def __getitem__(self, index: int) -> Integers: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Integers]: ...
+    def __getitem__(self, index: int | slice) -> Integers | Sequence[Integers]:
+        """One photograph; of a slice, those that it picks."""
+        if isinstance(index, slice):
+            return Selected(self._images, self._numbers[index])
+        return self._images[self._numbers[index]]
+
+
+def fitting(image_size: tuple[int, int], room: int) -> int:
+    """How many decoded photographs fit into so many bytes."""
+    return room // (image_size[0] * image_size[1])

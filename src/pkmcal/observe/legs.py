@@ -7,11 +7,14 @@ edges are strongest. A highlight imitates one edge; four at the right distances 
 
 Where the prediction is good to a pixel, :func:`measure` fits every edge by itself, to the profiles
 across it (:mod:`pkmcal.observe.profiles`).
+
+Both take the photographs through in windows: what is worked out of one, some megabytes, is
+forgotten with it, and a few hundred numbers of its edges remain.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -20,9 +23,10 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.geometry.cylinders import SIDE_SIGNS
-from pkmcal.measurements import EdgeSet, Rejection
+from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
+from pkmcal.observe.images import Selected, fitting
 from pkmcal.observe.predict import (
     EdgePoints,
     TubeList,
@@ -33,6 +37,10 @@ from pkmcal.observe.predict import (
 )
 from pkmcal.observe.profiles import EdgeFits, edge_set, fit_edges
 
+WINDOW = 32
+"""Photographs that are looked at together: their profiles take some 80 MB."""
+WINDOW_BYTES = 96 * 2**20
+"""Bytes that these take as grey levels at most; one may take more."""
 REACH = 10.0
 """Pixels to each side that a leg is looked for: 2 mm of drawing error at 0.9 px/mm, several
 times over, and what the station's pose leaves."""
@@ -76,6 +84,10 @@ _HIDDEN = "hidden behind another leg or outside the photograph"
 _NO_PLACE = "not found: no place, or two places, where all its edges fit"
 
 
+Done = Callable[[int], None]
+"""Called with how many photographs more were looked at."""
+
+
 @dataclass(frozen=True)
 class LegPlaces:
     """Where legs were found in photographs, arrays (K, L).
@@ -98,7 +110,7 @@ class LegPlaces:
         return SIDE_SIGNS[tubes.side][:, None] * (shift + tilt * along)
 
 
-def sample(images: Sequence[Any], pixel: Array, cubic: bool = True) -> Array:
+def sample(images: Iterable[Any], pixel: Array, cubic: bool = True) -> Array:
     """Grey levels of K images at pixels (K, E, ..., 2): (K, E, ...), interpolated."""
     import cv2
 
@@ -115,7 +127,7 @@ def sample(images: Sequence[Any], pixel: Array, cubic: bool = True) -> Array:
 
 
 def search_legs(
-    images: list[Integers],
+    images: Sequence[Integers],
     tubes: TubeList,
     points: EdgePoints,
     clear: Booleans,
@@ -148,7 +160,7 @@ def search_legs(
 
 
 def gradient_strength(
-    images: list[Integers], points: EdgePoints, reach: float
+    images: Sequence[Integers], points: EdgePoints, reach: float
 ) -> tuple[Array, Array]:
     """Strength 0..1 of grey-level edges across the predicted ones, (K, E, n, offsets).
 
@@ -160,7 +172,7 @@ def gradient_strength(
     import cv2
     from scipy.ndimage import maximum_filter1d
 
-    smooth = [cv2.GaussianBlur(im.astype(np.float32), (0, 0), SMOOTH) for im in images]
+    smooth = (cv2.GaussianBlur(im.astype(np.float32), (0, 0), SMOOTH) for im in images)
     level = np.sqrt(255.0 * sample(smooth, pixel, cubic=False))
     slope = np.abs(level[..., 2:] - level[..., :-2]) / 2
     peak = maximum_filter1d(slope, 2 * PEAK + 1, axis=-1)
@@ -195,17 +207,47 @@ def _choose(scores: Array, total: Array, share: Array, steps: Array) -> LegPlace
 
 @dataclass(frozen=True)
 class Photographs:
-    """One station's decoded photographs.
+    """One station's photographs.
 
     station : its number. configuration : (K,) rows of the session's joints. joints : (K, m).
-    images : K grey-level arrays (height, width).
+    images : K grey-level arrays (height, width), decoded or when they are looked at.
     """
 
     station: int
     camera: Camera
     configuration: Integers
     joints: Array
-    images: list[Integers]
+    images: Sequence[Integers]
+
+    def select(self, numbers: Integers) -> Photographs:
+        """Some of the photographs."""
+        return replace(
+            self,
+            configuration=self.configuration[numbers],
+            joints=self.joints[numbers],
+            images=Selected(self.images, numbers),
+        )
+
+    def spread(self, most: int) -> Integers:
+        """Numbers of up to ``most`` photographs, evenly over all."""
+        count = len(self.images)
+        return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+
+    @property
+    def window(self) -> int:
+        """How many photographs are looked at together."""
+        return min(max(fitting(self.camera.image_size, WINDOW_BYTES), 1), WINDOW)
+
+    def decoded(self) -> Photographs:
+        """The same with every photograph decoded; for no more than a window of them."""
+        return replace(self, images=list(self.images))
+
+    def windows(self) -> Iterator[tuple[slice, Photographs]]:
+        """All photographs, decoded, a window at a time, each with its place among them."""
+        for first in range(0, len(self.images), self.window):
+            part = slice(first, first + self.window)
+            numbers = np.arange(len(self.images))[part]
+            yield part, self.select(numbers).decoded()
 
 
 @dataclass(frozen=True)
@@ -231,11 +273,25 @@ def search(
     T_camera_base: Array,
     poses: Array,
     reach: float = REACH,
+    done: Done | None = None,
 ) -> StationEdges:
     """Every leg to about a pixel, each moved as a whole; edges have sigmas of a pixel.
 
     poses : T_base_platform (K, 4, 4) of the photographs.
     """
+    looks: list[StationEdges] = []
+    for part, window in photographs.windows():
+        looks.append(_searched(window, machine, T_camera_base, poses[part], reach))
+        if done is not None:
+            done(len(window.images))
+        del window  # before the next one is decoded
+    return _joined(looks, float("nan"), reach)
+
+
+def _searched(
+    photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array, reach: float
+) -> StationEdges:
+    """One window's part of :func:`search`."""
     tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, SEARCH_SAMPLES)
     places = search_legs(photographs.images, tubes, points, clear, reach)
     found = clear & places.clear[:, tubes.leg][..., None]
@@ -260,12 +316,63 @@ def measure(
     poses: Array,
     blur: float | None = None,
     refine_camera: bool = False,
+    done: Done | None = None,
 ) -> StationEdges:
     """Every edge to sub-pixel, by the shading-aware model of :mod:`pkmcal.observe.profiles`.
 
-    blur : px, from an earlier look; estimated from these profiles when absent. refine_camera :
-    also how the edges depend on the camera's parameters.
+    blur : px, from an earlier look; when absent, estimated from the profiles of as many photographs
+    as are looked at together, spread over all. refine_camera : also how the edges depend on the
+    camera's parameters.
     """
+    looks: list[StationEdges] = []
+    moved: list[Array] = []
+    ready: _Seen | None = None
+    if blur is None:
+        few = photographs.spread(photographs.window)
+        seen = _seen(photographs.select(few).decoded(), machine, T_camera_base, poses[few])
+        blur = profiles.estimate_blur(seen.across) if seen.full.any() else BLUR
+        ready = seen if len(few) == len(photographs.images) else None
+        del seen
+    for part, window in photographs.windows():
+        seen = ready or _seen(window, machine, T_camera_base, poses[part])
+        look, away = _measured(window, seen, blur, refine_camera)
+        looks.append(look)
+        moved.append(away)
+        if done is not None:
+            done(len(window.images))
+        del seen, window  # before the next one is decoded
+    away = np.concatenate(moved)
+    return _joined(looks, blur, float(np.median(away)) if len(away) else 0.0)
+
+
+def _joined(looks: Sequence[StationEdges], blur: float, moved: float) -> StationEdges:
+    """One station's windows as one look."""
+    first = np.cumsum([0] + [len(look.edges) for look in looks[:-1]])
+    return StationEdges(
+        edges=concatenate([look.edges for look in looks]),
+        rejected=tuple(rejection for look in looks for rejection in look.rejected),
+        points=np.concatenate([look.points for look in looks]),
+        point_edge=np.concatenate(
+            [look.point_edge + k for look, k in zip(looks, first, strict=True)]
+        ),
+        blur=blur,
+        moved=moved,
+    )
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A window's predicted places along edges, and the profiles where they are clear, ``full``
+    (K, E, SEGMENTS).
+    """
+
+    tubes: TubeList
+    places: EdgePoints
+    full: Booleans
+    across: profiles.Profiles
+
+
+def _seen(photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array) -> _Seen:
     tubes, points, clear = _predict(photographs, machine, T_camera_base, poses, PLACES)
     grey = sample(photographs.images, _profile_pixels(photographs.camera, points))
     middles = np.arange(SEGMENTS) * 5 + 2  # of the segments, among the points
@@ -273,8 +380,14 @@ def measure(
     places = replace(points, **{name: getattr(points, name)[:, :, middles] for name in per_point})
     half_width = places.gain * machine.values[tubes.radius][:, None]
     full, across = _segment_profiles(grey, np.repeat(clear, BETWEEN, axis=-1), half_width)
-    if blur is None:
-        blur = profiles.estimate_blur(across) if full.any() else BLUR
+    return _Seen(tubes, places, full, across)
+
+
+def _measured(
+    photographs: Photographs, seen: _Seen, blur: float, refine_camera: bool
+) -> tuple[StationEdges, Array]:
+    """One window's part of :func:`measure`, and how far (px) each place was from its prediction."""
+    tubes, places, full, across = seen.tubes, seen.places, seen.full, seen.across
     curves = profiles.residual_curves(across, blur)
     about = _leg_lines(profiles.likelihood(across, curves), places.along, full, tubes)
     at = profiles.locate(across, curves, about)
@@ -289,8 +402,8 @@ def measure(
     k, e, s = np.nonzero(fits.used & fits.good[..., None])
     xy = places.pixel[k, e, s] + position[k, e, s, None] * places.outward[k, e, s]
     number = np.cumsum(fits.good.ravel()).reshape(fits.good.shape) - 1
-    moved = float(np.median(np.abs(position[k, e, s]))) if len(k) else 0.0
-    return StationEdges(edges, rejected, xy, number[k, e], blur, moved)
+    look = StationEdges(edges, rejected, xy, number[k, e], blur, float("nan"))
+    return look, np.abs(position[k, e, s])
 
 
 def _predict(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
@@ -59,6 +60,18 @@ def quality(
     photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
 ) -> Quality:
     """Quality on the legs; poses : T_base_platform (K, 4, 4) of the photographs."""
+    looks = [
+        _quality(window, machine, T_camera_base, poses[part])
+        for part, window in photographs.windows()
+    ]
+    each = (f.name for f in fields(Quality))
+    return Quality(*(np.concatenate([getattr(look, name) for look in looks]) for name in each))
+
+
+def _quality(
+    photographs: Photographs, machine: Machine, T_camera_base: Array, poses: Array
+) -> Quality:
+    """The same of one window."""
     tubes = tubes_of(machine)
     legs = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
     points = edge_points(machine, photographs.camera, legs, tubes, SEARCH_SAMPLES)
@@ -90,13 +103,16 @@ def quality(
     )
 
 
-def unrecognised_quality(images: list[Integers], n_legs: int) -> Quality:
+def unrecognised_quality(images: Sequence[Integers], n_legs: int) -> Quality:
     """Quality of photographs in which the machine was not found: of the whole pictures."""
     count = len(images)
+    shares = np.array(
+        [(np.mean(image >= SATURATED), np.mean(image <= BLACK)) for image in images], dtype=float
+    ).reshape(count, 2)
     return Quality(
         legs=np.zeros((count, n_legs), dtype=bool),
-        saturated=np.array([float(np.mean(image >= SATURATED)) for image in images]),
-        black=np.array([float(np.mean(image <= BLACK)) for image in images]),
+        saturated=shares[:, 0],
+        black=shares[:, 1],
         blur=np.full(count, np.nan),
     )
 

@@ -9,6 +9,7 @@ not say where the machine is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -43,14 +44,16 @@ class PictureEdges(NamedTuple):
 
 @dataclass(frozen=True)
 class DistanceTables:
-    """Distances in reduced pixels, (K, DIRECTIONS, h, w), and the reduction factor.
+    """Distances in reduced pixels, (T, DIRECTIONS, h, w), and the reduction factor.
 
-    edges : of each photograph. moving : (h, w) share of the photographs in which each place differs
-    from the others; where a single one cannot tell, where it has edges. chance : (DIRECTIONS,
-    bins) of BIN: how often a place taken anywhere has that distance.
+    row : (K,) each photograph's table. edges : of each photograph. moving : (h, w) share of the
+    photographs in which each place differs from the others; where a single one cannot tell, where
+    it has edges. chance : (DIRECTIONS, bins) of BIN: how often a place taken anywhere has that
+    distance.
     """
 
     tables: Array
+    row: Integers
     scale: float
     edges: tuple[PictureEdges, ...]
     moving: Array
@@ -74,7 +77,7 @@ class DistanceTables:
             inside = (place[..., 0] >= 0) & (place[..., 0] <= width - 1)
             inside &= (place[..., 1] >= 0) & (place[..., 1] <= height - 1)
         x, y = (np.where(inside, np.rint(place[..., i]), 0).astype(np.intp) for i in (0, 1))
-        return self.tables[photograph, direction, y, x], inside
+        return self.tables[self.row[photograph], direction, y, x], inside
 
     def look_smooth(
         self, direction: Integers, pixel: Array, photograph: Integers
@@ -89,7 +92,7 @@ class DistanceTables:
         corner = np.floor(place).astype(np.intp)
         fx, fy = (place[..., i] - corner[..., i] for i in (0, 1))
         x, y = corner[..., 0], corner[..., 1]
-        at = self.tables
+        at, photograph = self.tables, self.row[photograph]
         upper = (1 - fx) * at[photograph, direction, y, x]
         upper = upper + fx * at[photograph, direction, y, x + 1]
         lower = (1 - fx) * at[photograph, direction, y + 1, x]
@@ -104,7 +107,7 @@ class DistanceTables:
     def select(self, photographs: Integers) -> DistanceTables:
         """Of some of the photographs; what moves and what chance gives, as all show it."""
         edges = tuple(self.edges[k] for k in photographs)
-        return replace(self, tables=self.tables[photographs], edges=edges)
+        return replace(self, row=self.row[photographs], edges=edges)
 
     def mirrored(self) -> DistanceTables:
         """Of the photographs with left and right exchanged."""
@@ -115,6 +118,7 @@ class DistanceTables:
         )
         return DistanceTables(
             self.tables[:, ::-1, :, ::-1],
+            self.row,
             self.scale,
             tuple(edges),
             self.moving[:, ::-1],
@@ -150,30 +154,28 @@ def distances(
 
 
 def distance_tables(
-    images: list[Integers],
+    images: Sequence[Integers],
     width: int = WORKING_WIDTH,
     directions: int = DIRECTIONS,
 ) -> DistanceTables:
     """Tables of one station's photographs, K arrays (height, width) uint8 of one size."""
     import cv2
 
-    scale = max(images[0].shape[1] / width, 1.0)
-    size = (round(images[0].shape[1] / scale), round(images[0].shape[0] / scale))
-    small = [_levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)) for image in images]
+    small: list[Integers] = []
+    scale = 1.0
+    for image in images:  # each is decoded once, and only its reduction kept
+        scale = max(image.shape[1] / width, 1.0)
+        size = (round(image.shape[1] / scale), round(image.shape[0] / scale))
+        small.append(_levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
     still = np.median(np.stack(small), axis=0) if len(small) >= ENOUGH_TO_COMPARE else None
     edges = tuple(_edges_of(image, still) for image in small)
-    tables = np.stack(
-        [
-            distances(
-                e.pixel.astype(int),
-                direction_of(e.normal, directions),
-                small[0].shape,
-                directions,
-            )
-            for e in edges
-        ]
-    )
-    return DistanceTables(tables, scale, edges, _moving(small, still, edges), _chance(tables))
+    shape = small[0].shape
+    tables = np.empty((len(small), directions, *shape), dtype=np.float32)
+    for table, e in zip(tables, edges, strict=True):
+        number = direction_of(e.normal, directions)
+        table[:] = distances(e.pixel.astype(int), number, shape, directions)
+    row = np.arange(len(small))
+    return DistanceTables(tables, row, scale, edges, _moving(small, still, edges), _chance(tables))
 
 
 def _levels(image: Any) -> Integers:

@@ -131,13 +131,7 @@ def first_edges(
     """
     machine, numbers = session.machine, camera_numbers(session, [p.station for p in photographs])
     few = [
-        replace(
-            p,
-            station=number,
-            configuration=p.configuration[own],
-            joints=p.joints[own],
-            images=[p.images[k] for k in own],
-        )
+        replace(p.select(own), station=number)
         for number, (p, own) in enumerate(zip(photographs, rows, strict=True))
     ]
 

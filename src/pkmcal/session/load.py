@@ -6,6 +6,7 @@ any work is spent; each fault is an `InputError` with file, line and field.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
@@ -493,9 +494,10 @@ def _check_distinct(document: Document, stations: tuple[Station, ...]) -> None:
 
 def _check_paths(document: Document, schema: SessionDocument, table: CsvTable) -> None:
     """Straight paths lead through configurations that the readings' table has."""
+    known = set(table.names)
     for name, members in (schema.paths or {}).items():
         for k, member in enumerate(members):
-            if member not in table.names:
+            if member not in known:
                 guess = closest(member, table.names)
                 raise InputError(
                     "there is no such configuration",
@@ -514,8 +516,8 @@ def _check_paths(document: Document, schema: SessionDocument, table: CsvTable) -
 
 def _check_names(document: Document, stations: tuple[Station | PoseTable, ...]) -> None:
     """A photograph by hand is a station of its own, and must not have another one's name."""
-    names = [station.name for station in stations]
-    twice = next((name for name in names if names.count(name) > 1), None)
+    many = Counter(station.name for station in stations)
+    twice = next((name for name, count in many.items() if count > 1), None)
     if twice is not None:
         raise InputError(
             "two stations, or photographs by hand, have the same name",

@@ -42,22 +42,30 @@ def find_photographs(
     """
     parts = _parts(pattern, where)
     wildcard = "".join(glob.escape(text) if field is None else "*" for text, field in parts)
-    known = re.compile(_regex(parts, "|".join(map(re.escape, sorted(names, key=len)[::-1]))))
+    rows = {name: row for row, name in enumerate(names)}
+    lengths = sorted({len(name) for name in names}, reverse=True)
+
+    def known(path: str) -> re.Match[str] | None:
+        """The path as the pattern's, of a configuration that there is; the longest name first."""
+        # only names that stand in it: thousands as one expression would be tried one by one
+        within = (path[at : at + n] for n in lengths for at in range(len(path) - n + 1))
+        some = dict.fromkeys(name for name in within if name in rows)
+        return re.fullmatch(_regex(parts, "|".join(map(re.escape, some))), path) if some else None
+
     files = [
         path
         for path in (Path(name).as_posix() for name in glob.glob(wildcard, root_dir=folder))
         # A folder or a pipe that has a photograph's name is told; others are nobody's business.
-        if (folder / path).is_file() or known.fullmatch(path)
+        if (folder / path).is_file() or known(path)
     ]
     if not files and not needed:
         return ()
     if not files:
         raise _none_found(folder, wildcard, pattern, where)
-    rows = {name: row for row, name in enumerate(names)}
     found: list[Photograph] = []
     strangers: list[str] = []
     for name in sorted(files):
-        match = known.fullmatch(name)
+        match = known(name)
         if match is None:
             strangers.append(name)
             continue

@@ -1,0 +1,71 @@
+"""What commands say of their progress where there is no terminal."""
+
+import re
+import threading
+from contextlib import redirect_stderr
+
+from conftest import run
+from pkmcal.commands import console
+
+
+class Heard:
+    """A stream that is no terminal, and tells when it was written to."""
+
+    encoding = "utf-8"
+
+    def __init__(self):
+        self.text, self.written = "", threading.Event()
+
+    def write(self, text):
+        self.text += text
+        self.written.set()
+        return len(text)
+
+    def flush(self):
+        pass
+
+    def isatty(self):
+        return False
+
+
+def test_a_long_step_is_told_in_plain_lines(monkeypatch, capsys):
+    monkeypatch.setattr(console, "EVERY", 0.01)
+    with redirect_stderr(Heard()) as heard, console.progress() as told:
+        told("Finding the legs: 3 of 9 photographs", 0.35)
+        assert heard.written.wait(60)
+    line = r"Finding the legs: 3 of 9 photographs \(35%, \d+ s\)"
+    assert all(re.fullmatch(line, x) for x in heard.text.splitlines())
+    assert capsys.readouterr().out == ""
+
+
+def test_nobody_speaks_where_nothing_is_wanted(monkeypatch):
+    monkeypatch.setattr(console, "EVERY", 0.01)
+    count = threading.active_count()
+    with redirect_stderr(Heard()) as heard, console.progress(quiet=True) as told:
+        told("Finding the legs", 0.35)
+        assert threading.active_count() == count
+    assert heard.text == ""
+
+
+def test_a_short_run_says_nothing():
+    with redirect_stderr(Heard()) as heard, console.progress() as told:
+        told("Finding the legs", 0.35)
+    assert heard.text == ""
+
+
+def test_nothing_is_said_before_there_is_anything_to_say(monkeypatch):
+    monkeypatch.setattr(console, "EVERY", 0.01)
+    with redirect_stderr(Heard()) as heard, console.progress():
+        assert not heard.written.wait(0.2)
+
+
+def test_a_calibration_tells_what_it_does(demo, tmp_path, monkeypatch):
+    monkeypatch.setattr(console, "EVERY", 0.01)
+    said = run("calibrate", demo.session, "-o", tmp_path / "told")
+    assert said.code == 0
+    steps = dict.fromkeys(re.sub(r" \(\d+%, \d+ s\)", "", x) for x in said.err.splitlines())
+    for step in ("Recognising", "Finding the legs", "Measuring edges", "Identifying"):
+        assert any(x.startswith(step) for x in steps)
+    assert not any(step in said.out for step in steps)
+    for silent in ("--json", "--quiet"):
+        assert run("calibrate", demo.session, "-o", tmp_path / silent, silent).err == ""

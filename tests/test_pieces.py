@@ -1,0 +1,101 @@
+"""A joint estimate of many configurations takes them in pieces: the same, piece by piece."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pkmcal import solver
+from pkmcal.identify.bundle import solve_batch
+from pkmcal.identify.covariance import Information, identifiability, reduced_rows
+from pkmcal.identify.noise import components
+from pkmcal.papers import linear
+from test_identify_scene import make_scene
+
+CONFIGURATIONS = 7
+
+
+def problem_of(runs=1):
+    rng = np.random.default_rng(3)
+    scene = make_scene(rng, runs=runs, configurations=CONFIGURATIONS, n_stations=2)
+    assembled, truth = scene.batch(rng)
+    return assembled.problem, truth, scene.machine
+
+
+@pytest.fixture
+def in_pieces(monkeypatch):
+    """Afterwards two configurations, or runs, are worked on at once."""
+
+    def begin(problem):
+        monkeypatch.setattr(solver, "ROWS", 2 * problem.n_rows)
+
+    return begin
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+def test_noise_and_estimate_are_the_same(runs, in_pieces):
+    problem, truth, _ = problem_of(runs)
+    whole = solve_batch(problem, truth)
+    at_whole = components(whole.info, whole.weight)
+    in_pieces(problem)
+    found = solve_batch(problem, truth)
+    pieces = list(found.info.pieces())
+    counts = [piece.state.T_base_platform.shape[1] for piece in pieces]
+    assert counts == [2, 2, 2, 1]
+    assert all(piece.linear.by_shared.shape[1] <= 2 for piece in pieces)
+    at = components(whole.info, whole.weight)
+    for name in ("chi2", "freedom", "square"):
+        np.testing.assert_allclose(getattr(at, name), getattr(at_whole, name), rtol=1e-9)
+    np.testing.assert_array_equal(found.info.value.shape, whole.info.value.shape)
+    np.testing.assert_allclose(found.solution.state.z, whole.solution.state.z, atol=1e-8)
+    np.testing.assert_allclose(found.scale.edges, whole.scale.edges, rtol=1e-6)
+
+
+def test_the_rows_of_pieces_say_the_same(in_pieces):
+    problem, truth, machine = problem_of()
+    names = ("machine", "stations")
+    rows, left = reduced_rows(problem, truth, names)
+    every, value = Information(problem, truth).rows
+    spectrum = identifiability(problem, machine, truth).singular_values
+    in_pieces(problem)
+    few, rest = reduced_rows(problem, truth, names)
+    assert len(few) <= 4 * (problem.unknowns.count + 1) + len(problem.prior)
+    for (a, x), (b, y) in (((rows, left), (few, rest)), (
+        (every[0], value[0]), tuple(part[0] for part in Information(problem, truth).rows)),
+    ):  # fmt: skip
+        size = np.abs(a.T @ a).max()
+        np.testing.assert_allclose(b.T @ b, a.T @ a, atol=1e-9 * size)
+        np.testing.assert_allclose(b.T @ y, a.T @ x, atol=1e-9 * np.abs(a.T @ x).max())
+        assert y @ y == pytest.approx(x @ x, rel=1e-9)
+    again = identifiability(problem, machine, truth).singular_values
+    np.testing.assert_allclose(again, spectrum, atol=1e-8 * spectrum[0])
+
+
+def test_condensed_rows_say_the_same():
+    rng = np.random.default_rng(0)
+    rows, value = rng.normal(size=(2, 50, 4)), rng.normal(size=(2, 50))
+    few, rest = solver.condensed(rows, value)
+    assert few.shape == (2, 5, 4)
+    np.testing.assert_allclose(few.mT @ few, rows.mT @ rows, atol=1e-12)
+    np.testing.assert_allclose(few.mT @ rest[..., None], rows.mT @ value[..., None], atol=1e-12)
+    np.testing.assert_allclose(np.sum(rest**2, axis=1), np.sum(value**2, axis=1))
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_least_median_leg_after_leg(monkeypatch, noisy):
+    rng = np.random.default_rng(1)
+    n = rng.normal(size=(2, 3, 20, 3))
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    present = (rng.random((2, 3, 20)) < 0.8).astype(float)
+    noise = np.broadcast_to(1e-6 * np.eye(3), (2, 3, 20, 3, 3)) if noisy else None
+    radius = -np.sum(n * rng.normal(size=(2, 3, 1, 3)), axis=-1) + 1e-3 * rng.normal(
+        size=n.shape[:-1]
+    )
+
+    def found():
+        return linear.least_median(n, radius, present, np.random.default_rng(0), noise=noise)
+
+    whole = found()
+    assert np.isfinite(whole).all()
+    monkeypatch.setattr(linear, "RESIDUALS", 1)
+    np.testing.assert_array_equal(found(), whole)

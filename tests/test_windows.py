@@ -1,0 +1,169 @@
+"""Photographs pass through in windows: what is held at a time, and that nothing else changes."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from pkmcal.calibration import recognise
+from pkmcal.calibration.recognise import mistake_in, platform_poses, read_photographs
+from pkmcal.observe import legs
+from pkmcal.observe.legs import measure, search
+from pkmcal.observe.tables import distance_tables
+from pkmcal.session.load import load_session
+from test_observe_drawing import FRONT, poses, redrawn
+from test_observe_measure import taken
+
+REPEATED = 3
+"""Times that the six drawn photographs are taken."""
+
+
+class Fresh(Sequence):
+    """Photographs that are made when they are looked at; counts how many there are at a time."""
+
+    def __init__(self, images):
+        self.images, self.alive, self.most, self.looks = images, 0, 0, 0
+
+    def __len__(self):
+        return len(self.images)
+
+    def __getitem__(self, index):
+        image = self.images[index].view()  # an object of its own
+        self.alive += 1
+        self.looks += 1
+        self.most = max(self.most, self.alive)
+        weakref.finalize(image, self._gone)
+        return image
+
+    def _gone(self):
+        self.alive -= 1
+
+
+def many(repeated=REPEATED):
+    """Photographs, their platform poses, and what counts them."""
+    few = taken()
+    rows = np.tile(np.arange(len(few.images)), repeated)
+    fresh = Fresh([few.images[k] for k in rows])
+    return replace(few.select(rows), images=fresh), poses()[rows], fresh
+
+
+LOOKS = {
+    "search": lambda p, T: search(p, redrawn(0, 0.0005), FRONT, T),
+    "measure": lambda p, T: measure(p, redrawn(0, 0.0005), FRONT, T),
+    "refine": lambda p, T: measure(p, redrawn(0, 0.0005), FRONT, T, 0.7, refine_camera=True),
+}
+
+
+@pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
+@pytest.mark.parametrize("window", [1, 4])
+def test_no_more_than_a_window_is_decoded_at_a_time(monkeypatch, look, window):
+    monkeypatch.setattr(legs, "WINDOW", window)
+    photographs, seen, fresh = many()
+    look(photographs, seen)
+    assert fresh.most == window
+    assert fresh.alive == 0
+    # each once, and a window's for the blur where that is not known
+    assert fresh.looks in (len(fresh), len(fresh) + window)
+
+
+@pytest.mark.parametrize("name", ["search", "refine"])
+def test_windows_change_nothing(monkeypatch, name):
+    photographs, seen, _ = many()
+    whole = LOOKS[name](photographs, seen)
+    monkeypatch.setattr(legs, "WINDOW", 4)
+    found = LOOKS[name](photographs, seen)
+    assert found.rejected == whole.rejected
+    for field in fields(whole.edges):
+        ours, theirs = (getattr(look.edges, field.name) for look in (found, whole))
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(found.point_edge, whole.point_edge)
+    np.testing.assert_allclose(found.points, whole.points, atol=1e-9)
+    np.testing.assert_allclose(found.moved, whole.moved, atol=1e-12)
+
+
+def test_the_blur_of_many_is_told_by_as_many_as_are_looked_at_together(monkeypatch):
+    photographs, seen, _ = many()
+    monkeypatch.setattr(legs, "WINDOW", 4)
+    few = photographs.spread(4)
+    assert few.tolist() == [0, 5, 11, 17]
+    of_few = LOOKS["measure"](photographs.select(few), seen[few]).blur
+    assert LOOKS["measure"](photographs, seen).blur == of_few
+
+
+def test_large_photographs_have_small_windows(monkeypatch):
+    photographs, _, _ = many()
+    width, height = photographs.camera.image_size
+    monkeypatch.setattr(legs, "WINDOW_BYTES", 5 * width * height)
+    assert [len(part.images) for _, part in photographs.windows()] == [5, 5, 5, 3]
+    monkeypatch.setattr(legs, "WINDOW_BYTES", 1)  # one may take more
+    assert photographs.window == 1
+
+
+def test_tables_look_at_each_photograph_once_and_share_their_memory():
+    _, _, fresh = many()
+    tables = distance_tables(fresh)
+    assert (fresh.most, fresh.looks) == (2, len(fresh))
+    some = tables.select(np.array([7, 2]))
+    assert np.shares_memory(some.tables, tables.tables)
+    place = np.array([100.0, 200.0])
+    for k, own in enumerate((7, 2)):
+        alike = [t.look(np.array(3), place, np.array(n))[0] for t, n in ((some, k), (tables, own))]
+        assert alike[0] == alike[1]
+
+
+# ------------------------------------------------------------------ a session
+
+
+@pytest.fixture(scope="module")
+def session(demo):
+    return load_session(demo.session)
+
+
+def test_so_many_bytes_of_a_session_stay_decoded(session, monkeypatch):
+    sizes = [np.prod(station.camera.image_size) for station in session.stations]
+    each = len(session.stations[0].photographs)
+    monkeypatch.setattr(recognise, "KEPT", int(sizes[0] * each + sizes[1]))
+    kept = [
+        [p.images[k] is p.images[k] for k in range(len(p.images))]
+        for p in read_photographs(session)
+    ]
+    assert kept[0] == [True] * each
+    assert kept[1] == [True] + [False] * (each - 1)
+    assert not any(kept[2])
+
+
+def test_the_machine_is_looked_for_in_some_of_many_photographs(session, monkeypatch):
+    """Spread over all of them, each under its own name."""
+    monkeypatch.setattr(recognise, "MOST_AT_A_STATION", 3)
+    monkeypatch.setattr(recognise, "FEWEST_AT_A_STATION", 2)
+    tables, seen = [], []
+
+    def counted(images):
+        tables.append(len(images))
+        return distance_tables(images)
+
+    monkeypatch.setattr(recognise, "distance_tables", counted)
+    monkeypatch.setattr(recognise, "mistake", lambda stations, _rng: seen.extend(stations))
+    photographs, rng = read_photographs(session), np.random.default_rng(0)
+    assert all(len(p.images) == 4 for p in photographs)
+    rngs = rng.spawn(len(photographs))
+    found = recognise.recognise(session, photographs, platform_poses(session), rngs)
+    assert tables == [3] * len(photographs)
+    assert [numbers.tolist() for numbers in found.seen] == [[0, 1, 3]] * len(photographs)
+    mistake_in(session, photographs, found, rng)
+    for station in seen:
+        names = [session.configurations[k] for k in station.view.configuration]
+        assert [name in file for name, file in zip(names, station.files, strict=True)] == [True] * 3
+
+
+def test_many_stations_share_the_photographs_that_are_looked_at(session, monkeypatch):
+    monkeypatch.setattr(recognise, "MOST_IN_ALL", 2 * len(session.stations))
+    monkeypatch.setattr(recognise, "FEWEST_AT_A_STATION", 1)
+    photographs = read_photographs(session)
+    rngs = np.random.default_rng(0).spawn(len(photographs))
+    found = recognise.recognise(session, photographs, platform_poses(session), rngs)
+    assert [len(numbers) for numbers in found.seen] == [2] * len(photographs)
