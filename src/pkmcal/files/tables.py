@@ -181,7 +181,7 @@ def _quickly(cells: list[str]) -> list[float] | None:
         numbers = list(map(float, cells[1:]))
     except ValueError:
         return None
-    return numbers if math.isfinite(sum(numbers)) else None
+    return numbers if max(map(abs, numbers), default=0.0) <= LARGEST else None
 
 
 def _numbers(cells: list[str], header: list[str], where: str) -> list[float]:
