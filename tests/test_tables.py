@@ -157,6 +157,8 @@ def test_a_large_table(tmp_path):
     np.testing.assert_array_equal(table.values, values)
 
 
-def test_numbers_whose_sum_is_none_are_numbers(tmp_path):
-    path = write(tmp_path, HEADER + "1,1e308,1.5e308\n")
-    np.testing.assert_array_equal(read_csv(path).values, [[1e308, 1.5e308]])
+@pytest.mark.parametrize("cell", ["1e308", "-1.5e308", "2e15"])
+def test_a_number_beyond_any_quantity_is_named_however_plain(tmp_path, cell):
+    path = write(tmp_path, HEADER + f"1,1,2\n2,1,{cell}\n")
+    with pytest.raises(InputError, match=r"line 3, column .*: this number is too large"):
+        read_csv(path)
