@@ -209,6 +209,20 @@ def moved(metres: float, radians: float) -> Any:
     return make
 
 
+def sleeve(metres: float) -> Any:
+    """A sleeve over a tube, which the drawing does not have."""
+
+    def make(folder: Path, rng: np.random.Generator) -> None:
+        def change(document: dict[str, Any]) -> None:
+            leg = document["legs"][rng.integers(len(document["legs"]))]
+            tube = leg["tubes"][rng.integers(len(leg["tubes"]))]
+            tube["radius"] = float(tube["radius"] - metres)
+
+        edited(folder / "mechanism.yaml", change)
+
+    return make
+
+
 def exchanged(folder: Path, rng: np.random.Generator) -> None:
     """Two photographs of a station under each other's names: of configurations that differ."""
     paths = sorted(sorted((folder / "images").iterdir())[0].iterdir())
@@ -243,6 +257,8 @@ FACTS: dict[str, Fact] = {
     "play of .3 mm": Fact(play(3e-4), ("play",)),
     "readings worse, .3 mm": Fact(noisier(3e-4), ("readings scatter",)),
     "one reading 1 mm off": Fact(one_off(1e-3), ("is off: what was seen",)),
+    "a sleeve of .3 mm": Fact(sleeve(3e-4), ("in radius than",), ("legs",)),
+    "a sleeve of 1.5 mm": Fact(sleeve(1.5e-3), ("in radius than",), ("legs",)),
     "a frozen reading": Fact(frozen, ("frozen", "never change")),
     "two photographs exchanged": Fact(exchanged, ("each other's names", "the other way round")),
 }

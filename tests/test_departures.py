@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from pkmcal import calibrate
 from pkmcal.boards.poses import pose_set, size_departure
 from pkmcal.calibration.departures import LEVEL
 from pkmcal.calibration.gather import edges_by_camera
+from pkmcal.calibration.outlines import outlines
 from pkmcal.calibration.results import load
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify import score
@@ -289,7 +291,72 @@ def test_boards_of_another_size_show_where_readings_give_the_scale():
     assert abs(fit.value[0] - 0.004) < 4 * fit.sigma[0] + 2e-4
 
 
+def outlined(seed, lines_off):
+    """What is told of tubes whose edges are moved by {(leg, tube, station, side): px} outward, and
+    by how many mm that is, median of all.
+    """
+    drawing, data, where = measured(seed, count=20)
+    edges = data.edges
+    turn, away = np.zeros((len(edges), 2)), np.zeros(0)
+    for (leg, tube, station, side), px in lines_off.items():
+        mine = (edges.leg == leg) & (edges.tube == tube)
+        mine &= (edges.station == station) & (edges.side == side)
+        assert mine.sum() > 5
+        turn[mine] = px * edges.shift[mine]
+        T = where[station] @ load_mechanism("gough-stewart").home()
+        away = np.append(away, np.linalg.norm(turn[mine], axis=1) * np.linalg.norm(T[:3, 3]))
+    normal = edges.normal + (edges.basis @ turn[..., None])[..., 0]
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    turned = edges.basis - normal[..., None] * (normal[:, None] @ edges.basis)  # bases follow
+    basis, by = np.linalg.qr(turned)
+    basis = basis * np.sign(np.einsum("nii->ni", by))[:, None]
+    data = replace(data, edges=replace(edges, normal=normal, basis=basis), shaded=True)
+    estimate = bundle(drawing, data, start_state(drawing, data, where))
+    session = SimpleNamespace(
+        machine=drawing, station_names=("one", "two"), document={"mechanism": "mechanism.yaml"}
+    )
+    told = list(outlines(session, data, estimate, LEVEL))
+    return told, 1e3 * np.median(away) if away.size else 0.0
+
+
+def test_a_tube_that_is_thicker_is_named():
+    off = {(2, 0, s, side): 3.0 for s in (0, 1) for side in (0, 1)}
+    (found,), thicker = outlined(11, off)
+    one = found.departure
+    assert (one.kind, one.of) == ("tube radius", "legs[3].tubes[1]")
+    assert found.value == pytest.approx(1e-3 * thicker, rel=0.15)
+    what, todo = one.says(np.array([0.0015]), np.array([0.0001]))
+    assert "Tube 1 of leg 3 is 1.5 mm thicker in radius than mechanism.yaml says" in what
+    assert "legs[3].tubes[1].radius" in todo
+
+
+def test_an_edge_that_is_off_alone_is_named_with_its_station():
+    (found,), _ = outlined(12, {(4, 0, 1, 0): -4.0})
+    one = found.departure
+    assert found.value < -5 * found.sigma
+    assert (one.kind, one.of) == ("tube edge", "legs[5].tubes[1], two")
+    what, _ = one.says(np.array([-0.002]), np.array([0.0001]))
+    assert "Of tube 1 of leg 5, two sees one edge 2.0 mm inside" in what
+
+
+def test_right_tubes_are_not_named():
+    assert [outlined(seed, {})[0] for seed in (13, 14)] == [[], []]
+
+
 # ------------------------------------------------------------------ on photographs
+
+
+def test_a_sleeve_is_named_and_harms_little(session):
+    path = session / "mechanism.yaml"
+    document = yaml.safe_load(path.read_text())
+    document["legs"][1]["tubes"][0]["radius"] -= 0.002
+    path.write_text(yaml.safe_dump(document))
+    found = calibrate(session)
+    (one,) = found.departures
+    assert (one.kind, one.of) == ("tube radius", "legs[2].tubes[1]")
+    assert abs(one.value[0] - 2e-3) < 4 * one.sigma[0]
+    assert one.value[0] > 1e-3
+    assert not one.against
 
 
 def scaled_readings(folder, column, factor):

@@ -1,4 +1,4 @@
-"""What the session takes for granted, tested: readings' scales and play, lenses, boards, tripods.
+"""What the session takes for granted, tested: readings, lenses, boards, tripods, tubes.
 
 Each departure is declared beside the thing that it departs from, with what it would do to the
 measurements and in which words it is told; here they are put together and tested, all at one level
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,11 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.boards.poses import size_departure
 from pkmcal.calibration.gather import edges_by_camera
+from pkmcal.calibration.outlines import Outline, outlines
 from pkmcal.identify.bundle import as_ended
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.score import Departures, Freed, Score
+from pkmcal.identify.score import MOST, Departures, Freed, Score
 from pkmcal.identify.tool import ToolError, tool_error
 from pkmcal.measurements import Departure, Effect, Measurements, Observation
 from pkmcal.mechanisms.closure import scales
@@ -94,13 +96,17 @@ def departures(
         list(_boards(session, measurements)),
         list(_tripods(session, measurements)),
     ]
+    tubes = list(islice(outlines(session, measurements, estimate, LEVEL), MOST))
+    families.append([one.departure for one in tubes])
     listed = [one for family in families for one in family]
+    first_tube = len(listed) - len(tubes)
     number = np.repeat(np.arange(len(families)), [len(family) for family in families])
     assembled, state = as_ended(measurements, estimate)
     tests = Departures(
         assembled, state, [one.effect for one in listed], number.tolist(), singles=True
     )
-    found = tests.found(LEVEL)
+    known = [(first_tube + k, one.score) for k, one in enumerate(tubes)]
+    found = [*tests.found(LEVEL, [k for k, _ in known]), *known]
     if not found:
         return ()
     used = estimate.configurations
@@ -122,10 +128,18 @@ def departures(
         return readings.wrong_reading(columns[m], units[m], name)
 
     fits = tests.fitted([k for k, _ in found])
+    last = len(fits) - len(tubes)
+    fits[last:] = [_as_told(fit, one) for fit, one in zip(fits[last:], tubes, strict=True)]
     return tuple(
         _departed(declared(k), score, fit, tool)
         for (k, score), fit in zip(found, fits, strict=True)
     )
+
+
+def _as_told(fit: Freed, one: Outline) -> Freed:
+    """A tube's departure by the value that its lines tell."""
+    value, sigma = np.array([one.value]), np.array([one.sigma])
+    return Freed(value, sigma, fit.moved * (one.value / fit.value[0] if fit.value[0] else 0.0))
 
 
 def _departed(one: Departure, score: Score, fit: Freed, tool: ToolError) -> Departed:

@@ -85,7 +85,7 @@ def assemble(
     estimate has told it.
     """
     _check(machine, measurements)
-    seen, line = seen_configurations(measurements), _lines(measurements)
+    seen, line = seen_configurations(measurements), lines(measurements)[1]
     edges = _places(measurements.edges.configuration, seen)
     # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
     poses = _places(measurements.poses.configuration, seen)
@@ -177,18 +177,20 @@ def _places(configuration: Integers, seen: Booleans) -> Places:
     return Places(row, place, (int(seen.sum()), int(place.max(initial=-1)) + 1))
 
 
-def _lines(measurements: Measurements) -> Integers:
-    """Number (N,) of each edge's line: station, leg, tube and side; none if nothing is shaded, and
-    -1 at stations of one photograph, where each edge is a line of its own.
+def lines(measurements: Measurements) -> tuple[Integers, Integers]:
+    """Each line's station, leg, tube and side (n, 4), and the number (N,) of each edge's line; none
+    if nothing is shaded, and -1 at stations of one photograph, where each edge is a line of its
+    own.
     """
     e = measurements.edges
     if not measurements.shaded or not len(e):
-        return np.zeros(0, dtype=int)
+        return np.zeros((0, 4), dtype=int), np.zeros(0, dtype=int)
     number = np.full(len(e), -1)
     many = ~_alone(measurements)
     keys = np.stack([e.station, e.leg, e.tube, e.side], axis=1)[many]
-    number[many] = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
-    return number
+    keys, own = np.unique(keys, axis=0, return_inverse=True)
+    number[many] = own.reshape(-1)
+    return keys, number
 
 
 def _alone(measurements: Measurements) -> Booleans:

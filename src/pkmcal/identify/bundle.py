@@ -371,6 +371,9 @@ def _estimate(
         pose_residuals=residuals.poses,
         pose_weights=weights.poses,
         line_shading=result.problem.data.shading[0],
+        line_shift=(result.problem.data.shading * found.shading)[0],
+        line_shift_sigma=result.problem.data.shading[0]
+        * np.sqrt(np.diagonal(result.info.covariance[0])[u.shading]),
         breathing_sigma=np.sqrt(np.diagonal(result.info.covariance[0])[u.breathing]),
         size_sigma=np.sqrt(np.diagonal(result.info.covariance[0])[u.sizes]),
     )

@@ -100,7 +100,9 @@ class Estimate:
     data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
         data decide; near 0, the value is the drawing's.
     pose_residuals : (N, 6) whitened, of the measured poses; pose_weights : (N,) robust weights.
-    line_shading : (n,) px, standard deviation of each tube's side's shading at each station.
+    line_shading : (n,) px, standard deviation of each tube's side's shading at each station;
+        line_shift : (n,) px outward, what it came to, and line_shift_sigma : (n,) how well that is
+        known. Lines are numbered by :func:`~pkmcal.identify.assembly.lines`.
     breathing_sigma : (S,) standard deviations of ``state.breathing``, in the same units.
     size_sigma : (n,) the same of ``state.sizes``.
     configurations : (K,) True where the configuration was seen and its pose estimated.
@@ -122,6 +124,8 @@ class Estimate:
     pose_residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
     pose_weights: Array = field(default_factory=lambda: np.zeros(0))
     line_shading: Array = field(default_factory=lambda: np.zeros(0))
+    line_shift: Array = field(default_factory=lambda: np.zeros(0))
+    line_shift_sigma: Array = field(default_factory=lambda: np.zeros(0))
     breathing_sigma: Array = field(default_factory=lambda: np.zeros(0))
     size_sigma: Array = field(default_factory=lambda: np.zeros(0))
 

@@ -36,6 +36,9 @@ MOSTLY = 0.5
 """Share of configurations near a singular pose from which on nothing said here can be trusted."""
 LARGE = 0.3
 """Share of what is undecided from which on a single cause of it is worth a reason."""
+WORTH_SAYING = 0.5
+"""Part of the platform's deviation from which on what makes it is worth a warning; half of it makes
+the whole larger by an eighth."""
 
 
 EXACT_SHARE = 1e-9
@@ -87,7 +90,7 @@ def judge(
         ]
     reasons = tuple(_reasons(estimate, method, left) + _poses_against(estimate, richer)) + doubts
     # what is a small part of the deviation that was reached is in that, and in the report
-    least = LARGE * _platform_sigma(estimate) if small else 0.0
+    least = WORTH_SAYING * _platform_sigma(estimate) if small else 0.0
     matter = tuple(s for s in small if s.matters and s.moves_platform > least)
     warnings = (
         *_warnings(observation, estimate, held_out),
