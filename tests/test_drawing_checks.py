@@ -128,43 +128,50 @@ FAULTS = {
     "half an axis held": (
         "3-upu",
         [("legs:", 'fixed: ["legs[1].base.axis.x"]\nlegs:')],
-        "m.yaml: legs[1].base.axis.x cannot be held alone: an axis is one direction; expected the "
+        "m.yaml, line 3, fixed[1]: "
+        "legs[1].base.axis.x cannot be held alone: an axis is one direction; expected the "
         "whole axis, 'legs[1].base.axis'.",
     ),
     "half an axis tied": (
         "3-upu",
         [("legs:", 'tied: [["legs[1].base.axis.x", "legs[1].platform.axis.x"]]\nlegs:')],
-        "m.yaml: legs[1].base.axis.x cannot be held alone: an axis is one direction; expected the "
+        "m.yaml, line 3, tied[1][1]: "
+        "legs[1].base.axis.x cannot be held alone: an axis is one direction; expected the "
         "whole axis, 'legs[1].base.axis'.",
     ),
     "axes that differ tied": (
         "3-upu",
         [("legs:", 'tied: [["legs[1].base.axis", "legs[2].base.axis"]]\nlegs:')],
-        "m.yaml: axes that differ in the drawing are tied; found legs[1].base.axis, "
+        "m.yaml, line 3, tied[1][1]: "
+        "axes that differ in the drawing are tied; found legs[1].base.axis, "
         "legs[2].base.axis, expected whole axes with the same direction in their bodies' frames.",
     ),
     "an axis tied to a number": (
         "3-upu",
         [("legs:", 'tied: [["legs[1].base.axis", "legs[1].length.offset"]]\nlegs:')],
-        "m.yaml: a whole centre or axis is tied to a single number; found legs[1].base.axis, "
+        "m.yaml, line 3, tied[1][1]: "
+        "a whole centre or axis is tied to a single number; found legs[1].base.axis, "
         "legs[1].length.offset, expected entries of one kind, each once.",
     ),
     "a centre tied to an axis": (
         "3-upu",
         [("legs:", 'tied: [["legs[2].base.center", "legs[1].base.axis"]]\nlegs:')],
-        "m.yaml: an axis is tied to a centre; found legs[2].base.center, legs[1].base.axis, "
+        "m.yaml, line 3, tied[1][1]: "
+        "an axis is tied to a centre; found legs[2].base.center, legs[1].base.axis, "
         "expected entries of one kind, each once.",
     ),
     "a number tied to its opposite": (
         "3-upu",
         [("legs:", 'tied: [["legs[1].length.offset", "-legs[1].length.offset"]]\nlegs:')],
-        "m.yaml: a parameter is tied to itself; found legs[1].length.offset, "
+        "m.yaml, line 3, tied[1][1]: "
+        "a parameter is tied to itself; found legs[1].length.offset, "
         "-legs[1].length.offset, expected entries of one kind, each once.",
     ),
     "an axis that is no parameter": (
         "gough-stewart",
         [("legs:", 'fixed: ["legs[1].base.axis"]\nlegs:')],
-        "m.yaml: there is no parameter 'legs[1].base.axis'; expected a name such as "
+        "m.yaml, line 3, fixed[1]: "
+        "there is no parameter 'legs[1].base.axis'; expected a name such as "
         "'legs[1].base.center.x'. Write the parameter as its path in the mechanism file, legs "
         "from 1.",
     ),
@@ -176,7 +183,8 @@ FAULTS = {
     "an offset of a leg that has none": (
         "6-spu-passive",
         [("legs:", 'fixed: ["legs[7].length.offset"]\nlegs:')],
-        "m.yaml: there is no parameter 'legs[7].length.offset'; expected a name such as "
+        "m.yaml, line 3, fixed[1]: "
+        "there is no parameter 'legs[7].length.offset'; expected a name such as "
         "'legs[6].length.offset'. Write the parameter as its path in the mechanism file, legs "
         "from 1.",
     ),

@@ -302,7 +302,7 @@ def constant_legs(rng):
     """Three legs of constant length 1 about fixed centres: a body that they carry."""
     scene = make_scene("constant-legs", rng, 30)
     machine = scene.machine
-    from pkmcal.mechanisms.closure import leg_readings, limb_ends
+    from pkmcal.mechanisms.closure import joint_values, limb_ends
 
     ends = limb_ends(
         machine.layout, machine.values, scene.measurements.joints, scene.truth.T_base_platform
@@ -310,7 +310,7 @@ def constant_legs(rng):
     line = ends.b - ends.a
     u = line / np.linalg.norm(line, axis=-1, keepdims=True)
     photos = np.arange(30)
-    readings = leg_readings(machine.layout, scene.measurements.joints)
+    readings = joint_values(machine.layout, machine.values, scene.measurements.joints)
     seen = np.ones((30, 6), dtype=bool)
     axes = Axes(0 * photos, photos, seen, u[None], 0 * u[None], readings[None])
     return machine, axes, np.broadcast_to(ends.a, u.shape)[None]

@@ -274,7 +274,7 @@ def at_truth(monkeypatch, folder, off=2e-3):
     """Let photographs by hand be placed where they were taken, nearly."""
     rng = np.random.default_rng(1)
 
-    def place(session, photographs, _poses, boards, _known):
+    def place(session, photographs, _poses, boards, _known, _told):
         truth = load_truth(folder, session.machine).T_camera_base
         return Placed(session, photographs, boards, perturb(truth, off * rng.normal(size=(3, 6))))
 

@@ -160,8 +160,11 @@ def photographs(distorted=True):
 
 def redrawn(seed, spread):
     """The machine with every joint centre drawn wrongly, by ``spread`` m along each axis."""
-    error = spread * np.random.default_rng(seed).normal(size=len(machine().values))
-    centres = machine().parameters.of_kind("center")
+    table = machine().parameters
+    centres, own = table.of_kind("center"), np.ones(len(table), dtype=bool)
+    own[table.of_kind("scale")] = False
+    error = np.zeros(len(own))
+    error[own] = spread * np.random.default_rng(seed).normal(size=own.sum())
     values = machine().values.copy()
     values[centres] += error[centres]
     return machine().with_values(values)

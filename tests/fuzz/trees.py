@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import string
+from copy import deepcopy
 from dataclasses import dataclass
 from random import Random
 
@@ -280,9 +281,9 @@ def _ragged(place, rng):
 def _exchange(place, rng):
     other, there, _ = rng.choice(place.found)
     if not isinstance(other, Pairs):
-        place.put(other[there])
+        place.put(deepcopy(other[there]))
         return
-    mine, its = place.value, other[there][1]
+    mine, its = deepcopy(place.value), deepcopy(other[there][1])  # one may hold the other
     place.put(its)
     other[there] = [other[there][0], mine]
 
