@@ -53,6 +53,8 @@ REFUSED = 1e-3
 """The same of a step that the residuals refuse, though the linear model promises something: so
 little is their rounding, where a direction is a millionth as well known as the others."""
 
+LEAST = 1e-150
+"""Of a singular value or an eigenvalue; where all are zero nothing is known, and that is finite."""
 EPSILON = float(np.finfo(float).eps)
 ROUNDING = 1e-13
 """Of the cost, relative."""
@@ -695,7 +697,7 @@ def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:
     """
     s, vt, scale = directions(rows)
     limit = least * s[..., :1]
-    inverse = 1 / np.maximum(s, limit) if loose else _of_known(s, limit)
+    inverse = 1 / np.maximum(s, limit + LEAST) if loose else _of_known(s, limit)
     return vt.mT * inverse[..., None, :] / scale[..., None]
 
 
@@ -704,7 +706,7 @@ def normal_root(normal: Array, least: float, *, loose: bool) -> Array:
     scaled, scale = _unit_diagonal(normal)
     values, vectors = np.linalg.eigh(scaled)
     limit = least * values[..., -1:]
-    inverse = 1 / np.maximum(values, limit) if loose else _of_known(values, limit)
+    inverse = 1 / np.maximum(values, limit + LEAST) if loose else _of_known(values, limit)
     return vectors * np.sqrt(inverse)[..., None, :] / scale[..., None]
 
 

@@ -30,11 +30,15 @@ INTERNALS = re.compile(
     r"|pydantic|Errno|validation error|\bstr\b|KeyError|IndexError|TypeError|ValueError|imdecode"
 )
 """What no person should be shown."""
+PROGRESS = re.compile(r"[A-Z][^:]* \(\d+%, \d+ s\)")
+"""What a long command says off a terminal."""
 PLACE = re.compile(
-    r"\bline \d+|\bcolumn |\.(yaml|json|csv|xml), [\w\[\]{}.-]+|[\w-]+\.(png|jpg)\b|mechanism '"
+    r"\bline \d+|\bcolumn |\bstation\d|\bat station |camera [\w/.]+:"
+    r"|\.(yaml|json|csv|xml), [\w\[\]{}.-]+|[\w-]+\.(png|jpg)\b|mechanism '"
 )
-"""Where a fault is: by its line, its column, a file's field, or a photograph's name; or what kind
-of machine it is that a command does not take."""
+"""Where a fault is: by its line, its column, a file's field, a station, a camera that stands in no
+place of its own, or a photograph's name; or what kind of machine it is that a command does not
+take."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +179,7 @@ def judged(case, code, seconds, kilobytes, out, err, before, after) -> Result:
 
 def _errors(case, code, out, err, faults) -> list[str]:
     """The sentences of what is wrong with the input, however they were told."""
-    lines = err.splitlines()
+    lines = [line for line in err.splitlines() if not PROGRESS.fullmatch(line)]
     if len(lines) > 1 or (lines and not lines[0].startswith("Error: ")):
         faults.append(f"on standard error: {err[:200]!r}")
     if "--json" in case.words:

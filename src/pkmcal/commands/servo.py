@@ -123,6 +123,9 @@ def servo(
     subject = controlled(
         machine, session=session, station=station, camera=camera, legs=numbers, seed=seed
     )
-    with console.progress(as_json) as told:
-        outcome = outcome_of(subject, study(subject.scene, plan, told))
+    try:
+        with console.progress(as_json) as told:
+            outcome = outcome_of(subject, study(subject.scene, plan, told))
+    except InputError as error:  # what a camera does not see is told with its file
+        raise error if error.where or camera is None else error.located(str(camera)) from None
     return finish(outcome, folder, FILES, as_json=as_json)

@@ -526,7 +526,9 @@ def _grain(view: StationView, T_camera_base: Array) -> float:
     """
     every = view.few(len(view.configuration))
     length = _look(view, T_camera_base[None], every, 2).length[0]
-    return float(length[length > 0].mean()) / 2  # two samples stand for an edge's length each
+    seen = length[length > 0]
+    # two samples stand for an edge's length each; where no edge is in the picture none counts
+    return float(seen.mean()) / 2 if seen.size else 1.0
 
 
 def _second(evidence: Array, grain: float) -> float:

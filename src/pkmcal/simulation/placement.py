@@ -52,6 +52,8 @@ SPARE = 1.18
 """Distance in the machine's own at home: platforms move, and plates reach beyond joints."""
 FULL = 1.1
 """The same where the machine's own takes in where its motors move it."""
+NARROWEST = 1e-6
+"""Half a view (rad) below which a lens sees nothing from anywhere."""
 
 BY_HAND = (np.deg2rad(5), np.deg2rad(45))
 """Lowest and highest view of a person who walks about a machine with a telephone."""
@@ -380,7 +382,7 @@ def _distance(machine: Machine, half: float, board: Body | None) -> float:
         share = FULL
     else:
         share = SPARE if board is None else WITH_BOARD[_is_flat(legs_space(machine))]
-    return float(share / np.sin(half))
+    return float(share / np.sin(max(half, NARROWEST)))
 
 
 def _outside(
