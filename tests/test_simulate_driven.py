@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from conftest import run
 from pkmcal.commands.comparison import compare
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse
-from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms import load_mechanism, mechanism_text
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.profiles import Profiles, estimate_blur, profile_offsets
 from pkmcal.simulation import (
@@ -340,3 +341,14 @@ def test_legs_and_board_know_more_than_each(name, tmp_path):
     legs, board, both = (np.median(s[kinematic & (s > 1e-9)]) for s in sigma)
     assert both < min(legs, board)
     assert errors.calibrated.position < errors.drawing.position / 3
+
+
+def test_a_home_that_a_limb_does_not_reach_is_told_with_its_file(tmp_path):
+    text = mechanism_text(load_mechanism("6-rus"))
+    path = tmp_path / "short.yaml"
+    path.write_text(re.sub(r"constant: [\d.]+", "constant: 0.01", text, count=1))
+    result = run("simulate", str(tmp_path / "out"), "--mechanism", str(path), "--size", "64x64")
+    told = " ".join((result.out + result.err).split())
+    assert result.code == 2
+    assert "short.yaml: mechanism '6-rus' cannot take its home pose: joint 1 cannot reach" in told
+    assert not (tmp_path / "out").exists()

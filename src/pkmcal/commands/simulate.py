@@ -110,7 +110,10 @@ def simulate(
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
     planned = rehearsal_of(plan) if plan else None
     drawing = planned.machine if planned else load_mechanism(mechanism, label=None)
-    machine = with_forearms(drawing)
+    try:
+        machine = with_forearms(drawing)
+    except InputError as error:
+        raise error.located(str(plan or mechanism)) from None
     place = "platform" if on_platform else "base"
     settings = Settings(
         stations=stations,

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
@@ -179,12 +180,20 @@ def with_forearms(machine: Machine) -> Machine:
     """The machine with one cylinder a rod where its drawing gives no leg any; else unchanged.
 
     A forearm is two rods where it is a parallelogram; here it is the one that stands for them.
+    Raises InputError where a limb does not reach the platform at home.
     """
     document = machine.document
     if any(leg.tubes for leg in document.legs):
         return machine
     home = machine.home()
     readings = machine.inverse(home[None])[0]
+    if not np.isfinite(readings).all():
+        joint = int(np.flatnonzero(~np.isfinite(readings))[0]) + 1
+        raise InputError(
+            f"mechanism {machine.name!r} cannot take its home pose: joint {joint} cannot reach it",
+            expected="arms and rods that reach the platform at home",
+            next_step="Check the drawing's lengths and centres, and home",
+        )
     ends = limb_ends(machine.layout, machine.values, readings, home)
     lengths = np.linalg.norm(ends.b - ends.a, axis=1)
     legs = tuple(
