@@ -245,7 +245,7 @@ FACTS: dict[str, Fact] = {
         board(0.002), ("squares are", "board came out", "as if the board"), ("board",)
     ),
     "board's squares 1 %": Fact(
-        board(0.01), ("squares are", "as if the board", "another size"), ("board",)
+        board(0.01), ("squares are", "came out", "as if the board", "another size"), ("board",)
     ),
     "focal length .2 %": Fact(focal(0.002), ("is not the one that took",)),
     "focal length 1 %": Fact(focal(0.01), ("is not the one that took",)),

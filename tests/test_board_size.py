@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pkmcal.boards.board import PRINTED, board_from_document
 from pkmcal.boards.poses import pose_set
+from pkmcal.calibration.doubts import sizes_told
 from pkmcal.errors import InputError
 from pkmcal.files import Document
 from pkmcal.geometry.rigid import perturb
@@ -118,6 +121,23 @@ def test_sigma_contains_the_size_where_nothing_tells_it():
     # the size is one direction, and most of the tool's error: squares scatter as of one normal
     assert abs(z - 1) < 4 * np.sqrt(2 / runs)
     assert blind > 1 + 10 * np.sqrt(2 / runs)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.01, -0.01])
+def test_a_hint_says_what_size_all_else_would_have(size):
+    drawing = load_mechanism("h4")
+    _, data = seen_by(drawing, np.random.default_rng(1), size, TOLERANCE)
+    session = SimpleNamespace(document={"board": {"file": "board.yaml"}})
+    (told,) = sizes_told(session, data, estimated(drawing, data))
+    assert told.startswith("Nothing but board.yaml tells how large the board is: to 0.2 %")
+    if size == 0:
+        assert "All else" not in told
+        return
+    value, sigma, way = re.search(r"were ([\d.]+) ± ([\d.]+) % (\w+)\.$", told).groups()
+    assert way == ("larger" if size > 0 else "smaller")
+    # the file's own deviation is not in it: what all else tells is off by its own alone
+    assert float(sigma) < 100 * TOLERANCE * 1.6
+    assert abs(float(value) - 100 * abs(size)) < 3 * float(sigma)
 
 
 def test_files_say_how_well_the_size_is_known():

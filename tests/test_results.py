@@ -152,7 +152,9 @@ def test_nothing_there(tmp_path):
     ("text", "said"),
     [
         ("", "not valid JSON"),
-        ('{"a": NaN}', "not valid JSON; found NaN"),
+        ('{"NaN":\n1,\n"a": NaN}', "json, line 3: not a number in JSON; found 'NaN'"),
+        ('{"a\\"": [\n-Infinity, 1]}', "json, line 2: not a number in JSON; found '-Infinity'"),
+        ('{"a": ' + "1" * 5000 + "}", "json, line 1: not a number in JSON; found '1111"),
         ("[]", "the top of the file is not an object"),
         ('{"a": 1}', "this is not a calibration; expected 1"),
         ('{"pkmcal_calibration": 9}', "of a version that is known; found 9, expected 1"),

@@ -33,7 +33,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.rotation_axis import rotation_axis
 from pkmcal.session.load import Session
-from pkmcal.wording import listed
+from pkmcal.wording import listed, ratio
 
 BAD = 2.0
 """Factor on the poses' noise, from which mistakes are looked for."""
@@ -55,6 +55,9 @@ ENOUGH = 4.0
 """Standard deviations that it may leave: a drawing's own errors are in them."""
 OPEN = 0.7
 """Part of its tolerance from which a board's size is known from its file: the data say less."""
+DISAGREES = 2.0
+"""Standard deviations between a board's size by its file and by all else from which a hint says so:
+one of these in twenty is chance."""
 SURELY = 3.0
 """Standard deviations by which a reading's scale is told to be another than the drawing's."""
 HOPELESS = 50.0
@@ -483,11 +486,21 @@ def sizes_told(session: Session, measurements: Measurements, estimate: Estimate)
     out: list[str] = []
     for tolerance, value, sigma in told:
         file = session.document["board"]["file"]
+        # of the estimate's two sources, N(0, 1) is the file's: the rest is what all else tells
+        other = max(1 - sigma**2, np.finfo(float).eps)
+        without, apart = value / other, abs(value) / np.sqrt(other)
         if sigma > OPEN:
             out.append(
                 f"Nothing but {file} tells how large the board is: to {100 * tolerance:.2g} %, its"
                 " tolerance, and standard deviations contain that. Measure its squares over as many"
                 " as there are, correct square and marker, and state how well you measured."
+                + (
+                    " All else, the drawing's lengths first, fits best as if the board were"
+                    f" {ratio(tolerance * without, tolerance * sigma / np.sqrt(other))}"
+                    f" {'larger' if value > 0 else 'smaller'}."
+                    if apart > DISAGREES
+                    else ""
+                )
             )
         else:
             out.append(

@@ -46,6 +46,15 @@ def camera_from_document(document: Document) -> Camera:
         )
     fields = validate(document, models[name].schema)
     camera = models[name].from_document(fields)
+    width, height = camera.image_size
+    if not np.isfinite(camera.ray(np.array([[(width - 1) / 2, (height - 1) / 2]]))).all():
+        raise InputError(
+            "the camera sees nothing in the middle of its image",
+            where=document.label,
+            found=f"image_size {shown(list(camera.image_size))}, and lens numbers by which no ray"
+            " of light ends there",
+            expected="focal, center and distortion of images of this size",
+        )
     if fields.covariance is None:
         return camera
     where = document.where("covariance")

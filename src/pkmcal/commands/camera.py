@@ -139,7 +139,12 @@ def photographs(images: list[Path]) -> list[Path]:
         if path.is_dir():
             inside = sorted(p for p in path.iterdir() if p.suffix.lower() in ENDINGS)
             if not inside:
-                raise InputError("the folder holds no photographs", where=str(path))
+                raise InputError(
+                    "the folder holds no photographs",
+                    where=str(path),
+                    expected=f"some in it ({', '.join(sorted(ENDINGS))}), or a session.yaml that"
+                    " names them",
+                )
             out += inside
         elif path.is_file():
             out.append(path)

@@ -112,6 +112,7 @@ def simulate(
     drawing = planned.machine if planned else load_mechanism(mechanism, label=None)
     try:
         machine = with_forearms(drawing)
+        machine.home()
     except InputError as error:
         raise error.located(str(plan or mechanism)) from None
     place = "platform" if on_platform else "base"

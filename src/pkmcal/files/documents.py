@@ -471,18 +471,29 @@ def read_json(path: Path | str, label: str | None = None) -> Document:
     path = Path(path)
     label = label or path.name
     try:
-        data = json.loads(read_text(path, label), parse_constant=_refuse)
+        text = read_text(path, label)
+        data = json.loads(text, parse_constant=_refuse)
     except RecursionError:
         raise InputError("the file is nested too deeply to be read", where=label) from None
     except json.JSONDecodeError as error:
         raise InputError(
             f"not valid JSON ({error.msg})", where=f"{label}, line {error.lineno}"
         ) from None
-    except ValueError as error:
-        raise InputError("not valid JSON", where=label, found=str(error)) from None
+    except ValueError:  # a number that JSON has not, or one of thousands of digits
+        odd = next(found for found in _ODD.finditer(text) if found["number"])
+        raise InputError(
+            "not a number in JSON",
+            where=f"{label}, line {text.count(chr(10), 0, odd.start()) + 1}",
+            found=shown(odd["number"]),
+            expected="digits with at most one point and exponent, or null",
+        ) from None
     if not isinstance(data, dict):
         raise InputError("the top of the file is not an object", where=label, found=shown(data))
     return _checked(Document(path, label, data, {}))
+
+
+_ODD = re.compile(r'"(?:\\.|[^"\\])*"|(?P<number>NaN|-?Infinity|-?\d{1000,})')
+"""Numbers that Python's reader refuses without saying where, outside strings."""
 
 
 def _refuse(constant: str) -> float:

@@ -66,7 +66,8 @@ class Components:
         any smaller one it stays: they know no better, and a noise of nothing promises too much.
         """
         square = self._variance(kind, self.chi2[:, kind])
-        less = np.minimum(self.chi2 / np.maximum(self.freedom, TINY), 1.0)[:, kind]
+        freedom = np.maximum(self.freedom, TINY)
+        less = (np.minimum(self.chi2, freedom) / freedom)[:, kind]
         step = np.sqrt(np.clip(np.where(square > less, square, less), STEP**-2, STEP**2))
         low, high = self.interval(kind)
         return np.where((low == 0) & (high >= 1), 1.0, step)
@@ -96,7 +97,7 @@ class Components:
         """
         own = self.square[:, kind, kind]
         known = self.freedom > FEWEST
-        others = np.where(known, self.chi2 / np.maximum(self.freedom, TINY), 1.0)
+        others = np.where(known, self.chi2 / np.where(known, self.freedom, 1.0), 1.0)
         others[:, kind] = 1.0
         by_others = np.sum((others - 1) * self.square[:, kind], axis=-1)
         return 1 + (chi2 - self.freedom[:, kind] - by_others) / np.maximum(own, TINY)

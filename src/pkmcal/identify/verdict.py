@@ -20,7 +20,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
 from pkmcal.outcome import Verdict
 from pkmcal.solver import Stop
-from pkmcal.wording import listed
+from pkmcal.wording import count, listed
 
 FAR = 5.0
 """Tolerances by which a value may leave the drawing before a person should look."""
@@ -283,11 +283,11 @@ def _left_open(
 
 def _harmless(sentences: tuple[Sentence, ...]) -> list[str]:
     """One line about what is open and does no harm; the report has the sentences."""
-    count = sum(not s.matters for s in sentences)
-    if not count:
+    harmless = sum(not s.matters for s in sentences)
+    if not harmless:
         return []
     what = sentences[[s.matters for s in sentences].index(False)].text.partition(".")[0]
-    more = f" ({count - 1} more in the report)" if count > 1 else ""
+    more = f" ({harmless - 1} more in the report)" if harmless > 1 else ""
     return [f"Open, without effect on the platform: {what[0].lower()}{what[1:]}{more}."]
 
 
@@ -316,7 +316,9 @@ def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> li
     )
     unseen = int(np.sum(~estimate.configurations)) - held_out
     if unseen:
-        out.append(f"{unseen} configurations had no usable photograph and did not take part.")
+        out.append(
+            f"{count(unseen, 'configuration')} had no usable photograph and did not take part."
+        )
     if estimate.statistics.noise_scale > 1.5:
         out.append(
             f"The edges scatter {estimate.statistics.noise_scale:.1f} times more than their"
