@@ -70,6 +70,10 @@ class PkmcalError(Exception):
         place = where if self.where is None else f"{where}: {self.where}"
         return type(self)(**{**self._fields(), "where": place})
 
+    def as_input(self, where: str) -> InputError:
+        """Return the same as a fault of the input at `where`, such as a drawing's geometry."""
+        return InputError(**self.located(where)._fields())
+
     def as_dict(self) -> dict[str, Any]:
         """Everything above under its name, for ``--json``."""
         return {

@@ -97,13 +97,7 @@ def platform_poses(session: Session, *, most: bool = False) -> Array:
     try:
         found = session.machine.forward_result(session.joints)
     except GeometryError as error:  # the drawing is the user's: it is at fault
-        raise InputError(
-            error.what,
-            where=session.document["mechanism"],
-            found=error.found,
-            expected=error.expected,
-            next_step=error.next_step,
-        ) from None
+        raise error.as_input(session.document["mechanism"]) from None
     # near the ends of its workspace a drawing that is right to its tolerance may not close
     near = found.error < NEARLY * session.machine.document.tolerance.center
     if near.all() or (most and near.mean() > MOST):

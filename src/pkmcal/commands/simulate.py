@@ -13,7 +13,7 @@ import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.numbers import check_positive
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, PkmcalError
 
 if TYPE_CHECKING:
     from pkmcal.cameras import Camera
@@ -113,8 +113,8 @@ def simulate(
     try:
         machine = with_forearms(drawing)
         machine.home()
-    except InputError as error:
-        raise error.located(str(plan or mechanism)) from None
+    except PkmcalError as error:  # it cannot be put together: the drawing is at fault
+        raise error.as_input(str(plan or mechanism)) from None
     place = "platform" if on_platform else "base"
     settings = Settings(
         stations=stations,

@@ -417,13 +417,7 @@ def _board_place(
     try:
         return _bracket(session.machine, board, cameras, T_camera_base[users], rng)
     except GeometryError as error:
-        raise InputError(
-            error.what,
-            where="session.yaml, stations",
-            found=error.found,
-            expected=error.expected,
-            next_step=error.next_step,
-        ) from None
+        raise error.as_input("session.yaml, stations") from None
 
 
 def _known(saved: SavedCalibration, session: Session, same_place: bool) -> Known:

@@ -175,9 +175,7 @@ def _check(folder: Path, drawing: Machine) -> None:
     try:
         drawing.home()
     except GeometryError as error:  # the drawing is the user's: it is at fault
-        raise InputError(
-            error.what, found=error.found, expected=error.expected, next_step=error.next_step
-        ) from None
+        raise error.as_input("mechanism") from None
 
 
 def _write_texts(
