@@ -34,7 +34,7 @@ PROGRESS = re.compile(r"[A-Z][^:]* \(\d+%, \d+ s\)")
 """What a long command says off a terminal."""
 PLACE = re.compile(
     r"\bline \d+|\bcolumn |\bstation\d|\bat station |camera [\w/.]+:"
-    r"|\.(yaml|json|csv|xml), [\w\[\]{}.-]+|[\w-]+\.(png|jpg)\b|mechanism '"
+    r"|\.(yaml|json|csv|xml)(, [\w\[\]{}.-]+|: (legs|the camera)\b)|[\w-]+\.(png|jpg)\b|mechanism '"
 )
 """Where a fault is: by its line, its column, a file's field, a station, a camera that stands in no
 place of its own, or a photograph's name; or what kind of machine it is that a command does not
