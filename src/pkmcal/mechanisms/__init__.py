@@ -88,8 +88,11 @@ def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
         for g, group in enumerate(checked.tied)
         for k, name in enumerate(group)
     ]
-    named = (keys for keys, name in entries if name and name.removeprefix("-") in sentence)
-    return next(named, ())
+
+    def is_named(name: str) -> bool:
+        return repr(name) in sentence or (bool(name) and name.removeprefix("-") in sentence)
+
+    return next((keys for keys, name in entries if is_named(name)), ())
 
 
 def _model(document: MechanismDocument, name: str) -> Model:
