@@ -40,6 +40,8 @@ PLACE = re.compile(
 place of its own, or a photograph's name; or what kind of machine it is that a command does not
 take."""
 
+ELSEWHERE = re.compile(r"(^|: )/[\w/.-]+, line \d+")
+
 
 @dataclass(frozen=True)
 class Result:
@@ -161,7 +163,8 @@ def judged(case, code, seconds, kilobytes, out, err, before, after) -> Result:
     has_file, has_field = True, True
     if refused and case.spoilt:
         text = " ".join(errors)
-        has_file = any(name in text for name in _files_of(case))
+        # another file that a spoilt session names, such as /etc/passwd, is a file as well
+        has_file = any(name in text for name in _files_of(case)) or bool(ELSEWHERE.search(text))
         places = [words for _, _, words in case.spoilt]
         if len(places) == 1 and places[0] and "mine.txt" not in text:
             said = text.lower()
