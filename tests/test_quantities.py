@@ -101,6 +101,7 @@ def changed(tmp_path, old, new):
     [
         ("3 kg", "'3 kg' is not a length; write it in metres, or with a unit, such as 269.3 mm."),
         ("3 deg", "'3 deg' is not a length"),
+        ("3 dB", "'3 dB' is not a length"),
         ("3 mmm", "'3 mmm' is not a length"),
         ("3 mm mm", "found '3 mm mm', expected a number"),
         ("1e99999 mm", "found '1e99999 mm', expected a number"),

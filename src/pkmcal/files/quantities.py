@@ -20,6 +20,7 @@ TOO_LARGE = 50.0
 """m; a machine or a camera's place without a unit that is larger was written in millimetres."""
 _QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([A-Za-zµμ°%]{1,20})")
 _HEAD = re.compile(r"(.*\S)\s*(?:\[([A-Za-zµμ°%]{1,20})\]|\(([A-Za-zµμ°%]{1,20})\))")
+SHARES = ("%", "percent", "ppm")
 _ROOTS = {"meter": "m", "radian": "rad", "dimensionless": ""}
 _KINDS = {
     "m": ("a length", "metres", "269.3 mm"),
@@ -45,7 +46,10 @@ def unit(name: str) -> Unit | None:
         factor, root = _registry().get_root_units(name)
     except (pint.PintError, AssertionError):  # the latter for signs that stand alone
         return None
-    return Unit(float(factor), _ROOTS[str(root)]) if str(root) in _ROOTS else None
+    kind = _ROOTS.get(str(root))
+    # without a dimension there are decibels and pi, too
+    known = kind is not None and (kind != "" or name in SHARES)
+    return Unit(float(factor), kind) if known else None
 
 
 @cache
