@@ -48,8 +48,9 @@ def unit(name: str) -> Unit | None:
         return None
     kind = _ROOTS.get(str(root))
     # without a dimension there are decibels and pi, too
-    known = kind is not None and (kind != "" or name in SHARES)
-    return Unit(float(factor), kind) if known else None
+    if kind is None or (kind == "" and name not in SHARES):
+        return None
+    return Unit(float(factor), kind)
 
 
 @cache
