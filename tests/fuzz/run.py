@@ -117,11 +117,11 @@ def _command(words: tuple[str, ...]) -> int:
 
     if words[0] != "read-camera":
         return main(words)
-    from pkmcal.cameras.files import read_camera
+    from pkmcal.cameras.files import load_camera
     from pkmcal.errors import PkmcalError
 
     try:
-        read_camera(words[1])
+        load_camera(words[1])
     except PkmcalError as error:
         sys.stderr.write(f"Error: {error}\n")
         return error.exit_code
