@@ -17,6 +17,7 @@ import typer
 
 from pkmcal import __version__
 from pkmcal.commands import (
+    board,
     calibrate,
     camera,
     check,
@@ -48,6 +49,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo.demo,
     "new": new.new,
     "check": check.check,
+    "board": board.board,
     "camera": camera.camera,
     "plan": plan.plan,
     "calibrate": calibrate.calibrate,
