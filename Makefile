@@ -1,5 +1,6 @@
 # make install   the package and what it needs, in .venv
 # make demo      simulates a session, calibrates it, writes the report
+# make docs      the documentation as a site, in site/; any warning is an error
 # make test      formatting, lint, types and tests, as the continuous integration does
 # make clean     removes .venv and what tools left behind
 #
@@ -10,12 +11,15 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
-.PHONY: install demo test clean
+.PHONY: install demo docs test clean
 
 install: $(VENV)/.installed
 
 demo: install
 	$(BIN)/pkmcal demo
+
+docs: $(VENV)/.test-tools
+	$(BIN)/mkdocs build --strict
 
 test: $(VENV)/.test-tools
 	@./.ci/chromium $(VENV)/.chromium-tried
@@ -24,7 +28,7 @@ test: $(VENV)/.test-tools
 	./.ci/checks $(BIN)
 
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Stamps: a second call does nothing until pyproject.toml changes. The installation is editable,

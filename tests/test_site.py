@@ -1,0 +1,76 @@
+"""The documentation as a site: builds without a warning, leads nowhere that is not there."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import pkmcal
+
+ROOT = Path(__file__).parents[1]
+
+
+class Links(HTMLParser):
+    """A page's links, pictures and marks."""
+
+    def __init__(self):
+        super().__init__()
+        self.links, self.marks = [], set()
+
+    def handle_starttag(self, tag, attrs):
+        del tag
+        found = dict(attrs)
+        self.links += [found[key] for key in ("href", "src") if found.get(key)]
+        self.marks |= {found[key] for key in ("id", "name") if found.get(key)}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet"]
+    done = subprocess.run(
+        [*command, "--site-dir", str(folder)], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr
+    return folder
+
+
+def test_every_link_leads_somewhere(site):
+    pages = {}
+    for path in site.rglob("*.html"):
+        parser = Links()
+        parser.feed(path.read_text("utf-8"))
+        pages[path] = parser
+    assert len(pages) > len(list((ROOT / "docs").glob("*.md")))
+    lost = []
+    for path, page in pages.items():
+        for link in page.links if path.name != "404.html" else ():
+            if re.match(r"[a-z]+:", link) or link.startswith(("//", "#")):
+                continue
+            name, _, mark = link.partition("#")
+            there = (path.parent / name).resolve()
+            known = pages.get(there)
+            if not there.exists() or (mark and known and mark not in known.marks):
+                lost.append(f"{path.name}: {link}")
+    assert not lost
+
+
+def test_no_mark_of_the_pages_source_is_left_over(site):
+    for path in site.glob("*.html"):
+        text = re.sub(r"<(pre|code).*?</\1>", "", path.read_text("utf-8"), flags=re.DOTALL)
+        assert not re.search(r"```|^#+ |^\| ?---", text, re.MULTILINE), path.name
+
+
+def test_the_page_of_python_has_every_public_name(site):
+    text = (site / "api.html").read_text("utf-8")
+    for name in pkmcal.__all__:
+        if not name.startswith("__"):
+            assert f'id="pkmcal.{name}"' in text, name
+    # what stands in docstrings, and not names alone
+    assert "Read a camera file of pkmcal, OpenCV, ROS or Kalibr" in text

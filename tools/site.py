@@ -1,0 +1,41 @@
+"""What the documentation's site does differently from the pages in the repository (a MkDocs hook).
+
+Pages link to sources, which are no pages of the site: there such a link is its text alone. The
+README, to which pages lead as well, is taken in as a page.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[1]
+OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./(?!README\.md)[^)]+\)")
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Takes in the README."""
+    text = (ROOT / "README.md").read_text("utf-8").replace("](docs/", "](")
+    text = re.sub(r"\[([^\]]+)\]\((?!https?:|#|pictures/)([^)]+?)\)", _inside, text)
+    files.append(File.generated(config, "readme.md", content=text))
+    return files
+
+
+def _inside(link: re.Match[str]) -> str:
+    """A link of the README where it leads to a page; else its text."""
+    there = (ROOT / "docs" / link[2].partition("#")[0]).is_file()
+    return link[0] if there else link[1]
+
+
+FENCE = re.compile(r"^```(\w+) [\w ]+$", re.MULTILINE)
+"""Of code that the tests run; Python's Markdown takes one word only."""
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Links that lead out of the pages' folder, and fences of two words."""
+    del page
+    markdown = FENCE.sub(r"```\1", markdown)
+    return OUTSIDE.sub(r"\1", markdown).replace("(../README.md", "(readme.md")
