@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from conftest import run
+from pkmcal.session.load import load_session
 
 
 def replaced(session, name, old, new, count=-1):
@@ -217,9 +218,9 @@ def test_a_folder_with_the_name_of_a_photograph(session):
 
 
 def test_a_folder_beside_the_photographs_is_nobodys_business(session):
-    path = photographs(session, "station2")[1].with_name("thumbnails.png")
-    path.mkdir()
-    assert run("check", session, "--json").json["exit_code"] == 0
+    files = photographs(session, "station2")
+    files[1].with_name("thumbnails.png").mkdir()
+    assert [p.path for p in load_session(session).stations[1].photographs] == files
 
 
 LONG = "n" * 5000
@@ -350,11 +351,13 @@ def test_no_work_is_spent_before_the_output_is_known_to_be_writable(session, mon
     def worked(*_, **__):
         pytest.fail("calibrated before looking at the output folder")
 
-    monkeypatch.setattr("pkmcal.calibration.calibrate", worked)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", worked)
     unwritten(session, session / "joints.csv", "outputs cannot go here")
 
 
-def test_a_disk_that_fills_up_leaves_nothing(session, monkeypatch):
+def test_a_disk_that_fills_up_leaves_nothing(session, calibrated, monkeypatch):
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", lambda *_, **_more: calibrated)
+
     def full(_self, _content):
         raise OSError(28, "No space left on device")
 

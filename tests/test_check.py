@@ -38,8 +38,8 @@ def texts(found, level):
 # whole sessions
 
 
-def test_a_good_session(session):
-    found = check_session(session)
+def test_a_good_session(checked):
+    found = checked.found
     assert found.exit_code == 0
     assert texts(found, Level.WRONG) == texts(found, Level.DOUBTFUL) == []
     assert (found.n_legs, found.configurations) == (6, 12)
@@ -58,9 +58,8 @@ def test_a_good_session(session):
     assert all(0.6 < joint.used < 1 for joint in found.joints)
 
 
-def test_progress_is_told_in_order(session):
-    told = []
-    check_session(session, progress=lambda text, share: told.append((share, text)))
+def test_progress_is_told_in_order(checked):
+    told = checked.told
     assert told == sorted(told)
     assert told[-1][1] == "What such photographs will give"
 

@@ -190,7 +190,9 @@ def test_diameters_for_radii():
     assert "the tubes' radii look like diameters" in str(error)
 
 
+@pytest.mark.slow
 def test_photographs_of_nothing_are_refused():
+    """From Python; by both commands in test_bad_input.py and test_check.py."""
     rng = np.random.default_rng(0)
     error = said([clouds(rng) for _ in range(6)], by_hand=given(True))
     assert "not recognised in the photographs of front" in str(error)
