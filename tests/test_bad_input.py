@@ -1,8 +1,8 @@
 """What people get wrong with a session: each mistake answered by one sentence to act on.
 
 Every mistake goes through ``pkmcal calibrate``, and most through ``pkmcal check``, which must say
-the same. What photographs betray takes both a search of many seconds; test_diagnose.py has the
-other mistakes of this kind.
+the same. What photographs betray takes a search of many seconds, so ``calibrate`` alone is asked
+here, ``check`` in test_check.py; test_diagnose.py has the other mistakes of this kind.
 """
 
 from __future__ import annotations
@@ -174,21 +174,6 @@ def test_all_configurations_alike(session):
     )
 
 
-def test_two_legs_mixed_up(session):
-    def swap(table):
-        for cells in table[1:]:
-            cells[1], cells[4] = cells[4], cells[1]
-
-    rows(session, swap)
-    only(session, "station1")
-    said = refused_by_calibrate(session)
-    assert said == (
-        "joints.csv: the readings of legs 1 and 4 are mixed up; found the photographs fit with"
-        " these two columns exchanged. Exchange the columns of legs 1 and 4 in joints.csv, or the"
-        " two legs in the drawing."
-    )
-
-
 # photographs
 
 
@@ -310,7 +295,7 @@ def test_two_stations_swapped(session):
 
     stations(session, swap)
     only(session, "station1", "station2")
-    said = refused(session)
+    said = refused_by_calibrate(session)
     assert said == (
         "session.yaml, stations: stations station1 and station2 are mixed up; found the"
         " photographs of each fit the pose of the other. Exchange the poses of station1 and"
