@@ -133,7 +133,7 @@ def test_one_station_alone(demo, calibrated):
     assert any("configurations" in w for w in found.verdict.warnings)
 
 
-@pytest.mark.parametrize("method", ["four-step", "linear"])
+@pytest.mark.parametrize("method", [pytest.param("four-step", marks=pytest.mark.slow), "linear"])
 def test_papers_methods_are_told_apart_from_the_joint_one(demo, calibrated, method):
     """They run on the same edges and come nowhere near; the verdict names the better method."""
     found = pkmcal.calibrate(demo.session, method=method)

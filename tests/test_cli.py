@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -293,7 +294,11 @@ def test_calibrate(session, demo):
     assert np.array_equal(machine.values, load(demo.calibration).machine.values)
 
 
-def test_calibrate_again_replaces_the_result(session, demo, tmp_path):
+def test_calibrate_again_replaces_the_result(session, demo, calibrated, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "pkmcal.calibration.calibrate.calibrate",
+        lambda *_, seed, **_more: replace(calibrated, seed=seed),
+    )
     out = shutil.copytree(demo.calibration, tmp_path / "result")
     assert load(out).seed == 0
     done = run("calibrate", session, "-o", out, "--seed", 5, "--quiet")

@@ -416,11 +416,6 @@ def test_a_frozen_reading_is_named(session):
     for row in rows:
         row[2] = rows[0][2]
     path.write_text("\n".join(",".join(row) for row in [head, *rows]) + "\n")
-    # each station that is not recognised is a search more
-    path = session / "session.yaml"
-    document = yaml.safe_load(path.read_text())
-    document["stations"] = {"station1": document["stations"]["station1"]}
-    path.write_text(yaml.safe_dump(document))
     result = run("calibrate", str(session))
     told = " ".join((result.out + result.err).split())
     assert result.code == 2
