@@ -9,12 +9,16 @@ import shutil
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from pkmcal.commands import console
 from pkmcal.commands.cli import main
 from rendered import once
+
+if TYPE_CHECKING:
+    from pkmcal.check.check import SessionCheck
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,24 @@ def calibrated(demo):
     from pkmcal.calibration.calibrate import calibrate
 
     return calibrate(demo.session)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What the check found in the demonstration's session, and the progress that it told."""
+
+    found: SessionCheck
+    told: list[tuple[float, str]]
+
+
+@pytest.fixture(scope="session")
+def checked(demo) -> Checked:
+    """The demonstration's session, checked from Python."""
+    from pkmcal.check.check import check_session
+
+    told: list[tuple[float, str]] = []
+    found = check_session(demo.session, progress=lambda text, share: told.append((share, text)))
+    return Checked(found, told)
 
 
 @pytest.fixture

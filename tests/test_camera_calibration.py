@@ -162,6 +162,11 @@ def test_opencv_agrees():
     np.testing.assert_allclose(ours[4:8], d[:4], atol=3e-3)
 
 
+@pytest.mark.parametrize(
+    "true",
+    [pytest.param(true, id=name, marks=pytest.mark.slow if name == "fisheye" else ())
+     for name, true in TRUE.items()],
+)  # fmt: skip
 def test_single_bad_corners_do_no_harm(true):
     found = calibrate_camera(
         detections(true, poses_for(true, 10, 1), 2, wrong=2), BOARD, true.model

@@ -24,12 +24,9 @@ from pkmcal.planning.first import EdgesOf
 from pkmcal.report.check import BAR, GAP, leg_colours, picture_names, with_pictures, write_pictures
 
 
-@pytest.fixture(scope="module")
-def found(demo, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("check") / "session"
-    shutil.copytree(demo.session, folder)
-    (folder / "truth.json").unlink()
-    return check_session(folder)
+@pytest.fixture
+def found(checked):
+    return checked.found
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import re
 import threading
+import time
 from contextlib import redirect_stderr
 
 from conftest import run
@@ -67,5 +68,17 @@ def test_a_calibration_tells_what_it_does(demo, tmp_path, monkeypatch):
     for step in ("Recognising", "Finding the legs", "Measuring edges", "Identifying"):
         assert any(x.startswith(step) for x in steps)
     assert not any(step in said.out for step in steps)
+
+
+def test_what_is_to_be_silent_is(demo, calibrated, tmp_path, monkeypatch):
+    def long(*_, progress, **_more):
+        progress("Finding the legs", 0.35)
+        time.sleep(0.2)
+        return calibrated
+
+    monkeypatch.setattr(console, "EVERY", 0.01)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", long)
+    words = ("calibrate", demo.session, "-o", tmp_path / "out")
+    assert "Finding the legs" in run(*words).err
     for silent in ("--json", "--quiet"):
-        assert run("calibrate", demo.session, "-o", tmp_path / silent, silent).err == ""
+        assert run(*words, silent).err == ""

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal.observe.diagnose import SeenStation, mistake
+from pkmcal.observe.diagnose import SeenStation, _numbering, mistake
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import StationView, find_station
 from pkmcal.observe.tables import distance_tables
@@ -86,20 +86,34 @@ def test_two_columns_exchanged(pair, by_hand):
     order = np.arange(6)
     order[list(pair)] = order[list(pair)[::-1]]
     error = said(pictures(), readings_with(order), by_hand=given(by_hand))
-    assert error is not None
     a, b = pair
-    assert f"the readings of legs {a + 1} and {b + 1} are mixed up" in str(error)
+    assert str(error) == (
+        f"joints.csv: the readings of legs {a + 1} and {b + 1} are mixed up; found the photographs"
+        f" fit with these two columns exchanged. Exchange the columns of legs {a + 1} and {b + 1}"
+        " in joints.csv, or the two legs in the drawing."
+    )
 
 
 @pytest.mark.parametrize("turn", [1, also(2)])
 def test_columns_turned_round(turn):
     """By the pose by hand: a hexapod turned by a third looks the same, and only it can tell."""
     error = said(pictures(), readings_with(np.roll(np.arange(6), turn)), by_hand=given(True))
-    assert "numbered differently" in str(error)
-    assert f"leg 1 takes the readings of column {turn + 1}," in str(error)
-    assert "round" in str(error)
+    assert str(error) == (
+        "joints.csv: the legs are numbered differently in the readings and in the drawing; found"
+        f" the photographs fit when leg 1 takes the readings of column {turn + 1}, leg 2 those of"
+        f" column {turn + 2}, and so on round. Give the columns of joints.csv the order of the legs"
+        " in the drawing."
+    )
 
 
+def test_which_way_round_legs_are_numbered_is_told():
+    said = str(_numbering(np.array([5, 4, 3, 2, 1, 0])))
+    assert "leg 1 takes the readings of column 6, leg 2 those of column 5" in said
+    assert "and so on backwards" in said
+    assert "and so on round" in str(_numbering(np.array([5, 0, 1, 2, 3, 4])))
+
+
+@pytest.mark.slow
 def test_columns_in_reverse():
     error = said(pictures(), readings_with(np.arange(6)[::-1]), by_hand=given(True))
     assert "leg 1 takes the readings of column 6, leg 2 those of column 5" in str(error)
@@ -187,7 +201,9 @@ def test_diameters_for_radii():
     assert "the tubes' radii look like diameters" in str(error)
 
 
+@pytest.mark.slow
 def test_photographs_of_nothing_are_refused():
+    """From Python; by both commands in test_bad_input.py and test_check.py."""
     rng = np.random.default_rng(0)
     error = said([clouds(rng) for _ in range(6)], by_hand=given(True))
     assert "not recognised in the photographs of front" in str(error)

@@ -91,11 +91,11 @@ def test_plain_and_m_regressions_collapse(method):
 
 
 def test_a_hexapod_seen_through_a_mirror(tmp_path):
-    """Rendered photographs from between the legs, one place, to two tenths of a millimetre."""
+    """Rendered photographs from between the legs, one place, to a fifth of the drawing's error."""
     folder = Path(tmp_path) / "session"
     station = StationPlace((0.01, -0.02, 0.07), (0.01, -0.02, 0.4), (0.0, -1.0, 0.0))
     settings = Settings(
-        stations=(station,), configurations=12, rough_position=0.02, rough_angle=0.05
+        stations=(station,), configurations=8, rough_position=0.02, rough_angle=0.05
     )
     rendered(folder, pkmcal.load_mechanism("gough-stewart"), mirror(), settings, seed=3)
     found = pkmcal.calibrate(folder)

@@ -10,7 +10,7 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.check.check import Level
+from pkmcal.check.check import Level, check_session
 from pkmcal.check.repeats import (
     Cylinders,
     _findings,
@@ -19,6 +19,7 @@ from pkmcal.check.repeats import (
     axis_coordinates,
     by_ends,
     fit_motions,
+    study_repeats,
 )
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import tangent_basis
@@ -385,6 +386,20 @@ def test_repeats_do_not_promise_more_than_they_hold(repeats, tmp_path):
     assert four.observation.point_edge.max() < len(edges)
 
 
+@pytest.fixture(scope="module")
+def looked(repeats):
+    """What the check finds in them, and the study of the repeats."""
+    return check_session(repeats), study_repeats(repeats)
+
+
+@pytest.fixture
+def once(looked, monkeypatch):
+    """Commands tell of one look at the photographs, as it does not depend on what they write."""
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: looked[0])
+    monkeypatch.setattr("pkmcal.check.repeats.study_repeats", lambda *_, **_more: looked[1])
+
+
+@pytest.mark.usefixtures("once")
 def test_check_repeat_gives_table_1(repeats):
     told = run("check", repeats, "--repeat")
     assert told.code == run("check", repeats).code
@@ -395,6 +410,7 @@ def test_check_repeat_gives_table_1(repeats):
     assert "more repeats will hardly help" in " ".join(told.out.split())
 
 
+@pytest.mark.usefixtures("once")
 def test_check_repeat_as_json(repeats):
     plain, told = run("check", repeats, "--json").json, run("check", repeats, "--repeat", "--json")
     found = told.json["repeats"]
@@ -427,7 +443,8 @@ def test_a_shaken_camera_is_told(tmp_path):
     assert "as if the camera moved: fix the camera" in text
 
 
-def test_check_repeat_without_repeats_says_what_to_write(demo):
+def test_check_repeat_without_repeats_says_what_to_write(demo, checked, monkeypatch):
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     told = run("check", demo.session, "--repeat")
     assert told.code == 2
     assert "the session has no repeated photographs" in told.err

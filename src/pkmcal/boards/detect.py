@@ -63,8 +63,8 @@ def detect_boards(paths: Sequence[Path | str], board: Board) -> tuple[Detection,
         again = pool.map(lambda k: _detect(files[k], size, board, quick=False), missed)
         for k, detection in zip(missed, again, strict=True):
             found[k] = detection
+    check_any(found, board)  # another board would have been told above
     check_boards(files, found, board)
-    check_any(found, board)
     return tuple(found)
 
 
