@@ -84,6 +84,17 @@ class Statistics:
     reading_range: tuple[float, float | None] = (0.0, None)
     pose_range: tuple[float, float | None] = (0.0, None)
 
+    @property
+    def chi2_as_stated(self) -> float:
+        """Chi-square per degree of freedom of the noise as it was stated, NaN without freedoms.
+
+        With the noise as found it is 1 or so for any model, however wrong: its factors were chosen
+        for that.
+        """
+        chi2 = self.chi2_edges * self.noise_scale**2 + self.chi2_poses * self.pose_scale**2
+        chi2 += self.chi2_joints * self.reading_scale**2 + self.chi2_drawing
+        return chi2 / self.dof if self.dof > 0 else float("nan")
+
 
 @dataclass(frozen=True)
 class Estimate:

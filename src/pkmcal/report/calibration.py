@@ -197,7 +197,7 @@ def numbers(
         "platform_orientation_change": _mean(tool.off_orientation),
         "edges": len(observation.edges),
         "rejected": len(observation.rejected),
-        "chi2_per_freedom": statistics.chi2 / statistics.dof if statistics.dof > 0 else None,
+        "chi2_per_freedom": statistics.chi2_as_stated if statistics.dof > 0 else None,
         "edge_noise_scale": statistics.noise_scale,
         "reading_noise_scale": statistics.reading_scale,
     }
@@ -285,11 +285,10 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
 
 
 def _fit(estimate: Estimate) -> Figure:
-    """Chi-square per degree of freedom."""
+    """Chi-square per degree of freedom, of the noise as stated."""
     s = estimate.statistics
-    value = s.chi2 / s.dof if s.dof > 0 else float("nan")
     scaled = [
-        f"the {what}' stated noise was multiplied by {number(scale, 2)}"
+        f"the {what}' by {number(scale, 2)}"
         for what, scale in (
             ("edges", s.noise_scale),
             ("poses", s.pose_scale),
@@ -297,11 +296,16 @@ def _fit(estimate: Estimate) -> Figure:
         )
         if np.isfinite(scale) and abs(scale - 1) > 0.005
     ]
+    found = s.chi2 / s.dof if s.dof > 0 else float("nan")
     return Figure(
         "Does the model explain the data?",
-        ((number(value, 2), "χ² per degree of freedom"),),
-        f"1 is expected, over {count(s.dof, 'degree')} of freedom"
-        + (f"; reached after {' and '.join(scaled)}" if scaled else ""),
+        ((number(s.chi2_as_stated, 2), "χ² per degree of freedom"),),
+        f"1 is expected of the noise as stated, over {count(s.dof, 'degree')} of freedom"
+        + (
+            f"; {number(found, 2)} after the stated noise was multiplied, {' and '.join(scaled)}"
+            if scaled
+            else ""
+        ),
     )
 
 
