@@ -15,6 +15,7 @@ from pkmcal.calibration.results import EVERYTHING, MECHANISM, SavedCalibration, 
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import load_camera
 from pkmcal.errors import InputError
+from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
 
@@ -97,7 +98,8 @@ def load_source(origin: Path | str, session: Path | None = None) -> Source:
         raise InputError(
             "there is no such calibration and no such machine",
             found=str(origin),
-            expected="a folder that pkmcal calibrate wrote, a mechanism file, or"
+            expected=closest(str(origin), catalogue())
+            or "a folder that pkmcal calibrate wrote, a mechanism file, or"
             f" {listed(sorted(catalogue()), 20)}",
         )
     return Source(load_mechanism(path), origin=path.name)

@@ -253,7 +253,12 @@ def _read(folder: Path) -> tuple[Path, Document]:
     if folder.name == FILE and folder.is_file():
         folder = folder.parent
     if not folder.is_dir():
-        raise InputError("there is no such session folder", where=str(folder))
+        beside = closest(folder.name, (p.parent.name for p in folder.parent.glob(f"*/{FILE}")))
+        raise InputError(
+            "there is no such session folder",
+            where=str(folder),
+            next_step=f"There is {folder.with_name(beside)}" if beside else None,
+        )
     if not (folder / FILE).exists():
         below = sorted(path.parent.name for path in folder.glob(f"*/{FILE}"))
         raise InputError(
