@@ -311,12 +311,25 @@ def test_calibrate(session):
     assert np.array_equal(machine.values, load(folder).machine.values)
 
 
-def test_calibrate_again_replaces_the_result(session, tmp_path):
+def test_calibrate_again_keeps_the_earlier_result(session, tmp_path, monkeypatch):
     out = tmp_path / "result"
     assert run("calibrate", session, "-o", out, "--quiet").code == 0
     done = run("calibrate", session, "-o", out, "--seed", 5, "--quiet")
     assert (done.code, done.out, done.err) == (0, "", "")
     assert load(out).seed == 5
+    (kept,) = tmp_path.glob("result-*")
+    assert load(kept).seed == 0
+    # the same again: nothing is kept, and nothing told
+    assert "kept" not in run("calibrate", session, "-o", out, "--seed", 5, "--json").json
+    assert len(list(tmp_path.glob("result-*"))) == 1
+    found = run("calibrate", session, "-o", out, "--json").json
+    assert load(found["kept"]).seed == 5
+    before = set(tmp_path.iterdir())
+    assert run("calibrate", session, "-o", out, "--seed", 6, "--force", "--quiet").code == 0
+    assert set(tmp_path.iterdir()) == before
+    monkeypatch.chdir(tmp_path)
+    done = run("calibrate", session, "-o", "result")
+    assert re.search(r"^  result-\S+ +the earlier result, kept$", done.out, re.MULTILINE)
 
 
 def test_calibrate_as_json_in_a_process_of_its_own(session, tmp_path):

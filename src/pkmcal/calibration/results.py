@@ -80,11 +80,12 @@ Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Factor = Annotated[float, Field(gt=0)]
 
 
-def check_output(folder: Path | str) -> list[str]:
+def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
     """Raise `InputError` where a result cannot go into `folder`; call it before the work.
 
     Only a new or empty folder, or an earlier result, is written to: a session's own
-    mechanism.yaml must not be lost to its calibrated one. Returns the files of that result.
+    mechanism.yaml must not be lost to its calibrated one. Returns the files of that result, which
+    is kept beside its place (:mod:`pkmcal.calibration.kept`) unless ``force`` replaces it.
     """
     folder = Path(folder)
     check_writable(folder)
@@ -96,9 +97,19 @@ def check_output(folder: Path | str) -> list[str]:
             "the output folder holds something other than a calibration",
             where=str(folder),
             found=listed(foreign or standing, 4),
-            expected="a new or empty folder, or an earlier calibration to replace",
+            expected="a new or empty folder, or one of an earlier calibration",
             next_step="Name another folder with -o, or move these files away",
         )
+    if standing and not force:
+        try:
+            check_writable(folder.resolve().parent)
+        except InputError:
+            raise InputError(
+                "the calibration that is there cannot be kept, for nothing can be written beside"
+                " its folder",
+                where=str(folder),
+                next_step="Name another folder with -o, or replace it with --force",
+            ) from None
     return standing
 
 

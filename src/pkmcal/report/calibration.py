@@ -11,6 +11,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration import toolmap
+from pkmcal.calibration.kept import keep_earlier
 from pkmcal.calibration.results import REPORT, check_output, texts_of
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.errors import PkmcalError
@@ -84,11 +85,17 @@ def _tool_map(calibration: Calibration) -> ToolMap | str:
         return f"There is no map of the workspace: {error}"
 
 
-def save(calibration: Calibration, folder: Path | str) -> None:
-    """Write a calibration's three files into `folder`, whole or not at all."""
-    over = check_output(folder)
+def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -> Path | None:
+    """Write a calibration's three files into `folder`, whole or not at all.
+
+    An earlier result in it is kept beside it, under its date, in the folder that is returned;
+    ``force`` replaces it. Raises InputError where the folder holds anything else.
+    """
+    over = check_output(folder, force=force)
     found = outcome_of(calibration)
+    kept = None if force else keep_earlier(Path(folder), found.texts)
     write_folder(Path(folder), {REPORT: page.page_html(found), **found.texts}, over)
+    return kept
 
 
 def report_of(
