@@ -11,7 +11,6 @@ import json
 import shutil
 from collections.abc import Mapping
 from datetime import datetime
-from itertools import count
 from pathlib import Path
 
 from pkmcal.calibration.results import EVERYTHING, REPORT
@@ -32,12 +31,12 @@ def keep_earlier(folder: Path, texts: Mapping[str, str | bytes]) -> Path | None:
         return None
     written = datetime.fromtimestamp((folder / EVERYTHING).stat().st_mtime)
     stem = f"{folder.name}-{written:%Y-%m-%dT%H%M}"
-    for number in count(1):
-        place = folder.with_name(stem if number == 1 else f"{stem}-{number}")
-        if not entries(place) and not place.is_file():
-            break
+    number, place = 1, folder.with_name(stem)
+    while entries(place) or place.is_file():
         if _copied(folder, names, place):
             return place
+        number += 1
+        place = folder.with_name(f"{stem}-{number}")
     with staged_folder(place) as stage:
         for name in names:
             shutil.copy2(folder / name, stage / name)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.identify.unknowns import Unknowns, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
@@ -36,6 +36,8 @@ class State:
     internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
     breathing: Array = field(default_factory=lambda: np.zeros(0))
     sizes: Array = field(default_factory=lambda: np.zeros(0))
+
+    __repr__ = short_repr
 
 
 def told_unknowns(state: State) -> Unknowns:
@@ -139,6 +141,8 @@ class Estimate:
     line_shift_sigma: Array = field(default_factory=lambda: np.zeros(0))
     breathing_sigma: Array = field(default_factory=lambda: np.zeros(0))
     size_sigma: Array = field(default_factory=lambda: np.zeros(0))
+
+    __repr__ = short_repr
 
     def as_found(self, measurements: Measurements) -> Measurements:
         """The measurements with the readings' noise as the data show it."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, short_repr
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import LONGEST_NAME, InputError
 from pkmcal.files import (
@@ -43,7 +43,7 @@ from pkmcal.session.schema import (
     StationDocument,
     Vector,
 )
-from pkmcal.wording import listed
+from pkmcal.wording import count, listed
 
 __all__ = [
     "Photograph",
@@ -87,6 +87,8 @@ class Station:
     handheld: bool = False
     from_exif: bool = False
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True)
 class Session:
@@ -119,6 +121,15 @@ class Session:
     model: str | None = None
     mechanism: Path | str = ""
     workspace: Region | None = None
+
+    def __repr__(self) -> str:
+        taken = sum(len(station.photographs) for station in self.stations)
+        parts = (
+            count(len(self.configurations), "configuration"),
+            count(len(self.station_names), "station"),
+            count(taken, "photograph"),
+        )
+        return f"<Session {self.folder.resolve().name}: {self.machine.name}, {', '.join(parts)}>"
 
     @property
     def station_names(self) -> tuple[str, ...]:
