@@ -27,7 +27,7 @@ from pkmcal.session.starter import TO_FILL, template_files
 
 COMMANDS = (
     *("demo", "new", "check", "camera", "plan", "calibrate", "validate", "servo", "export"),
-    *("watch", "simulate", "study", "reproduce"),
+    *("watch", "diff", "simulate", "study", "reproduce"),
 )
 
 
