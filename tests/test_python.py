@@ -93,6 +93,8 @@ def test_reprs_are_short(result, loaded):
     assert repr(result.machine) == (
         "<Machine gough-stewart: spatial, 6 legs, 6 readings, 60 parameters>"
     )
+    camera = repr(result.session.stations[0].camera)
+    assert camera.startswith("<Pinhole 480 × 360: focal.x 423, focal.y 423.6, center.x 241.")
     assert repr(result.session).startswith("<Session session: gough-stewart, ")
     assert repr(result).startswith("<Calibration of gough-stewart from session, method bundle, ")
     assert repr(result).endswith(": usable>")

@@ -254,9 +254,10 @@ def _clear_abandoned(place: Path) -> None:
     """Remove stages in a folder whose process has ended before it was done, whatever they were
     for: an hour's photographs may lie in one. Those of which that is not certain stay.
     """
-    if not place.is_dir():
-        return
-    for stage in [path for path in place.iterdir() if _LEFT_OVER.fullmatch(path.name)]:
+    stages: list[Path] = []
+    with suppress(OSError):  # no such folder yet, or one whose names may not be listed
+        stages = [path for path in place.iterdir() if _LEFT_OVER.fullmatch(path.name)]
+    for stage in stages:
         with suppress(OSError):  # no stage, or one that another process removes
             with (stage / _HELD).open("r+b") as held:  # empty: not locked yet
                 abandoned = held.read() == _computer() and held.seek(0) == 0 and lock(held.fileno())

@@ -31,7 +31,7 @@ NAMED = 4
 
 
 @dataclass(frozen=True)
-class Compared:
+class ComparedMachine:
     """One of the two. name : as it was given. saved : None of a drawing."""
 
     name: str
@@ -50,7 +50,7 @@ class Compared:
 
 
 @dataclass(frozen=True)
-class Difference:
+class MachineDifference:
     """Everything that differs.
 
     found : b less a. chance : of a chi-square as large in a machine that did not change; 1 between
@@ -60,8 +60,8 @@ class Difference:
     configurations that both saw. assumed : sentences.
     """
 
-    a: Compared
-    b: Compared
+    a: ComparedMachine
+    b: ComparedMachine
     found: MachineChange
     chance: float
     chances: Array
@@ -144,7 +144,7 @@ def _tool(found: ToolMap) -> dict[str, Any]:
 
 def difference(
     a: SavedCalibration | Machine | Path | str, b: SavedCalibration | Machine | Path | str
-) -> Difference:
+) -> MachineDifference:
     """Compare two calibrations, mechanism files or built-in machines; nothing is written.
 
     Raises InputError where they are not of one machine.
@@ -173,7 +173,7 @@ def difference(
     held = (found.sigma <= SAME) & (np.abs(found.change) > SAME)
     changed = bool(chance < ALPHA / 2 or least < ALPHA / 2 or held.any())
     free = free_of_gauge(found.machine, found.covariance)
-    out = Difference(
+    out = MachineDifference(
         a=one,
         b=other,
         found=found,
@@ -189,15 +189,17 @@ def difference(
     return _judged(out)
 
 
-def _compared(origin: SavedCalibration | Machine | Path | str) -> Compared:
+def _compared(origin: SavedCalibration | Machine | Path | str) -> ComparedMachine:
     found = loaded(origin) if isinstance(origin, Path | str) else origin
     if isinstance(found, SavedCalibration):
         name = str(origin) if isinstance(origin, Path | str) else str(found.path.parent)
-        return Compared(name, found.machine, found)
-    return Compared(str(origin) if isinstance(origin, Path | str) else found.name, found, None)
+        return ComparedMachine(name, found.machine, found)
+    return ComparedMachine(
+        str(origin) if isinstance(origin, Path | str) else found.name, found, None
+    )
 
 
-def _check_same_machine(a: Compared, b: Compared) -> None:
+def _check_same_machine(a: ComparedMachine, b: ComparedMachine) -> None:
     one, other = (side.machine.parameters.names for side in (a, b))
     if one == other and a.machine.document.motion == b.machine.document.motion:
         return
@@ -263,7 +265,7 @@ def _chances(found: MachineChange) -> tuple[float, Array]:
 
 
 def _assumed(
-    a: Compared, b: Compared, one_drawing: bool, shared: int, share: float
+    a: ComparedMachine, b: ComparedMachine, one_drawing: bool, shared: int, share: float
 ) -> tuple[str, ...]:
     """What the standard deviations of the change take for granted."""
     out = [
@@ -303,7 +305,7 @@ MODEL = (
 )
 
 
-def _judged(d: Difference) -> Difference:
+def _judged(d: MachineDifference) -> MachineDifference:
     """With its verdict."""
     refused = [
         f"{side.name} was refused when it was made: {' '.join(side.saved.verdict.reasons)}"
@@ -342,7 +344,7 @@ def _judged(d: Difference) -> Difference:
     return replace(d, verdict=verdict)
 
 
-def _of_tool(d: Difference) -> str:
+def _of_tool(d: MachineDifference) -> str:
     """What it does to the tool, as the end of a sentence."""
     if isinstance(d.tool, str):
         return ""
@@ -359,14 +361,14 @@ def _of_tool(d: Difference) -> str:
     )
 
 
-def _named(d: Difference, k: int) -> str:
+def _named(d: MachineDifference, k: int) -> str:
     """A parameter's change in a sentence."""
     table = d.a.machine.parameters
     words = table.in_words(table.names[k])
     return f"{words[0].upper()}{words[1:]} by {change_text(d, k)}."
 
 
-def change_text(d: Difference, k: int) -> str:
+def change_text(d: MachineDifference, k: int) -> str:
     """``+0.54 mm (±0.07 mm)``, or the bare number of what has no unit."""
     unit = d.a.machine.parameters.units[k]
     value, sigma = float(d.found.change[k]), float(d.found.sigma[k])

@@ -8,7 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.toolmap import ToolMap
-from pkmcal.judge.difference import Difference
+from pkmcal.judge.difference import MachineDifference
 from pkmcal.outcome import AXIS, LOOKS, Figure, Level, Outcome, Part, Plot, Row, Table
 from pkmcal.report.scene import markers, space_layout
 from pkmcal.report.watch import chance_text
@@ -22,7 +22,7 @@ BRIEF = 8
 """Changes that a terminal shows."""
 
 
-def outcome_of(d: Difference) -> Outcome:
+def outcome_of(d: MachineDifference) -> Outcome:
     """Everything that ``pkmcal diff`` tells and writes."""
     tool = () if isinstance(d.tool, str) else (_space(d.tool),)
     said = (d.tool,) if isinstance(d.tool, str) else ()
@@ -52,7 +52,7 @@ def outcome_of(d: Difference) -> Outcome:
     )
 
 
-def _cards(d: Difference) -> tuple[Figure, ...]:
+def _cards(d: MachineDifference) -> tuple[Figure, ...]:
     """The main numbers."""
     out: list[Figure] = []
     if not isinstance(d.tool, str):
@@ -97,7 +97,7 @@ def _even(found: ToolMap) -> tuple[Array, Array]:
     )
 
 
-def _tool_tables(d: Difference) -> tuple[Table, ...]:
+def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
     """Medians and largest of the tool's change."""
     if isinstance(d.tool, str):
         return ()
@@ -121,7 +121,7 @@ def _tool_tables(d: Difference) -> tuple[Table, ...]:
     return (Table("How far the tool differs", columns, tuple(rows), note),)
 
 
-def _legs(d: Difference) -> Table:
+def _legs(d: MachineDifference) -> Table:
     """How far each leg's joints moved."""
     rows: list[Row] = []
     sides = [(np.linalg.norm(x.change, axis=-1) * 1e3, x.sigma * 1e3) for x in d.centres]
@@ -142,7 +142,7 @@ def _legs(d: Difference) -> Table:
     )
 
 
-def _parameters(d: Difference) -> tuple[Table, ...]:
+def _parameters(d: MachineDifference) -> tuple[Table, ...]:
     """What changed beyond chance, for a terminal too, and all numbers."""
     columns = ("Parameter", "A", "B", "change", "1σ", "chance")
     out: list[Table] = []
@@ -163,7 +163,7 @@ def _parameters(d: Difference) -> tuple[Table, ...]:
     return tuple(out)
 
 
-def _row(d: Difference, k: int) -> Row:
+def _row(d: MachineDifference, k: int) -> Row:
     table = d.a.machine.parameters
     factor, unit = SCALES.get(table.units[k], (1.0, ""))
     value = float(table.unit_axes(d.a.machine.values)[k]) * factor
@@ -188,7 +188,7 @@ def _row(d: Difference, k: int) -> Row:
 # ------------------------------------------------------------------ pictures
 
 
-def _joints(d: Difference) -> Plot:
+def _joints(d: MachineDifference) -> Plot:
     """How far each joint moved, with the deviation of that by chance."""
     legs = [f"leg {leg + 1}" for leg in range(d.a.machine.n_legs)]
     data: list[dict[str, Any]] = []
