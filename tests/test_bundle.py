@@ -293,6 +293,19 @@ def test_result_statistics_add_up():
     assert np.median(found.data_share) > 0.9
 
 
+def test_chi2_of_the_noise_as_stated_tells_that_it_was_stated_seven_times_too_small():
+    """The noise as found makes chi2 one whatever was stated."""
+    rng = np.random.default_rng(8)
+    scene = make_scene(rng)
+    full = scene.measurements(rng)
+    honest = estimate(scene, full, rng).statistics
+    assert honest.chi2_as_stated == pytest.approx(1, abs=0.15)
+    edges = replace(full.edges, covariance=full.edges.covariance / 49)
+    s = estimate(scene, replace(full, edges=edges), rng).statistics
+    assert s.chi2 / s.dof == pytest.approx(1, abs=0.1)
+    assert s.chi2_as_stated == pytest.approx(s.chi2_edges * 49 / s.dof, rel=0.2)
+
+
 def test_fixed_and_tied_parameters():
     machine = load_mechanism("gough-stewart")
     names = machine.parameters.names

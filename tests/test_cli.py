@@ -32,7 +32,7 @@ from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
 
 COMMANDS = (
     *("demo", "new", "check", "board", "camera", "plan", "calibrate", "validate", "servo"),
-    *("export", "watch", "simulate", "study", "reproduce"),
+    *("export", "watch", "diff", "simulate", "study", "reproduce"),
 )
 
 
@@ -51,8 +51,9 @@ def test_the_installed_command_is_main():
 
 
 def test_as_a_module():
-    done = python("-m", "pkmcal", "--version")
-    assert (done.returncode, done.stdout) == (0, f"pkmcal {pkmcal.__version__}\n")
+    for option in ("--version", "-V"):
+        done = python("-m", "pkmcal", option)
+        assert (done.returncode, done.stdout) == (0, f"pkmcal {pkmcal.__version__}\n")
 
 
 def test_help_imports_nothing_heavy():
@@ -326,6 +327,22 @@ def test_check_as_json(session, checked, monkeypatch):
     assert len(found["joints"]) == 6
 
 
+def test_check_tells_errors_as_every_command_does(session, tmp_path):
+    shape = {"error", "exit_code", "message", "what", "where", "found", "expected", "next_step"}
+    nowhere = run("check", tmp_path / "none", "--json").json
+    assert run("calibrate", tmp_path / "none", "--json").json.items() <= nowhere.items()
+    photograph = min((session / "images" / "station1").iterdir())
+    photograph.write_bytes(photograph.read_bytes()[:1000])
+    found = run("check", session, "--json").json
+    assert shape <= set(found)
+    assert found["exit_code"] == 2
+    assert found["what"] == "the photograph cannot be decoded"
+    broken, *others = found["findings"]
+    assert broken.items() >= {key: found[key] for key in shape - {"exit_code"}}.items()
+    assert broken["station"] == "station1"
+    assert all(set(finding) == {"level", "text", "station"} for finding in others)
+
+
 # calibrate
 
 
@@ -347,7 +364,7 @@ def test_calibrate(session, demo):
     assert np.array_equal(machine.values, load(demo.calibration).machine.values)
 
 
-def test_calibrate_again_replaces_the_result(session, demo, calibrated, tmp_path, monkeypatch):
+def test_calibrate_again_keeps_the_result(session, demo, calibrated, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "pkmcal.calibration.calibrate.calibrate",
         lambda *_, seed, **_more: replace(calibrated, seed=seed),
@@ -357,6 +374,19 @@ def test_calibrate_again_replaces_the_result(session, demo, calibrated, tmp_path
     done = run("calibrate", session, "-o", out, "--seed", 5, "--quiet")
     assert (done.code, done.out, done.err) == (0, "", "")
     assert load(out).seed == 5
+    (kept,) = tmp_path.glob("result-*")
+    assert load(kept).seed == 0
+    # the same again: nothing is kept, and nothing told
+    assert "kept" not in run("calibrate", session, "-o", out, "--seed", 5, "--json").json
+    assert len(list(tmp_path.glob("result-*"))) == 1
+    found = run("calibrate", session, "-o", out, "--json").json
+    assert load(found["kept"]).seed == 5
+    before = set(tmp_path.iterdir())
+    assert run("calibrate", session, "-o", out, "--seed", 6, "--force", "--quiet").code == 0
+    assert set(tmp_path.iterdir()) == before
+    monkeypatch.chdir(tmp_path)
+    done = run("calibrate", session, "-o", "result")
+    assert re.search(r"^  result-\S+ +the earlier result, kept$", done.out, re.MULTILINE)
 
 
 def test_calibrate_as_json_in_a_process_of_its_own(session, tmp_path):
@@ -462,20 +492,58 @@ def test_simulate_refuses(tmp_path, option, value, said):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["chek"], "No such command 'chek', did you mean 'check'. See pkmcal --help."),
+        (["chek"], "No such command 'chek', did you mean check. See pkmcal --help."),
+        (["chek", "--json"], "No such command 'chek', did you mean check. See pkmcal --help."),
+        (["view-from-above"], "No such command 'view-from-above'. See pkmcal --help."),
         (["check"], "Missing argument 'SESSION'. See pkmcal check --help."),
         (["check", "a", "b"], "unexpected extra argument"),
-        (["calibrate", "s", "--sed", "1"], "No such option: --sed"),
-        (["calibrate", "s", "--seed", "many"], "'--seed'"),
+        (["calibrate", "s", "--sed", "1"], "No such option: --sed, did you mean --seed. See"),
+        (["calibrate", "s", "--foo"], "No such option: --foo. See pkmcal calibrate --help."),
+        (["calibrate", "s", "-x"], "No such option: -x. See pkmcal calibrate --help."),
+        (["calibrate", "s", "--seed", "many"], "'--seed': it should be a valid integer. See"),
+        (["calibrate", "s", "--seed", "-1"], "'--seed': it should be greater than or equal to 0"),
         (["calibrate", "s", "--method", "best"], "'bundle', 'four-step', 'linear'"),
+        (["calibrate", "s", "--method", "bundel"], "'inverse-kinematic', did you mean bundle. See"),
+        (["reproduce", "d"], "'d' is not one of 'a', 'c'. See pkmcal reproduce --help."),
     ],
 )
 def test_usage_errors(words, said):
-    done = run(*words)
+    done = run(*[word for word in words if word != "--json"])
     assert (done.code, done.out) == (2, "")
     assert said in done.err
     assert done.err.startswith("Error: ")
-    assert run(*words, "--json").json["exit_code"] == 2
+    assert not re.search("Value error|Input should|Possible options", done.err)
+    told = run(*words, "--json").json
+    assert told["exit_code"] == 2
+    assert done.err == f"Error: {told['message']}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["servo", "gough"], "expected gough-stewart."),
+        (["study", "stewart"], "expected gough-stewart."),
+        (["simulate", "DIR/new", "--mechanism", "four"], "expected four-belt."),
+        (["calibrate", "DIR/sesion"], "There is DIR/session."),
+        (["calibrate", "DIR/nothing-like-it"], "there is no such session folder.\n"),
+    ],
+)
+def test_what_was_meant_is_said_where_it_is_likely(words, said, tmp_path):
+    (tmp_path / "session").mkdir()
+    (tmp_path / "session" / "session.yaml").touch()
+    (tmp_path / "letters").mkdir()  # like it, but no session
+    there = [word.replace("DIR", str(tmp_path)) for word in words]
+    done = run(*there)
+    assert done.code == 2
+    assert said.replace("DIR", str(tmp_path)) in done.err
+
+
+def test_completion_knows_commands_and_options():
+    words = {"COMP_WORDS": "pkmcal cal", "COMP_CWORD": "1", "_PKMCAL_COMPLETE": "complete_bash"}
+    assert python("-m", "pkmcal", env=os.environ | words).stdout.split() == ["calibrate"]
+    words |= {"COMP_WORDS": "pkmcal calibrate --hold", "COMP_CWORD": "2"}
+    assert python("-m", "pkmcal", env=os.environ | words).stdout.split() == ["--holdout"]
+    assert "--install-completion" in run("--help").out
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -61,3 +64,48 @@ def test_without_a_camera_one_sentence_says_so(demo):
     assert done.returncode == 2
     assert done.stderr.startswith("the source of pictures cannot be opened; found nothing.mp4")
     assert "Traceback" not in done.stderr
+
+
+BOOK = json.loads((EXAMPLES / "calibration.ipynb").read_text(encoding="utf-8"))
+
+
+def text_of(source) -> str:
+    """Of a notebook's strings, which may be lists of lines."""
+    return "".join(source)
+
+
+def test_the_notebook_is_small_and_names_no_place_of_one_computer():
+    assert (EXAMPLES / "calibration.ipynb").stat().st_size < 100_000
+    for cell in BOOK["cells"]:
+        for output in cell.get("outputs", []):
+            assert output["output_type"] in ("execute_result", "display_data", "stream")
+            assert output.get("name") != "stderr"
+            shown = {"text/plain": output.get("text", ""), **output.get("data", {})}
+            told = [text_of(text) for kind, text in shown.items() if kind != "image/png"]
+            assert not re.search(r"/(home|root|tmp|work|Users)/", " ".join(told))
+
+
+def test_the_notebook_runs(tmp_path, monkeypatch):
+    """Its cells one after the other, as Jupyter would; what they show is not compared to the digit,
+    for that differs from one computer to the next.
+    """
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, object] = {}
+    for cell in BOOK["cells"]:
+        if cell["cell_type"] == "code":
+            source = re.sub(r"^%.*$", "", text_of(cell["source"]), flags=re.MULTILINE)
+            exec(compile(source, "calibration.ipynb", "exec"), namespace)
+    assert namespace["result"].verdict.usable
+    assert (tmp_path / "bench" / "calibration" / "report.html").is_file()
+    summary = next(
+        text_of(cell["outputs"][0]["text"]) for cell in BOOK["cells"]
+        if "result.summary()" in text_of(cell["source"])
+    )  # fmt: skip
+    shown = [line.partition(":")[0] for line in summary.splitlines()[:7]]
+    assert shown == [line.partition(":")[0] for line in
+                     namespace["result"].summary().splitlines()[:7]]  # fmt: skip
+    from matplotlib import pyplot
+
+    pyplot.close("all")

@@ -64,6 +64,29 @@ def test_colour_and_sixteen_bits_become_grey(tmp_path):
     np.testing.assert_allclose(decoded(tmp_path, deep).astype(int), GREY, atol=1)
 
 
+@pytest.mark.parametrize(
+    ("suffix", "bits", "times"), [("png", 12, 16), ("tiff", 12, 16), ("pgm", 12, 16),
+                                  ("png", 10, 64), ("png", 8, 256)],
+)  # fmt: skip
+def test_twelve_bits_in_sixteen_are_told_as_such(tmp_path, suffix, bits, times):
+    levels = np.linspace(0, 2**bits - 1, 48).astype(np.uint16).reshape(6, 8)
+    path = tmp_path / f"a.{suffix}"
+    assert cv2.imwrite(str(path), levels)
+    with pytest.raises(InputError) as caught:
+        decode(path, (8, 6), path.name)
+    assert f"a 16-bit file whose grey levels fill {bits} bits" in str(caught.value)
+    assert f"found levels up to {2**bits - 1}, expected levels up to 65535" in str(caught.value)
+    assert f"measures {bits} bits, multiply by {times} when" in str(caught.value)
+    assert cv2.imwrite(str(path), levels * times)  # as the sentence says
+    assert decode(path, (8, 6), path.name).max() > 250
+
+
+def test_a_dark_photograph_of_eight_bits_is_no_fault_of_its_file(tmp_path):
+    path = tmp_path / "a.png"
+    assert cv2.imwrite(str(path), np.full((6, 8), 3, np.uint8))
+    assert decode(path, (8, 6), path.name).max() == 3
+
+
 def test_a_turned_jpeg_stays_as_the_sensor_gave_it(tmp_path):
     """EXIF orientation 6 asks viewers for a quarter turn; the camera model knows none."""
     entry = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)

@@ -12,7 +12,9 @@ from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.tool import pose_by_parameters, tool_error
 from pkmcal.observe.predict import legs_in_camera
+from pkmcal.outcome import Verdict
 from pkmcal.report import parameters, pictures, provenance, residuals
+from pkmcal.report.calibration import report_of
 from pkmcal.report.charts import ticks_between
 from pkmcal.report.scene import enlargement
 from test_report_case import OUTWARD, RADIUS, Case, edges_of, make_case
@@ -69,6 +71,26 @@ def with_covariance(estimate, covariance):
     joint = estimate.joint_covariance.copy()
     joint[: len(covariance), : len(covariance)] = covariance
     return replace(estimate, joint_covariance=joint)
+
+
+def test_the_row_of_chi2_is_of_the_noise_as_stated(case):
+    s = case.estimate.statistics
+    noisy = replace(
+        s, chi2=1040.0, chi2_edges=940.0, chi2_joints=60.0, chi2_drawing=40.0, chi2_poses=0.0,
+        dof=1000.0, noise_scale=7.0, pose_scale=1.0, reading_scale=1.0,
+    )  # fmt: skip
+    refused = Verdict(False, "Not to be used.", ("The edges disagree with the machine.",))
+    estimate = replace(case.estimate, statistics=noisy)
+    found = report_of(case.session, case.observation, estimate, refused)
+    (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
+    assert card.values == (("46.16", "χ² per degree of freedom"),)  # 0.94 * 49 + 0.1
+    assert "1.04 after the stated noise was multiplied, the edges' by 7.00" in card.note
+    assert found.summary["figures"]["chi2_per_freedom"] == pytest.approx(46.16)
+    plain = replace(noisy, noise_scale=1.0)
+    found = report_of(case.session, case.observation, replace(estimate, statistics=plain), refused)
+    (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
+    assert card.values == (("1.04", "χ² per degree of freedom"),)
+    assert "multiplied" not in card.note
 
 
 def test_groups_follow_the_legs(case):

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -107,6 +110,104 @@ def test_twice_the_same_but_for_the_timings(folder, calibrated, tmp_path):
     assert one == two
     texts = [(place / "mechanism.yaml").read_text() for place in (folder, tmp_path / "again")]
     assert texts[0] == texts[1]
+
+
+# an earlier result
+
+
+def files_in(place):
+    return {path.name: path.read_bytes() for path in place.iterdir()}
+
+
+def dated(out):
+    """Folders of earlier results beside a result's."""
+    return sorted(path for path in out.parent.iterdir() if path.name.startswith(f"{out.name}-"))
+
+
+@pytest.fixture
+def earlier(folder, tmp_path) -> Path:
+    """A result of some other seed, of a quarter past three on a winter's day."""
+    out = tmp_path / "out"
+    shutil.copytree(folder, out)
+    path = out / "calibration.json"
+    path.write_text(path.read_text().replace('"seed": 0', '"seed": 7'))
+    then = datetime(2026, 11, 23, 15, 2, 7).timestamp()
+    os.utime(path, (then, then))
+    return out
+
+
+def test_an_earlier_result_is_kept_under_its_date(calibrated, earlier):
+    before = files_in(earlier)
+    kept = save(calibrated, earlier)
+    assert kept == earlier.with_name("out-2026-11-23T1502")
+    assert dated(earlier) == [kept]
+    assert files_in(kept) == before
+    assert load(kept).seed == 7  # as good a calibration as any
+    assert load(earlier).seed == 0
+
+
+def test_the_same_result_is_not_kept_twice(calibrated, folder, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(folder, out)
+    path = out / "calibration.json"
+    path.write_text(re.sub(r'"decode": [0-9.]+', '"decode": 12345.0', path.read_text()))
+    (out / "report.html").unlink()
+    assert save(calibrated, out) is None
+    assert dated(out) == []
+    assert (out / "report.html").exists()
+
+
+def test_a_result_that_was_changed_by_hand_is_kept(calibrated, folder, tmp_path):
+    for name in ("mechanism.yaml", "calibration.json"):
+        out = tmp_path / name
+        shutil.copytree(folder, out)
+        (out / name).write_text((out / name).read_text() + "\n#")
+        assert files_in(save(calibrated, out))[name].endswith(b"\n#")
+
+
+def test_force_replaces_it(calibrated, earlier):
+    assert save(calibrated, earlier, force=True) is None
+    assert dated(earlier) == []
+    assert load(earlier).seed == 0
+
+
+def test_two_of_one_minute_are_both_kept(calibrated, earlier, folder):
+    other = (folder / "calibration.json").read_text().replace('"seed": 0', '"seed": 8')
+    then = (earlier / "calibration.json").stat().st_mtime + 20
+    save(calibrated, earlier)
+    (earlier / "calibration.json").write_text(other)
+    os.utime(earlier / "calibration.json", (then, then))
+    save(calibrated, earlier)
+    names = [place.name for place in dated(earlier)]
+    assert names == ["out-2026-11-23T1502", "out-2026-11-23T1502-2"]
+    assert [load(place).seed for place in dated(earlier)] == [7, 8]
+
+
+def test_a_run_that_was_killed_after_the_copy_leaves_no_second_one(
+    calibrated, earlier, monkeypatch
+):
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("pkmcal.report.calibration.write_folder", killed)
+        with pytest.raises(KeyboardInterrupt):
+            save(calibrated, earlier)
+    assert load(earlier).seed == 7
+    save(calibrated, earlier)
+    assert len(dated(earlier)) == 1
+    assert load(earlier).seed == 0
+
+
+def test_where_nothing_can_be_kept_it_is_told_before_the_work(earlier, monkeypatch):
+    def refuse(place):
+        if place == earlier.parent:
+            raise InputError("cannot be written")
+
+    monkeypatch.setattr(results, "check_writable", refuse)
+    with pytest.raises(InputError, match=r"cannot be kept.* or replace it with --force\."):
+        check_output(earlier)
+    assert "report.html" in check_output(earlier, force=True)
 
 
 # whole or not at all

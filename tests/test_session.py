@@ -12,6 +12,7 @@ from pkmcal.errors import InputError
 from pkmcal.files import read_csv
 from pkmcal.session.load import load_session
 from pkmcal.session.readings import check_readings
+from pkmcal.wording import MINUS
 
 SESSION = """\
 pkmcal: 1
@@ -384,6 +385,41 @@ def test_motors_in_degrees(folder):
     ranges = np.tile([0.345, 0.485], (len(table.columns), 1))
     with pytest.raises(InputError, match="line 2, column leg1: the readings look like degrees"):
         check_readings(table, ranges, 1e-5, ["rad"] * len(table.columns))
+
+
+def shifted(by, columns=range(6)):
+    header, *rows = JOINTS.splitlines()
+    for row in rows:
+        name, *cells = row.split(",")
+        moved = [float(x) + by * (k in columns) for k, x in enumerate(cells)]
+        header += f"\n{name}," + ",".join(f"{x:.4f}" for x in moved)
+    return header
+
+
+def test_one_constant_that_explains_all_readings_is_told(folder):
+    """0.345 to 0.485, 7 mm to spare; readings are from 0.35 to 0.46."""
+    (folder / "joints.csv").write_text(shifted(-0.34))
+    message = fault(folder)
+    assert message.startswith("joints.csv, line 2, column leg1: the readings of leg1, leg2, leg3,")
+    assert "leg6 are off by one constant" in message
+    assert "found 0.02, expected 0.345 to 0.485" in message
+    assert "one number between +328 and +372 mm added" in message
+
+
+def test_one_constant_of_one_joint_is_told(folder):
+    (folder / "joints.csv").write_text(shifted(0.2, [2]))
+    message = fault(folder)
+    assert "column leg3: the readings of leg3 are off by one constant" in message
+    assert f"between {MINUS}242 and {MINUS}148 mm added" in message
+
+
+def test_two_joints_with_two_constants_are_out_of_range(folder):
+    (folder / "joints.csv").write_text(shifted(0.2, [2]))
+    header, *rows = (folder / "joints.csv").read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    other = "\n".join(",".join([*c[:4], f"{float(c[4]) - 0.2:.4f}", *c[5:]]) for c in cells)
+    (folder / "joints.csv").write_text(f"{header}\n{other}\n")
+    assert "this reading is outside the machine's range" in fault(folder)
 
 
 def test_one_reading_in_millimetres_is_a_mistake_of_its_own(folder):

@@ -223,6 +223,49 @@ def test_what_a_killed_run_left_is_in_nobodys_way(tmp_path):
     assert everything_in(tmp_path) == ["a"]
 
 
+STAGED = """
+import os, signal, sys
+from pkmcal.files import staged_folder
+
+with staged_folder(sys.argv[1]) as stage:
+    (stage / "photograph").write_bytes(b"1")
+    print("written", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs SIGKILL")
+@pytest.mark.parametrize("there", [False, True], ids=["new folder", "folder that is there"])
+def test_the_next_run_clears_what_a_killed_one_left_and_no_other(tmp_path, there):
+    """As after ``pkmcal simulate one`` and Ctrl-\\: ``pkmcal simulate three`` clears it away."""
+
+    def begin(name):
+        if there:
+            (tmp_path / name).mkdir()
+        run = subprocess.Popen(
+            [sys.executable, "-c", STAGED, tmp_path / name],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert run.stdout.readline() == "written\n"
+        return run
+
+    def stages():
+        return list(tmp_path.rglob("photograph"))
+
+    killed, alive = begin("one"), begin("two")
+    killed.kill()
+    killed.communicate()
+    assert len(stages()) == 2
+    with staged_folder(tmp_path / ("one" if there else "three")) as stage:
+        (left,) = stages()
+        assert ".two." in str(left) or "/two/" in left.as_posix()
+        (stage / "a").write_text("1")
+    alive.communicate("")
+    assert alive.returncode == 0
+    assert stages() == [tmp_path / "two" / "photograph"]
+    assert everything_in(tmp_path / "two") == ["photograph"]
+
+
 def test_of_an_earlier_result_no_file_stays(tmp_path):
     (tmp_path / "mine").write_text("1")
     write_folder(tmp_path, {"a": "1", "b": "1"})

@@ -2,6 +2,8 @@
 
     >>> import pkmcal
     >>> result = pkmcal.calibrate("session")                      # doctest: +SKIP
+    >>> print(result.summary())                                   # doctest: +SKIP
+    >>> result.save("out")                                        # doctest: +SKIP
     >>> machine = pkmcal.load_mechanism("out/mechanism.yaml")     # doctest: +SKIP
 
 Names below are imported when they are first used, so that ``import pkmcal`` and the command
@@ -16,7 +18,9 @@ from typing import TYPE_CHECKING, Any
 from pkmcal import errors
 
 if TYPE_CHECKING:
-    from pkmcal.calibration.calibrate import calibrate
+    from pkmcal.api.calibrate import calibrate, load_result
+    from pkmcal.api.plan import plan
+    from pkmcal.api.simulate import simulate
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import Machine, load_mechanism
     from pkmcal.session.load import load_session
@@ -31,16 +35,22 @@ __all__ = [
     "errors",
     "load_camera",
     "load_mechanism",
+    "load_result",
     "load_session",
+    "plan",
+    "simulate",
     "study",
 ]
 
 _HOMES = {
     "Machine": "pkmcal.mechanisms",
-    "calibrate": "pkmcal.calibration.calibrate",
+    "calibrate": "pkmcal.api.calibrate",
     "load_camera": "pkmcal.cameras",
     "load_mechanism": "pkmcal.mechanisms",
+    "load_result": "pkmcal.api.calibrate",
     "load_session": "pkmcal.session.load",
+    "plan": "pkmcal.api.plan",
+    "simulate": "pkmcal.api.simulate",
     "study": "pkmcal.studies.findings",
 }
 

@@ -1,7 +1,11 @@
-"""The one array type of the project, so that signatures stay readable; and its plain figure."""
+"""The one array type of the project, so that signatures stay readable, what it is told as, and its
+plain figure.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -15,3 +19,29 @@ Booleans = NDArray[np.bool_]
 def rms(values: Array) -> float:
     """Root mean square of all values; NaN of none."""
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+LONGEST_VALUE = 40
+"""Characters of a value that a short repr shows."""
+
+
+def short_repr(self: Any) -> str:
+    """The repr of a dataclass that holds arrays: of these their shapes, of what is long its kind.
+
+    For use as ``__repr__`` in a dataclass's body.
+    """
+    told = (f"{one.name}={_short(getattr(self, one.name))}" for one in fields(self) if one.repr)
+    return f"{type(self).__name__}({', '.join(told)})"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"<{' × '.join(map(str, value.shape)) or 'one number'}>"
+    if is_dataclass(value):
+        return f"<{type(value).__name__}>"
+    if isinstance(value, Collection) and not isinstance(value, str | bytes):
+        inside = next((item for item in value), None)
+        if is_dataclass(inside) or len(repr(value)) > LONGEST_VALUE:
+            return f"<{type(value).__name__} of {len(value)}>"
+    text = repr(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"

@@ -8,7 +8,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.geometry.rigid import perturb
 
 SHADING_SIGMA = 0.03
@@ -43,6 +43,8 @@ class PoseSet:
     whiten: Array
     by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 6, 0)))
     by_focal: Array = field(default_factory=lambda: np.zeros((0, 6)))
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Poses without derivatives by intrinsics get empty ones, so that all select alike."""
@@ -112,6 +114,8 @@ class EdgeSet:
     by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
     by_focal: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         """Edges without derivatives by intrinsics get empty ones, so that all select alike."""
         if len(self.by_intrinsics) != len(self.station):
@@ -179,6 +183,8 @@ class Observation:
     T_camera_base: Array
     poses: PoseSet = field(default_factory=PoseSet.empty)
 
+    __repr__ = short_repr
+
 
 Set = TypeVar("Set", PoseSet, EdgeSet)
 
@@ -238,6 +244,8 @@ class Measurements:
     mounts: tuple[Mount, ...] = ()
     shaded: bool = False
     breathing_at: Array = field(default_factory=lambda: np.zeros(0))
+
+    __repr__ = short_repr
 
     @property
     def n_cameras(self) -> int:

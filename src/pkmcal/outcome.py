@@ -7,6 +7,7 @@ tables and figures.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Literal
@@ -60,16 +61,33 @@ AXIS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing found, as a sentence; station : where it is one's."""
+    """One thing found, as a sentence; station : where it is one's. error : that it tells of."""
 
     level: Level
     text: str
     station: str | None = None
+    error: PkmcalError | None = None
+
+    def document(self) -> dict[str, Any]:
+        """For programs; of an error what every error tells."""
+        told = {"level": self.level.value, "text": self.text, "station": self.station}
+        return told if self.error is None else {**told, **_parts_of(self.error)}
+
+
+def first_error(findings: Sequence[Finding]) -> dict[str, Any]:
+    """What a command's JSON tells of an error, of the first among findings; nothing without one."""
+    errors = (finding.error for finding in findings if finding.error is not None)
+    return next((_parts_of(error) for error in errors), {})
+
+
+def _parts_of(error: PkmcalError) -> dict[str, Any]:
+    """All but the exit code, which is the command's."""
+    return {name: value for name, value in error.as_dict().items() if name != "exit_code"}
 
 
 def wrong(error: PkmcalError, station: str | None = None) -> Finding:
     """An error as a finding."""
-    return Finding(Level.WRONG, str(error), station)
+    return Finding(Level.WRONG, str(error), station, error)
 
 
 def doubtful(text: str, station: str | None = None) -> Finding:

@@ -219,6 +219,7 @@ def results(folder: Path) -> None:
             "study 3-rpr --vary configurations=3 --runs 2 -o study",
             "validate calibration later -o validation",
             "watch calibration later -o watch",
+            "diff calibration machines/gough-stewart.yaml -o diff",
             "check tracker -o check",
             "export calibration --to json -o export",
             "camera board -o camera",

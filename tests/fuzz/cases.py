@@ -65,6 +65,8 @@ TASKS = (
     Task("plan 3-rpr --camera FILE -n 2 -o OUT", ("cameras/pinhole.yaml",), "plan", 1),
     Task("validate calibration later -o OUT", LATER + 4 * RESULT, "validation", 8),
     Task("watch calibration later -o OUT", LATER + 4 * RESULT, "watch", 8),
+    Task("diff calibration machines/gough-stewart.yaml -o OUT", RESULT, "diff", 2),
+    Task("diff FILE FILE -o OUT", ("machines/*.yaml",), "diff", 1),
     Task("export calibration --to json -o OUT", RESULT, "export", 4),
     Task("export calibration --to FORMAT -o OUT", RESULT, "", 4),
     Task("export calibration --to ros --session tracker -o OUT", RESULT + TRACKER[:1], "", 1),

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.boards.board import Board, Detection, load_board
 from pkmcal.boards.detect import check_boards
 from pkmcal.boards.poses import (
@@ -68,6 +68,8 @@ class Boards:
     stations: Mapping[int, StationBoard] = field(default_factory=dict[int, StationBoard])
     body: Body = "platform"
     tolerance: float = 0.0
+
+    __repr__ = short_repr
 
     @property
     def poses(self) -> PoseSet:

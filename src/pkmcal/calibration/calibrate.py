@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -37,7 +37,10 @@ from pkmcal.calibration.recognise import (
     read_photographs,
     station_poses,
 )
+from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, take_turns
+from pkmcal.errors import InputError
+from pkmcal.files import closest, shown
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Estimate
@@ -52,12 +55,14 @@ from pkmcal.papers.conditions import conditions
 from pkmcal.papers.methods import Method as PaperMethod
 from pkmcal.papers.methods import by_paper
 from pkmcal.session.load import Session, load_session
+from pkmcal.wording import listed
 
 Method = Literal["bundle"] | PaperMethod
+METHODS: tuple[str, ...] = ("bundle", *get_args(PaperMethod))
 
 
-@dataclass(frozen=True)
-class Calibration:
+@dataclass(frozen=True, repr=False)
+class Calibration(ShownCalibration):
     """Everything that a calibration found.
 
     boards : the calibration board, where stations observe one. findings : what the data tell of
@@ -84,6 +89,25 @@ class Calibration:
     def machine(self) -> Machine:
         """The calibrated machine."""
         return self.estimate.machine
+
+    def overview(self) -> Overview:
+        """What it shows of itself."""
+        session, e = self.session, self.estimate
+        edges, poses = e.edge_residuals[e.edge_weights >= 0.5], e.pose_residuals
+        return Overview(
+            source=session.folder.resolve().name,
+            method=self.method,
+            machine=e.machine,
+            verdict=self.verdict,
+            drawing=session.machine.values,
+            covariance=e.covariance,
+            data_share=e.data_share,
+            poses=e.state.T_base_platform[e.configurations],
+            stations=session.station_names,
+            residuals=np.concatenate([edges.ravel(), poses[e.pose_weights >= 0.5].ravel()]),
+            chi2=e.statistics.chi2_as_stated,
+            warnings=session.warnings,
+        )
 
     def tool_error(self, T_base_platform: Array) -> ToolError:
         """How sure poses (n, 4, 4) of the calibrated machine are, and how wrong the drawing's were;
@@ -125,6 +149,7 @@ def calibrate(
     """
     from threadpoolctl import threadpool_limits
 
+    _check_options(method, seed, holdout)
     # Matrices here are small: threads inside the linear algebra only wait for one another, and
     # beside our own threads they slow it twentyfold.
     with threadpool_limits(1, "blas"):
@@ -143,6 +168,23 @@ def calibrate(
             cameras = refinement_of(session, refine_camera)
             found = _identify(session, seen, cameras, method, seed, holdout, clock)
         return _judge(session, seen, found, method, seed, clock)
+
+
+def _check_options(method: str, seed: int, holdout: int) -> None:
+    """Raise InputError for what no caller may ask."""
+    if method not in METHODS:
+        guess = closest(str(method), METHODS)
+        raise InputError(
+            "there is no method of this name",
+            where="method",
+            found=shown(method),
+            expected=guess or listed(METHODS),
+        )
+    for name, value in (("seed", seed), ("holdout", holdout)):
+        if value < 0:
+            raise InputError(
+                "this number is negative", where=name, found=shown(value), expected="0 or more"
+            )
 
 
 class _Seen(NamedTuple):

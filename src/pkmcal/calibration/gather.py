@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.views import Boards
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
@@ -48,6 +48,8 @@ class CameraRefinement:
     of_station: tuple[str, ...]
     breathes: Booleans
     breath: Array
+
+    __repr__ = short_repr
 
     @property
     def refined(self) -> bool:

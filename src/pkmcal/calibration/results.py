@@ -9,7 +9,7 @@ from __future__ import annotations
 import platform
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import (
     Document,
@@ -31,7 +32,7 @@ from pkmcal.files import (
 )
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.centres import free_of_gauge
-from pkmcal.identify.decided import decided_by
+from pkmcal.identify.estimate import Statistics
 from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import (
@@ -71,6 +72,7 @@ POSE_COLUMNS = (
     "station", "configuration", "target", "weight", "turn1", "turn2", "turn3", "x", "y", "z",
 )  # fmt: skip
 """Of a row in residuals.poses, the last six whitened together, in standard deviations."""
+EDGE_WEIGHT, POSE_WEIGHT = EDGE_COLUMNS.index("weight"), POSE_COLUMNS.index("weight")
 OPEN = 1.0
 """m or rad; a target's place that is known no better is not told by the data."""
 
@@ -80,11 +82,12 @@ Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Factor = Annotated[float, Field(gt=0)]
 
 
-def check_output(folder: Path | str) -> list[str]:
+def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
     """Raise `InputError` where a result cannot go into `folder`; call it before the work.
 
     Only a new or empty folder, or an earlier result, is written to: a session's own
-    mechanism.yaml must not be lost to its calibrated one. Returns the files of that result.
+    mechanism.yaml must not be lost to its calibrated one. Returns the files of that result, which
+    is kept beside its place (:mod:`pkmcal.calibration.kept`) unless ``force`` replaces it.
     """
     folder = Path(folder)
     check_writable(folder)
@@ -96,9 +99,19 @@ def check_output(folder: Path | str) -> list[str]:
             "the output folder holds something other than a calibration",
             where=str(folder),
             found=listed(foreign or standing, 4),
-            expected="a new or empty folder, or an earlier calibration to replace",
+            expected="a new or empty folder, or one of an earlier calibration",
             next_step="Name another folder with -o, or move these files away",
         )
+    if standing and not force:
+        try:
+            check_writable(folder.resolve().parent)
+        except InputError:
+            raise InputError(
+                "the calibration that is there cannot be kept, for nothing can be written beside"
+                " its folder",
+                where=str(folder),
+                next_step="Name another folder with -o, or replace it with --force",
+            ) from None
     return standing
 
 
@@ -206,23 +219,8 @@ def versions() -> dict[str, str]:
 
 
 def _parameters(calibration: Calibration) -> list[dict[str, Any]]:
-    """One entry a parameter; decided_by : data, drawing, frame (of the result) or fixed."""
-    estimate = calibration.estimate
-    table = estimate.machine.parameters
-    source = decided_by(table, estimate.covariance, estimate.data_share)
-    sigma = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
-    return [
-        {
-            "name": name,
-            "unit": table.units[k],
-            "drawing": calibration.session.machine.values[k],
-            "value": estimate.machine.values[k],
-            "sigma": sigma[k],
-            "data_share": estimate.data_share[k],
-            "decided_by": source[k],
-        }
-        for k, name in enumerate(table.names)
-    ]
+    """One entry a parameter."""
+    return [asdict(row) for row in calibration.parameters]
 
 
 def identifiability_of(findings: Findings | None) -> dict[str, Any] | None:
@@ -466,9 +464,11 @@ class SavedStation:
     sigma_rotation: Array
     sigma_translation: Array
 
+    __repr__ = short_repr
 
-@dataclass(frozen=True)
-class SavedCalibration:
+
+@dataclass(frozen=True, repr=False)
+class SavedCalibration(ShownCalibration):
     """A calibration read back, in the frames that `gauge` names.
 
     machine : with the calibrated values. drawing : (P,) values before.
@@ -502,6 +502,33 @@ class SavedCalibration:
         """(P, P) of the machine's parameters."""
         n = len(self.machine.parameters)
         return self.joint_covariance[:n, :n]
+
+    def overview(self) -> Overview:
+        """What it shows of itself; an older file may not have all of it."""
+        document = self.document
+        residuals = document.get("residuals") or {}
+        parts = [
+            [x for row in residuals.get(key) or () if row[weight] >= 0.5 for x in row[weight + 1 :]]
+            for key, weight in (("edges", EDGE_WEIGHT), ("poses", POSE_WEIGHT))
+        ]
+        known = {f.name for f in fields(Statistics)}
+        statistics = {k: v for k, v in (document.get("statistics") or {}).items() if k in known}
+        needed = {f.name for f in fields(Statistics) if f.default is MISSING}
+        whole = needed <= statistics.keys()
+        return Overview(
+            source=str((document.get("session") or {}).get("folder", "")),
+            method=self.method,
+            machine=self.machine,
+            verdict=self.verdict,
+            drawing=self.drawing,
+            covariance=self.covariance,
+            data_share=self.data_share,
+            poses=self.T_base_platform[self.used],
+            stations=tuple(station.name for station in self.stations),
+            residuals=np.array([*parts[0], *parts[1]], dtype=float),
+            chi2=Statistics(**statistics).chi2_as_stated if whole else float("nan"),
+            warnings=tuple(document.get("warnings") or ()),
+        )
 
     def tool_error(self, T_base_platform: Array) -> ToolError:
         """As :meth:`pkmcal.calibration.calibrate.Calibration.tool_error`, from the file."""

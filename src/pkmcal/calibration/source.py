@@ -21,6 +21,7 @@ from pkmcal.calibration.results import (
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import camera_path, load_camera
 from pkmcal.errors import InputError
+from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
 
@@ -92,21 +93,34 @@ def load_source(origin: Path | str, session: Path | None = None) -> Source:
     session : the calibration's session, for its cameras; else it is looked for around the folder.
     Raises InputError where `origin` is none of these.
     """
+    found = loaded(origin)
+    if isinstance(found, SavedCalibration):
+        return _of_calibration(found, session)
+    built_in = str(origin) in catalogue()
+    return Source(found, origin=f"the built-in machine {origin}" if built_in else Path(origin).name)
+
+
+def loaded(origin: Path | str) -> SavedCalibration | Machine:
+    """A calibration's folder or a file in it, a mechanism file, or a built-in machine by its name.
+
+    Raises InputError where `origin` is none of these.
+    """
     path = Path(origin)
     if str(origin) in catalogue() and not (path / EVERYTHING).is_file():
-        return Source(load_mechanism(str(origin)), origin=f"the built-in machine {origin}")
+        return load_mechanism(str(origin))
     if path.name == MECHANISM and (path.parent / EVERYTHING).is_file():
         path = path.parent  # a calibration's own mechanism file: the rest lies beside it
     if path.is_dir() or path.name == EVERYTHING:
-        return _of_calibration(load(path), session)
+        return load(path)
     if not path.exists() and path.suffix not in (".yaml", ".yml"):
         raise InputError(
             "there is no such calibration and no such machine",
             found=str(origin),
-            expected="a folder that pkmcal calibrate wrote, a mechanism file, or"
+            expected=closest(str(origin), catalogue())
+            or "a folder that pkmcal calibrate wrote, a mechanism file, or"
             f" {listed(sorted(catalogue()), 20)}",
         )
-    return Source(load_mechanism(path), origin=path.name)
+    return load_mechanism(path)
 
 
 def _of_calibration(saved: SavedCalibration, session: Path | None) -> Source:

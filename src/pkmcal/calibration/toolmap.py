@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.geometry.rigid import pose, pose_difference
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.tool import ToolError, tool_error
@@ -76,6 +76,8 @@ class ToolMap:
     slices: tuple[Slice, ...]
     after: ToolError
     before: ToolError
+
+    __repr__ = short_repr
 
     def document(self) -> dict[str, Any]:
         """For programs, of the evenly spread poses: m and rad."""

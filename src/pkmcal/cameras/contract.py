@@ -92,6 +92,12 @@ class Camera(ABC):
     parameters: Array
     covariance: Array | None = None
 
+    def __repr__(self) -> str:
+        width, height = self.image_size
+        told = zip(self.parameter_names, self.parameters.tolist(), strict=True)
+        numbers = ", ".join(f"{name} {value:.6g}" for name, value in told if value)
+        return f"<{type(self).__name__} {width} × {height}: {numbers}>"
+
     @abstractmethod
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3) in the camera frame; NaN outside the valid field."""

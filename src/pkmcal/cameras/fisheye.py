@@ -31,7 +31,7 @@ class FisheyeSchema(CameraSchema):
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Fisheye(Camera):
     """p = K r(t) (x, y) / sqrt(x^2 + y^2), OpenCV's fisheye model."""
 

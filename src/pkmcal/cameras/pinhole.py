@@ -137,7 +137,7 @@ class PinholeSchema(CameraSchema):
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Pinhole(Camera):
     """Perspective camera: p = K distort(x / z, y / z), OpenCV's model."""
 

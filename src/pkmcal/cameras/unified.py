@@ -30,7 +30,7 @@ class UnifiedSchema(CameraSchema):
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Unified(Camera):
     """p = K distort(x / (z + xi r), y / (z + xi r)) with r the point's distance."""
 

@@ -58,6 +58,7 @@ from pkmcal.outcome import (
     Table,
     Verdict,
     doubtful,
+    first_error,
     note,
     wrong,
 )
@@ -186,13 +187,14 @@ class SessionCheck:
         return _exit_code(self.findings)
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything under its name, for ``--json``."""
-        kept = replace(self, look=None, forecast=self.forecast and replace(self.forecast, edges=()))
-        out = plain(asdict(kept))
+        """Everything under its name, for ``--json``, and the first error as every command's."""
+        seen = self.forecast and replace(self.forecast, edges=())
+        out = plain(asdict(replace(self, look=None, forecast=seen, findings=())))
         out.pop("look")
+        out["findings"] = [finding.document() for finding in self.findings]
         if self.forecast:
             out["forecast"].pop("edges")
-        return out
+        return first_error(self.findings) | out
 
 
 def _exit_code(findings: Sequence[Finding]) -> int:

@@ -136,7 +136,9 @@ class RepeatStudy:
         """Everything under its name, for ``--json``."""
         causes = [{**asdict(s), "cause": s.cause} for s in self.stations]
         paper = {name: getattr(PAPER, name) for name in ("psi", "theta", "x", "z")}
-        return plain({**asdict(self), "stations": causes, "paper": paper})
+        findings = [finding.document() for finding in self.findings]
+        own = asdict(replace(self, findings=()))
+        return plain({**own, "findings": findings, "stations": causes, "paper": paper})
 
 
 def study_repeats(

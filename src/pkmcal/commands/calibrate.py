@@ -56,6 +56,10 @@ def calibrate(
         int,
         typer.Option(metavar="N", min=0, help="Leave N configurations out, and predict them."),
     ] = 0,
+    force: Annotated[
+        bool,
+        typer.Option("--force", help="Replace an earlier result; otherwise it is kept, dated."),
+    ] = False,
     as_json: console.Json = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Say nothing if it is well.")
@@ -63,13 +67,14 @@ def calibrate(
 ) -> int:
     """Calibrate the machine; write model, numbers and report."""
     from pkmcal.calibration.calibrate import calibrate as run
+    from pkmcal.calibration.kept import keep_earlier
     from pkmcal.calibration.results import check_output
     from pkmcal.report.calibration import outcome_of
     from pkmcal.session.load import load_session
 
     loaded = load_session(session, model)
     folder = out or loaded.folder / "calibration"
-    over = check_output(folder)
+    over = check_output(folder, force=force)
     with console.progress(quiet or as_json) as told:
         found = run(
             loaded,
@@ -81,4 +86,5 @@ def calibrate(
         )
         told("Writing the report", 0.97)
         outcome = outcome_of(found)
-    return finish(outcome, folder, FILES, over=over, as_json=as_json, quiet=quiet)
+    kept = None if force else keep_earlier(folder, outcome.texts)
+    return finish(outcome, folder, FILES, over=over, kept=kept, as_json=as_json, quiet=quiet)

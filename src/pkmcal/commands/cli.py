@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ from pkmcal.commands import (
     camera,
     check,
     demo,
+    diff,
     export,
     new,
     plan,
@@ -57,6 +59,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "servo": servo.servo,
     "export": export.export,
     "watch": watch.watch,
+    "diff": diff.diff,
     "simulate": simulate.simulate,
     "study": study.study,
     "reproduce": reproduce.reproduce,
@@ -65,7 +68,6 @@ COMMANDS: dict[str, Callable[..., int]] = {
 
 app = typer.Typer(
     name="pkmcal",
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -86,7 +88,11 @@ def _top(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", callback=_show_version, is_eager=True, help="Show the version, and exit."
+            "-V",
+            "--version",
+            callback=_show_version,
+            is_eager=True,
+            help="Show the version, and exit.",
         ),
     ] = False,
 ) -> None:
@@ -133,10 +139,8 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
     if isinstance(error, PkmcalError):
         return error, error.exit_code
     if isinstance(error, _UsageError):
-        message = " ".join(getattr(error, "format_message", error.__str__)().split())
-        message = message.replace(". Did you mean", ", did you mean").rstrip("?.")
         command = words[0] + " " if words and words[0] in COMMANDS else ""
-        said = InputError(message, next_step=f"See pkmcal {command}--help")
+        said = InputError(_usage(error), next_step=f"See pkmcal {command}--help")
         return said, said.exit_code
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return PkmcalError("interrupted; what was not finished was not written"), INTERRUPTED
@@ -159,3 +163,30 @@ def _in_words(error: BaseException, words: list[str]) -> tuple[PkmcalError, int]
         next_step=f"Set {DEBUG}=1, run the command again, and report what it then prints",
     )
     return defect, DEFECT
+
+
+_SUGGESTED = re.compile(r"\.? *(Did you mean|\(Possible options:).*")
+_MACHINERY = ((r"Value error, ", ""), (r"Input should be", "it should be"), (r", unable to .*", ""))
+"""In the complaints of typer's own checks: what names their inside, and what a reader needs."""
+
+
+def _usage(error: Exception) -> str:
+    """A complaint about words of the command line, with the one known word that most likely was
+    meant; typer's own suggestions are as many as resemble it from afar.
+    """
+    from pkmcal.files import closest
+
+    message = " ".join(getattr(error, "format_message", error.__str__)().split())
+    message = _SUGGESTED.sub("", message).rstrip("?.")
+    for inside, instead in _MACHINERY:
+        message = re.sub(inside, instead, message)
+    guess: str | None = None
+    if option := re.match(r"No such option:? '?-*([^\s']+)", message):
+        known = [name for p in error.ctx.command.params for name in p.opts]  # pyright: ignore
+        bare = {name.lstrip("-"): name for name in known if name.startswith("--")}
+        guess = bare.get(closest(option[1], bare) or "")
+    elif command := re.match(r"No such command '(.+)'", message):
+        guess = closest(command[1], COMMANDS)
+    elif choice := re.search(r"'([^']*)' is not one of (.+)", message):
+        guess = closest(choice[1], re.findall(r"'([^']+)'", choice[2]))
+    return f"{message}, did you mean {guess}" if guess else message

@@ -29,18 +29,19 @@ def finish(
     files: Mapping[str, str],
     *,
     over: Collection[str] = (),
+    kept: Path | None = None,
     as_json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Write the files, tell what was found, and return the exit code.
 
-    over : files of an earlier result, of which none is to stay. quiet : say nothing of a result
-    that may be used, and one sentence of another.
+    over : files of an earlier result, of which none is to stay. kept : where a copy of it is.
+    quiet : say nothing of a result that may be used, and one sentence of another.
     """
     with console.progress(as_json or quiet) as told:
         told("Writing the report", 0.97)
         write(outcome, folder, files, over)
-    return answer(outcome, folder, files, as_json=as_json, quiet=quiet)
+    return answer(outcome, folder, files, kept=kept, as_json=as_json, quiet=quiet)
 
 
 def write(
@@ -57,18 +58,25 @@ def answer(
     folder: Path,
     files: Mapping[str, str],
     *,
+    kept: Path | None = None,
     as_json: bool = False,
     quiet: bool = False,
 ) -> int:
     """Tell what was found and where it stands, and return the exit code."""
     if as_json:
-        console.print_json(printed(outcome, folder, files))
+        earlier = {"kept": str(kept)} if kept else {}
+        console.print_json({**printed(outcome, folder, files), **earlier})
     elif not quiet:
         out = console.out()
         tell(out, outcome)
         if files:
             out.print()
-            console.print_files(out, [(str(folder / name), what) for name, what in files.items()])
+            told = [(str(folder / name), what) for name, what in files.items()]
+            if kept:
+                here = Path.cwd()
+                place = kept.relative_to(here) if kept.is_relative_to(here) else kept
+                told.append((str(place), "the earlier result, kept"))
+            console.print_files(out, told)
     elif not outcome.verdict.usable:
         verdict = outcome.verdict
         console.print_error(" ".join([verdict.headline, *verdict.reasons]))

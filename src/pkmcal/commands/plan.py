@@ -15,7 +15,6 @@ from pkmcal.commands.numbers import check_positive
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
-    from pkmcal.mechanisms.region import Region
     from pkmcal.planning.subject import Subject
 
 
@@ -34,8 +33,6 @@ FILES = {
     "plan.json": NUMBERS,
 }
 STATIONS = {"stations.yaml": "the places, for session.yaml"}
-LAST = "calibration"
-"""Where calibrate writes, inside a session."""
 
 
 def plan(
@@ -111,10 +108,11 @@ def plan(
     """The next configurations worth measuring."""
     from threadpoolctl import threadpool_limits
 
+    from pkmcal.api.plan import as_it_stands
     from pkmcal.files import check_own_folder
     from pkmcal.planning.plan import plan as run
     from pkmcal.report.plan import outcome_of
-    from pkmcal.session.load import session_folder
+    from pkmcal.session.load import load_session, session_folder
 
     check_positive("--edge-noise", edge_noise, 100)
     check_positive("--corner-noise", corner_noise, 100)
@@ -128,15 +126,15 @@ def plan(
         region = None
         if session is not None:
             _only_of("a machine", {"--camera": camera, "--board": board, "--tracker": tracker})
-            source, region = _of_session(
-                session,
+            source, region = as_it_stands(
+                load_session(session, measured=False),
                 after,
-                from_drawing,
-                same_place,
-                places is not None,
-                edge_noise,
-                corner_noise,
-                seed,
+                from_drawing=from_drawing,
+                same_place=same_place,
+                anywhere=places is not None,
+                edge=edge_noise,
+                corner=corner_noise,
+                seed=seed,
             )
         else:
             given = {"--after": after, "--same-place": same_place, "--best-of": best_of}
@@ -172,54 +170,6 @@ def _only_of(owner: str, given: Mapping[str, object]) -> None:
     for name, value in given.items():
         if value:
             raise InputError(f"this option is for {owner}", where=name, next_step="Leave it out")
-
-
-def _of_session(
-    folder: Path,
-    after: Path | None,
-    from_drawing: bool,
-    same_place: bool,
-    anywhere: bool,
-    edge_noise: float,
-    corner_noise: float,
-    seed: int,
-) -> tuple[Subject, Region | None]:
-    """The session as it stands, and its workspace."""
-    from pkmcal.calibration.results import EVERYTHING, load
-    from pkmcal.judge.new_data import read
-    from pkmcal.planning.subject import of_session
-    from pkmcal.session.load import load_session
-
-    session, saved = load_session(folder, measured=False), None
-    if after is None and not from_drawing and (session.folder / LAST / EVERYTHING).is_file():
-        after = session.folder / LAST
-        if not load(after).verdict.usable:  # it says of itself not to be used
-            after = None
-    if after is not None:
-        saved, session = read(after, session)
-        if not saved.verdict.usable:
-            raise InputError(
-                "this calibration should not be used, so no plan is made from it",
-                where=str(saved.path),
-                found=saved.verdict.headline,
-                next_step="Plan without it: --from-drawing",
-            )
-    if same_place and saved is None:
-        raise InputError(
-            "there is no calibration in which the cameras stood anywhere",
-            where="--same-place",
-            expected="--after CALIBRATION, or a session with its calibration",
-        )
-    subject = of_session(
-        session,
-        saved,
-        same_place=same_place,
-        anywhere=anywhere,
-        edge=edge_noise,
-        corner=corner_noise,
-        seed=seed,
-    )
-    return subject, session.workspace
 
 
 def _of_machine(

@@ -21,6 +21,8 @@ from pkmcal.files.writing import settle
 LONGEST_SHOWN = 60
 """Characters of a found value that a message quotes: enough to recognise it, short enough for
 one line."""
+SHORTEST_PART = 4
+"""Letters from which on a part of a name stands for the whole."""
 BLOCK = 2**20
 """Bytes of a text that are in memory at a time where it is read line by line."""
 
@@ -97,13 +99,19 @@ def wanted_file(path: Path) -> str:
     folder = path.parent
     if not folder.is_dir():
         return f"a file {path} (its folder does not exist either)"
-    neighbour = closest(path.name, (entry.name for entry in folder.iterdir()))
+    # by their stems: any two files of one kind are alike by their suffix
+    stems = {entry.stem: entry.name for entry in sorted(folder.iterdir(), reverse=True)}
+    neighbour = stems.get(closest(path.stem, stems) or "")
     return f"a file {path}" + (f" (there is {neighbour})" if neighbour else "")
 
 
 def closest(name: str, known: Iterable[str]) -> str | None:
     """Return the known name that a misspelt one most likely means, or None."""
     by_lower = {candidate.lower(): candidate for candidate in known}
+    if len(name) >= SHORTEST_PART:  # such as gough of gough-stewart
+        whole = [candidate for candidate in by_lower if name.lower() in candidate]
+        if len(whole) == 1:
+            return by_lower[whole[0]]
     # 0.6 is difflib's own threshold: one or two wrong letters in a short key.
     matches = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.6)
     return by_lower[matches[0]] if matches else None

@@ -17,6 +17,7 @@ from pkmcal.wording import listed
 __all__ = ["Schema", "field_path", "validate"]
 
 JsonSchema = Mapping[str, Any]
+LONGEST_REPR = 200
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -28,6 +29,10 @@ class Schema(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    def __repr__(self) -> str:
+        text = super().__repr__()
+        return text if len(text) <= LONGEST_REPR else f"{text[: LONGEST_REPR - 1]}…"
 
 
 def validate(document: Document, model: type[Model]) -> Model:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import platform
 import re
 import secrets
 import shutil
 from collections.abc import Collection, Generator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from pkmcal.errors import InputError
+from pkmcal.files.locks import lock
 from pkmcal.wording import listed
 
 COMMITTED = ".pkmcal-replacing"
@@ -18,6 +21,8 @@ COMMITTED = ".pkmcal-replacing"
 STAGE, PROBE = "stage", "probe"
 _NEW, _GONE = "new", "gone"
 """In a stage: the files as they will stand, and empty ones that name those which go."""
+_HELD = "held"
+"""In a stage, beside them: a file that its process has locked for as long as it lives."""
 _LEFT_OVER = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part")
 """Names of `_beside`."""
 
@@ -128,9 +133,13 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
     # Inside a folder that exists, because that may be a mount of its own, where moves would copy.
     stage = _beside(folder / STAGE) if folder.is_dir() else _beside(folder)
     new, gone = stage / _NEW, stage / _GONE
+    for place in {stage.parent, folder.parent}:
+        _clear_abandoned(place)
+    held: BinaryIO | None = None
     try:
         new.mkdir(parents=True)
         gone.mkdir()
+        held = _hold(stage)
         yield new
         written = _files(new)
         for path in written:
@@ -140,6 +149,8 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
             for name in over:
                 if new / name not in written and (folder / name).is_file():
                     (gone / name).touch()
+            held.close()
+            (stage / _HELD).unlink()
             stage.replace(folder / COMMITTED)
             settle(folder)
         else:
@@ -148,6 +159,8 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
     except OSError as error:
         raise _unwritable(folder, error) from None
     finally:
+        if held is not None:
+            held.close()
         shutil.rmtree(stage, ignore_errors=True)
 
 
@@ -222,6 +235,34 @@ def _sweep(folder: Path) -> None:
             left = _LEFT_OVER.fullmatch(path.name)
             if left and left["name"] in names and path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
+
+
+def _hold(stage: Path) -> BinaryIO:
+    """A stage's file, locked, and the computer's name written into it when it is."""
+    held = (stage / _HELD).open("wb", buffering=0)
+    lock(held.fileno())
+    held.write(_computer())
+    return held
+
+
+def _computer() -> bytes:
+    """Not all file systems of a network tell one computer what another has locked."""
+    return platform.node().encode() or b"?"
+
+
+def _clear_abandoned(place: Path) -> None:
+    """Remove stages in a folder whose process has ended before it was done, whatever they were
+    for: an hour's photographs may lie in one. Those of which that is not certain stay.
+    """
+    stages: list[Path] = []
+    with suppress(OSError):  # no such folder yet, or one whose names may not be listed
+        stages = [path for path in place.iterdir() if _LEFT_OVER.fullmatch(path.name)]
+    for stage in stages:
+        with suppress(OSError):  # no stage, or one that another process removes
+            with (stage / _HELD).open("r+b") as held:  # empty: not locked yet
+                abandoned = held.read() == _computer() and held.seek(0) == 0 and lock(held.fileno())
+            if abandoned:
+                shutil.rmtree(stage, ignore_errors=True)
 
 
 def _beside(path: Path) -> Path:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.geometry.rigid import apply, register
 from pkmcal.identify.gauge import BestFit, generators, projector
 from pkmcal.mechanisms import Machine
@@ -34,6 +34,8 @@ class Centres:
     drawing: Array
     T_calibrated_drawing: Array
     covariance: Array
+
+    __repr__ = short_repr
 
     @property
     def change(self) -> Array:

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, short_repr
 from pkmcal.identify.estimate import State, told_unknowns
 from pkmcal.identify.gauge import (
     Gauge,
@@ -242,10 +242,14 @@ class Identifiability:
     weak: tuple[Direction, ...]
     singular_values: Array
 
+    __repr__ = short_repr
+
     @property
     def basis(self) -> Array:
         """Changes (n, P) of all parameters that the data cannot see, m and rad."""
-        return np.array([d.vector for d in self.unidentified]).reshape(len(self.unidentified), -1)
+        vectors = [d.vector for d in self.unidentified]
+        size = next((d.vector.size for d in (*self.unidentified, *self.weak)), self.n_parameters)
+        return np.array(vectors).reshape(-1, size)
 
 
 def identifiability(problem: Problem, machine: Machine, state: BatchState) -> Identifiability:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.identify.unknowns import Unknowns, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
@@ -36,6 +36,8 @@ class State:
     internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
     breathing: Array = field(default_factory=lambda: np.zeros(0))
     sizes: Array = field(default_factory=lambda: np.zeros(0))
+
+    __repr__ = short_repr
 
 
 def told_unknowns(state: State) -> Unknowns:
@@ -84,6 +86,17 @@ class Statistics:
     reading_range: tuple[float, float | None] = (0.0, None)
     pose_range: tuple[float, float | None] = (0.0, None)
 
+    @property
+    def chi2_as_stated(self) -> float:
+        """Chi-square per degree of freedom of the noise as it was stated, NaN without freedoms.
+
+        With the noise as found it is 1 or so for any model, however wrong: its factors were chosen
+        for that.
+        """
+        chi2 = self.chi2_edges * self.noise_scale**2 + self.chi2_poses * self.pose_scale**2
+        chi2 += self.chi2_joints * self.reading_scale**2 + self.chi2_drawing
+        return chi2 / self.dof if self.dof > 0 else float("nan")
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -128,6 +141,8 @@ class Estimate:
     line_shift_sigma: Array = field(default_factory=lambda: np.zeros(0))
     breathing_sigma: Array = field(default_factory=lambda: np.zeros(0))
     size_sigma: Array = field(default_factory=lambda: np.zeros(0))
+
+    __repr__ = short_repr
 
     def as_found(self, measurements: Measurements) -> Measurements:
         """The measurements with the readings' noise as the data show it."""

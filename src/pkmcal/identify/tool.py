@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
@@ -99,6 +99,8 @@ class ToolError:
     by_parameters: Array
     parameters: Array
     off: Array
+
+    __repr__ = short_repr
 
     @cached_property
     def covariance(self) -> Array:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.motions import Motion, Situation, all_radii, candidates
@@ -78,6 +78,8 @@ class Findings:
     conditions: tuple[Condition, ...] = ()
     conventional: tuple[str, ...] = ()
     also_conventional: int = 0
+
+    __repr__ = short_repr
 
 
 def explain(

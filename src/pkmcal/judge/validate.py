@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Booleans
+from pkmcal.arrays import Booleans, short_repr
 from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.results import SavedCalibration
 from pkmcal.errors import InputError, ResultError
@@ -48,6 +48,8 @@ class Validation:
     regions: tuple[HoldOut, ...]
     paths: tuple[LinePath, ...]
     timings: dict[str, float] = field(default_factory=dict)
+
+    __repr__ = short_repr
 
     def document(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.calibration.aside import select
 from pkmcal.calibration.calibrate import Calibration, Progress
 from pkmcal.calibration.results import SavedCalibration
@@ -62,6 +62,8 @@ class Watch:
     same_place: tuple[str, ...] = ()
     moved: tuple[StationTest, ...] = ()
     timings: dict[str, float] = field(default_factory=dict)
+
+    __repr__ = short_repr
 
     def document(self) -> dict[str, Any]:
         """Plain data for JSON: m and rad."""

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.geometry.batches import fresh, moments
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import (
@@ -100,6 +100,8 @@ class LimbLayout:
     radius: tuple[Integers, ...]
     motion: Array
     n_parameters: int
+
+    __repr__ = short_repr
 
     @cached_property
     def n_equations(self) -> int:

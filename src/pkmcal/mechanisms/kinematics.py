@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.geometry.batches import WORTH, batch_last, damped_step, fresh, picked, stepped
 from pkmcal.geometry.rigid import perturb, pose, rotation
 from pkmcal.mechanisms.closure import (
@@ -214,6 +214,8 @@ class ForwardResult:
     layout: LimbLayout = field(repr=False)
     theta: Array = field(repr=False)
     readings: Array = field(repr=False)
+
+    __repr__ = short_repr
 
     @cached_property
     def singularity(self) -> Array:

@@ -38,7 +38,7 @@ from pkmcal.mechanisms.motors import (
     scale_tolerances,
 )
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.wording import split_name
+from pkmcal.wording import count, split_name
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,12 @@ class Machine:
     parameters: ParameterTable
     layout: LimbLayout
     values: Array
+
+    def __repr__(self) -> str:
+        what = f"{count(self.n_legs, 'leg')}, {count(self.n_joints, 'reading')}"
+        return (
+            f"<Machine {self.name}: {self.document.motion}, {what}, {len(self.values)} parameters>"
+        )
 
     @property
     def name(self) -> str:

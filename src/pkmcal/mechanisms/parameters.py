@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
 
 EVERY = "legs[*]"
@@ -47,6 +47,8 @@ class ParameterTable:
     fixed: tuple[str, ...] = ()
     tied: tuple[tuple[str, ...], ...] = ()
     opposed: tuple[tuple[str, ...], ...] = ()
+
+    __repr__ = short_repr
 
     def __len__(self) -> int:
         return len(self.names)

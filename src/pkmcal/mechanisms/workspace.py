@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose, pose_difference
 from pkmcal.mechanisms.closure import LimbLayout
@@ -46,6 +46,8 @@ class Limits:
     ranges: Array
     units: tuple[str, ...]
     home: Array
+
+    __repr__ = short_repr
 
     @cached_property
     def at_home(self) -> tuple[float, float]:
@@ -81,6 +83,8 @@ class Reach:
     singular: Booleans
     crossed: Booleans
     limits: Limits
+
+    __repr__ = short_repr
 
     @property
     def inside(self) -> Booleans:

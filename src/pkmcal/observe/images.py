@@ -27,6 +27,9 @@ KEPT = 128 * 2**20
 THREADS = 2
 PNG_START = 8
 """Bytes before a PNG file's first chunk: length, kind, body and checksum of kind and body."""
+DEPTHS, DARK = (8, 10, 12), 15
+"""Bits that cameras measure and programs put into 16 without shifting them up, and the highest of
+256 grey levels that is left of them then."""
 JPEG_END = b"\xff\xd9"
 
 
@@ -68,6 +71,8 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         raise _broken(label, f"a {kind} file that is damaged ({fault})")
     if image is None:
         raise _broken(label, "no readable image")
+    if image.max() <= DARK:
+        _check_depth(data, label)
     if image.shape == tuple(image_size) and image_size[0] != image_size[1]:
         clockwise = {6: True, 8: False}.get(read_exif(data).orientation)
         if clockwise is None:
@@ -77,6 +82,29 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
     if (image.shape[1], image.shape[0]) != tuple(image_size):
         raise _other_size(label, (image.shape[1], image.shape[0]), image_size)
     return image
+
+
+def _check_depth(data: bytes, label: str) -> None:
+    """Raise `InputError` for a 16-bit file whose levels fill its lowest bits alone: of the 8 bits
+    that all else works on, next to nothing is left.
+    """
+    import cv2
+
+    raw: Any = cv2.imdecode(
+        np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE
+    )
+    if raw.dtype != np.uint16:
+        return
+    highest = int(raw.max())
+    bits = next(bits for bits in DEPTHS if highest < 2**bits)
+    raise InputError(
+        f"the photograph is nearly black: a 16-bit file whose grey levels fill {bits} bits",
+        where=label,
+        found=f"levels up to {highest}",
+        expected="levels up to 65535, or an 8-bit file",
+        next_step=f"If the camera measures {bits} bits, multiply by {2 ** (16 - bits)} when they"
+        " are saved, or save 8 bits; if this photograph alone is dark, remove it",
+    )
 
 
 def _check_png(data: bytes, label: str) -> None:

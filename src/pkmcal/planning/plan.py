@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import Region, poses_in
@@ -112,6 +112,8 @@ class MeasurementPlan:
     travel: tuple[float, float]
     tried: tuple[TriedPlace, ...] = ()
     together: bool = False
+
+    __repr__ = short_repr
 
     @property
     def pays_until(self) -> float | None:

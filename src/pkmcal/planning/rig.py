@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.poses import LEAST_CORNERS, pose_set
 from pkmcal.cameras import Camera
 from pkmcal.geometry.rigid import apply, inverse, skew
@@ -201,6 +201,8 @@ class Rig:
     mounts: tuple[Mount, ...] = ()
     T_mount: Array | None = None
     shading: float = SHADING_SIGMA
+
+    __repr__ = short_repr
 
     def only(self, stations: Sequence[int]) -> Rig:
         """With some of its stations, in this order; mounts stay."""

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, short_repr
 from pkmcal.boards.board import Board, load_board
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
@@ -66,6 +66,8 @@ class Subject:
     names: tuple[str, ...]
     words: tuple[str, ...]
     board: dict[str, Any] | None = None
+
+    __repr__ = short_repr
 
 
 class _Noise(NamedTuple):

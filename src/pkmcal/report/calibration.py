@@ -11,6 +11,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration import toolmap
+from pkmcal.calibration.kept import keep_earlier
 from pkmcal.calibration.results import REPORT, check_output, texts_of
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.errors import PkmcalError
@@ -84,11 +85,17 @@ def _tool_map(calibration: Calibration) -> ToolMap | str:
         return f"There is no map of the workspace: {error}"
 
 
-def save(calibration: Calibration, folder: Path | str) -> None:
-    """Write a calibration's three files into `folder`, whole or not at all."""
-    over = check_output(folder)
+def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -> Path | None:
+    """Write a calibration's three files into `folder`, whole or not at all.
+
+    An earlier result in it is kept beside it, under its date, in the folder that is returned;
+    ``force`` replaces it. Raises InputError where the folder holds anything else.
+    """
+    over = check_output(folder, force=force)
     found = outcome_of(calibration)
+    kept = None if force else keep_earlier(Path(folder), found.texts)
     write_folder(Path(folder), {REPORT: page.page_html(found), **found.texts}, over)
+    return kept
 
 
 def report_of(
@@ -197,7 +204,7 @@ def numbers(
         "platform_orientation_change": _mean(tool.off_orientation),
         "edges": len(observation.edges),
         "rejected": len(observation.rejected),
-        "chi2_per_freedom": statistics.chi2 / statistics.dof if statistics.dof > 0 else None,
+        "chi2_per_freedom": statistics.chi2_as_stated if statistics.dof > 0 else None,
         "edge_noise_scale": statistics.noise_scale,
         "reading_noise_scale": statistics.reading_scale,
     }
@@ -285,11 +292,10 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
 
 
 def _fit(estimate: Estimate) -> Figure:
-    """Chi-square per degree of freedom."""
+    """Chi-square per degree of freedom, of the noise as stated."""
     s = estimate.statistics
-    value = s.chi2 / s.dof if s.dof > 0 else float("nan")
     scaled = [
-        f"the {what}' stated noise was multiplied by {number(scale, 2)}"
+        f"the {what}' by {number(scale, 2)}"
         for what, scale in (
             ("edges", s.noise_scale),
             ("poses", s.pose_scale),
@@ -297,11 +303,16 @@ def _fit(estimate: Estimate) -> Figure:
         )
         if np.isfinite(scale) and abs(scale - 1) > 0.005
     ]
+    found = s.chi2 / s.dof if s.dof > 0 else float("nan")
     return Figure(
         "Does the model explain the data?",
-        ((number(value, 2), "χ² per degree of freedom"),),
-        f"1 is expected, over {count(s.dof, 'degree')} of freedom"
-        + (f"; reached after {' and '.join(scaled)}" if scaled else ""),
+        ((number(s.chi2_as_stated, 2), "χ² per degree of freedom"),),
+        f"1 is expected of the noise as stated, over {count(s.dof, 'degree')} of freedom"
+        + (
+            f"; {number(found, 2)} after the stated noise was multiplied, {' and '.join(scaled)}"
+            if scaled
+            else ""
+        ),
     )
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, short_repr
 from pkmcal.cameras import Camera
 from pkmcal.cameras.files import camera_path, load_camera
 from pkmcal.errors import LONGEST_NAME, InputError
@@ -48,7 +48,7 @@ from pkmcal.session.schema import (
     StationDocument,
     Vector,
 )
-from pkmcal.wording import listed
+from pkmcal.wording import count, listed
 
 __all__ = [
     "Photograph",
@@ -92,6 +92,8 @@ class Station:
     handheld: bool = False
     from_exif: bool = False
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True)
 class Session:
@@ -124,6 +126,15 @@ class Session:
     model: str | None = None
     mechanism: Path | str = ""
     workspace: Region | None = None
+
+    def __repr__(self) -> str:
+        taken = sum(len(station.photographs) for station in self.stations)
+        parts = (
+            count(len(self.configurations), "configuration"),
+            count(len(self.station_names), "station"),
+            count(taken, "photograph"),
+        )
+        return f"<Session {self.folder.resolve().name}: {self.machine.name}, {', '.join(parts)}>"
 
     @property
     def station_names(self) -> tuple[str, ...]:
@@ -264,7 +275,12 @@ def _read(folder: Path) -> tuple[Path, Document]:
     if folder.name == FILE and folder.is_file():
         folder = folder.parent
     if not folder.is_dir():
-        raise InputError("there is no such session folder", where=str(folder))
+        beside = closest(folder.name, (p.parent.name for p in folder.parent.glob(f"*/{FILE}")))
+        raise InputError(
+            "there is no such session folder",
+            where=str(folder),
+            next_step=f"There is {folder.with_name(beside)}" if beside else None,
+        )
     if not (folder / FILE).exists():
         below = sorted(path.parent.name for path in folder.glob(f"*/{FILE}"))
         raise InputError(

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable, closest, read_csv
 from pkmcal.geometry.rigid import from_quaternion, pose, register, rotation
@@ -54,6 +54,8 @@ class PoseTable:
     T: Array
     position: float
     rotation: float | None
+
+    __repr__ = short_repr
 
     @classmethod
     def to_come(cls, name: str, label: str, position: float, rotation: float | None) -> PoseTable:

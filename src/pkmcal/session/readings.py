@@ -13,7 +13,7 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
 from pkmcal.measurements import Departure, Effect
-from pkmcal.wording import amount, listed, ratio
+from pkmcal.wording import SCALES, amount, listed, number, ratio
 
 # A drawing's range is no hard stop: homing shifts it by the offset's tolerance, so a reading that
 # is out by less than this part of the stroke is told, and one that is further out is refused.
@@ -58,6 +58,7 @@ def check_readings(
         )
     _check_units(table, ranges, units or ["m"] * len(ranges))
     _check_signs(table, ranges)
+    _check_shift(table, ranges, units or ["m"] * len(ranges))
     return _check_ranges(table, ranges) + _check_movement(table, noise)
 
 
@@ -116,6 +117,49 @@ def _check_signs(table: CsvTable, ranges: Array) -> None:
         found=f"{table.values[row, column]:g}",
         expected=f"{low:g} to {high:g}, where all of them lie with the other sign",
         next_step="Turn the sign of this column round, or the axis and range in the mechanism file",
+    )
+
+
+def _check_shift(table: CsvTable, ranges: Array, units: Sequence[str]) -> None:
+    """Most readings of all joints, or of some, out of range, and all in it after one constant
+    shift: counted from another place, not so many mistakes.
+    """
+    inside, loosely = _inside(table.values, ranges, margin=0.0), _inside(table.values, ranges)
+    if loosely.all():
+        return
+    few = inside.mean(axis=0) < 0.5
+    for unit in dict.fromkeys(units):
+        alike = np.array(units) == unit
+        for which in (alike, alike & few):
+            if not which.any() or inside[:, which].mean() > 0.5 or not loosely[:, ~which].all():
+                continue
+            low, high = ranges[which].T
+            values, slack = table.values[:, which], _MARGIN * (high - low)
+            # fmax, fmin: a range that is not known allows any shift
+            least = float(np.fmax.reduce(low - slack - values.min(axis=0)))
+            most = float(np.fmin.reduce(high + slack - values.max(axis=0)))
+            if least <= most:
+                raise _shifted(table, ranges, which, (least, most), unit)
+
+
+def _shifted(
+    table: CsvTable, ranges: Array, which: Booleans, shift: tuple[float, float], unit: str
+) -> InputError:
+    """The error about joints ``which`` (m,) whose readings a shift puts into their ranges."""
+    column = int(np.flatnonzero(which)[0])
+    low, high = ranges[column]
+    scale, name = SCALES[unit]
+    least, most = (number(end * scale, 0 if unit == "m" else 1, signed=True) for end in shift)
+    return InputError(
+        f"the readings of {listed([table.columns[k] for k in np.flatnonzero(which)], 7)} are off by"
+        " one constant: they count from another place than the mechanism file does, such as from"
+        " the homing switch",
+        where=table.where(0, column),
+        found=f"{table.values[0, column]:g}",
+        expected=f"{low:g} to {high:g}, where all of them lie with one number between {least} and"
+        f" {most} {name} added",
+        next_step="Add the readings' constant to these columns, as far as you know it, or put it"
+        " into the mechanism file's offsets: what is left of it is calibrated",
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError
@@ -128,6 +128,8 @@ class Truth:
     repeats: int = 1
     T_platform_board: Array | None = None
     focal_scale: Array | None = None
+
+    __repr__ = short_repr
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.studies.calibrations import ESTIMATE, covered
 from pkmcal.studies.cluster import on_cluster
@@ -73,6 +73,8 @@ class CellFindings:
     parameters: tuple[str, ...]
     by_parameter: Array
 
+    __repr__ = short_repr
+
     @property
     def honest(self) -> bool | None:
         """Whether 95 % intervals hold often enough, chance aside (Student's, both ways); None where
@@ -122,6 +124,8 @@ class SweepResult:
     found: tuple[CellFindings, ...]
     runs: int
     seed: int
+
+    __repr__ = short_repr
 
     @property
     def wall(self) -> float:

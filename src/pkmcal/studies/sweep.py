@@ -132,7 +132,8 @@ def subject_of(origin: str) -> StudySubject:
         raise InputError(
             "there is nothing of this name to study",
             found=origin,
-            expected=f"a session's folder, a mechanism file, the paper {PAPER}, or"
+            expected=closest(origin, catalogue())
+            or f"a session's folder, a mechanism file, the paper {PAPER}, or"
             f" {listed(sorted(catalogue()), 20)}",
         )
     machine = load_mechanism(origin, label=None)

@@ -1,0 +1,1 @@
+"""What ``import pkmcal`` gives: the commands' work as functions, results that show themselves."""

@@ -1,0 +1,77 @@
+"""``pkmcal.simulate``: a session with photographs and known truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from pkmcal.cameras import Camera, load_camera
+from pkmcal.errors import InputError, PkmcalError
+from pkmcal.files import closest
+from pkmcal.mechanisms import Machine, load_mechanism
+from pkmcal.session.load import Session, load_session
+from pkmcal.simulation import Settings, simulate_session, with_forearms
+from pkmcal.simulation.demo import demo_camera
+from pkmcal.wording import listed
+
+
+def simulate(
+    folder: Path | str,
+    mechanism: Machine | Path | str = "gough-stewart",
+    *,
+    camera: Camera | Path | str | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    **settings: Any,
+) -> Session:
+    """Simulate a session into a new folder: photographs, readings, and the truth in truth.json.
+
+    Parameters
+    ----------
+    folder :
+        A new or empty one.
+    mechanism :
+        A built-in machine's name, a mechanism file, or a loaded machine. A drawing without visible
+        cylinders gets one on each rod.
+    camera :
+        A camera's file, or a loaded camera; a small industrial one of 800 x 600 unless given.
+    seed :
+        Of everything that is drawn.
+    progress :
+        Called with the photographs done and in all.
+    settings :
+        Fields of :class:`pkmcal.simulation.Settings`: ``stations=3``, ``configurations=15``,
+        ``tolerance=1.0`` (how far the machine is off its drawing), ``joint_noise=3e-6``,
+        ``board=``, ``finish="metal"`` and so on.
+
+    Returns
+    -------
+    Session
+        As :func:`pkmcal.load_session` loads it. ``pkmcal.simulation.load_truth`` reads its truth.
+
+    Raises
+    ------
+    pkmcal.errors.InputError
+        The folder is not empty, or a machine, a camera or a setting cannot be.
+
+    """
+    known = [one.name for one in fields(Settings)]
+    for name in settings:
+        if name not in known:
+            guess = closest(name, known)
+            raise InputError(
+                "this is no setting of a simulation",
+                found=name,
+                expected=guess or listed(known, len(known)),
+            )
+    drawing = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
+    eye = camera if isinstance(camera, Camera) else load_camera(camera) if camera else demo_camera()
+    try:
+        machine = with_forearms(drawing)
+        machine.home()
+    except PkmcalError as error:  # it cannot be put together: the drawing is at fault
+        raise error.as_input(drawing.name) from None
+    simulate_session(folder, machine, eye, Settings(**settings), seed=seed, progress=progress)
+    return load_session(folder)

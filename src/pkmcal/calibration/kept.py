@@ -1,0 +1,75 @@
+"""An earlier result is kept when a new one takes its place: beside it, under its date.
+
+The copy is made first, whole or not at all; then the new result takes the folder as it would any
+other. A run that is killed between the two leaves the earlier result twice, and the next one finds
+its copy there.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+
+from pkmcal.calibration.results import EVERYTHING, REPORT
+from pkmcal.files import entries, staged_folder
+
+
+def keep_earlier(folder: Path, texts: Mapping[str, str | bytes]) -> Path | None:
+    """Copy the result that ``folder`` holds into a folder beside it; returns that.
+
+    texts : the new result's by their files' names. None where there is no earlier one, or the new
+    one is the same but for how long it took: nothing needs keeping twice. The copy's name is the
+    folder's with the earlier result's date, as calibration-2026-11-23T1502; a second one of the
+    same minute ends in -2.
+    """
+    folder = folder.resolve()
+    names = entries(folder)
+    if EVERYTHING not in names or _same(folder, names, texts):
+        return None
+    written = datetime.fromtimestamp((folder / EVERYTHING).stat().st_mtime)
+    stem = f"{folder.name}-{written:%Y-%m-%dT%H%M}"
+    number, place = 1, folder.with_name(stem)
+    while entries(place) or place.is_file():
+        if _copied(folder, names, place):
+            return place
+        number += 1
+        place = folder.with_name(f"{stem}-{number}")
+    with staged_folder(place) as stage:
+        for name in names:
+            shutil.copy2(folder / name, stage / name)
+    return place
+
+
+def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes]) -> bool:
+    """Whether the new result tells what the one in the folder does; pages are made from these."""
+    if {*names} - {REPORT} != {*texts} - {REPORT}:
+        return False
+    return all(
+        _told(name, (folder / name).read_bytes()) == _told(name, texts[name])
+        for name in names
+        if name != REPORT
+    )
+
+
+def _told(name: str, content: str | bytes) -> object:
+    """What a file says, but for how long it took to find out."""
+    raw = content if isinstance(content, bytes) else content.encode("utf-8")
+    if name != EVERYTHING:
+        return raw
+    try:
+        document = json.loads(raw)
+    except ValueError:  # changed by hand, or cut short: kept all the same
+        return raw
+    if isinstance(document, dict):
+        document.pop("timings", None)
+    return document
+
+
+def _copied(folder: Path, names: list[str], place: Path) -> bool:
+    """Whether a folder holds these files already."""
+    return entries(place) == names and all(
+        (folder / name).read_bytes() == (place / name).read_bytes() for name in names
+    )

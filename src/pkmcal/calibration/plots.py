@@ -1,0 +1,93 @@
+"""Plots of a calibration with matplotlib, which is an extra: ``pip install 'pkmcal[plot]'``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.identify.found import FoundParameters
+from pkmcal.identify.tool import ToolError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+CALIBRATED, DRAWING, QUIET = "#2a6fb0", "#b5651d", "#888888"
+ROW = 0.17
+"""Inches of a parameter's line."""
+REACH = 5.0
+"""Standard deviations to either side in which residuals are counted one by one."""
+
+
+def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
+    """The axes to draw into, made where there are none."""
+    if ax is not None:
+        return ax
+    try:
+        from matplotlib import pyplot
+    except ImportError:
+        raise InputError(
+            "plots need matplotlib", next_step="Install it with: pip install 'pkmcal[plot]'"
+        ) from None
+    return pyplot.subplots(figsize=size, layout="constrained")[1]
+
+
+def residuals(values: Array, ax: Axes | None = None) -> Axes:
+    """Residuals (n,) in standard deviations, beside the normal distribution of noise alone."""
+    ax = _axes(ax, (6.0, 3.4))
+    if not values.size:
+        ax.set_title("There are no edges and no measured poses")
+        return ax
+    at = np.linspace(-REACH, REACH, 200)
+    outside = int(np.sum(np.abs(values) > REACH))
+    bins = np.linspace(-REACH, REACH, 51).tolist()
+    ax.hist(np.clip(values, -REACH, REACH), bins=bins, density=True, color=CALIBRATED, alpha=0.6,
+            label=f"{values.size} residuals")  # fmt: skip
+    ax.plot(at, np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi), color=QUIET, label="noise alone")
+    ax.set_xlabel("residual, standard deviations")
+    ax.set_ylabel("density")
+    ax.set_title(f"Residuals ({outside} beyond {REACH:g}, in the outermost bars)")
+    ax.legend(frameon=False)
+    return ax
+
+
+def parameters(found: FoundParameters, tolerance: Array, ax: Axes | None = None) -> Axes:
+    """Each parameter's change from the drawing in its tolerances (P,), two deviations either way;
+    those that a frame or the file holds are left out.
+    """
+    rows = [k for k, row in enumerate(found) if row.decided_by in ("data", "drawing")]
+    ax = _axes(ax, (6.0, 1.2 + ROW * len(rows)))
+    for place, k in enumerate(rows):
+        row, size = found[k], float(tolerance[k])
+        colour = CALIBRATED if row.decided_by == "data" else DRAWING
+        reach = 2 * row.sigma / size
+        ax.errorbar(row.change / size, place, xerr=reach, fmt="o", ms=3, color=colour, lw=1)
+    ax.axvline(0, color=QUIET, linewidth=0.8)
+    ax.axvspan(-1, 1, color=QUIET, alpha=0.12, linewidth=0)
+    ax.set_yticks(range(len(rows)), [found[k].name for k in rows], fontsize=7)
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    ax.set_xlabel("calibrated less drawing ± 2σ, in tolerances of the drawing")
+    ax.set_title("Parameters: blue by the data, brown by the drawing", fontsize=10)
+    return ax
+
+
+def tool(error: ToolError, ax: Axes | None = None) -> Axes:
+    """The drawing's error and the calibrated machine's standard deviation at each pose, mm."""
+    ax = _axes(ax, (6.0, 3.4))
+    known = np.flatnonzero(np.isfinite(error.position))
+    order = known[np.argsort(error.position[known])]
+    place = np.arange(len(order))
+    for values, colour, name in (
+        (error.off_position, DRAWING, "the drawing's error"),
+        (error.position, CALIBRATED, "calibrated, 1σ"),
+    ):
+        ax.plot(place, values[order] * 1e3, "o", ms=4, color=colour, label=name)
+    ax.set_yscale("log")
+    ax.set_xlabel("pose, by how sure it is")
+    ax.set_ylabel("tool position, mm")
+    for formatted in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+        formatted("{x:g}")
+    ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
+    return ax

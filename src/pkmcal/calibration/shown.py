@@ -1,0 +1,167 @@
+"""A calibration as people look at it in Python: short, as a summary, as tables and plots.
+
+The same for one that was just made and for one read back from its file.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.identify.found import FoundParameters, found_parameters
+from pkmcal.identify.tool import ToolError
+from pkmcal.mechanisms import Machine
+from pkmcal.outcome import Verdict
+from pkmcal.wording import brief, count, number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+NO_TURN = 1e-9
+"""rad; what rounding leaves."""
+
+
+@dataclass(frozen=True)
+class Overview:
+    """What a summary is made of.
+
+    source : the session's name. drawing : (P,) values before. covariance : (P, P). data_share :
+    (P,). poses : (n, 4, 4) of the platform, of the configurations in use. residuals : (n,) of edges
+    and poses, whitened, with weights of half and more. chi2 : per degree of freedom, of the noise
+    as stated; NaN where it is not known. warnings : about the session.
+    """
+
+    source: str
+    method: str
+    machine: Machine
+    verdict: Verdict
+    drawing: Array
+    covariance: Array
+    data_share: Array
+    poses: Array
+    stations: tuple[str, ...]
+    residuals: Array
+    chi2: float
+    warnings: tuple[str, ...]
+
+
+class ShownCalibration:
+    """What a calibration shows of itself."""
+
+    @abstractmethod
+    def overview(self) -> Overview:
+        """What it is made of."""
+
+    @abstractmethod
+    def tool_error(self, T_base_platform: Array) -> ToolError:
+        """How sure poses (n, 4, 4) are."""
+
+    @property
+    def parameters(self) -> FoundParameters:
+        """All parameters: drawing, value, standard deviation, and what decides them. Shows itself
+        as a table; ``to_pandas()`` makes a DataFrame.
+        """
+        told = self.overview()
+        return found_parameters(told.drawing, told.machine, told.covariance, told.data_share)
+
+    def summary(self) -> str:
+        """The verdict and the main figures, some ten lines of text."""
+        told = self.overview()
+        verdict = told.verdict
+        mark = "✓" if verdict.usable else "✗"
+        lines = [self._title(told), f"{mark} {verdict.headline}"]
+        lines += [f"  • {reason}" for reason in verdict.reasons]
+        lines += [f"  {name + ':':12} {text}" for name, text in self._figures(told)]
+        lines += [f"! {text}" for text in (*verdict.warnings, *told.warnings)]
+        lines += [f"→ {text}" for text in verdict.advice]
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        told = self.overview()
+        told_as = "usable" if told.verdict.usable else "not to be used"
+        return f"<{self._title(told)}: {told_as}>"
+
+    def _repr_html_(self) -> str:
+        told = self.overview()
+        verdict = told.verdict
+        rows = "".join(
+            f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>"
+            for name, text in self._figures(told)
+        )
+        said = [*verdict.reasons, *verdict.warnings, *told.warnings, *verdict.advice]
+        points = "".join(f"<li>{escape(text)}</li>" for text in said)
+        mark = "✓" if verdict.usable else "✗"
+        return (
+            f"<p><b>{escape(self._title(told))}</b></p>"
+            f"<p>{mark} {escape(verdict.headline)}</p><table>{rows}</table>"
+            + (f"<ul>{points}</ul>" if points else "")
+        )
+
+    def _title(self, told: Overview) -> str:
+        return (
+            f"Calibration of {told.machine.name} from {told.source or 'a session'}, method"
+            f" {told.method}, {count(len(told.poses), 'configuration')}"
+        )
+
+    def _figures(self, told: Overview) -> list[tuple[str, str]]:
+        """Names and values of the main figures."""
+        out: list[tuple[str, str]] = []
+        tool = self.tool_error(told.poses)
+        for name, place, turn in (
+            ("Tool, σ", tool.position, tool.orientation),
+            ("Drawing off", tool.off_position, tool.off_orientation),
+        ):
+            known = np.isfinite(place)
+            if known.any():
+                angle = float(np.rad2deg(turn[known].mean()))
+                turned = f", {brief(angle)}°" if angle > np.rad2deg(NO_TURN) else ""
+                where = f"{brief(float(place[known].max()) * 1e3)} mm at worst"
+                out.append(
+                    (name, f"{brief(float(place[known].mean()) * 1e3)} mm{turned} ({where})")
+                )
+        kinds = [row.decided_by for row in self.parameters]
+        parts = [f"{kinds.count(k)} by {said}" for k, said in
+                 (("data", "the data"), ("drawing", "the drawing")) if k in kinds]  # fmt: skip
+        held = len(kinds) - kinds.count("data") - kinds.count("drawing")
+        parts += [f"{held} held by frame or file"] if held else []
+        out.append(("Parameters", f"{len(kinds)}: {', '.join(parts)}"))
+        if told.stations:
+            out.append(
+                ("Stations", ", ".join(told.stations[:6]) + ", …" * (len(told.stations) > 6))
+            )
+        if np.isfinite(told.chi2):
+            out.append(("Fit", f"χ² {number(told.chi2, 2)} per degree of freedom, noise as stated"))
+        return out
+
+    # ------------------------------------------------------------------ plots
+
+    def plot_residuals(self, ax: Axes | None = None) -> Axes:
+        """Residuals of all edges and poses in standard deviations, against what noise alone makes.
+
+        ax : axes to draw into; new ones unless given. Needs ``pip install 'pkmcal[plot]'``.
+        """
+        from pkmcal.calibration.plots import residuals
+
+        return residuals(self.overview().residuals, ax)
+
+    def plot_parameters(self, ax: Axes | None = None) -> Axes:
+        """How far each parameter is from its drawing, with two standard deviations, in tolerances
+        of the drawing. ax, needs : as :meth:`plot_residuals`.
+        """
+        from pkmcal.calibration.plots import parameters
+
+        return parameters(self.parameters, self.overview().machine.parameters.tolerance, ax)
+
+    def plot_tool(self, T_base_platform: Array | None = None, ax: Axes | None = None) -> Axes:
+        """The tool's error at poses (n, 4, 4), the photographed ones unless given: the drawing's,
+        and what is uncertain after the calibration. ax, needs : as :meth:`plot_residuals`.
+        """
+        from pkmcal.calibration.plots import tool
+
+        poses = self.overview().poses if T_base_platform is None else T_base_platform
+        return tool(self.tool_error(poses), ax)

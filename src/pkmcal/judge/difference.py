@@ -1,0 +1,380 @@
+"""What differs between two calibrations, two drawings, or one and the other: ``pkmcal diff``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, short_repr
+from pkmcal.calibration.results import SavedCalibration
+from pkmcal.calibration.source import loaded
+from pkmcal.calibration.toolmap import ToolMap, map_of
+from pkmcal.errors import InputError, PkmcalError
+from pkmcal.files import plain
+from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
+from pkmcal.identify.change import MachineChange, machine_change
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.region import AXES, Region
+from pkmcal.outcome import Verdict
+from pkmcal.wording import amount, brief, count, listed, number
+
+FORMAT = 1
+ALPHA = 0.01
+"""Share of unchanged machines that are said to have changed all the same."""
+SAME = 1e-9
+"""m or rad; numbers that differ by less are the same."""
+NAMED = 4
+"""Changes that the verdict names."""
+
+
+@dataclass(frozen=True)
+class ComparedMachine:
+    """One of the two. name : as it was given. saved : None of a drawing."""
+
+    name: str
+    machine: Machine
+    saved: SavedCalibration | None
+
+    @property
+    def covariance(self) -> Array | None:
+        """(P, P) of its parameters; None of a drawing."""
+        return None if self.saved is None else self.saved.covariance
+
+    @property
+    def kind(self) -> str:
+        """What it is, for people."""
+        return "drawing" if self.saved is None else "calibration"
+
+
+@dataclass(frozen=True)
+class MachineDifference:
+    """Everything that differs.
+
+    found : b less a. chance : of a chi-square as large in a machine that did not change; 1 between
+    drawings. chances : (P,) of each parameter's change, their number allowed for; NaN of what has
+    no standard deviation. centres : base and platform, a's laid over b's. tool : what the change
+    does to the tool over the workspace, its ``after``, or why there is no map. shared :
+    configurations that both saw. assumed : sentences.
+    """
+
+    a: ComparedMachine
+    b: ComparedMachine
+    found: MachineChange
+    chance: float
+    chances: Array
+    centres: tuple[Centres, ...]
+    tool: ToolMap | str
+    shared: int
+    assumed: tuple[str, ...]
+    verdict: Verdict
+    changed: bool
+
+    __repr__ = short_repr
+
+    @property
+    def ordered(self) -> list[int]:
+        """Parameters with a change to tell of, the one least like chance first."""
+        size = np.abs(self.found.change)
+        some = np.flatnonzero(size > SAME)
+        if self.found.dof:
+            sigma = np.maximum(self.found.sigma, SAME)
+            size = size / sigma
+        else:
+            size = size / self.a.machine.parameters.tolerance
+        return [int(k) for k in some[np.argsort(-size[some], kind="stable")]]
+
+    @property
+    def significant(self) -> list[int]:
+        """Those that chance does not explain; between drawings, all that differ."""
+        return [k for k in self.ordered if not self.chances[k] >= ALPHA / 2]
+
+    def document(self) -> dict[str, Any]:
+        """Plain data for JSON: m and rad."""
+        table, found = self.a.machine.parameters, self.found
+        before = table.unit_axes(self.a.machine.values)
+        sides = [
+            {
+                "name": side.name,
+                "kind": side.kind,
+                "usable": None if side.saved is None else side.saved.verdict.usable,
+            }
+            for side in (self.a, self.b)
+        ]
+        return plain(
+            {
+                "pkmcal_diff": FORMAT,
+                "verdict": asdict(self.verdict),
+                "changed": self.changed,
+                "a": sides[0],
+                "b": sides[1],
+                "chi2": found.chi2 if found.dof else None,
+                "dof": found.dof,
+                "chance": self.chance if found.dof else None,
+                "parameters": [
+                    {
+                        "name": name,
+                        "unit": table.units[k],
+                        "a": before[k],
+                        "b": before[k] + found.change[k],
+                        "change": found.change[k],
+                        "sigma": found.sigma[k],
+                        "chance": self.chances[k],
+                    }
+                    for k, name in enumerate(table.names)
+                ],
+                "tool": {"why_not": self.tool} if isinstance(self.tool, str) else _tool(self.tool),
+                "shared_configurations": self.shared,
+                "assumed": self.assumed,
+            }
+        )
+
+
+def _tool(found: ToolMap) -> dict[str, Any]:
+    told = found.document()
+    return {
+        "region": told["region"],
+        "poses": told["poses"],
+        "change": told["drawing_off"],
+        "sigma": told["sigma"],
+    }
+
+
+def difference(
+    a: SavedCalibration | Machine | Path | str, b: SavedCalibration | Machine | Path | str
+) -> MachineDifference:
+    """Compare two calibrations, mechanism files or built-in machines; nothing is written.
+
+    Raises InputError where they are not of one machine.
+    """
+    one, other = _compared(a), _compared(b)
+    _check_same_machine(one, other)
+    both = [side.saved for side in (one, other) if side.saved is not None]
+    shared, share = _shared(both)
+    one_drawing = len(both) == 2 and _one_drawing(both)
+    found = machine_change(
+        one.machine,
+        other.machine,
+        (one.covariance, other.covariance),
+        one_drawing=one_drawing,
+        shared=share,
+    )
+    seen = all((saved.document.get("residuals") or {}).get("edges") for saved in both)
+    try:
+        tool: ToolMap | str = map_of(
+            one.machine, found.machine, found.covariance, _region(both), legs_seen=seen
+        )
+    except PkmcalError as error:
+        tool = f"There is no map of the workspace: {error}"
+    chance, chances = _chances(found)
+    least = float(np.nanmin(chances, initial=1.0))
+    held = (found.sigma <= SAME) & (np.abs(found.change) > SAME)
+    changed = bool(chance < ALPHA / 2 or least < ALPHA / 2 or held.any())
+    free = free_of_gauge(found.machine, found.covariance)
+    out = MachineDifference(
+        a=one,
+        b=other,
+        found=found,
+        chance=chance,
+        chances=chances,
+        centres=joint_centres(one.machine, found.machine, free),
+        tool=tool,
+        shared=shared,
+        assumed=_assumed(one, other, one_drawing, shared, share),
+        verdict=Verdict(True, ""),
+        changed=changed,
+    )
+    return _judged(out)
+
+
+def _compared(origin: SavedCalibration | Machine | Path | str) -> ComparedMachine:
+    found = loaded(origin) if isinstance(origin, Path | str) else origin
+    if isinstance(found, SavedCalibration):
+        name = str(origin) if isinstance(origin, Path | str) else str(found.path.parent)
+        return ComparedMachine(name, found.machine, found)
+    return ComparedMachine(
+        str(origin) if isinstance(origin, Path | str) else found.name, found, None
+    )
+
+
+def _check_same_machine(a: ComparedMachine, b: ComparedMachine) -> None:
+    one, other = (side.machine.parameters.names for side in (a, b))
+    if one == other and a.machine.document.motion == b.machine.document.motion:
+        return
+    odd = sorted({*one} ^ {*other})
+    raise InputError(
+        "these are two different machines",
+        where=b.name,
+        found=f"{b.machine.name}, {b.machine.n_legs} legs, {len(other)} parameters"
+        + (f" ({listed(odd, 3)} not in both)" if odd else ""),
+        expected=f"{a.machine.name}, {a.machine.n_legs} legs, {len(one)} parameters, as in"
+        f" {a.name}",
+        next_step="Compare calibrations or drawings of one machine",
+    )
+
+
+def _one_drawing(both: list[SavedCalibration]) -> bool:
+    """Whether two calibrations lean on the same values with the same tolerances."""
+    one, other = both
+    first, second = (saved.machine.parameters.tolerance for saved in both)
+    alike = np.allclose(one.drawing, other.drawing, rtol=0, atol=SAME)
+    return alike and np.allclose(first, second)
+
+
+def _shared(both: list[SavedCalibration]) -> tuple[int, float]:
+    """Configurations that two calibrations used, and their share of the fewer: by their
+    photographs, or, without any, by readings that agree to the last digit.
+    """
+    if len(both) < 2:
+        return 0, 0.0
+    one, other = ([_marks(saved, k) for k in np.flatnonzero(saved.used).tolist()] for saved in both)
+    every = set().union(*other)
+    number_of = sum(bool(marks & every) for marks in one)
+    fewest = min(len(one), len(other))
+    return number_of, min(1.0, number_of / fewest) if fewest else 0.0
+
+
+def _marks(saved: SavedCalibration, k: int) -> set[object]:
+    """What a configuration is known by."""
+    photographs = saved.document["configurations"][k].get("photographs", ())
+    return set(photographs) or {tuple(saved.joints[k].tolist())}
+
+
+def _region(both: list[SavedCalibration]) -> Region | None:
+    """The workspace that the first of them was calibrated for; None for the whole reach."""
+    for saved in both:
+        region = (saved.document.get("tool") or {}).get("region")
+        if region:
+            sides = {k: tuple(region[k]) if region.get(k) else None for k in AXES}
+            return Region(**sides, turn=region.get("turn"))
+    return None
+
+
+def _chances(found: MachineChange) -> tuple[float, Array]:
+    """Of the whole, and (P,) of each parameter, their number allowed for."""
+    from scipy.special import chdtrc, ndtr
+
+    sigma = found.sigma
+    known = sigma > SAME
+    chances = np.full(len(sigma), np.nan)
+    single = 2 * ndtr(-np.abs(found.change[known]) / sigma[known])
+    chances[known] = np.minimum(1.0, single * found.dof)
+    return float(chdtrc(found.dof, found.chi2)) if found.dof else 1.0, chances
+
+
+def _assumed(
+    a: ComparedMachine, b: ComparedMachine, one_drawing: bool, shared: int, share: float
+) -> tuple[str, ...]:
+    """What the standard deviations of the change take for granted."""
+    out = [
+        "The change leads from A to B, told in A's frames, B laid over it where the two differ"
+        " least: by least squares over all free numbers, each in its tolerance."
+    ]
+    drawn = [side for side in (a, b) if side.saved is None]
+    if len(drawn) == 2:
+        return (*out, "Drawings are taken at their word, so any difference is one.")
+    if drawn:
+        return (
+            *out,
+            f"The drawing {drawn[0].name} is taken at its word; the standard deviations are the"
+            " calibration's.",
+            MODEL,
+        )
+    out.append(
+        "Both calibrations lean on the same drawing: where that alone decides, they agree, and its"
+        " error is common to both."
+        if one_drawing
+        else "The calibrations lean on different drawings, whose errors are taken to be"
+        " independent."
+    )
+    out.append(
+        f"{count(shared, 'configuration')} were seen by both, {share:.0%} of those of the one that"
+        " has fewer; their noise is taken to be common to both, and each configuration to tell as"
+        " much as any other."
+        if shared
+        else "They share no configuration, so the noise of one is independent of the other's."
+    )
+    return (*out, MODEL)
+
+
+MODEL = (
+    "What the model leaves out and differs from one day to the next (bending, play, a lens, warmth)"
+    " comes on top of the standard deviations, and counts as a change."
+)
+
+
+def _judged(d: MachineDifference) -> MachineDifference:
+    """With its verdict."""
+    refused = [
+        f"{side.name} was refused when it was made: {' '.join(side.saved.verdict.reasons)}"
+        for side in (d.a, d.b)
+        if side.saved is not None and not side.saved.verdict.usable
+    ]
+    if not np.any(np.abs(d.found.change) > SAME):
+        headline = "The two are the same: no number differs by more than rounding."
+    elif not d.changed:
+        headline = (
+            f"No change beyond what chance explains (χ² {number(d.found.chi2, 0)} for"
+            f" {d.found.dof} degrees of freedom){_of_tool(d)}."
+        )
+    elif d.a.saved and d.b.saved:
+        headline = f"The calibrations differ by more than chance explains{_of_tool(d)}."
+    elif d.found.dof:
+        headline = f"Drawing and calibration differ by more than chance explains{_of_tool(d)}."
+    else:
+        headline = f"The drawings differ{_of_tool(d)}."
+    named = [_named(d, k) for k in d.significant[:NAMED]] if d.changed else []
+    left = len(d.significant) - len(named)
+    if named and left > 0:
+        named.append(f"{count(left, 'more number')}.")
+    if d.changed and not named:
+        named.append(
+            f"No number by itself, but all together: χ² {number(d.found.chi2, 0)} for"
+            f" {d.found.dof} degrees of freedom."
+        )
+    advice: tuple[str, ...] = ()
+    if d.changed and d.a.saved and d.b.saved:
+        advice = (
+            "If nothing was done to the machine in between, something that the model leaves out"
+            " differs between the two: see pkmcal validate of each on the other's session.",
+        )
+    verdict = Verdict(not d.changed and not refused, headline, (*refused, *named), advice=advice)
+    return replace(d, verdict=verdict)
+
+
+def _of_tool(d: MachineDifference) -> str:
+    """What it does to the tool, as the end of a sentence."""
+    if isinstance(d.tool, str):
+        return ""
+    even = slice(0, d.tool.spread)
+    off, sigma = d.tool.after.off_position[even], d.tool.after.position[even]
+    off, sigma = off[np.isfinite(off)], sigma[np.isfinite(sigma)]
+    if not off.size:
+        return ""
+    one_sigma = brief(float(np.median(sigma)) * 1e3)
+    by_chance = f"; chance alone makes {one_sigma} mm (1σ)" if d.found.dof else ""
+    return (
+        f": the tool differs by {brief(float(np.median(off)) * 1e3)} mm over {d.tool.region}"
+        f" (median), {brief(float(off.max()) * 1e3)} mm at worst{by_chance}"
+    )
+
+
+def _named(d: MachineDifference, k: int) -> str:
+    """A parameter's change in a sentence."""
+    table = d.a.machine.parameters
+    words = table.in_words(table.names[k])
+    return f"{words[0].upper()}{words[1:]} by {change_text(d, k)}."
+
+
+def change_text(d: MachineDifference, k: int) -> str:
+    """``+0.54 mm (±0.07 mm)``, or the bare number of what has no unit."""
+    unit = d.a.machine.parameters.units[k]
+    value, sigma = float(d.found.change[k]), float(d.found.sigma[k])
+    sign = "+" if value >= 0 else "−"
+    if unit in ("m", "rad"):
+        text = f"{sign}{amount(abs(value), unit)}"
+        return f"{text} (±{amount(sigma, unit)})" if sigma > SAME else text
+    text = f"{sign}{abs(value):.2g}"
+    return f"{text} (±{sigma:.2g})" if sigma > SAME else text

@@ -1,0 +1,268 @@
+"""What differs between two machines, as an outcome: tables, and pictures of joints and tool."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.toolmap import ToolMap
+from pkmcal.judge.difference import MachineDifference
+from pkmcal.outcome import AXIS, LOOKS, Figure, Level, Outcome, Part, Plot, Row, Table
+from pkmcal.report.scene import markers, space_layout
+from pkmcal.report.watch import chance_text
+from pkmcal.report.workspace import COLOURS
+from pkmcal.wording import SCALES, brief, count, decimals, number
+
+NONE = "–"
+NO_TURN = 1e-9
+"""rad; what rounding leaves."""
+BRIEF = 8
+"""Changes that a terminal shows."""
+
+
+def outcome_of(d: MachineDifference) -> Outcome:
+    """Everything that ``pkmcal diff`` tells and writes."""
+    tool = () if isinstance(d.tool, str) else (_space(d.tool),)
+    said = (d.tool,) if isinstance(d.tool, str) else ()
+    parts = (
+        Part("tool", "What it does to the tool", said, plots=tool, tables=_tool_tables(d)),
+        Part(
+            "joints",
+            "Joints and legs",
+            plots=(_joints(d),),
+            tables=(_legs(d),),
+        ),
+        Part("parameters", "All numbers", tables=_parameters(d)),
+        Part("how", "How they were compared", d.assumed),
+    )
+    refused = any(side.saved and not side.saved.verdict.usable for side in (d.a, d.b))
+    return Outcome(
+        command="diff",
+        title=f"Difference of two {d.a.machine.name}",
+        kicker=f"{d.a.name} → {d.b.name}",
+        subject=f"A: {d.a.name}, a {d.a.kind}; B: {d.b.name}, a {d.b.kind}",
+        verdict=d.verdict,
+        stamp="Changed" if d.changed else "Cannot be told" if refused else "No change",
+        level=Level.WRONG if d.changed else Level.DOUBTFUL,
+        figures=_cards(d),
+        parts=parts,
+        document=d.document(),
+    )
+
+
+def _cards(d: MachineDifference) -> tuple[Figure, ...]:
+    """The main numbers."""
+    out: list[Figure] = []
+    if not isinstance(d.tool, str):
+        off, sigma = _even(d.tool)
+        if off.size:
+            one_sigma = brief(float(np.median(sigma)))
+            spread = f"; chance alone makes {one_sigma} mm" if d.found.dof else ""
+            out.append(
+                Figure(
+                    "How much does the tool differ?",
+                    ((brief(float(np.median(off))), "mm"),),
+                    f"median over {d.tool.region}; at worst {brief(float(off.max()))} mm{spread}",
+                )
+            )
+    moved = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in d.centres]) * 1e3
+    out.append(
+        Figure(
+            "How far did the joints move?",
+            ((brief(float(moved.mean())), "mm"),),
+            f"mean distance of {count(len(moved), 'joint centre')}, largest"
+            f" {brief(float(moved.max()))} mm",
+        )
+    )
+    if d.found.dof:
+        out.append(
+            Figure(
+                "How likely by chance alone?",
+                ((chance_text(d.chance), ""),),
+                f"χ² {number(d.found.chi2, 1)} for {count(d.found.dof, 'degree')} of freedom",
+            )
+        )
+    return tuple(out)
+
+
+def _even(found: ToolMap) -> tuple[Array, Array]:
+    """Changes and standard deviations of the tool at the evenly spread poses, mm."""
+    even = slice(0, found.spread)
+    known = np.isfinite(found.after.off_position[even])
+    return (
+        found.after.off_position[even][known] * 1e3,
+        found.after.position[even][known] * 1e3,
+    )
+
+
+def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
+    """Medians and largest of the tool's change."""
+    if isinstance(d.tool, str):
+        return ()
+    even, after = slice(0, d.tool.spread), d.tool.after
+    kinds = [("Position, mm", after.off_position[even] * 1e3, after.position[even] * 1e3)]
+    turn = np.rad2deg(after.off_orientation[even])
+    if np.nanmax(turn, initial=0.0) > np.rad2deg(NO_TURN):
+        kinds.append(("Turn, °", turn, np.rad2deg(after.orientation[even])))
+    rows: list[Row] = []
+    for name, off, sigma in kinds:
+        known = np.isfinite(off)
+        if known.any():
+            by_chance = brief(float(np.median(sigma[known]))) if d.found.dof else NONE
+            middle, worst = float(np.median(off[known])), float(off[known].max())
+            rows.append(Row(name, (brief(middle), brief(worst), by_chance)))
+    columns = ("At the same readings", "median", "worst", "by chance, 1σ")
+    note = (
+        f"At {count(d.tool.spread, 'pose')} spread evenly over {d.tool.region}: the platform's pose"
+        " by B less that by A at the same readings, frames laid over each other."
+    )
+    return (Table("How far the tool differs", columns, tuple(rows), note),)
+
+
+def _legs(d: MachineDifference) -> Table:
+    """How far each leg's joints moved."""
+    rows: list[Row] = []
+    sides = [(np.linalg.norm(x.change, axis=-1) * 1e3, x.sigma * 1e3) for x in d.centres]
+    by_chance = bool(d.found.dof)
+    for leg in range(d.a.machine.n_legs):
+        cells = tuple(
+            brief(float(moved[leg])) + (f" (±{brief(float(sigma[leg]))})" if by_chance else "")
+            for moved, sigma in sides
+        )
+        rows.append(Row(f"Leg {leg + 1}", cells))
+    brackets = "; in brackets the standard deviation of a coordinate by chance" if by_chance else ""
+    return Table(
+        "Joint centres",
+        ("Leg", "base joint, mm", "platform joint, mm"),
+        tuple(rows),
+        f"Distances after both machines' joints were laid over each other{brackets}.",
+        brief=False,
+    )
+
+
+def _parameters(d: MachineDifference) -> tuple[Table, ...]:
+    """What changed beyond chance, for a terminal too, and all numbers."""
+    columns = ("Parameter", "A", "B", "change", "1σ", "chance")
+    out: list[Table] = []
+    if d.significant:
+        rows = tuple(_row(d, k) for k in d.significant)
+        more = len(rows) - BRIEF
+        legend = (f"and {count(more, 'more number')}",) if more > 0 else ()
+        out.append(Table("What changed", columns, rows[:BRIEF], legend=legend))
+    names = range(len(d.a.machine.parameters))
+    note = (
+        "1σ: of the change by chance. Chance: of as large a change of this number in a machine that"
+        " did not change, the number of numbers allowed for."
+        if d.found.dof
+        else ""
+    )
+    every = tuple(_row(d, k) for k in names)
+    out.append(Table("All numbers", columns, every, note, brief=False, folded=True))
+    return tuple(out)
+
+
+def _row(d: MachineDifference, k: int) -> Row:
+    table = d.a.machine.parameters
+    factor, unit = SCALES.get(table.units[k], (1.0, ""))
+    value = float(table.unit_axes(d.a.machine.values)[k]) * factor
+    change, sigma = float(d.found.change[k]) * factor, float(d.found.sigma[k]) * factor
+    size = sigma if sigma > 0 else abs(change)
+    places = decimals(size) if size > 0 else 3
+    name = table.in_words(table.names[k])
+    chance = chance_text(float(d.chances[k]))
+    return Row(
+        f"{name}, {unit}" if unit else name,
+        (
+            number(value, places),
+            number(value + change, places),
+            number(change, places, signed=True),
+            brief(sigma) if sigma > 0 else NONE,
+            chance,
+        ),
+        mark=Level.DOUBTFUL if k in d.significant else None,
+    )
+
+
+# ------------------------------------------------------------------ pictures
+
+
+def _joints(d: MachineDifference) -> Plot:
+    """How far each joint moved, with the deviation of that by chance."""
+    legs = [f"leg {leg + 1}" for leg in range(d.a.machine.n_legs)]
+    data: list[dict[str, Any]] = []
+    for side, colour in zip(d.centres, ("--drawing", "--calibrated"), strict=True):
+        moved = np.linalg.norm(side.change, axis=-1) * 1e3
+        data.append(
+            {
+                "type": "bar",
+                "name": f"{side.side} joint",
+                "x": legs,
+                "y": np.round(moved, 5).tolist(),
+                "marker": {"color": colour},
+                "error_y": {
+                    "type": "data",
+                    "array": np.round(side.sigma * 1e3, 5).tolist(),
+                    "visible": bool(d.found.dof),
+                    "color": "--ink",
+                    "thickness": 1,
+                },
+                "hovertemplate": "%{x}, %{data.name}: %{y:.3g} mm<extra></extra>",
+            }
+        )
+    layout = {
+        **LOOKS,
+        "barmode": "group",
+        "margin": {"l": 56, "r": 12, "t": 10, "b": 36},
+        "xaxis": {**AXIS},
+        "yaxis": {**AXIS, "title": {"text": "moved, mm"}, "rangemode": "tozero"},
+        "legend": {"orientation": "h", "y": 1.08},
+    }
+    return Plot(
+        "joints",
+        "How far each joint moved",
+        "Bars with lines: the standard deviation by chance."
+        if d.found.dof
+        else "Joints of both drawings laid over each other.",
+        "Bars of how far each leg's base joint and platform joint moved, in millimetres; the table"
+        " below has the numbers.",
+        {"data": data, "layout": layout, "config": {}},
+        height=320,
+    )
+
+
+def _space(found: ToolMap) -> Plot:
+    """The evenly spread poses, coloured by how far the tool moved there."""
+    even = slice(0, found.spread)
+    known = np.flatnonzero(np.isfinite(found.after.off_position[even]))
+    off = found.after.off_position[known] * 1e3
+    sigma = found.after.position[known] * 1e3
+    look = {
+        "size": 4,
+        "color": [float(f"{x:.3g}") for x in off.tolist()],
+        "colorscale": COLOURS,
+        "showscale": True,
+        "colorbar": {
+            "title": {"text": "mm", "side": "top"}, "thickness": 12, "outlinewidth": 0, "len": 0.8,
+        },
+    }  # fmt: skip
+    told = [[float(f"{a:.3g}"), float(f"{b:.3g}")] for a, b in zip(off, sigma, strict=True)]
+    points = markers(
+        "tool",
+        found.after.T_base_platform[known, :3, 3],
+        look,
+        customdata=told,
+        hovertemplate="x: %{x:.3g}<br>y: %{y:.3g}<br>z: %{z:.3g}<br>differs by %{customdata[0]:.3g}"
+        " mm<br>σ %{customdata[1]:.3g} mm<extra></extra>",
+    )
+    layout = space_layout({"x": 1.45, "y": -1.45, "z": 0.8})
+    layout["showlegend"] = False
+    return Plot(
+        "reach",
+        "Where the tool differs",
+        "The tool's place at the same readings, by the second less by the first. Drag to turn.",
+        "Points of the workspace in three dimensions, coloured by how far the tool differs.",
+        {"data": [points], "layout": layout, "config": {"scrollZoom": True}},
+        height=420,
+    )

@@ -1,0 +1,285 @@
+"""What differs between two machines: the spread by chance, its frames, the tool, the command."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.calibration.results import load
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import perturb
+from pkmcal.identify.change import machine_change
+from pkmcal.identify.gauge import moved_centres
+from pkmcal.judge.difference import difference
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.report.difference import outcome_of
+from pkmcal.report.page import page_html
+from test_bundle import estimate
+from test_identify_scene import make_scene
+
+# ------------------------------------------------------------------ what chance does
+
+PAIRS = 24
+
+
+def of_configurations(measurements, keep):
+    chosen = np.isin(measurements.edges.configuration, keep)
+    return replace(measurements, edges=measurements.edges.select(chosen))
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """Pairs of estimates of machines that did not change, by what of their data is common."""
+    out = {"new data": [], "half of the data": [], "all data of the smaller": []}
+    for seed in range(PAIRS):
+        rng = np.random.default_rng(seed)
+        scene = make_scene(rng)
+        one, other = scene.measurements(rng), scene.measurements(rng)
+        k = len(one.joints)
+        a = estimate(scene, one, rng)
+        out["new data"].append((a, estimate(scene, other, rng), 0.0))
+        first, last = (
+            estimate(scene, of_configurations(one, keep), rng)
+            for keep in (np.arange(2 * k // 3), np.arange(k // 3, k))
+        )
+        out["half of the data"].append((first, last, 0.5))
+        few = estimate(scene, of_configurations(one, np.arange(k // 2)), rng)
+        out["all data of the smaller"].append((few, a, 1.0))
+    return out
+
+
+def changes(pairs):
+    return [
+        machine_change(a.machine, b.machine, (a.covariance, b.covariance), shared=shared)
+        for a, b, shared in pairs
+    ]
+
+
+@pytest.mark.parametrize("kind", ["new data", "half of the data", "all data of the smaller"])
+def test_the_stated_spread_is_that_of_unchanged_machines(pairs, kind):
+    """Of 24 pairs with 47 degrees of freedom chi-square over those has a deviation of 0.042."""
+    found = changes(pairs[kind])
+    dof = sum(c.dof for c in found)
+    assert sum(c.chi2 for c in found) / dof == pytest.approx(1, abs=0.2)
+    z = np.concatenate([(c.change / np.maximum(c.sigma, 1e-12))[c.sigma > 1e-9] for c in found])
+    assert np.mean(np.abs(z) < 1.96) == pytest.approx(0.95, abs=0.03)
+
+
+def test_common_data_make_a_smaller_spread_and_that_is_needed(pairs):
+    """As if independent, estimates that share data would agree too well."""
+    kind = pairs["half of the data"]
+    alone = [machine_change(a.machine, b.machine, (a.covariance, b.covariance)) for a, b, _ in kind]
+    ratio = sum(c.chi2 for c in alone) / sum(c.dof for c in alone)
+    assert ratio < 0.75
+    assert np.all(alone[0].sigma >= changes(kind)[0].sigma - 1e-12)
+
+
+def test_a_result_beside_itself(pairs):
+    a = pairs["new data"][0][0]
+    found = machine_change(a.machine, a.machine, (a.covariance, a.covariance), shared=1.0)
+    assert np.abs(found.change).max() < 1e-12
+    assert found.chi2 < 1e-6
+
+
+def test_frames_make_no_difference(pairs):
+    a, b, _ = pairs["new data"][1]
+    rng = np.random.default_rng(0)
+    e, f = (perturb(np.eye(4), rng.normal(size=6) * 0.05) for _ in range(2))
+    theta = moved_centres(b.machine.layout, b.machine.values, e, f)
+    moved = b.machine.with_values(theta)
+    same = machine_change(a.machine, a.machine.with_values(
+        moved_centres(a.machine.layout, a.machine.values, e, f)), (None, None))  # fmt: skip
+    assert np.abs(same.change).max() < 1e-9
+    one = machine_change(a.machine, b.machine, (None, None)).change
+    two = machine_change(a.machine, moved, (None, None)).change
+    assert np.allclose(one, two, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "times"), [("legs[3].length.offset", 7.0), ("legs[5].platform.center.z", 14.0)]
+)
+def test_what_changed_is_found_where_it_changed(pairs, name, times):
+    """By seven standard deviations, of which chance may take two; of the height of one of six
+    joints a frame takes half, as a plane fitted to six points does.
+    """
+    hits = 0
+    for a, b, _ in pairs["new data"]:
+        k = a.machine.parameters.index(name)
+        quiet = machine_change(a.machine, b.machine, (a.covariance, b.covariance))
+        values = b.machine.values.copy()
+        values[k] += times * quiet.sigma[k]
+        found = machine_change(a.machine, b.machine.with_values(values), (a.covariance,
+                               b.covariance))  # fmt: skip
+        z = np.abs(found.change) / np.maximum(found.sigma, 1e-9)
+        hits += z[k] > 3.5
+        assert found.chi2 > quiet.chi2
+    assert hits >= PAIRS - 2
+
+
+def test_a_drawing_is_taken_at_its_word(pairs):
+    a = pairs["new data"][0][0]
+    drawing = a.machine.with_values(a.machine.parameters.drawing)
+    found = machine_change(drawing, a.machine, (None, a.covariance))
+    assert found.dof > 40
+    assert found.chi2 > 10 * found.dof  # it was built two millimetres off
+    both = machine_change(drawing, a.machine, (None, None))
+    assert both.dof == 0
+    assert not both.sigma.any()
+    assert np.allclose(both.change, found.change)
+
+
+# ------------------------------------------------------------------ calibrations
+
+
+@pytest.fixture
+def saved(demo):
+    return load(demo.calibration)
+
+
+def changed(saved, name, by):
+    values = saved.machine.values.copy()
+    values[saved.machine.parameters.index(name)] += by
+    return replace(saved, machine=saved.machine.with_values(values))
+
+
+def test_after_a_crash(saved):
+    """The same deviations, another zero of leg 3, and photographs of its own."""
+    k = saved.machine.parameters.index("legs[3].length.offset")
+    after = changed(saved, "legs[3].length.offset", 8e-3)
+    document = json.loads(json.dumps(saved.document))
+    for entry in document["configurations"]:
+        entry["photographs"] = [f"new {digest}" for digest in entry["photographs"]]
+    found = difference(saved, replace(after, document=document))
+    assert found.changed
+    assert found.shared == 0
+    assert found.ordered[0] == k
+    assert found.found.change[k] == pytest.approx(8e-3, rel=0.35)
+    assert found.verdict.headline.startswith("The calibrations differ by more than chance")
+    assert found.verdict.reasons[0].startswith("Leg 3 ")
+    # what leg 3's zero does to the tool, at the same readings
+    table = found.tool.after
+    even = slice(0, found.tool.spread)
+    poses = table.T_base_platform[even]
+    readings = after.machine.inverse(poses)
+    away = saved.machine.forward_result(readings, poses).T_base_platform
+    moved = np.linalg.norm(away[:, :3, 3] - poses[:, :3, 3], axis=1)
+    ratio = np.nanmedian(table.off_position[even]) / np.nanmedian(moved)
+    assert 0.2 < ratio < 1.2  # less, for frames take a part of it
+
+
+def test_shared_photographs_are_counted(saved):
+    found = difference(saved, saved)
+    assert not found.changed
+    assert found.shared == int(saved.used.sum())
+    assert found.verdict.headline == (
+        "The two are the same: no number differs by more than rounding."
+    )
+    assert any("100% of those" in text for text in found.assumed)
+
+
+def test_a_refused_calibration_is_no_base_for_a_comparison(saved):
+    refused = replace(saved, verdict=replace(saved.verdict, usable=False, reasons=("No light.",)))
+    found = difference(saved, refused)
+    assert not found.changed
+    assert not found.verdict.usable
+    assert "was refused when it was made: No light." in found.verdict.reasons[0]
+    assert outcome_of(found).exit_code == 1
+
+
+def test_another_machine_is_refused(saved):
+    with pytest.raises(InputError, match=r"two different machines; found delta.*Compare"):
+        difference(saved, "delta")
+
+
+def test_two_drawings():
+    drawing = load_mechanism("gough-stewart")
+    values = drawing.values.copy()
+    k = drawing.parameters.index("legs[2].length.offset")
+    values[k] += 1e-3
+    found = difference(drawing, drawing.with_values(values))
+    assert found.changed
+    assert found.found.dof == 0
+    assert found.ordered[0] == k
+    assert found.verdict.headline.startswith("The drawings differ: the tool differs by ")
+    assert np.isnan(found.chances).all()
+    told = found.document()
+    assert told["chi2"] is None
+    assert told["parameters"][k]["change"] == pytest.approx(1e-3, rel=0.2)
+
+
+def test_a_fixed_number_that_differs_is_told():
+    """It has no deviation, and no frame can take it up."""
+    drawing = load_mechanism("gough-stewart")
+    name = "legs[2].length.offset"
+    held = replace(drawing, parameters=drawing.parameters.with_roles(fixed=(name,)))
+    k = drawing.parameters.index(name)
+    values = held.values.copy()
+    values[k] += 1e-4
+    found = difference(held, held.with_values(values))
+    assert found.found.change[k] == pytest.approx(1e-4)
+    assert found.changed
+
+
+# ------------------------------------------------------------------ command
+
+
+def test_the_command(demo, tmp_path):
+    out = tmp_path / "d"
+    done = run("diff", demo.calibration, demo.calibration, "-o", out)
+    assert done.code == 0
+    assert "✓ The two are the same" in done.out
+    assert {path.name for path in out.iterdir()} == {"diff.html", "diff.json"}
+    done = run("diff", demo.calibration, "gough-stewart", "-o", out, "--json")
+    told = done.json
+    assert (done.code, told["exit_code"]) == (1, 1)
+    assert (told["a"]["kind"], told["b"]["kind"]) == ("calibration", "drawing")
+    assert told["changed"] is True
+    assert told["chance"] < 1e-6
+    assert told["tool"]["change"]["position"]["median"] > 1e-3
+    assert told["shared_configurations"] == 0
+    page = (out / "diff.html").read_text()
+    assert "How far each joint moved" in page
+    done = run("diff", demo.calibration, "gough-stewart", "-o", out)
+    assert "✗ Drawing and calibration differ by more than chance explains: the tool" in done.out
+    assert "What changed" in done.out
+    assert max(map(len, done.out.splitlines())) <= 80 + len(str(out))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("gough-stewart", "h5"), "there is no such calibration and no such machine"),
+        (("gough-stewart", "delta"), "delta: these are two different machines"),
+        (("gough-stewart", "."), "there is no calibration here"),
+    ],
+)
+def test_what_cannot_be_compared(words, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = run("diff", *words)
+    assert done.code == 2
+    assert said in done.err
+    assert not (tmp_path / "diff").exists()
+
+
+def test_a_folder_with_other_things_is_left_alone(demo, tmp_path):
+    shutil.copytree(demo.calibration, tmp_path / "a")
+    done = run("diff", tmp_path / "a", tmp_path / "a", "-o", tmp_path / "a")
+    assert done.code == 2
+    assert "something other than a difference" in done.err
+
+
+def test_a_machine_without_a_map_is_compared_all_the_same(monkeypatch):
+    def refuse(*_, **__):
+        raise InputError("nothing can be reached")
+
+    monkeypatch.setattr("pkmcal.judge.difference.map_of", refuse)
+    found = difference("h4", "h4")
+    outcome = outcome_of(found)
+    assert "There is no map of the workspace: " in outcome.parts[0].text[0]
+    assert found.document()["tool"]["why_not"]
+    assert "There is no map" in page_html(outcome)

@@ -1,0 +1,299 @@
+"""pkmcal as people use it in Python: what shows itself, tables, plots, results saved and loaded."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import subprocess
+import sys
+from dataclasses import is_dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pkmcal
+from pkmcal.arrays import short_repr
+from pkmcal.calibration import plots
+from pkmcal.errors import InputError
+from pkmcal.identify.tool import ToolError
+
+ROOT = Path(__file__).parents[1]
+LONGEST = 500
+"""Characters of a repr; that of a table of parameters has twelve lines."""
+
+
+@pytest.fixture(scope="module")
+def result(demo) -> pkmcal.api.calibrate.CalibrationResult:
+    return pkmcal.calibrate(demo.session)
+
+
+@pytest.fixture(scope="module")
+def loaded(result, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results") / "out"
+    assert result.save(folder) is None
+    return pkmcal.load_result(folder)
+
+
+# what is reachable
+
+
+def test_everything_named_is_there_and_nothing_heavy_before_it_is_used():
+    assert set(pkmcal.__all__) >= {
+        "calibrate", "load_result", "load_session", "load_mechanism", "simulate", "plan", "study",
+    }  # fmt: skip
+    for name in pkmcal.__all__:
+        assert getattr(pkmcal, name) is not None
+    code = (
+        "import sys, pkmcal; dir(pkmcal);"
+        "print([m for m in ('numpy', 'cv2', 'scipy', 'matplotlib', 'pandas') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("name", ["calibrate", "load_result", "simulate", "plan"])
+def test_help_names_every_argument_with_its_type(name):
+    function = getattr(pkmcal, name)
+    text = inspect.getdoc(function)
+    for argument in inspect.signature(function).parameters.values():
+        assert argument.name in text
+        assert argument.annotation is not inspect.Parameter.empty
+    if name == "calibrate":
+        assert "'bundle', 'four-step'" in str(inspect.signature(function)).replace('"', "'")
+
+
+# what shows itself
+
+
+def objects_of(value, name, depth, seen):
+    """pkmcal's objects that a person comes across behind a name."""
+    yield name, value
+    for attribute in dir(value):
+        if depth and not attribute.startswith("_") and is_dataclass(value):
+            other = getattr(value, attribute)
+            inside = type(other).__module__.startswith("pkmcal") and not callable(other)
+            if inside and type(other) not in seen:
+                seen.add(type(other))
+                yield from objects_of(other, f"{name}.{attribute}", depth - 1, seen)
+
+
+def test_reprs_are_short(result, loaded):
+    tool = result.tool_error(result.estimate.state.T_base_platform)
+    plan = pkmcal.plan(result.session, count=3)
+    seen = set()
+    for name, value in {
+        "result": result, "loaded": loaded, "session": result.session, "machine": result.machine,
+        "camera": result.session.stations[0].camera, "tool": tool, "plan": plan,
+    }.items():  # fmt: skip
+        for path, found in objects_of(value, name, 3, seen):
+            most = 1200 if path.endswith(".parameters") else LONGEST
+            assert len(repr(found)) <= most, path
+    assert len(seen) > 20
+    assert repr(result.machine) == (
+        "<Machine gough-stewart: spatial, 6 legs, 6 readings, 60 parameters>"
+    )
+    camera = repr(result.session.stations[0].camera)
+    assert camera.startswith("<Pinhole 480 × 360: focal.x 423, focal.y 423.6, center.x 241.")
+    assert repr(result.session).startswith("<Session session: gough-stewart, ")
+    assert repr(result).startswith("<Calibration of gough-stewart from session, method bundle, ")
+    assert repr(result).endswith(": usable>")
+    count = len(tool.position)
+    assert repr(tool).startswith(f"ToolError(T_base_platform=<{count} × 4 × 4>, by_parameters=<")
+
+
+def test_short_reprs_of_all_kinds_of_values():
+    tool = ToolError(np.zeros((2, 4, 4)), np.array(1.0), ["a"] * 30, {"a": np.zeros(3)})
+    assert repr(tool) == short_repr(tool)
+    assert repr(tool) == (
+        "ToolError(T_base_platform=<2 × 4 × 4>, by_parameters=<one number>, parameters=<list of"
+        " 30>, off={'a': array([0., 0., 0.])})"
+    )
+
+
+def test_a_summary_has_verdict_and_figures(result, loaded):
+    text = result.summary()
+    first, second, *rest = text.splitlines()
+    assert first.startswith("Calibration of gough-stewart from session, method bundle")
+    assert second == f"✓ {result.verdict.headline}"
+    assert [line.split(":")[0].strip() for line in rest[:5]] == [
+        "Tool, σ", "Drawing off", "Parameters", "Stations", "Fit",
+    ]  # fmt: skip
+    tool = result.tool_error(result.estimate.state.T_base_platform[result.estimate.configurations])
+    assert f"{tool.position.mean() * 1e3:.2g} mm" in rest[0]
+    assert loaded.summary() == text
+    assert repr(loaded) == repr(result)
+
+
+def test_what_a_notebook_shows_is_escaped(loaded):
+    from dataclasses import replace
+
+    odd = replace(
+        loaded,
+        method="<script>",
+        verdict=replace(loaded.verdict, warnings=("a < b & c",), usable=False),
+    )
+    html = odd._repr_html_()
+    assert "&lt;script&gt;" in html
+    assert "<li>a &lt; b &amp; c</li>" in html
+    assert "<script" not in html
+    assert "not to be used" in repr(odd)
+    assert odd.parameters._repr_html_().count("<tr>") == 1 + len(odd.parameters)
+
+
+# parameters
+
+
+def test_parameters_are_a_table(result, loaded):
+    found = result.parameters
+    table = result.machine.parameters
+    assert [row.name for row in found] == list(table.names)
+    assert np.array_equal([row.value for row in found], result.machine.values)
+    assert np.array_equal([row.drawing for row in found], result.session.machine.values)
+    variance = np.diag(result.estimate.covariance)
+    assert np.allclose([row.sigma**2 for row in found], variance, atol=1e-30)
+    row = found["legs[2].base.center.x"]
+    assert row == found[table.index("legs[2].base.center.x")]
+    assert row.change == row.value - row.drawing
+    assert [r.value for r in loaded.parameters] == [r.value for r in found]
+    assert [r.decided_by for r in loaded.parameters] == [r.decided_by for r in found]
+    with pytest.raises(InputError, match=r"such as 'legs\[2\].base.center.x'"):
+        found["legs[2].base.centre.x"]
+
+
+def test_a_table_is_short_as_a_repr_and_whole_when_printed(result):
+    lines = repr(result.parameters).splitlines()
+    assert lines[0].split() == ["parameter", "drawing", "calibrated", "sigma", "unit", "decided",
+                                "by"]  # fmt: skip
+    assert lines[-1] == f"… and {len(result.parameters) - 12} more; print() shows all"
+    whole = str(result.parameters).splitlines()
+    assert len(whole) == 1 + len(result.parameters)
+    assert repr(result.parameters[:3]).splitlines() == str(result.parameters[:3]).splitlines()
+
+
+def test_parameters_as_a_data_frame(result):
+    pytest.importorskip("pandas")
+    frame = result.parameters.to_pandas()
+    assert list(frame.columns) == [
+        "unit", "drawing", "value", "change", "sigma", "data_share", "decided_by",
+    ]  # fmt: skip
+    assert frame.loc["legs[2].base.center.x", "value"] == (
+        result.parameters["legs[2].base.center.x"].value
+    )
+    assert len(frame) == len(result.parameters)
+
+
+@pytest.mark.parametrize(
+    ("missing", "ask", "said"),
+    [
+        ("pandas", lambda r: r.parameters.to_pandas(), "pip install pandas"),
+        ("matplotlib", lambda r: r.plot_tool(), r"pip install 'pkmcal\[plot\]'"),
+    ],
+)
+def test_what_is_not_installed_is_told(loaded, monkeypatch, missing, ask, said):
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(InputError, match=f"needs? {missing}.*{said}"):
+        ask(loaded)
+
+
+# plots
+
+
+@pytest.fixture
+def axes(monkeypatch):
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    yield pyplot.subplots()[1]
+    pyplot.close("all")
+
+
+def test_plots_show_the_numbers(result, loaded, axes):
+    assert result.plot_tool(ax=axes) is axes
+    drawing, calibrated = (np.asarray(line.get_ydata()) for line in axes.get_lines())
+    poses = result.estimate.state.T_base_platform[result.estimate.configurations]
+    tool = result.tool_error(poses)
+    assert np.allclose(np.sort(calibrated), np.sort(tool.position) * 1e3)
+    assert np.allclose(np.sort(drawing), np.sort(tool.off_position) * 1e3)
+    for one in (result, loaded):
+        ax = one.plot_parameters()
+        free = [r for r in one.parameters if r.decided_by in ("data", "drawing")]
+        assert [t.get_text() for t in ax.get_yticklabels()] == [r.name for r in free]
+        ax = one.plot_residuals()
+        area = sum(bar.get_height() * bar.get_width() for bar in ax.patches)
+        assert area == pytest.approx(1)
+        assert f"{one.overview().residuals.size} residuals" in ax.get_legend_handles_labels()[1]
+    few = result.plot_tool(poses[:2]).get_lines()[0].get_ydata()
+    assert len(few) == 2
+
+
+def test_residuals_of_a_file_are_those_of_the_result(result, loaded):
+    ours, theirs = result.overview().residuals, loaded.overview().residuals
+    assert ours.size == theirs.size > 100
+    assert np.allclose(np.sort(ours), np.sort(theirs), atol=1e-3)  # rounded in the file
+
+
+def test_nothing_seen_is_no_plot_of_nothing(axes):
+    assert "no edges" in plots.residuals(np.zeros(0), axes).get_title()
+
+
+# functions
+
+
+def test_a_result_is_saved_as_the_command_saves_it(result, demo, tmp_path):
+    result.save(tmp_path / "out")
+    one, two = (
+        json.loads((folder / "calibration.json").read_text())
+        for folder in (tmp_path / "out", demo.calibration)
+    )
+    assert one.pop("timings") != two.pop("timings")
+    assert one == two
+    assert (tmp_path / "out" / "report.html").stat().st_size > 100_000
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"method": "bundel"}, "method: there is no method of this name; found 'bundel', expected"
+                               " bundle."),
+        ({"method": "best"}, "expected bundle, four-step, linear and inverse-kinematic."),
+        ({"method": None}, "found nothing, expected bundle, four-step"),
+        ({"seed": -1}, "seed: this number is negative; found -1, expected 0 or more."),
+        ({"holdout": -2}, "holdout: this number is negative"),
+    ],
+)  # fmt: skip
+def test_an_option_that_cannot_be_is_refused_before_any_work(options, said):
+    with pytest.raises(InputError) as caught:
+        pkmcal.calibrate("nowhere", **options)
+    assert said in str(caught.value)
+
+
+def test_a_session_is_simulated(tmp_path):
+    session = pkmcal.simulate(
+        tmp_path / "s", "delta", stations=1, configurations=2, seed=3,
+    )  # fmt: skip
+    assert session.machine.name == "delta"
+    assert len(session.configurations) == 2
+    assert (tmp_path / "s" / "truth.json").is_file()
+    with pytest.raises(
+        InputError, match="no setting of a simulation; found station, expected stat"
+    ):
+        pkmcal.simulate(tmp_path / "t", station=1)
+    with pytest.raises(InputError, match="is not empty"):
+        pkmcal.simulate(tmp_path / "s")
+    with pytest.raises(InputError, match="no built-in machine"):
+        pkmcal.simulate(tmp_path / "t", "nothing")
+    assert not (tmp_path / "t").exists()
+
+
+def test_configurations_are_planned(demo, result):
+    of_session = pkmcal.plan(demo.session, count=3)
+    assert of_session.joints.shape == (9, 6)
+    assert of_session.promised.position < of_session.now.position
+    of_machine = pkmcal.plan("gough-stewart", count=3, places=1)
+    assert of_machine.joints.shape == (3, 6)
+    with pytest.raises(InputError, match="cameras of its own"):
+        pkmcal.plan(demo.session, camera=result.session.stations[0].camera)
+    with pytest.raises(InputError, match="known of a session's machine"):
+        pkmcal.plan("gough-stewart", after=demo.calibration)
