@@ -14,6 +14,7 @@ from pkmcal.files.documents import (
     wanted_file,
     yaml_text,
 )
+from pkmcal.files.edits import with_numbers
 from pkmcal.files.exif import Exif, read_exif, with_exif
 from pkmcal.files.headers import stated_size
 from pkmcal.files.locking import alone_in
@@ -64,6 +65,7 @@ __all__ = [
     "validate",
     "wanted_file",
     "with_exif",
+    "with_numbers",
     "write_bytes",
     "write_folder",
     "write_text",
