@@ -29,6 +29,7 @@ from pkmcal.commands import (
     simulate,
     study,
     validate,
+    view,
     watch,
 )
 from pkmcal.commands.console import print_error
@@ -48,6 +49,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo.demo,
     "new": new.new,
     "check": check.check,
+    "view": view.view,
     "camera": camera.camera,
     "plan": plan.plan,
     "calibrate": calibrate.calibrate,
