@@ -28,7 +28,6 @@ def view(
     as_json: console.Json = False,
 ) -> int:
     """Show photographs with the machine laid over; move it there."""
-    from pkmcal.calibration.results import EVERYTHING
     from pkmcal.errors import InputError
     from pkmcal.session.load import load_session
     from pkmcal.view.server import LOOPBACK, application, listening, new_token, serve
@@ -42,7 +41,9 @@ def view(
             expected="a station with a camera",
         )
     beside = loaded.folder / "calibration"
-    subject = Subject(loaded, calibration or (beside if (beside / EVERYTHING).is_file() else None))
+    subject = Subject(
+        loaded, calibration or (beside if (beside / "calibration.json").is_file() else None)
+    )
     if calibration is not None:
         _ = subject.saved  # a wrong one is told before a page stands
     token = new_token()

@@ -17,9 +17,9 @@ from pkmcal.view.requests import LookRequest
 from pkmcal.view.subject import Subject
 from pkmcal.wording import count
 
-LOOKED_AT = 8
-"""Photographs of a station that take part: as many as a search looks at, so that it takes a second
-and no minute; `calibrate` asks more of them."""
+LOOKED_AT = 16
+"""Photographs of a station that take part: a search looks at eight and asks the others, in about a
+second; `calibrate` asks up to 64."""
 FEWEST = 2
 """Photographs from which some can be asked what the others found."""
 LEAST = 1e-9

@@ -24,6 +24,8 @@ from pkmcal.wording import count, number
 
 KEPT = 0.5
 """Weight in the estimate below which an edge counts as put aside."""
+SIGMAS = 2.0
+"""Standard deviations, of drawing and search, within which the middle edge has to lie."""
 SIDES = ("right", "left")
 """The two edges of a leg as a picture shows them, looking along the leg from A to B."""
 
@@ -189,20 +191,19 @@ def _words(
     """How well the machine lies on what is seen."""
     if seen + missed == 0:
         return ["No leg of the machine would be in this photograph at this pose."]
-    if median is None or seen < missed:
-        near = f"within {legs.REACH:.0f} px" if look.shown == "drawing" else "where they should be"
-        return [
-            f"The machine is not here: {seen} of {seen + missed} edges of legs are found {near}."
-        ]
-    said = f"{seen} of {seen + missed} edges of legs are found; the middle one lies"
+    said = f"{seen} of {seen + missed} edges of legs are found"
+    if median is None:
+        return [f"It does not fit: {said}."]
     if look.shown == "calibration":
-        return [f"{said} {number(median, 2)} px from the calibrated machine's."]
+        return [f"{said}; the middle one lies {number(median, 2)} px from the calibrated machine."]
     tubes, tolerance = tubes_of(sight.machine), sight.machine.document.tolerance.center
     axes = legs_in_camera(sight.machine, T_camera_base, sight.T_base_platform, sight.joints)
     gain = edge_points(sight.machine, sight.camera, axes, tubes, 3).gain
     allowed = tolerance * float(np.nanmedian(gain))
+    fits = seen > missed and median < SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
     return [
-        f"{said} {number(median, 1)} px from the drawing's. The drawing's tolerance of"
+        f"{'It fits' if fits else 'It does not fit'}: {said}, and the middle one lies"
+        f" {number(median, 1)} px from the drawing. The drawing's tolerance of"
         f" {tolerance * 1e3:.3g} mm is {number(allowed, 1)} px here."
     ]
 

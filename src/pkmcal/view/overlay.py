@@ -1,8 +1,11 @@
-"""The machine laid over a photograph, and the pose that a hand gives it: one round trip a move."""
+"""The machine laid over a photograph, and the pose that a hand gives it: one round trip a move.
+
+Here and in the modules beside, what the first picture can do without is imported when it is needed.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,10 +13,12 @@ from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import apply
 from pkmcal.report.drawn import CURVE, Drawn, laid_over, straightened
 from pkmcal.session.schema import Vector
-from pkmcal.simulation.placement import StationPlace, default_stations
 from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned
 from pkmcal.view.requests import LookRequest, pose_of
 from pkmcal.view.subject import Sight, Subject
+
+if TYPE_CHECKING:
+    from pkmcal.simulation.placement import StationPlace
 
 DIGITS = 4
 """Decimals of a metre that are written: nobody places a camera to a tenth of a millimetre."""
@@ -66,6 +71,8 @@ def start_of(sight: Sight) -> Array:
     """
     if sight.T_camera_base is not None:
         return sight.T_camera_base
+    from pkmcal.simulation.placement import default_stations
+
     rng = np.random.default_rng(0)
     return default_stations(sight.machine, (sight.camera,), rng)[0].T_camera_base()
 
@@ -97,6 +104,7 @@ def moved(subject: Subject, sight: Sight, look: LookRequest) -> Array:
 
 def place_of(T_camera_base: Array) -> StationPlace:
     """A pose as session.yaml has it, with as many digits as are written there."""
+    from pkmcal.simulation.placement import StationPlace
 
     def rounded(part: Vector) -> Vector:
         x, y, z = (round(value, DIGITS) + 0.0 for value in part)  # never -0.0
@@ -117,6 +125,8 @@ def _joint(subject: Subject, look: LookRequest, k: int) -> Array:
 def _bare_limbs(sight: Sight, T_camera_base: Array) -> list[Drawn]:
     """Axes of the legs that show no tube."""
     bare = [j for j, leg in enumerate(sight.machine.document.legs) if not leg.tubes]
+    if not bare:
+        return []
     a, b = (part[bare, None] for part in sight.points)
     pixel = sight.camera.project(
         apply(T_camera_base, a + np.linspace(0, 1, CURVE)[:, None] * (b - a))

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import plain
-from pkmcal.view.fit import fitted
-from pkmcal.view.found import found
 from pkmcal.view.guard import Guard
 from pkmcal.view.keep import PoseFile
 from pkmcal.view.overlay import moved, overlay, sight_of
@@ -61,6 +59,16 @@ def application(subject: Subject, token: str, port: int) -> Guard:
 
     kept = PoseFile(subject.session.folder)
 
+    def found(subject: Subject, look: LookRequest) -> dict[str, Any]:
+        from pkmcal.view.found import found
+
+        return found(subject, look)
+
+    def fit(subject: Subject, look: LookRequest) -> dict[str, Any]:
+        from pkmcal.view.fit import fitted
+
+        return fitted(subject, look)
+
     def save(subject: Subject, look: LookRequest) -> dict[str, Any]:
         pose = moved(subject, sight_of(subject, look), look)
         return {"said": kept.write(subject.station(look.station), pose)}
@@ -98,7 +106,7 @@ def application(subject: Subject, token: str, port: int) -> Guard:
         *(
             Route(f"/{name}", asked(answer), methods=["POST"])
             for name, answer in (
-                ("overlay", overlay), ("found", found), ("fit", fitted), ("save", save),
+                ("overlay", overlay), ("found", found), ("fit", fit), ("save", save),
             )
         ),
     ]  # fmt: skip

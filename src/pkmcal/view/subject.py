@@ -8,24 +8,24 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
-from pkmcal.boards.board import Board, Detection
-from pkmcal.boards.find import detect_board
-from pkmcal.boards.views import board_of
-from pkmcal.calibration import results
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
-from pkmcal.observe.stations import StationView
 from pkmcal.session.load import Session, Station
 from pkmcal.session.photographs import Photograph, label_of
+
+if TYPE_CHECKING:
+    from pkmcal.boards.board import Board, Detection
+    from pkmcal.calibration.results import SavedCalibration
+    from pkmcal.observe.stations import StationView
 
 KEPT = 16
 """Decoded photographs that are kept: those that one goes back and forth between."""
@@ -129,15 +129,17 @@ class Subject:
         return Sight(saved.machine, camera, saved.joints[row], pose, T_camera_base)
 
     @cached_property
-    def saved(self) -> results.SavedCalibration:
+    def saved(self) -> SavedCalibration:
         """The calibration. Raises InputError where there is none, or it is another session's."""
+        from pkmcal.calibration.results import load
+
         if self.calibration is None:
             raise InputError(
                 "there is no calibration of this session",
                 where=str(self.session.folder),
                 next_step="Run pkmcal calibrate, or name its folder with --calibration",
             )
-        saved = results.load(self.calibration)
+        saved = load(self.calibration)
         same = saved.configurations == self.session.configurations
         if not same or not np.allclose(saved.joints, self.session.joints):
             raise InputError(
@@ -160,10 +162,14 @@ class Subject:
 
     @cached_property
     def _board(self) -> Board | None:
+        from pkmcal.boards.views import board_of
+
         return board_of(self.session)
 
     def _corners(self, s: int, k: int) -> Detection | None:
         """The board in a photograph of a station that observes it; None of one that does not."""
+        from pkmcal.boards.find import detect_board
+
         if self._board is None or "board" not in self.station(s).observe:
             return None
         return detect_board(self.image(s, k), self._board)

@@ -53,9 +53,12 @@ function overlay(more = {}) {
   return asking;
 }
 
+let finding = 0;
 async function find() {
   const now = epoch;
+  finding += 1;
   const answer = await post("found", request({}));
+  finding -= 1;
   if (answer && now === epoch) show(answer);
 }
 
@@ -89,9 +92,9 @@ function draw(answer) {
   for (const cell of document.querySelectorAll("#place dd")) cell.textContent = `[${answer.place[cell.dataset.part].join(", ")}]`;
   const station = state.stations[here.s];
   $("from").textContent = held() ? "As the calibration found it." : mine().changed ? "Not written yet."
-    : station.posed ? "As session.yaml has it." : "session.yaml has none; this is a guess to begin with.";
+    : station.handheld ? "A camera held by hand has no one pose in session.yaml." : station.posed ? "As session.yaml has it." : "session.yaml has none; this is a guess to begin with.";
   $("undo").disabled = held() || !mine().before.length;
-  $("save").disabled = held() || station.handheld;
+  $("save").disabled = held() || station.handheld || !mine().changed;
 }
 
 function show(answer) {
@@ -255,6 +258,7 @@ async function save() {
   state.stations[here.s].posed = true;
   say(answer.said, "good");
   $("from").textContent = "As session.yaml has it.";
+  $("save").disabled = true;
 }
 
 // ---------------------------------------------------------------- controls
