@@ -427,6 +427,13 @@ def test_the_command_serves_until_it_is_interrupted(demo):
         assert told.stdout.read() == told.stderr.read() == ""
 
 
+def test_answers_are_sent_at_once():
+    """asyncio sends without delay (TCP_NODELAY) where it knows the protocol; else by 40 ms later."""
+    with server.listening(0) as found:
+        assert found.getsockname()[0] == "127.0.0.1"
+        assert found.proto == socket.IPPROTO_TCP
+
+
 def test_what_cannot_be_shown_is_told_before(demo, session, tmp_path):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -148,6 +148,7 @@ function go(s, k, shown = here.shown) {
   for (const button of document.querySelectorAll("[data-shown]")) button.setAttribute("aria-pressed", button.dataset.shown === shown);
   for (const button of document.querySelectorAll("#tools button")) button.disabled = held();
   for (const id of ["fit", "anywhere"]) $(id).disabled = held() || !station.legs;
+  history.replaceState(null, "", `#${s + 1}/${k + 1}/${shown}`);
   overlay().then(find);
 }
 
@@ -291,6 +292,9 @@ addEventListener("keydown", (event) => {
 });
 addEventListener("beforeunload", (event) => { if (stations.some((station) => station.changed)) event.preventDefault(); });
 
+// An address names its photograph, and a page that is loaded again comes back to it.
+const [s0, k0, shown0] = location.hash.slice(1).split("/");
 const first = state.stations.findIndex((station) => station.photographs.length);
-if (first >= 0) go(first, 0);
-else say("The session has no photographs.", "bad");
+if (first < 0) say("The session has no photographs.", "bad");
+else if (state.stations[s0 - 1]?.photographs[k0 - 1]) go(s0 - 1, k0 - 1, state.calibrated && shown0 === "calibration" ? shown0 : "drawing");
+else go(first, 0);
