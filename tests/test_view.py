@@ -27,7 +27,7 @@ from pkmcal.simulation import Settings, board_for, load_truth
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.view import server
 from pkmcal.view.keep import PoseFile
-from pkmcal.view.subject import Subject
+from pkmcal.view.viewed import Viewed
 from rendered import rendered
 from test_report_page import CHROMIUM, Found
 
@@ -52,7 +52,7 @@ class Page:
     """A page that is served, and its questions, as the server passes them on."""
 
     def __init__(self, folder, calibration=None):
-        self.subject = Subject(load_session(folder), calibration)
+        self.subject = Viewed(load_session(folder), calibration)
         self.app = server.application(self.subject, TOKEN, PORT)
 
     def request(self, path, content=None, kind="http", **headers):
@@ -178,7 +178,7 @@ def test_nothing_is_decoded_before_it_is_looked_at(demo):
 
 
 def test_a_large_photograph_is_sent_at_the_screens_size(page, monkeypatch):
-    monkeypatch.setattr("pkmcal.view.subject.WIDEST", 100)
+    monkeypatch.setattr("pkmcal.view.viewed.WIDEST", 100)
     image = cv2.imdecode(np.frombuffer(page.get("photograph/0/0").content, np.uint8), 0)
     assert image.shape[1] == 100
 
@@ -205,7 +205,7 @@ def test_faults_are_told_in_words(page, session):
 
 
 def test_a_defect_is_told_as_one(page, monkeypatch):
-    monkeypatch.setattr(Subject, "jpeg", lambda *_: 1 / 0)
+    monkeypatch.setattr(Viewed, "jpeg", lambda *_: 1 / 0)
     answer = page.get("photograph/0/0")
     assert answer.status == 500
     assert "a defect of pkmcal" in answer.json()["message"]
@@ -215,11 +215,11 @@ def test_the_overlay_is_where_the_machine_is(page, truth):
     """By the true pose, the joints are where the camera sees them."""
     T = truth.T_camera_base[0]
     answer = page.ask("overlay", pose=T.tolist())
-    sight = page.subject.drawn(0, 0)
+    pane = page.subject.drawn(0, 0)
     for joint in answer["joints"]:
-        point = sight.points[("base", "platform").index(joint["end"]), joint["leg"] - 1]
+        point = pane.points[("base", "platform").index(joint["end"]), joint["leg"] - 1]
         np.testing.assert_allclose(
-            [joint["x"], joint["y"]], sight.camera.project(apply(T, point)), atol=0.051
+            [joint["x"], joint["y"]], pane.camera.project(apply(T, point)), atol=0.051
         )
     assert {leg["leg"] for leg in answer["legs"]} == {1, 2, 3, 4, 5, 6}
     assert len(answer["joints"]) == 12
@@ -428,7 +428,7 @@ def test_the_command_serves_until_it_is_interrupted(demo):
 
 
 def test_answers_are_sent_at_once():
-    """asyncio sends without delay (TCP_NODELAY) where it knows the protocol; else by 40 ms later."""
+    """asyncio sends without delay (TCP_NODELAY) where it knows the protocol, else 40 ms later."""
     with server.listening(0) as found:
         assert found.getsockname()[0] == "127.0.0.1"
         assert found.proto == socket.IPPROTO_TCP
@@ -522,7 +522,7 @@ def test_the_page_works_in_a_browser(session, demo, tmp_path, monkeypatch, width
     before = (session / "session.yaml").read_text()
     with server.listening(0) as found:
         port = found.getsockname()[1]
-        subject = Subject(load_session(session), demo.calibration)
+        subject = Viewed(load_session(session), demo.calibration)
         app = server.application(subject, TOKEN, port)
         # a thread of its own has no signals to be ended by: it ends with the tests
         threading.Thread(target=server.serve, args=(app, found), daemon=True).start()

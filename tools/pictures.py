@@ -38,7 +38,7 @@ from pkmcal.session.load import Session
 from pkmcal.simulation import EdgeNoise, load_truth, simulate_edges, simulate_session
 from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera
 from pkmcal.view.server import LOOPBACK, application, listening, new_token, serve
-from pkmcal.view.subject import Subject
+from pkmcal.view.viewed import Viewed
 
 sys.path.insert(0, str(Path(__file__).parent))
 import drawings
@@ -291,7 +291,7 @@ def served(session: Session) -> str:
     """The address at which a session is to be viewed, until this program ends."""
     found, token = listening(0), new_token()
     port = found.getsockname()[1]
-    app = application(Subject(session, None), token, port)
+    app = application(Viewed(session, None), token, port)
     Thread(target=serve, args=(app, found), daemon=True).start()
     return f"http://{LOOPBACK}:{port}/{token}/"
 

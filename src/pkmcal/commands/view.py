@@ -31,7 +31,7 @@ def view(
     from pkmcal.errors import InputError
     from pkmcal.session.load import load_session
     from pkmcal.view.server import LOOPBACK, application, listening, new_token, serve
-    from pkmcal.view.subject import Subject
+    from pkmcal.view.viewed import Viewed
 
     loaded = load_session(session)
     if not loaded.stations:
@@ -41,7 +41,7 @@ def view(
             expected="a station with a camera",
         )
     beside = loaded.folder / "calibration"
-    subject = Subject(
+    subject = Viewed(
         loaded, calibration or (beside if (beside / "calibration.json").is_file() else None)
     )
     if calibration is not None:

@@ -12,9 +12,9 @@ from pkmcal.observe.alone import find_alone
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import DOUBT, StationView, find_station
 from pkmcal.observe.tables import distance_tables
-from pkmcal.view.overlay import moved, overlay, sight_of
+from pkmcal.view.overlay import moved, overlay, pane_of
 from pkmcal.view.requests import LookRequest
-from pkmcal.view.subject import Subject
+from pkmcal.view.viewed import Viewed
 from pkmcal.wording import count
 
 LOOKED_AT = 16
@@ -26,7 +26,7 @@ LEAST = 1e-9
 """Probability below which no digits are told."""
 
 
-def fitted(subject: Subject, look: LookRequest) -> dict[str, Any]:
+def fitted(subject: Viewed, look: LookRequest) -> dict[str, Any]:
     """The pose at which the machine is recognised, from the one given or from anywhere, what it
     lays over, and how sure that is, in words; where it is not recognised, the pose stays.
     """
@@ -38,7 +38,7 @@ def fitted(subject: Subject, look: LookRequest) -> dict[str, Any]:
             found="observe: board" if "legs" not in station.observe else "legs without tubes",
             next_step="Its place is found from the board when you calibrate",
         )
-    start = moved(subject, sight_of(subject, look), look)
+    start = moved(subject, pane_of(subject, look), look)
     view = _view(subject, look.station)
     many = len(view.configuration) >= FEWEST
     if many:
@@ -80,7 +80,7 @@ def _alone(view: StationView, image: Integers) -> tuple[Array, bool, str]:
     return best, False, f"Not sure: {why}. Bring it to where it is, joint by joint."
 
 
-def _view(subject: Subject, s: int) -> StationView:
+def _view(subject: Viewed, s: int) -> StationView:
     """What the search looks at; kept, for one fits again and again."""
     kept: dict[int, StationView] = subject.views
     if s not in kept:

@@ -17,9 +17,9 @@ from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
 from pkmcal.observe.predict import TubeList, edge_points, legs_in_camera, plane_normals, tubes_of
 from pkmcal.report.drawn import CURVE, Drawn, measured_curves, radius_positions, straightened
-from pkmcal.view.overlay import moved, sight_of
+from pkmcal.view.overlay import moved, pane_of
 from pkmcal.view.requests import LookRequest
-from pkmcal.view.subject import Sight, Subject
+from pkmcal.view.viewed import Pane, Viewed
 from pkmcal.wording import count, number
 
 KEPT = 0.5
@@ -38,15 +38,15 @@ class _Judged(NamedTuple):
     tilt: float
 
 
-def found(subject: Subject, look: LookRequest) -> dict[str, Any]:
+def found(subject: Viewed, look: LookRequest) -> dict[str, Any]:
     """Edges with how far (px) they lie from the machine laid over, what was not found and why, the
     board's corners, and all that in words.
     """
-    sight = sight_of(subject, look)
+    pane = pane_of(subject, look)
     said: list[str] = []
     out: dict[str, Any] = {"edges": [], "missed": [], "corners": [], "told": said, "median": None}
-    if "legs" in subject.station(look.station).observe and len(tubes_of(sight.machine)):
-        _legs(subject, look, sight, out)
+    if "legs" in subject.station(look.station).observe and len(tubes_of(pane.machine)):
+        _legs(subject, look, pane, out)
     detection = subject.corners(look.station, look.photograph)
     if detection is not None:
         out["corners"] = np.round(detection.pixels, 1)
@@ -56,21 +56,21 @@ def found(subject: Subject, look: LookRequest) -> dict[str, Any]:
     return out
 
 
-def _legs(subject: Subject, look: LookRequest, sight: Sight, out: dict[str, Any]) -> None:
+def _legs(subject: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) -> None:
     """What is found of the legs, put into the answer."""
-    T_camera_base = moved(subject, sight, look)
+    T_camera_base = moved(subject, pane, look)
     row = subject.photograph(look.station, look.photograph).configuration
     taken = legs.Photographs(
         look.station,
-        sight.camera,
+        pane.camera,
         np.array([row]),
-        sight.joints[None],
+        pane.joints[None],
         [subject.image(look.station, look.photograph)],
     )
     take = legs.measure if look.shown == "calibration" else legs.search
-    seen = take(taken, sight.machine, T_camera_base, sight.T_base_platform[None])
+    seen = take(taken, pane.machine, T_camera_base, pane.T_base_platform[None])
     judged, reasons = _judged(subject, look)
-    curves, away = _off(sight, T_camera_base, seen.edges)
+    curves, away = _off(pane, T_camera_base, seen.edges)
     for n, curve in enumerate(curves):
         place = (int(seen.edges.leg[n]), int(seen.edges.tube[n]), int(seen.edges.side[n]))
         tip = f"{_name(*place)}: {number(float(away[n]), 2, signed=True)} px outward"
@@ -88,14 +88,14 @@ def _legs(subject: Subject, look: LookRequest, sight: Sight, out: dict[str, Any]
             points = tuple((float(x), float(y)) for x, y in line)
             drawn = Drawn(place[0] + 1, points, quiet, tip)
             out["edges"].append({"leg": drawn.leg, "d": drawn.path, "quiet": quiet, "tip": tip})
-    missed = _missed(sight, T_camera_base, seen.edges, seen.rejected, reasons)
+    missed = _missed(pane, T_camera_base, seen.edges, seen.rejected, reasons)
     out["missed"] = missed
     out["median"] = float(np.median(np.abs(away))) if len(away) else None
-    out["told"] += _words(sight, T_camera_base, look, len(curves), len(missed), out["median"])
+    out["told"] += _words(pane, T_camera_base, look, len(curves), len(missed), out["median"])
 
 
 def _judged(
-    subject: Subject, look: LookRequest
+    subject: Viewed, look: LookRequest
 ) -> tuple[dict[tuple[int, int, int], _Judged], dict[tuple[int, int, int], str]]:
     """What the calibration says of a photograph's edges, and why some were left out, by leg, tube
     and side from 0; -1 where all of them are meant.
@@ -120,14 +120,14 @@ def _judged(
     return judged, reasons
 
 
-def _off(sight: Sight, T_camera_base: Array, edges: EdgeSet) -> tuple[Array, Array]:
+def _off(pane: Pane, T_camera_base: Array, edges: EdgeSet) -> tuple[Array, Array]:
     """Measured edges as curves (n, CURVE, 2) px, and how far outward (n,) px of the machine's own
     they lie in the middle.
     """
     if not len(edges):
         return np.zeros((0, CURVE, 2)), np.zeros(0)
-    machine = sight.machine
-    axes = legs_in_camera(machine, T_camera_base, sight.T_base_platform, sight.joints)
+    machine = pane.machine
+    axes = legs_in_camera(machine, T_camera_base, pane.T_base_platform, pane.joints)
     radius = radius_positions(machine, edges)
     start, stop = edges.span.T
     each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
@@ -136,12 +136,12 @@ def _off(sight: Sight, T_camera_base: Array, edges: EdgeSet) -> tuple[Array, Arr
     predicted = replace(edges, normal=own)
     measured, drawn = (
         measured_curves(
-            machine, sight.camera, T_camera_base, sight.T_base_platform, sight.joints, part
+            machine, pane.camera, T_camera_base, pane.T_base_platform, pane.joints, part
         )
         for part in (edges, predicted)
     )
     # outward of the leg: away from where its axis is seen
-    axis = sight.camera.project(a + (edges.span.mean(axis=1))[:, None] * u)
+    axis = pane.camera.project(a + (edges.span.mean(axis=1))[:, None] * u)
     middle = CURVE // 2
     tangent = drawn[:, middle + 1] - drawn[:, middle - 1]
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
@@ -151,7 +151,7 @@ def _off(sight: Sight, T_camera_base: Array, edges: EdgeSet) -> tuple[Array, Arr
 
 
 def _missed(
-    sight: Sight,
+    pane: Pane,
     T_camera_base: Array,
     edges: EdgeSet,
     rejected: tuple[Rejection, ...],
@@ -160,15 +160,15 @@ def _missed(
     """Edges of the machine that were looked for and not found, as they should lie, each with why;
     those of which a part would be in the picture.
     """
-    tubes = tubes_of(sight.machine)
-    axes = legs_in_camera(sight.machine, T_camera_base, sight.T_base_platform, sight.joints)
-    pixel = edge_points(sight.machine, sight.camera, axes, tubes, CURVE).pixel
+    tubes = tubes_of(pane.machine)
+    axes = legs_in_camera(pane.machine, T_camera_base, pane.T_base_platform, pane.joints)
+    pixel = edge_points(pane.machine, pane.camera, axes, tubes, CURVE).pixel
     seen = set(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
     now = {(r.leg, r.tube, r.side): r.reason for r in rejected}
     out: list[dict[str, Any]] = []
     for e, curve in enumerate(pixel):
         place = (int(tubes.leg[e]), int(tubes.tube[e]), int(tubes.side[e]))
-        inside = curve[sight.camera.in_image(curve)]
+        inside = curve[pane.camera.in_image(curve)]
         if place in seen or len(inside) < 2:
             continue
         whole = (place[0], -1, -1)
@@ -181,7 +181,7 @@ def _missed(
 
 
 def _words(
-    sight: Sight,
+    pane: Pane,
     T_camera_base: Array,
     look: LookRequest,
     seen: int,
@@ -196,9 +196,9 @@ def _words(
         return [f"It does not fit: {said}."]
     if look.shown == "calibration":
         return [f"{said}; the middle one lies {number(median, 2)} px from the calibrated machine."]
-    tubes, tolerance = tubes_of(sight.machine), sight.machine.document.tolerance.center
-    axes = legs_in_camera(sight.machine, T_camera_base, sight.T_base_platform, sight.joints)
-    gain = edge_points(sight.machine, sight.camera, axes, tubes, 3).gain
+    tubes, tolerance = tubes_of(pane.machine), pane.machine.document.tolerance.center
+    axes = legs_in_camera(pane.machine, T_camera_base, pane.T_base_platform, pane.joints)
+    gain = edge_points(pane.machine, pane.camera, axes, tubes, 3).gain
     allowed = tolerance * float(np.nanmedian(gain))
     near = median < SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
     # other things' edges lie near by chance, too, though not most of them

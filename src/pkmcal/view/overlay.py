@@ -15,7 +15,7 @@ from pkmcal.report.drawn import CURVE, Drawn, laid_over, straightened
 from pkmcal.session.schema import Vector
 from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned
 from pkmcal.view.requests import LookRequest, pose_of
-from pkmcal.view.subject import Sight, Subject
+from pkmcal.view.viewed import Pane, Viewed
 
 if TYPE_CHECKING:
     from pkmcal.simulation.placement import StationPlace
@@ -24,25 +24,25 @@ DIGITS = 4
 """Decimals of a metre that are written: nobody places a camera to a tenth of a millimetre."""
 
 
-def sight_of(subject: Subject, look: LookRequest) -> Sight:
+def pane_of(subject: Viewed, look: LookRequest) -> Pane:
     """The machine that a request shows, before the camera where the files have it."""
     take = subject.calibrated if look.shown == "calibration" else subject.drawn
     return take(look.station, look.photograph)
 
 
-def overlay(subject: Subject, look: LookRequest) -> dict[str, Any]:
+def overlay(subject: Viewed, look: LookRequest) -> dict[str, Any]:
     """The pose after the gesture, and what it lays over the photograph, in pixels."""
-    sight = sight_of(subject, look)
-    T_camera_base = moved(subject, sight, look)
+    pane = pane_of(subject, look)
+    T_camera_base = moved(subject, pane, look)
     edges, spots = laid_over(
-        sight.machine, sight.camera, T_camera_base, sight.joints, sight.T_base_platform
+        pane.machine, pane.camera, T_camera_base, pane.joints, pane.T_base_platform
     )
-    lines = [*edges, *_bare_limbs(sight, T_camera_base)]
+    lines = [*edges, *_bare_limbs(pane, T_camera_base)]
     legs = sorted({edge.leg for edge in lines})
     paths = [
         {
             "leg": leg,
-            "quiet": not sight.machine.document.legs[leg - 1].tubes,
+            "quiet": not pane.machine.document.legs[leg - 1].tubes,
             "d": "".join(edge.path for edge in lines if edge.leg == leg),
         }
         for leg in legs
@@ -65,24 +65,24 @@ def overlay(subject: Subject, look: LookRequest) -> dict[str, Any]:
     }
 
 
-def start_of(sight: Sight) -> Array:
+def start_of(pane: Pane) -> Array:
     """Where a camera is taken to stand, T_camera_base (4, 4), before anybody has said it: before
     the machine, far enough to have all of it in the picture.
     """
-    if sight.T_camera_base is not None:
-        return sight.T_camera_base
+    if pane.T_camera_base is not None:
+        return pane.T_camera_base
     from pkmcal.simulation.placement import default_stations
 
     rng = np.random.default_rng(0)
-    return default_stations(sight.machine, (sight.camera,), rng)[0].T_camera_base()
+    return default_stations(pane.machine, (pane.camera,), rng)[0].T_camera_base()
 
 
-def moved(subject: Subject, sight: Sight, look: LookRequest) -> Array:
+def moved(subject: Viewed, pane: Pane, look: LookRequest) -> Array:
     """T_camera_base (4, 4) after what the hand did."""
     T_camera_base = pose_of(look)
     if T_camera_base is None:
-        T_camera_base = start_of(sight)
-    camera, points = sight.camera, sight.points.reshape(-1, 3)
+        T_camera_base = start_of(pane)
+    camera, points = pane.camera, pane.points.reshape(-1, 3)
     if look.pins:
         pins = np.stack([_joint(subject, look, k) for k in range(len(look.pins))])
         pixels = np.array([pin.pixel for pin in look.pins], dtype=float)
@@ -114,21 +114,21 @@ def place_of(T_camera_base: Array) -> StationPlace:
     return StationPlace(rounded(place.position), rounded(place.look_at), rounded(place.up))
 
 
-def _joint(subject: Subject, look: LookRequest, k: int) -> Array:
+def _joint(subject: Viewed, look: LookRequest, k: int) -> Array:
     """A pinned joint's centre (3,), base frame, m, in its own photograph's configuration."""
     pin = look.pins[k]
     other = look.model_copy(update={"photograph": pin.photograph})
-    points = sight_of(subject, other).points[0 if pin.end == "base" else 1]
+    points = pane_of(subject, other).points[0 if pin.end == "base" else 1]
     return points[min(pin.leg, len(points)) - 1]
 
 
-def _bare_limbs(sight: Sight, T_camera_base: Array) -> list[Drawn]:
+def _bare_limbs(pane: Pane, T_camera_base: Array) -> list[Drawn]:
     """Axes of the legs that show no tube."""
-    bare = [j for j, leg in enumerate(sight.machine.document.legs) if not leg.tubes]
+    bare = [j for j, leg in enumerate(pane.machine.document.legs) if not leg.tubes]
     if not bare:
         return []
-    a, b = (part[bare, None] for part in sight.points)
-    pixel = sight.camera.project(
+    a, b = (part[bare, None] for part in pane.points)
+    pixel = pane.camera.project(
         apply(T_camera_base, a + np.linspace(0, 1, CURVE)[:, None] * (b - a))
     )
     out: list[Drawn] = []

@@ -12,9 +12,9 @@ from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import plain
 from pkmcal.view.guard import Guard
 from pkmcal.view.keep import PoseFile
-from pkmcal.view.overlay import moved, overlay, sight_of
+from pkmcal.view.overlay import moved, overlay, pane_of
 from pkmcal.view.requests import LookRequest, checked
-from pkmcal.view.subject import Subject
+from pkmcal.view.viewed import Viewed
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -31,8 +31,8 @@ def listening(port: int) -> socket.socket:
     """A socket on the loopback, of a free port where ``port`` is 0. Raises InputError where the
     port is taken.
     """
-    # the protocol by its number: of others asyncio does not ask to send at once, and the second part
-    # of every answer would wait 40 ms for the first one to be acknowledged
+    # the protocol by its number: without it asyncio does not ask to send at once, and the second
+    # part of every answer waits 40 ms for the first one to be acknowledged
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -53,7 +53,7 @@ def new_token() -> str:
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
-def application(subject: Subject, token: str, port: int) -> Guard:
+def application(subject: Viewed, token: str, port: int) -> Guard:
     """The ASGI application, of a page at /TOKEN/ and of what it asks for."""
     from starlette.applications import Starlette
     from starlette.responses import HTMLResponse, Response
@@ -61,21 +61,21 @@ def application(subject: Subject, token: str, port: int) -> Guard:
 
     kept = PoseFile(subject.session.folder)
 
-    def found(subject: Subject, look: LookRequest) -> dict[str, Any]:
+    def found(subject: Viewed, look: LookRequest) -> dict[str, Any]:
         from pkmcal.view.found import found
 
         return found(subject, look)
 
-    def fit(subject: Subject, look: LookRequest) -> dict[str, Any]:
+    def fit(subject: Viewed, look: LookRequest) -> dict[str, Any]:
         from pkmcal.view.fit import fitted
 
         return fitted(subject, look)
 
-    def save(subject: Subject, look: LookRequest) -> dict[str, Any]:
-        pose = moved(subject, sight_of(subject, look), look)
+    def save(subject: Viewed, look: LookRequest) -> dict[str, Any]:
+        pose = moved(subject, pane_of(subject, look), look)
         return {"said": kept.write(subject.station(look.station), pose)}
 
-    def asked(answer: Callable[[Subject, LookRequest], dict[str, Any]]) -> Any:
+    def asked(answer: Callable[[Viewed, LookRequest], dict[str, Any]]) -> Any:
         async def endpoint(request: Request) -> Response:
             body = await request.body()
 
@@ -151,7 +151,7 @@ def serve(app: Guard, found: socket.socket) -> None:
         uvicorn.Server(config).run(sockets=[found])
 
 
-def page_html(subject: Subject) -> str:
+def page_html(subject: Viewed) -> str:
     """The page itself; photographs and overlays are asked for by it."""
     from pkmcal.report.page import environment
 

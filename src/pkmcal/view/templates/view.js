@@ -134,6 +134,7 @@ function go(s, k, shown = here.shown) {
   say("");
   const [width, height] = station.size, picture = $("photograph"), name = station.photographs[k];
   $("shot").setAttribute("viewBox", `-0.5 -0.5 ${width} ${height}`);
+  $("shot").style.setProperty("--ratio", width / height);
   $("shot").classList.toggle("held", held());
   picture.setAttribute("width", width);
   picture.setAttribute("height", height);

@@ -35,7 +35,7 @@ QUALITY = 88
 
 
 @dataclass(frozen=True)
-class Sight:
+class Pane:
     """A machine before a camera: what is laid over one photograph.
 
     joints : (m,) readings. T_base_platform : (4, 4). T_camera_base : (4, 4) where the camera stands
@@ -56,7 +56,7 @@ class Sight:
         return np.stack([ends.a, ends.b])
 
 
-class Subject:
+class Viewed:
     """A session and, where there is one, its calibration.
 
     calibration : folder that `pkmcal calibrate` wrote; None for none.
@@ -98,12 +98,12 @@ class Subject:
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 
-    def drawn(self, s: int, k: int) -> Sight:
+    def drawn(self, s: int, k: int) -> Pane:
         """The drawing's machine before a station's camera."""
         row, station = self.photograph(s, k).configuration, self.station(s)
         machine, joints = self.session.machine, self.session.joints[row]
         pose = self.poses[row]
-        return Sight(machine, station.camera, joints, pose, station.T_camera_base)
+        return Pane(machine, station.camera, joints, pose, station.T_camera_base)
 
     @cached_property
     def poses(self) -> Array:
@@ -113,7 +113,7 @@ class Subject:
         except GeometryError as error:  # the drawing is the user's: it is at fault
             raise error.as_input(self.session.document["mechanism"]) from None
 
-    def calibrated(self, s: int, k: int) -> Sight:
+    def calibrated(self, s: int, k: int) -> Pane:
         """The calibrated machine, as the calibration left it, before the camera as it found it.
 
         Raises InputError where the calibration is another session's, or has not this station.
@@ -126,7 +126,7 @@ class Subject:
         excess = saved.document["stations"][number].get("focal_scale", 1.0) - 1.0
         camera = replace(camera, parameters=camera.parameters + excess * camera.focal_part)
         pose = saved.T_base_platform[row]
-        return Sight(saved.machine, camera, saved.joints[row], pose, T_camera_base)
+        return Pane(saved.machine, camera, saved.joints[row], pose, T_camera_base)
 
     @cached_property
     def saved(self) -> SavedCalibration:
