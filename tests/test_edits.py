@@ -96,6 +96,7 @@ def test_line_ends_and_a_byte_order_mark_stay():
         "  front: {pose: {position: [1, 2], look_at: [1, 2, 4]}}\n",
         "  front: {pose: {position: 1}}\n",
         "  rear: {}\n",
+        "  front: [legs]\n",
     ],
 )
 def test_what_would_change_something_else_is_refused(stations):

@@ -13,14 +13,16 @@ import sys
 import threading
 import urllib.request
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from conftest import run
+from pkmcal.cameras.files import camera_text
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import apply, inverse, perturb, pose, pose_difference
+from pkmcal.geometry.rigid import apply, inverse, perturb, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, board_for, load_truth
@@ -196,6 +198,7 @@ def test_faults_are_told_in_words(page, session):
         ({"pose": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "no rotation"),
         ({"gesture": {"kind": "jump", "start": [0, 0], "end": [1, 1]}}, "gesture.kind"),
         ({"pose": 7}, "the page, pose"),
+        ({"pins": [{"photograph": 0, "end": "base", "leg": 7, "pixel": [1, 2]}]}, "pins[1]"),
     ):
         answer = page.post("overlay", **body)
         assert answer.status == 422
@@ -257,6 +260,23 @@ def test_a_station_without_a_pose_begins_with_the_machine_in_the_picture(session
     opened = Page(session)
     assert opened.subject.station(0).T_camera_base is None
     assert len(opened.ask("overlay")["joints"]) == 12
+
+
+def test_no_pose_is_too_odd(page):
+    """Cameras among the legs, behind the machine, kilometres away: lines and words, no warnings."""
+    rng = np.random.default_rng(0)
+    for away in (0.0, 0.01, 0.3, 1.0, 1e6):
+        for _ in range(4):
+            T = pose(rotation(2 * rng.normal(size=3)), away * rng.normal(size=3)).tolist()
+            start, end = rng.uniform(-800, 1600, (2, 2)).tolist()
+            pin = {"photograph": 0, "end": "base", "leg": 3, "pixel": end}
+            for more in (
+                {},
+                {"gesture": {"kind": "turn", "start": start, "end": end}},
+                {"pins": [pin, {**pin, "leg": 4, "pixel": start}]},
+            ):
+                assert np.isfinite(page.ask("overlay", pose=T, **more)["pose"]).all()
+            assert page.ask("found", pose=T)["told"]
 
 
 # ------------------------------------------------------------------ what is found
@@ -361,6 +381,29 @@ def test_a_calibration_of_another_session_is_refused(page, demo, session):
     assert "there is no calibration of this session" in message
 
 
+def test_a_station_that_was_left_out_is_told(page, monkeypatch):
+    saved = page.subject.saved
+    others = replace(saved, stations=saved.stations[1:])
+    monkeypatch.setitem(page.subject.__dict__, "saved", others)
+    message = page.post("overlay", shown="calibration").json()["message"]
+    assert "the calibration has no station station1" in message
+    assert page.ask("overlay", station=1, shown="calibration")["pose"]
+
+
+def test_cameras_are_those_that_the_calibration_left(demo, session, tmp_path):
+    folder = tmp_path / "calibration"
+    shutil.copytree(demo.calibration, folder)
+    camera = camera_of_size((320, 240))
+    file = Path(load_session(session).stations[0].camera_file)
+    (folder / f"camera-{file.stem}.yaml").write_text(camera_text(camera))
+    document = json.loads((folder / "calibration.json").read_text())
+    document["stations"][0]["focal_scale"] = 1.01
+    (folder / "calibration.json").write_text(json.dumps(document))
+    shown = Page(session, folder).subject.calibrated(0, 0).camera
+    np.testing.assert_allclose(shown.parameters[:2], 1.01 * camera.parameters[:2])
+    np.testing.assert_array_equal(shown.parameters[2:], camera.parameters[2:])
+
+
 # ------------------------------------------------------------------ what is written
 
 
@@ -445,6 +488,14 @@ def test_what_cannot_be_shown_is_told_before(demo, session, tmp_path):
     done = run("view", demo.session, "--calibration", tmp_path)
     assert (done.code, "there is no calibration here" in done.err) == (2, True)
     assert run("view", tmp_path / "nowhere").code == 2
+    names = load_session(session).configurations
+    rows = [f"{name},0,0,0.3{k},1,0,0,0" for k, name in enumerate(names)]
+    (session / "poses.csv").write_text("\n".join(["configuration,x,y,z,qw,qx,qy,qz", *rows]))
+    text = (session / "session.yaml").read_text().partition("stations:")[0]
+    tracker = "{poses: poses.csv, noise: {position: 1.0e-5, rotation: 1.0e-5}}"
+    (session / "session.yaml").write_text(f"{text}stations: {{t: {{tracker: {tracker}}}}}\n")
+    done = run("view", session)
+    assert (done.code, "there are no photographs to be shown" in done.err) == (2, True)
 
 
 # ------------------------------------------------------------------ in a browser

@@ -41,16 +41,16 @@ def view(
             expected="a station with a camera",
         )
     beside = loaded.folder / "calibration"
-    subject = Viewed(
+    viewed = Viewed(
         loaded, calibration or (beside if (beside / "calibration.json").is_file() else None)
     )
     if calibration is not None:
-        _ = subject.saved  # a wrong one is told before a page stands
+        _ = viewed.saved  # a wrong one is told before a page stands
     token = new_token()
     with listening(port) as found:
         port = found.getsockname()[1]
         address = f"http://{LOOPBACK}:{port}/{token}/"
-        app = application(subject, token, port)
+        app = application(viewed, token, port)
         if as_json:
             console.print_json({"url": address})
         else:

@@ -26,28 +26,28 @@ LEAST = 1e-9
 """Probability below which no digits are told."""
 
 
-def fitted(subject: Viewed, look: LookRequest) -> dict[str, Any]:
+def fitted(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     """The pose at which the machine is recognised, from the one given or from anywhere, what it
     lays over, and how sure that is, in words; where it is not recognised, the pose stays.
     """
-    station = subject.station(look.station)
-    if "legs" not in station.observe or not len(tubes_of(subject.session.machine)):
+    station = viewed.station(look.station)
+    if "legs" not in station.observe or not len(tubes_of(viewed.session.machine)):
         raise InputError(
             "there are no legs to be recognised at this station",
             where=f"session.yaml, stations.{station.entry}",
             found="observe: board" if "legs" not in station.observe else "legs without tubes",
             next_step="Its place is found from the board when you calibrate",
         )
-    start = moved(subject, pane_of(subject, look), look)
-    view = _view(subject, look.station)
+    start = moved(viewed, pane_of(viewed, look), look)
+    view = _view(viewed, look.station)
     many = len(view.configuration) >= FEWEST
     if many:
         found, sure, said = _together(view, None if look.anywhere else start)
     else:
-        found, sure, said = _alone(view, subject.image(look.station, look.photograph))
+        found, sure, said = _alone(view, viewed.image(look.station, look.photograph))
     pose = found if sure else start
     plain = {"pose": tuple(map(tuple, pose.tolist())), "gesture": None, "pins": ()}
-    return {**overlay(subject, look.model_copy(update=plain)), "recognised": sure, "said": said}
+    return {**overlay(viewed, look.model_copy(update=plain)), "recognised": sure, "said": said}
 
 
 def _together(view: StationView, start: Array | None) -> tuple[Array, bool, str]:
@@ -80,21 +80,21 @@ def _alone(view: StationView, image: Integers) -> tuple[Array, bool, str]:
     return best, False, f"Not sure: {why}. Bring it to where it is, joint by joint."
 
 
-def _view(subject: Viewed, s: int) -> StationView:
+def _view(viewed: Viewed, s: int) -> StationView:
     """What the search looks at; kept, for one fits again and again."""
-    kept: dict[int, StationView] = subject.views
+    kept: dict[int, StationView] = viewed.views
     if s not in kept:
-        session, station = subject.session, subject.station(s)
+        session, station = viewed.session, viewed.station(s)
         rows = np.array([photo.configuration for photo in station.photographs])
         few = np.unique(np.linspace(0, len(rows) - 1, min(LOOKED_AT, len(rows))).astype(int))
-        tables = distance_tables([subject.image(s, int(k)) for k in few])
+        tables = distance_tables([viewed.image(s, int(k)) for k in few])
         kept[s] = StationView(
             session.machine,
             station.camera,
             tubes_of(session.machine),
             rows[few],
             session.joints,
-            subject.poses,
+            viewed.poses,
             tables,
         )
     return kept[s]

@@ -38,16 +38,16 @@ class _Judged(NamedTuple):
     tilt: float
 
 
-def found(subject: Viewed, look: LookRequest) -> dict[str, Any]:
+def found(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     """Edges with how far (px) they lie from the machine laid over, what was not found and why, the
     board's corners, and all that in words.
     """
-    pane = pane_of(subject, look)
+    pane = pane_of(viewed, look)
     said: list[str] = []
     out: dict[str, Any] = {"edges": [], "missed": [], "corners": [], "told": said, "median": None}
-    if "legs" in subject.station(look.station).observe and len(tubes_of(pane.machine)):
-        _legs(subject, look, pane, out)
-    detection = subject.corners(look.station, look.photograph)
+    if "legs" in viewed.station(look.station).observe and len(tubes_of(pane.machine)):
+        _legs(viewed, look, pane, out)
+    detection = viewed.corners(look.station, look.photograph)
     if detection is not None:
         out["corners"] = np.round(detection.pixels, 1)
         corners = count(len(detection.ids), "corner")
@@ -56,20 +56,20 @@ def found(subject: Viewed, look: LookRequest) -> dict[str, Any]:
     return out
 
 
-def _legs(subject: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) -> None:
+def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) -> None:
     """What is found of the legs, put into the answer."""
-    T_camera_base = moved(subject, pane, look)
-    row = subject.photograph(look.station, look.photograph).configuration
+    T_camera_base = moved(viewed, pane, look)
+    row = viewed.photograph(look.station, look.photograph).configuration
     taken = legs.Photographs(
         look.station,
         pane.camera,
         np.array([row]),
         pane.joints[None],
-        [subject.image(look.station, look.photograph)],
+        [viewed.image(look.station, look.photograph)],
     )
     take = legs.measure if look.shown == "calibration" else legs.search
     seen = take(taken, pane.machine, T_camera_base, pane.T_base_platform[None])
-    judged, reasons = _judged(subject, look)
+    judged, reasons = _judged(viewed, look)
     curves, away = _off(pane, T_camera_base, seen.edges)
     for n, curve in enumerate(curves):
         place = (int(seen.edges.leg[n]), int(seen.edges.tube[n]), int(seen.edges.side[n]))
@@ -95,22 +95,22 @@ def _legs(subject: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) -
 
 
 def _judged(
-    subject: Viewed, look: LookRequest
+    viewed: Viewed, look: LookRequest
 ) -> tuple[dict[tuple[int, int, int], _Judged], dict[tuple[int, int, int], str]]:
     """What the calibration says of a photograph's edges, and why some were left out, by leg, tube
     and side from 0; -1 where all of them are meant.
     """
     if look.shown != "calibration":
         return {}, {}
-    document, s = subject.saved.document, subject.number(look.station) + 1
-    k = subject.photograph(look.station, look.photograph).configuration
+    document, s = viewed.saved.document, viewed.number(look.station) + 1
+    k = viewed.photograph(look.station, look.photograph).configuration
     rows = (document.get("residuals") or {}).get("edges") or []
     judged = {
         (int(leg) - 1, int(tube) - 1, int(side) - 1): _Judged(weight, shift, tilt)
         for station, row, leg, tube, side, weight, shift, tilt in rows
         if (station, row) == (s, k + 1)
     }
-    own = [subject.station(look.station).name, subject.session.configurations[k]]
+    own = [viewed.station(look.station).name, viewed.session.configurations[k]]
     reasons = {
         (leg - 1, tube - 1, side - 1): group["reason"]
         for group in document.get("rejected") or []

@@ -86,7 +86,8 @@ def pinned(
 
     for _ in range(1 if count == 4 else ROUNDS):
         moved = _motion(T_camera_base, points)
-        x = least_squares(misfit(moved), np.zeros(count), x_scale=1.0).x
+        with np.errstate(over="ignore"):  # of a pixel that is kilometres away
+            x = least_squares(misfit(moved), np.zeros(count)).x
         T_camera_base = moved(x * spread)
     return T_camera_base
 

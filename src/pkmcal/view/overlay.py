@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply
 from pkmcal.report.drawn import CURVE, Drawn, laid_over, straightened
 from pkmcal.session.schema import Vector
@@ -24,16 +25,16 @@ DIGITS = 4
 """Decimals of a metre that are written: nobody places a camera to a tenth of a millimetre."""
 
 
-def pane_of(subject: Viewed, look: LookRequest) -> Pane:
+def pane_of(viewed: Viewed, look: LookRequest) -> Pane:
     """The machine that a request shows, before the camera where the files have it."""
-    take = subject.calibrated if look.shown == "calibration" else subject.drawn
+    take = viewed.calibrated if look.shown == "calibration" else viewed.drawn
     return take(look.station, look.photograph)
 
 
-def overlay(subject: Viewed, look: LookRequest) -> dict[str, Any]:
+def overlay(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
     """The pose after the gesture, and what it lays over the photograph, in pixels."""
-    pane = pane_of(subject, look)
-    T_camera_base = moved(subject, pane, look)
+    pane = pane_of(viewed, look)
+    T_camera_base = moved(viewed, pane, look)
     edges, spots = laid_over(
         pane.machine, pane.camera, T_camera_base, pane.joints, pane.T_base_platform
     )
@@ -77,14 +78,14 @@ def start_of(pane: Pane) -> Array:
     return default_stations(pane.machine, (pane.camera,), rng)[0].T_camera_base()
 
 
-def moved(subject: Viewed, pane: Pane, look: LookRequest) -> Array:
+def moved(viewed: Viewed, pane: Pane, look: LookRequest) -> Array:
     """T_camera_base (4, 4) after what the hand did."""
     T_camera_base = pose_of(look)
     if T_camera_base is None:
         T_camera_base = start_of(pane)
     camera, points = pane.camera, pane.points.reshape(-1, 3)
     if look.pins:
-        pins = np.stack([_joint(subject, look, k) for k in range(len(look.pins))])
+        pins = np.stack([_joint(viewed, look, k) for k in range(len(look.pins))])
         pixels = np.array([pin.pixel for pin in look.pins], dtype=float)
         T_camera_base = pinned(camera, T_camera_base, points, pins, pixels)
     if look.gesture is not None:
@@ -114,12 +115,14 @@ def place_of(T_camera_base: Array) -> StationPlace:
     return StationPlace(rounded(place.position), rounded(place.look_at), rounded(place.up))
 
 
-def _joint(subject: Viewed, look: LookRequest, k: int) -> Array:
+def _joint(viewed: Viewed, look: LookRequest, k: int) -> Array:
     """A pinned joint's centre (3,), base frame, m, in its own photograph's configuration."""
     pin = look.pins[k]
     other = look.model_copy(update={"photograph": pin.photograph})
-    points = pane_of(subject, other).points[0 if pin.end == "base" else 1]
-    return points[min(pin.leg, len(points)) - 1]
+    points = pane_of(viewed, other).points[0 if pin.end == "base" else 1]
+    if pin.leg > len(points):
+        raise InputError("there is no such leg", where=f"the page, pins[{k + 1}]", found=pin.leg)
+    return points[pin.leg - 1]
 
 
 def _bare_limbs(pane: Pane, T_camera_base: Array) -> list[Drawn]:

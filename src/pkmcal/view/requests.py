@@ -12,9 +12,8 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import Document, Schema, validate
 
-Number = int | float
-Pixel = tuple[Number, Number]
-Row4 = tuple[Number, Number, Number, Number]
+Pixel = tuple[float, float]
+Row4 = tuple[float, float, float, float]
 Shown = Literal["drawing", "calibration"]
 """Which machine is laid over: the drawing's at the session's poses, or the calibrated one."""
 
@@ -36,7 +35,7 @@ class Gesture(Schema):
     kind: Literal["aim", "turn", "roll", "distance"]
     start: Pixel
     end: Pixel
-    factor: Number = Field(default=1.0, gt=0.01, lt=100)
+    factor: float = Field(default=1.0, gt=0.01, lt=100)
 
 
 class LookRequest(Schema):

@@ -53,34 +53,34 @@ def new_token() -> str:
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
-def application(subject: Viewed, token: str, port: int) -> Guard:
+def application(viewed: Viewed, token: str, port: int) -> Guard:
     """The ASGI application, of a page at /TOKEN/ and of what it asks for."""
     from starlette.applications import Starlette
     from starlette.responses import HTMLResponse, Response
     from starlette.routing import Mount, Route
 
-    kept = PoseFile(subject.session.folder)
+    kept = PoseFile(viewed.session.folder)
 
-    def found(subject: Viewed, look: LookRequest) -> dict[str, Any]:
+    def found(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
         from pkmcal.view.found import found
 
-        return found(subject, look)
+        return found(viewed, look)
 
-    def fit(subject: Viewed, look: LookRequest) -> dict[str, Any]:
+    def fit(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
         from pkmcal.view.fit import fitted
 
-        return fitted(subject, look)
+        return fitted(viewed, look)
 
-    def save(subject: Viewed, look: LookRequest) -> dict[str, Any]:
-        pose = moved(subject, pane_of(subject, look), look)
-        return {"said": kept.write(subject.station(look.station), pose)}
+    def save(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
+        pose = moved(viewed, pane_of(viewed, look), look)
+        return {"said": kept.write(viewed.station(look.station), pose)}
 
     def asked(answer: Callable[[Viewed, LookRequest], dict[str, Any]]) -> Any:
         async def endpoint(request: Request) -> Response:
             body = await request.body()
 
             def work() -> dict[str, Any]:
-                return answer(subject, checked(_json(body), LookRequest))
+                return answer(viewed, checked(_json(body), LookRequest))
 
             return await _answered(work)
 
@@ -88,10 +88,10 @@ def application(subject: Viewed, token: str, port: int) -> Guard:
 
     async def photograph(request: Request) -> Response:
         s, k = request.path_params["s"], request.path_params["k"]
-        return await _answered(lambda: Response(subject.jpeg(s, k), media_type="image/jpeg"))
+        return await _answered(lambda: Response(viewed.jpeg(s, k), media_type="image/jpeg"))
 
     async def page(_request: Request) -> Response:
-        return await _answered(lambda: HTMLResponse(page_html(subject)))
+        return await _answered(lambda: HTMLResponse(page_html(viewed)))
 
     async def script(_request: Request) -> Response:
         return Response(_template("view.js"), media_type="text/javascript")
@@ -151,11 +151,11 @@ def serve(app: Guard, found: socket.socket) -> None:
         uvicorn.Server(config).run(sockets=[found])
 
 
-def page_html(subject: Viewed) -> str:
+def page_html(viewed: Viewed) -> str:
     """The page itself; photographs and overlays are asked for by it."""
     from pkmcal.report.page import environment
 
-    session = subject.session
+    session = viewed.session
     stations = [
         {
             "name": station.name,
@@ -176,8 +176,8 @@ def page_html(subject: Viewed) -> str:
         folder=session.folder,
         n_legs=session.machine.n_legs,
         stations=stations,
-        calibrated=subject.calibration is not None,
-        state={"stations": stations, "calibrated": subject.calibration is not None},
+        calibrated=viewed.calibration is not None,
+        state={"stations": stations, "calibrated": viewed.calibration is not None},
     )
 
 
