@@ -5,6 +5,7 @@ const state = JSON.parse($("state").textContent);
 const SVG = "http://www.w3.org/2000/svg";
 const STEP = 1.05; // the distance's change by one notch of the wheel, or one press
 const NOTCH = 100; // what browsers call one notch
+const ENOUGH = 2; // joints put to their places, after which the machine snaps to the photographs
 const PAUSE = 250; // ms without a turn of the wheel after which the next is another one
 
 const here = { s: 0, k: 0, shown: "drawing", kind: "aim" };
@@ -174,6 +175,7 @@ $("photograph").addEventListener("load", () => { document.documentElement.datase
 function remember() {
   mine().before.push({ pose: mine().pose, pins: mine().pins, changed: mine().changed });
   mine().changed = true;
+  epoch += 1; // what was asked of the pose before is of no use
 }
 function undo() {
   const last = mine().before.pop();
@@ -212,10 +214,12 @@ async function release() {
   const done = pull;
   pull = null;
   $("shot").classList.remove("pulling");
-  if (!done.moved) { Object.assign(mine(), mine().before.pop()); return; }
+  if (!done.moved) { Object.assign(mine(), mine().before.pop()); overlay().then(find); return; }
   await asking;
   say("");
-  find();
+  // two joints tell the place well enough for the machine to be recognised there
+  if (done.joint && mine().pins.length >= ENOUGH) fit(false);
+  else find();
 }
 $("shot").addEventListener("pointerup", release);
 $("shot").addEventListener("pointercancel", release);
@@ -239,12 +243,14 @@ $("nearer").addEventListener("click", () => distance(1 / STEP, middle()));
 $("farther").addEventListener("click", () => distance(STEP, middle()));
 
 async function fit(anywhere) {
-  if ($("fit").disabled) return;
+  if ($("fit").disabled) { find(); return; }
   await asking;
   const now = epoch;
+  finding += 1;
   say("Looking for the machine …");
   for (const id of ["fit", "anywhere"]) $(id).disabled = true;
   const answer = await post("fit", request({ anywhere }));
+  finding -= 1;
   for (const id of ["fit", "anywhere"]) $(id).disabled = held() || !state.stations[here.s].legs;
   if (!answer || now !== epoch) return;
   say(answer.said, answer.recognised ? "good" : "bad");
