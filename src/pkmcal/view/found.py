@@ -203,9 +203,11 @@ def _words(
     near = median < SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
     # other things' edges lie near by chance, too, though not most of them
     verdict = "It fits" if near and seen > missed else "It may fit" if near else "It does not fit"
+    # the search goes by whole pixels
+    off = f"{number(median, 1)} px" if median > legs.SEARCH_SIGMA / 2 else "less than half a pixel"
     return [
-        f"{verdict}: {said}, and the middle one lies {number(median, 1)} px from the drawing. The"
-        f" drawing's tolerance of {tolerance * 1e3:.3g} mm is {number(allowed, 1)} px here."
+        f"{verdict}: {said}, and the middle one lies {off} from the drawing. The drawing's"
+        f" tolerance of {tolerance * 1e3:.3g} mm is {number(allowed, 1)} px here."
     ]
 
 

@@ -148,7 +148,7 @@ function go(s, k, shown = here.shown) {
     if (current) { button.setAttribute("aria-current", "true"); button.scrollIntoView({ block: "nearest", inline: "nearest" }); }
   }
   for (const button of document.querySelectorAll("[data-shown]")) button.setAttribute("aria-pressed", button.dataset.shown === shown);
-  for (const button of document.querySelectorAll("#tools button")) button.disabled = held();
+  for (const id of ["tools", "how", "keep"]) $(id).hidden = held();
   for (const id of ["fit", "anywhere"]) $(id).disabled = held() || !station.legs;
   history.replaceState(null, "", `#${s + 1}/${k + 1}/${shown}`);
   overlay().then(find);
