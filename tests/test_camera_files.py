@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pkmcal.cameras import camera_models, load_camera
-from pkmcal.cameras.files import read_camera, write_camera
+from pkmcal.cameras.files import write_camera
 from pkmcal.errors import InputError
 
 VALUES = {
@@ -31,7 +31,7 @@ def test_a_written_camera_is_read_back_the_same(model, form, ending, tmp_path):
         pytest.skip("no such file")
     path = tmp_path / f"camera.{ending}"
     write_camera(camera_of(model), path, form)
-    again = read_camera(path)
+    again = load_camera(path)
     assert again.model == model
     assert again.image_size == (1024, 768)
     np.testing.assert_allclose(again.parameters, VALUES[model], rtol=1e-12)
@@ -52,7 +52,7 @@ def test_own_files_are_read_too(tmp_path):
     from pkmcal.cameras.files import save_camera
 
     save_camera(camera_of("unified"), tmp_path / "a.yaml")
-    assert read_camera(tmp_path / "a.yaml").model == "unified"
+    assert load_camera(tmp_path / "a.yaml").model == "unified"
 
 
 ROS = """\
@@ -103,7 +103,7 @@ distortion_coefficients: !!opencv-matrix
 
 def read_text(tmp_path, text, camera=None):
     (tmp_path / "c.yaml").write_text(text)
-    return read_camera(tmp_path / "c.yaml", camera)
+    return load_camera(tmp_path / (f"c.yaml#{camera}" if camera else "c.yaml"))
 
 
 def test_files_as_others_write_them(tmp_path):
@@ -143,11 +143,11 @@ def test_files_as_others_write_them(tmp_path):
          "camera has a focal length that looks like millimetres; it is wanted in pixels; found 5 "
          "at a width of 640."),
         (ROS, "image_width: 640\n", "", "c.yaml, image_width: this is missing."),
-        (ROS, "camera_matrix", "matrix", "c.yaml: this is no camera file that is known; found the "
-         "keys image_width, image_height, camera_name and 3 more, expected model (pkmcal), "
-         "camera_matrix (OpenCV, ROS), or camera_model under cam0 (Kalibr)."),
+        (ROS, "camera_matrix", "matrix", "c.yaml, model: the camera's model is missing; expected "
+         "fisheye or pinhole or unified. OpenCV's files have camera_matrix, image_width and "
+         "image_height; ROS's camera_matrix; Kalibr's camera_model under cam0."),
         (KALIBR, "", "", "c.yaml: the file holds several cameras; found cam0 and cam1. Name one "
-         "of them."),
+         "behind a #, such as c.yaml#cam1."),
     ],
 )  # fmt: skip
 def test_faults_of_others_files(tmp_path, text, old, new, sentence):

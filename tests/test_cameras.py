@@ -420,7 +420,9 @@ def test_the_parameters_of_a_file_stand_in_their_order(tmp_path):
         (
             "model: pinhole\n",
             "",
-            "a.yaml, model: the camera's model is missing; expected MODELS.",
+            "a.yaml, model: the camera's model is missing; expected MODELS. OpenCV's files have "
+            "camera_matrix, image_width and image_height; ROS's camera_matrix; Kalibr's "
+            "camera_model under cam0.",
         ),
         (
             "model: pinhole",

@@ -18,12 +18,15 @@ import pytest
 
 import pkmcal
 from conftest import run
+from pkmcal.boards.board import load_board
 from pkmcal.calibration.results import load
 from pkmcal.cameras import load_camera
 from pkmcal.commands.cli import main
+from pkmcal.errors import InputError
 from pkmcal.files import read_csv
-from pkmcal.mechanisms import load_mechanism
-from pkmcal.session.starter import TO_FILL, template_files
+from pkmcal.mechanisms import catalogue, load_mechanism
+from pkmcal.session.load import load_session
+from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
 
 COMMANDS = (
     *("demo", "new", "check", "view", "camera", "plan", "calibrate", "validate", "servo"),
@@ -225,20 +228,20 @@ def test_an_earlier_demo_is_removed(tmp_path):
 def test_new_then_check_says_what_is_missing(tmp_path):
     done = run("new", tmp_path / "mine")
     assert done.code == 0
-    assert all(name in done.out for name in template_files())
+    assert all(name in done.out for name in session_texts())
     assert "pkmcal check" in done.out
     found = run("check", tmp_path / "mine")
     said = " ".join(found.out.split())
     assert found.code == 2
     assert "there is no photograph under this pattern; found only README.txt in" in said
-    for name, what in TO_FILL.items():
+    for name, what in ((n, w) for n, w in TO_FILL.items() if n in session_texts()):
         assert f"{name} is still the example of pkmcal new: {what}" in said
 
 
 def test_new_files_load(tmp_path):
     folder = tmp_path / "mine"
     done = run("new", folder, "--json")
-    assert sorted(done.json["files"]) == sorted(template_files())
+    assert sorted(done.json["files"]) == sorted(session_texts())
     machine = load_mechanism(folder / "mechanism.yaml")
     assert machine.n_legs == 6
     assert load_camera(folder / "cameras" / "front.yaml").image_size == (1024, 768)
@@ -246,6 +249,56 @@ def test_new_files_load(tmp_path):
     assert machine.forward_result(readings.values).converged.all()
     for name in ("session.yaml", "mechanism.yaml", "cameras/front.yaml"):
         assert (folder / name).read_text().startswith("# ")
+
+
+@pytest.mark.parametrize("name", sorted(catalogue()))
+def test_a_new_session_of_any_machine_lacks_its_photographs_alone(name, tmp_path):
+    done = run("new", tmp_path / "mine", "--machine", name, "--json")
+    assert done.code == 0
+    drawn, folder = load_mechanism(name), tmp_path / "mine"
+    assert load_mechanism(folder / "mechanism.yaml").parameters.names == drawn.parameters.names
+    readings = read_csv(folder / "joints.csv").values
+    assert drawn.forward_result(readings).converged.all()
+    assert np.ptp(readings, axis=0).max() > 0
+    text = (folder / "session.yaml").read_text()
+    if drawn.redundancy:
+        assert "\nstations:" not in text
+        session = load_session(folder)
+    else:
+        seen = "legs" if drawn.document.legs[0].tubes else "board"
+        assert f"observe: {seen}\n" in text
+        with pytest.raises(InputError, match="there is no photograph under this pattern"):
+            load_session(folder)
+        session = load_session(folder, measured=False)
+        assert (session.board is None) == (seen == "legs")
+    assert session.machine.n_joints == drawn.n_joints
+    untouched = " ".join(untouched_files(folder))
+    assert all(f"{what}" in untouched for what in TO_FILL if (folder / what).exists())
+
+
+def test_a_new_session_with_a_board_and_places(tmp_path):
+    folder = tmp_path / "mine"
+    options = ("--board", "--legs", "--places", "5", "--machine", "gough-stewart")
+    assert run("new", folder, *options).code == 0
+    session = load_session(folder, measured=False)
+    assert [s.name for s in session.stations] == ["front", "left", "right", "back", "place5"]
+    assert {s.observe for s in session.stations} == {("legs", "board")}
+    assert load_board(session.board).tolerance == 0.001
+    assert "board.yaml is still the example" in " ".join(untouched_files(folder))
+    refused = run("new", tmp_path / "delta", "--machine", "delta", "--legs")
+    assert refused.code == 2
+    assert "the drawing of delta has no cylinders that a camera could see" in refused.err
+    assert not (tmp_path / "delta").exists()
+
+
+def test_new_asks_on_a_terminal(tmp_path, monkeypatch):
+    answers = iter(["gough-stewart", "both", "3", "linear-delta", "1"])
+    monkeypatch.setattr("pkmcal.commands.new.on_terminal", lambda: True)
+    monkeypatch.setattr("rich.prompt.PromptBase.get_input", lambda *_a, **_k: next(answers))
+    assert run("new", tmp_path / "mine").code == 0
+    assert len(load_session(tmp_path / "mine", measured=False).stations) == 3
+    assert run("new", tmp_path / "delta").code == 0
+    assert (tmp_path / "delta" / "board.yaml").exists()
 
 
 def test_new_in_a_folder_that_is_not_empty(demo):
@@ -439,7 +492,7 @@ def test_usage_errors(words, said):
     ],
 )  # fmt: skip
 def test_no_traceback_whatever_happens(error, code, said, tmp_path, monkeypatch):
-    def fail(_folder):
+    def fail(*_words):
         raise error
 
     monkeypatch.setattr("pkmcal.session.starter.write_session", fail)

@@ -102,3 +102,9 @@ def test_line_ends_and_a_byte_order_mark_stay():
 def test_what_would_change_something_else_is_refused(stations):
     with pytest.raises(InputError, match=r"session\.yaml, line \d.*without changing something"):
         with_numbers(HEAD + stations, "session.yaml", KEYS, POSE)
+
+
+def test_a_number_with_its_unit_becomes_one_in_metres():
+    text = HEAD + "  front:\n    pose: {position: [250 mm, -1.5 m, 0], look_at: [0, 0, 1 m]}\n"
+    done = with_numbers(text, "session.yaml", KEYS, POSE)
+    assert "{position: [0.25, -1.5, 0.125], look_at: [0.0, 0.5, 0.2], up: [0.1" in done

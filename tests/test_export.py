@@ -12,7 +12,7 @@ import yaml
 from conftest import run
 from export_sources import CAMERA, built, calibration, source_of
 from pkmcal.calibration.source import load_source
-from pkmcal.cameras.files import read_camera
+from pkmcal.cameras.files import load_camera
 from pkmcal.cameras.unified import Unified
 from pkmcal.errors import InputError, ResultError
 from pkmcal.export import ros
@@ -288,7 +288,7 @@ def test_ros_gets_cameras_and_where_they_stand(tmp_path):
     np.testing.assert_allclose(found["left_side"][:3, 2], forward, atol=1e-12)
     path = tmp_path / "camera.yaml"
     path.write_text(made.files["camera_info_front.yaml"])
-    np.testing.assert_array_equal(read_camera(path).parameters, CAMERA.parameters)
+    np.testing.assert_array_equal(load_camera(path).parameters, CAMERA.parameters)
 
 
 def test_a_tampered_transform_is_found(tmp_path):

@@ -31,7 +31,7 @@ import numpy as np
 from pkmcal.files import Schema
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
-    BaseCarrier, Chain, Direction, Interval, PlatformCarrier, vectors,
+    BaseCarrier, Chain, Direction, Stroke, PlatformCarrier, vectors,
 )
 
 Point = tuple[float, float, float]
@@ -43,7 +43,7 @@ class RockerDocument(Schema):
     pivot: Point
     axis: Direction
     motor: int | None = None
-    range: Interval | None = None
+    range: Stroke | None = None
 
 
 class RampDocument(Schema):
@@ -51,7 +51,7 @@ class RampDocument(Schema):
     center: Point
     top: Point
     motor: int | None = None
-    range: Interval | None = None
+    range: Stroke | None = None
 
 
 class PostDocument(Schema):

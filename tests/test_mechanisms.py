@@ -392,6 +392,13 @@ def test_carriers_broadcast(side, carrier):
             "mechanism file, legs from 1.",
         ),
         (
+            "motion: planar",
+            'motion: planar\nfixed: ["\\x85"]',
+            "m.yaml, line 3, fixed[1]: there is no parameter '\\x85'; expected a name such as "
+            "'legs[1].base.center.x'. Write the parameter as its path in the mechanism file, legs "
+            "from 1.",
+        ),
+        (
             "name: small\n",
             "name: small\ntolerance: {center: 0.0}\n",
             "m.yaml, line 2, tolerance.center: this value cannot be used; found 0.0, "

@@ -50,7 +50,7 @@ import numpy as np
 from pkmcal.files import Schema
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
-    BaseCarrier, Chain, Direction, Interval, NamedMotion, ParameterKind, vectors,
+    BaseCarrier, Chain, Direction, Stroke, NamedMotion, ParameterKind, vectors,
 )
 
 
@@ -59,7 +59,7 @@ class LeaningDocument(Schema):
     center: tuple[float, float, float]
     axis: Direction
     arm: tuple[float, float, float]
-    range: Interval | None = None
+    range: Stroke | None = None
 
 
 class LeaningCrank(BaseCarrier):
@@ -105,7 +105,7 @@ class ArcDocument(Schema):
     axis: Direction
     normal: Direction
     radius: float
-    range: Interval | None = None
+    range: Stroke | None = None
 
 
 class Arc(BaseCarrier):

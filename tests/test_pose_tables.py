@@ -98,7 +98,7 @@ def spoilt(row, column, value):
         (FULL + "\n" + rows(whole()[1][:2]), ["too few poses", "found 2 rows"]),
         ("configuration,z\n" + rows(whole()[1][:6, :1]), ["too few heights", "7 at least"]),
         ("configuration,x,y,z,rx,ry,rz\n" + rows(np.rad2deg(whole()[2])),
-         ["line 2", "rx, ry, rz", "longer than a whole turn", "pi/180"]),
+         ["line 2", "rx, ry, rz", "longer than a whole turn", "rx [deg]"]),
         (spoilt(1, 1, "0,3"), ["line 3", "another number of cells"]),
         (spoilt(1, 1, "much"), ["line 3, column y", "not a number"]),
     ],

@@ -175,6 +175,12 @@ def test_a_changed_value(folder):
     assert "Calibrate again" in said
 
 
+def test_a_lost_reading(folder):
+    said = rewritten(folder, lambda data: data["configurations"][2]["joints"].pop())
+    assert "configurations[3].joints: the calibration does not agree with itself" in said
+    assert "expected the 6 readings of its machine, not 5" in said
+
+
 def test_a_changed_name(folder):
     said = rewritten(folder, lambda data: data["parameters"].pop())
     assert "expected the names of the mechanism's parameters" in said

@@ -69,6 +69,51 @@ def fault(folder):
 # what loads
 
 
+def test_lengths_with_units_are_what_they_are_in_metres(folder):
+    plain = load_session(folder)
+    change(folder, "session.yaml", "noise: 3.0e-6", "noise: 3 um")
+    change(folder, "session.yaml", "[0.0, -1.0, 0.2]", "[0 mm, -100 cm, 200 mm]")
+    header, *rows = JOINTS.splitlines()
+    rows = [row.split(",") for row in rows]
+    rows = [",".join([row[0], *(f"{float(x) * 1000:g}" for x in row[1:])]) for row in rows]
+    heads = header.replace(",", " [mm],").removeprefix("configuration [mm]") + " [mm]"
+    (folder / "joints.csv").write_text("\n".join(["configuration" + heads, *rows]) + "\n")
+    again = load_session(folder)
+    assert again.joint_noise == plain.joint_noise
+    np.testing.assert_allclose(again.joints, plain.joints, rtol=1e-15)
+    assert again.document["joints"]["columns"] == plain.document["joints"]["columns"]
+    np.testing.assert_array_equal(again.stations[0].T_camera_base, plain.stations[0].T_camera_base)
+
+
+OTHERS = {
+    "ros": "image_width: 8\nimage_height: 6\ndistortion_model: plumb_bob\n"
+    "camera_matrix: {rows: 3, cols: 3, data: [9, 0, 3.5, 0, 9, 2.5, 0, 0, 1]}\n",
+    "kalibr": "cam0:\n  camera_model: pinhole\n  distortion_model: none\n"
+    "  intrinsics: [9, 9, 3.5, 2.5]\n  resolution: [8, 6]\n",
+}
+
+
+@pytest.mark.parametrize("form", OTHERS)
+def test_a_stations_camera_is_read_as_other_programs_write_it(folder, form):
+    plain = load_session(folder).stations[0].camera
+    (folder / "cameras" / "front.yaml").write_text(OTHERS[form])
+    (front,) = load_session(folder).stations
+    assert type(front.camera) is type(plain)
+    np.testing.assert_array_equal(front.camera.parameters, plain.parameters)
+
+
+def test_one_of_several_cameras_is_named_behind_its_file(folder):
+    two = OTHERS["kalibr"] + OTHERS["kalibr"].replace("cam0", "cam1").replace("[9, 9", "[10, 10")
+    (folder / "cameras" / "front.yaml").write_text(two)
+    assert "Name one behind a #, such as cameras/front.yaml#cam1" in fault(folder)
+    change(folder, "session.yaml", "front.yaml", "front.yaml#cam1")
+    (front,) = load_session(folder).stations
+    assert front.camera.parameters[0] == 10
+    assert front.camera_file == "cameras/front.yaml#cam1"
+    change(folder, "session.yaml", "front.yaml#cam1", "front.yaml#cam7")
+    assert "no such camera; found cam7, expected cam0 and cam1" in fault(folder)
+
+
 def test_a_session(folder):
     session = load_session(folder)
     assert session.configurations == ("0000", "0001", "0002")
@@ -218,8 +263,16 @@ EDITS = [
     ("session.yaml", "observe: legs", "observe: leg",
      ["line 8, stations.front.observe: no station can observe this",
       "found 'leg', expected legs"]),
-    ("session.yaml", "3.0e-6", "0", ["line 3, joints.noise", "found 0, expected a number above 0"]),
-    ("session.yaml", "noise: 3.0e-6", "noise: 3 um", ["joints.noise", "'3 um', expected a number"]),
+    ("session.yaml", "3.0e-6", "0", ["line 3, joints.noise", "found 0, expected a number of 1e"]),
+    ("session.yaml", "noise: 3.0e-6", "noise: few", ["joints.noise", "'few', expected a number"]),
+    ("session.yaml", "noise: 3.0e-6", "noise: 3 kg",
+     ["line 3, joints.noise: '3 kg' is not a length or an angle; write it in metres or radians"]),
+    ("session.yaml", "noise: 3.0e-6", "noise: 3 deg",
+     ["line 3, joints.noise: '3 deg' is not a length; write it in metres, or with a unit"]),
+    ("session.yaml", "[0.0, -1.0, 0.2]", "[0.0, -1000, 200]",
+     ["line 10, stations.front.pose.position: the camera's place looks like millimetres",
+      "found 1000 m", "with its unit, such as 1250 mm, or divide by 1000"]),
+    ("joints.csv", "leg2", "leg2 [deg]", ["line 1, column leg2: this column is in another kind"]),
     ("session.yaml", ", noise: 3.0e-6", "", ["joints.noise: this is missing", "in metres or rad"]),
     ("session.yaml", "[0.0, -1.0, 0.2]", "[0.0, -1.0]",
      ["line 10, stations.front.pose.position: this has too few entries",
@@ -386,3 +439,9 @@ def test_one_stations_photographs_under_two_names(folder):
         stream.write(station.replace("  front:", "  left:"))
     message = fault(folder)
     assert "stations.left.images: station left has the photographs of station front" in message
+
+
+def test_photographs_of_another_ending_are_told(folder):
+    for path in (folder / "images" / "front").iterdir():
+        path.rename(path.with_suffix(".JPG"))
+    assert "Photographs there end in .JPG: write images/front/{configuration}.JPG." in fault(folder)

@@ -662,3 +662,15 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, alone):
     one = study("a", ["configurations=5"], runs=600)
     assert runs_bytes(many, "study.csv") == runs_bytes(one, "study.csv")
     assert str(document_of(many)) == str(document_of(one))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+def test_a_pipe_in_the_place_of_a_batch_is_none(tmp_path):
+    first = study("3-rpr", SMALL[1:2], runs=10, out=tmp_path)
+    batch = next(tmp_path.glob("batches/*.npz"))
+    batch.unlink()
+    os.mkfifo(batch)
+    again = study("3-rpr", SMALL[1:2], runs=10, out=tmp_path)
+    one, two = (r.results[0].values("position", *ESTIMATE) for r in (first, again))
+    np.testing.assert_array_equal(one, two)
+    assert batch.is_file()

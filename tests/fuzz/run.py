@@ -34,11 +34,13 @@ PROGRESS = re.compile(r"[A-Z][^:]* \(\d+%, \d+ s\)")
 """What a long command says off a terminal."""
 PLACE = re.compile(
     r"\bline \d+|\bcolumn |\bstation\d|\bat station |camera [\w/.]+:"
-    r"|\.(yaml|json|csv|xml), [\w\[\]{}.-]+|[\w-]+\.(png|jpg)\b|mechanism '"
+    r"|\.(yaml|json|csv|xml)(, [\w\[\]{}.-]+|: (legs|the camera)\b)|[\w-]+\.(png|jpg)\b|mechanism '"
 )
 """Where a fault is: by its line, its column, a file's field, a station, a camera that stands in no
 place of its own, or a photograph's name; or what kind of machine it is that a command does not
 take."""
+
+ELSEWHERE = re.compile(r"(^|: )/[\w/.-]+, line \d+")
 
 
 @dataclass(frozen=True)
@@ -127,9 +129,9 @@ def _command(words: tuple[str, ...]) -> int:
 
 
 def _read_camera(path: Path) -> None:
-    from pkmcal.cameras.files import read_camera
+    from pkmcal.cameras.files import load_camera
 
-    read_camera(path)
+    load_camera(path)
 
 
 def _look_at(folder: Path) -> None:
@@ -186,7 +188,8 @@ def judged(case, code, seconds, kilobytes, out, err, before, after) -> Result:
     has_file, has_field = True, True
     if refused and case.spoilt:
         text = " ".join(errors)
-        has_file = any(name in text for name in _files_of(case))
+        # another file that a spoilt session names, such as /etc/passwd, is a file as well
+        has_file = any(name in text for name in _files_of(case)) or bool(ELSEWHERE.search(text))
         places = [words for _, _, words in case.spoilt]
         if len(places) == 1 and places[0] and "mine.txt" not in text:
             said = text.lower()

@@ -17,14 +17,14 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.files import Document, Schema, closest, read_yaml, shown, validate
+from pkmcal.files import Document, Metres, Schema, Share, closest, read_yaml, shown, validate
 
 Count = Annotated[int, Field(ge=3, le=100)]
 Counts = tuple[Count, Count]
 InnerCorners = tuple[Annotated[int, Field(ge=3, le=100)], Annotated[int, Field(ge=3, le=100)]]
-Length = Annotated[float, Field(gt=0)]
+Length = Annotated[Metres, Field(gt=0)]
 Tolerance = Annotated[
-    float, Field(ge=0, le=0.05, description="standard deviation of the board's size, relative")
+    Share, Field(ge=0, le=0.05, description="standard deviation of the board's size, relative")
 ]
 PRINTED = 1e-3
 """Standard deviation of a printed board's size, relative, unless its file says otherwise: paper

@@ -121,8 +121,16 @@ def texts_of(
     cameras = calibration.cameras
     for file in cameras.files if cameras.refined else ():
         camera = cameras.result(calibration.estimate, file)
-        texts[f"camera-{Path(file).stem}.yaml"] = camera_text(camera)
+        texts[refined_camera(file)] = camera_text(camera)
     return texts
+
+
+def refined_camera(file: str) -> str:
+    """The name of a camera's file as refined with the machine, by the one that the session names:
+    camera-front.yaml of cameras/front.yaml; other folders, and a # in it, become hyphens.
+    """
+    parts = re.split(r"[/\\#]", re.sub(r"\.(ya?ml|xml|json)(?=#|$)", "", file))
+    return f"camera-{'-'.join(p for p in parts if p not in ('', '.', '..', 'cameras'))}.yaml"
 
 
 def calibrated_mechanism_text(calibration: Calibration) -> str:
@@ -632,6 +640,10 @@ def load(source: Path | str) -> SavedCalibration:
         ("targets", "T_platform_target"),
     ):
         _check_poses(document, group, key, getattr(saved, group))
+    for k, one in enumerate(saved.configurations):
+        if len(one.joints) != machine.n_joints:
+            wanted = f"the {machine.n_joints} readings of its machine, not {len(one.joints)}"
+            raise _edited(document, f"configurations[{k + 1}].joints", wanted)
     placed, joint = _covariance(document, saved)
     return SavedCalibration(
         path=document.path,

@@ -11,9 +11,15 @@ from types import MappingProxyType
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.results import EVERYTHING, MECHANISM, SavedCalibration, load
+from pkmcal.calibration.results import (
+    EVERYTHING,
+    MECHANISM,
+    SavedCalibration,
+    load,
+    refined_camera,
+)
 from pkmcal.cameras.contract import Camera
-from pkmcal.cameras.files import load_camera
+from pkmcal.cameras.files import camera_path, load_camera
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.wording import listed
@@ -149,10 +155,10 @@ def _camera_file(folder: Path, file: str, session: Path | None) -> Path | None:
     """A station's camera: as refined with the machine, or as the session had it; a tracker's
     table is none.
     """
-    if Path(file).suffix not in (".yaml", ".yml"):
+    if Path(file).suffix == ".csv":
         return None
-    refined = folder / f"camera-{Path(file).stem}.yaml"
+    refined = folder / refined_camera(file)
     if refined.is_file():
         return refined
     given = None if session is None else session / file
-    return given if given is not None and given.is_file() else None
+    return given if given is not None and camera_path(given)[0].is_file() else None

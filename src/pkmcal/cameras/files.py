@@ -17,7 +17,6 @@ from pkmcal.files import (
     closest,
     parse_yaml,
     read_text,
-    read_yaml,
     shown,
     validate,
     write_text,
@@ -28,8 +27,32 @@ from pkmcal.wording import listed
 
 
 def load_camera(path: Path | str, label: str | None = None) -> Camera:
-    """Read a camera file; every fault is an InputError with its line."""
-    return camera_from_document(read_yaml(path, label))
+    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; which one is told by its content.
+
+    path : of one of several cameras in a Kalibr file with its name, ``camchain.yaml#cam1``. label :
+    the file's name in messages. Every fault is an InputError with its line.
+    """
+    path, camera = camera_path(path)
+    label = label.removesuffix(f"#{camera}") if label else path.name
+    text = read_text(path, label)
+    if "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv")):
+        return _from_opencv(text, label)
+    document = parse_yaml(text, path, label)
+    cameras = [key for key, value in document.data.items() if _is_kalibr(value)]
+    if cameras:
+        return _from_kalibr(document, cameras, camera)
+    if camera is not None:
+        raise InputError("the file holds no cameras with names", where=label, found=camera)
+    if "camera_matrix" in document.data:
+        return _from_ros(document)
+    return camera_from_document(document)
+
+
+def camera_path(path: Path | str) -> tuple[Path, str | None]:
+    """A camera's file, and its name in it where one stands behind a #."""
+    path = Path(path)
+    file, sign, camera = path.name.rpartition("#")
+    return (path.with_name(file), camera) if file and sign and not path.exists() else (path, None)
 
 
 def camera_from_document(document: Document) -> Camera:
@@ -43,6 +66,10 @@ def camera_from_document(document: Document) -> Camera:
             where=document.where("model"),
             found=name,
             expected=f"{guess}" if guess else " or ".join(sorted(models)),
+            next_step=None
+            if name
+            else "OpenCV's files have camera_matrix, image_width and image_height; ROS's"
+            " camera_matrix; Kalibr's camera_model under cam0",
         )
     fields = validate(document, models[name].schema)
     camera = models[name].from_document(fields)
@@ -109,31 +136,6 @@ _OPENCV_NAMES: dict[str, tuple[str, ...]] = {
     "height": ("image_height", "image_Height", "height"),
     "xi": ("xi", "Xi"),
 }
-
-
-def read_camera(path: Path | str, camera: str | None = None) -> Camera:
-    """Read a camera file of pkmcal, OpenCV, ROS or Kalibr; which one is told by its content.
-
-    camera : name of one of several in a Kalibr file, such as cam1.
-    """
-    path = Path(path)
-    text = read_text(path)
-    if "opencv-matrix" in text or text.startswith(("%YAML:1.0", "<?xml", "<opencv")):
-        return _from_opencv(text, path.name)
-    document = parse_yaml(text, path)
-    if "model" in document.data:
-        return load_camera(path)
-    if "camera_matrix" in document.data:
-        return _from_ros(document)
-    cameras = [key for key, value in document.data.items() if _is_kalibr(value)]
-    if cameras:
-        return _from_kalibr(document, cameras, camera)
-    raise InputError(
-        "this is no camera file that is known",
-        where=path.name,
-        found=f"the keys {listed(list(document.data), 4)}",
-        expected="model (pkmcal), camera_matrix (OpenCV, ROS), or camera_model under cam0 (Kalibr)",
-    )
 
 
 def write_camera(camera: Camera, path: Path | str, form: str) -> None:
@@ -293,7 +295,7 @@ def _from_kalibr(document: Document, cameras: list[str], wanted: str | None) -> 
     if wanted is None and len(cameras) > 1:
         raise InputError(
             "the file holds several cameras", where=document.label, found=listed(cameras),
-            next_step="Name one of them",
+            next_step=f"Name one behind a #, such as {document.label}#{cameras[-1]}",
         )  # fmt: skip
     key = wanted or cameras[0]
     if key not in cameras:

@@ -12,7 +12,6 @@ import typer
 from pkmcal.commands import console
 from pkmcal.commands.finish import PAGE, finish
 
-ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"}
 FILES = {
     "camera.html": PAGE,
     "camera.yaml": "the camera, for a session's cameras/",
@@ -133,6 +132,7 @@ def of_session(folder: Path) -> tuple[list[Path], Path]:
 def photographs(images: list[Path]) -> list[Path]:
     """The photographs named, folders opened; in the order of their names."""
     from pkmcal.errors import InputError
+    from pkmcal.files import ENDINGS
 
     out: list[Path] = []
     for path in images:

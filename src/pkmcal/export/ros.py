@@ -17,7 +17,7 @@ import yaml
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.source import Source
-from pkmcal.cameras.files import read_camera, write_camera
+from pkmcal.cameras.files import load_camera, write_camera
 from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented, exact
 from pkmcal.geometry.rigid import from_quaternion, pose, quaternion
@@ -67,7 +67,7 @@ class Ros(Exporter):
                 with TemporaryDirectory() as folder:
                     path = Path(folder) / "camera.yaml"
                     path.write_text(text, encoding="utf-8")
-                    again = read_camera(path)
+                    again = load_camera(path)
                 worst = float(np.abs(again.parameters - camera.parameters).max())
                 limit = 1e-12 * float(np.abs(camera.parameters).max())
                 out.append(Difference(f"camera of {station} read again", worst, limit, "px"))

@@ -16,8 +16,20 @@ from pkmcal.files.documents import (
 )
 from pkmcal.files.edits import with_numbers
 from pkmcal.files.exif import Exif, read_exif, with_exif
-from pkmcal.files.headers import stated_size
+from pkmcal.files.headers import ENDINGS, stated_size
 from pkmcal.files.locking import alone_in
+from pkmcal.files.quantities import (
+    TOO_LARGE,
+    Metres,
+    Point,
+    Radians,
+    Reading,
+    Share,
+    any_unit,
+    no_such,
+    split_head,
+    with_unit,
+)
 from pkmcal.files.regular import check_regular
 from pkmcal.files.schema import Schema, field_path, validate
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
@@ -35,12 +47,20 @@ from pkmcal.files.writing import (
 from pkmcal.wording import listed
 
 __all__ = [
+    "ENDINGS",
+    "TOO_LARGE",
     "CsvTable",
     "Document",
     "Exif",
     "Keys",
+    "Metres",
+    "Point",
+    "Radians",
+    "Reading",
     "Schema",
+    "Share",
     "alone_in",
+    "any_unit",
     "check_own_folder",
     "check_regular",
     "check_writable",
@@ -50,6 +70,7 @@ __all__ = [
     "field_path",
     "json_text",
     "listed",
+    "no_such",
     "parse_yaml",
     "plain",
     "read_csv",
@@ -60,12 +81,14 @@ __all__ = [
     "remove_folder",
     "settle",
     "shown",
+    "split_head",
     "staged_folder",
     "stated_size",
     "validate",
     "wanted_file",
     "with_exif",
     "with_numbers",
+    "with_unit",
     "write_bytes",
     "write_folder",
     "write_text",

@@ -478,8 +478,8 @@ def read_json(path: Path | str, label: str | None = None) -> Document:
     """Read a JSON file whose top is an object; its values have no lines."""
     path = Path(path)
     label = label or path.name
+    text = read_text(path, label)
     try:
-        text = read_text(path, label)
         data = json.loads(text, parse_constant=_refuse)
     except RecursionError:
         raise InputError("the file is nested too deeply to be read", where=label) from None

@@ -8,6 +8,8 @@ import re
 import zlib
 from typing import BinaryIO, Literal
 
+ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm"})
+"""Of these files' names, in lower case."""
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START = b"\xff\xd8"
 # Start-of-frame markers: FFC0 to FFCF without tables (C4), arithmetic tables (CC), JPG (C8).

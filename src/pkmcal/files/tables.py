@@ -16,12 +16,15 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.errors import LONGEST_NAME, InputError
 from pkmcal.files.documents import LARGEST, closest, shown, text_blocks
+from pkmcal.files.quantities import Unit, split_head
 from pkmcal.wording import listed
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _PLAIN = re.compile(r"[-+.0-9eE]*", re.ASCII)
 _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)|#.*", re.IGNORECASE)
 """Words for "no number" that programs write into cells; spreadsheets write #N/A or #VALUE!."""
+
+_KINDS = {"m": "a length, such as mm", "rad": "an angle, such as deg", "": "plain numbers"}
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class CsvTable:
     label : the file's name in messages.
     columns : names of the m number columns, in the file's order.
     names : the first column, one name a row, all different.
-    values : (K, m) numbers, in the file's unit.
+    values : (K, m) numbers, in the file's unit, or in SI where its head names one.
     lines : the file's line (from 1) of each row.
     """
 
@@ -40,6 +43,21 @@ class CsvTable:
     names: tuple[str, ...]
     values: Array
     lines: tuple[int, ...]
+    units: tuple[Unit | None, ...] = ()
+    """What each column's head names behind its name, ``leg1 [mm]``."""
+
+    def check_kinds(self, kinds: Sequence[str]) -> None:
+        """Raise `InputError` where a column's head names a unit that is not of its kind, "m", "rad"
+        or "" for numbers without one.
+        """
+        for name, found, kind in zip(self.columns, self.units, kinds, strict=False):
+            if found is not None and found.kind != kind:
+                raise InputError(
+                    "this column is in another kind of unit than what it holds",
+                    where=f"{self.label}, line 1, column {name}",
+                    found=_KINDS[found.kind],
+                    expected=_KINDS[kind],
+                )
 
     def where(self, row: int, column: int | None = None) -> str:
         """Name file, line and column, as in "joints.csv, line 4, column leg2"."""
@@ -65,6 +83,8 @@ def read_csv(
     header_line, header = next(rows, (0, None))
     if header is None:
         raise InputError("the file is empty", where=label, expected=f"a header: {key},…")
+    heads = [split_head(head) for head in header[1:]]
+    header[1:] = [name for name, _ in heads]
     _check_header(header, key, columns, f"{label}, line {header_line}")
     lines: dict[str, int] = {}
     values = array("d")
@@ -85,7 +105,9 @@ def read_csv(
     if not lines:
         raise InputError("there are no rows under the header", where=label)
     each = np.array(values).reshape(len(lines), len(header) - 1)
-    return CsvTable(label, tuple(header[1:]), tuple(lines), each, tuple(lines.values()))
+    units = tuple(found for _, found in heads)
+    each *= [found.factor if found else 1.0 for found in units]
+    return CsvTable(label, tuple(header[1:]), tuple(lines), each, tuple(lines.values()), units)
 
 
 def csv_text(

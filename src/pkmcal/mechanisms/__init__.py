@@ -5,8 +5,18 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
 from pkmcal.errors import InputError
-from pkmcal.files import Document, closest, read_yaml, validate, yaml_text
+from pkmcal.files import (
+    TOO_LARGE,
+    Document,
+    any_unit,
+    closest,
+    read_yaml,
+    validate,
+    yaml_text,
+)
 from pkmcal.mechanisms.document import MechanismDocument, Model
 from pkmcal.mechanisms.machine import Machine, machine_from_document, with_exact_scales
 from pkmcal.mechanisms.parameters import ParameterTable
@@ -75,6 +85,18 @@ def checked_machine(checked: MechanismDocument, document: Document, *keys: str) 
         if (error.where or "").startswith(document.label):
             raise
         raise error.located(document.where(*keys, *_role(checked, str(error)))) from None
+    table = machine.parameters
+    lengths = np.where(np.array(table.units) == "m", np.abs(table.drawing), 0.0)
+    longest = int(np.argmax(lengths))
+    if lengths[longest] > TOO_LARGE and not any_unit(document.data):
+        raise InputError(
+            "the drawing's lengths look like millimetres",
+            where=document.where(*keys),
+            found=f"{table.names[longest]} of {lengths[longest]:g} m",
+            expected=f"metres, at most {TOO_LARGE:g} where no value has a unit",
+            next_step="Write each length with its unit, such as 269.3 mm, or divide them by 1000;"
+            " in a session also the camera's pose, and head the columns of joints.csv leg1 [mm]",
+        )
     return machine
 
 
@@ -88,8 +110,11 @@ def _role(checked: MechanismDocument, sentence: str) -> tuple[str | int, ...]:
         for g, group in enumerate(checked.tied)
         for k, name in enumerate(group)
     ]
-    named = (keys for keys, name in entries if name and name.removeprefix("-") in sentence)
-    return next(named, ())
+
+    def is_named(name: str) -> bool:
+        return repr(name) in sentence or (bool(name) and name.removeprefix("-") in sentence)
+
+    return next((keys for keys, name in entries if is_named(name)), ())
 
 
 def _model(document: MechanismDocument, name: str) -> Model:

@@ -18,7 +18,7 @@ from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 from pkmcal.arrays import Array
 from pkmcal.errors import LONGEST_NAME
-from pkmcal.files import Schema
+from pkmcal.files import Metres, Point, Radians, Schema, Share
 from pkmcal.mechanisms.carriers.contract import (
     Carrier,
     ParameterKind,
@@ -40,15 +40,15 @@ class ActuatedLength(Schema):
     """
 
     actuated: Literal[True]
-    offset: float = 0.0
-    range: Annotated[tuple[float, float], AfterValidator(_increasing)] | None = None
+    offset: Metres = 0.0
+    range: Annotated[tuple[Metres, Metres], AfterValidator(_increasing)] | None = None
 
 
 class ConstantLength(Schema):
     """``length: {actuated: false, constant: 0.48}``: a rod of one length, metres."""
 
     actuated: Literal[False]
-    constant: Annotated[float, Field(gt=0, description="the rod's length in metres")]
+    constant: Annotated[Metres, Field(gt=0, description="the rod's length in metres")]
 
 
 class PassiveLength(Schema):
@@ -139,9 +139,9 @@ PlatformNode = Annotated[Any, _OneOfTheCarriers(platform_carriers)]
 class Tube(Schema):
     """One visible cylinder of a leg; ``from`` and ``to`` in metres from A along the leg."""
 
-    radius: Annotated[float, Field(gt=0)]
-    start: Annotated[float, Field(alias="from", ge=0)]
-    stop: Annotated[float, Field(alias="to")]
+    radius: Annotated[Metres, Field(gt=0)]
+    start: Annotated[Metres, Field(alias="from", ge=0)]
+    stop: Annotated[Metres, Field(alias="to")]
 
     def model_post_init(self, _context: Any) -> None:
         """A tube has a length."""
@@ -167,20 +167,20 @@ class Tolerance(Schema):
     parts of one, where 0 is exact.
     """
 
-    center: Annotated[float, Field(gt=0)] = 0.002
-    offset: Annotated[float, Field(gt=0)] = 0.002
-    radius: Annotated[float, Field(gt=0)] = 0.0001
-    axis: Annotated[float, Field(gt=0, lt=1)] = 0.005
-    arm: Annotated[float, Field(gt=0)] = 0.001
-    angle: Annotated[float, Field(gt=0, lt=1)] = 0.02
-    scale: Annotated[float, Field(ge=0, lt=0.1)] | None = None
+    center: Annotated[Metres, Field(gt=0)] = 0.002
+    offset: Annotated[Metres, Field(gt=0)] = 0.002
+    radius: Annotated[Metres, Field(gt=0)] = 0.0001
+    axis: Annotated[Radians, Field(gt=0, lt=1)] = 0.005
+    arm: Annotated[Metres, Field(gt=0)] = 0.001
+    angle: Annotated[Radians, Field(gt=0, lt=1)] = 0.02
+    scale: Annotated[Share, Field(ge=0, lt=0.1)] | None = None
 
 
 class Home(Schema):
     """A pose in the middle of the workspace; it decides which assembly the machine has."""
 
-    position: tuple[float, float, float]
-    rotation_vector: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position: Point
+    rotation_vector: tuple[Radians, Radians, Radians] = (0.0, 0.0, 0.0)
 
 
 def _some_legs(legs: tuple[Leg, ...]) -> tuple[Leg, ...]:

@@ -1,8 +1,9 @@
 """What decoders say on standard error, which they do without asking, taken from there.
 
 libpng and libjpeg tell faults to the process' standard error and not to their caller. For as long
-as a picture is decoded that file stands for another one; one picture at a time, so that nobody is
-blamed for another's. What others write meanwhile, such as a progress bar, is passed on afterwards.
+as pictures are decoded that file stands for another one. Several are decoded at once; one that may
+have told a fault is decoded again alone, so that nobody is blamed for another's. What others write
+meanwhile, such as a progress bar, is passed on afterwards.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Callable
-from threading import Lock
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, contextmanager
+from threading import Condition
 from typing import TypeVar
 
 Decoded = TypeVar("Decoded")
@@ -28,33 +30,83 @@ _REMARK = re.compile(
     rb"|Warning: unknown JFIF .*\n?|Invalid SOS parameters .*\n?"
 )
 """What is wrong beside it, such as a colour profile, and nobody's business."""
-_one_at_a_time = Lock()
 
 
-def listening(decode: Callable[[], Decoded]) -> tuple[Decoded, str]:
-    """What `decode` returns, and the first fault of the picture that it told on standard error."""
-    with _one_at_a_time:
+class _Ear:
+    """Standard error stands for a file of ours while anybody decodes; many may at once.
+
+    Whose fault it was is told by decoding again alone, which only faulty pictures cost.
+    """
+
+    def __init__(self) -> None:
+        self._changed = Condition()
+        self._busy, self._waiting = 0, 0
+        self._held = ExitStack()
+        self._heard: int | None = None
+
+    @contextmanager
+    def listening(self, alone: bool) -> Generator[Callable[[], bytes]]:
+        """What was said since, by anybody who decoded meanwhile."""
+        with self._changed:
+            if alone:
+                self._waiting += 1
+                self._changed.wait_for(lambda: not self._busy)
+                self._waiting -= 1
+            else:
+                self._changed.wait_for(lambda: self._busy >= 0 and not self._waiting)
+            if not self._busy:
+                self._begin()
+            self._busy = -1 if alone else self._busy + 1
+            start = self._said()
+        try:
+            yield lambda: self._since(start)
+        finally:
+            with self._changed:
+                self._busy = 0 if alone else self._busy - 1
+                if not self._busy:
+                    self._held.close()
+                self._changed.notify_all()
+
+    def _begin(self) -> None:
         if sys.stderr is not None:  # pyright: ignore[reportUnnecessaryComparison]
             sys.stderr.flush()
         try:
             own = os.dup(STANDARD_ERROR)
         except OSError:  # it is closed, and nobody hears them
-            return decode(), ""
-        try:
-            with tempfile.TemporaryFile() as heard:
-                os.dup2(heard.fileno(), STANDARD_ERROR)
-                try:
-                    found = decode()
-                finally:
-                    os.dup2(own, STANDARD_ERROR)
-                heard.seek(0)
-                said = heard.read()
-            rest = _REMARK.sub(b"", _FAULT.sub(b"", said))
-            if rest:
-                os.write(own, rest)
-        finally:
-            os.close(own)
-    fault = _FAULT.search(said)
+            return
+        self._held.callback(os.close, own)
+        heard = self._held.enter_context(tempfile.TemporaryFile())  # noqa: SIM115
+        self._heard = heard.fileno()
+        os.dup2(self._heard, STANDARD_ERROR)
+        self._held.callback(self._give_back, own)
+
+    def _give_back(self, own: int) -> None:
+        os.dup2(own, STANDARD_ERROR)
+        rest = _REMARK.sub(b"", _FAULT.sub(b"", self._since(0)))
+        if rest:
+            os.write(own, rest)
+        self._heard = None
+
+    def _said(self) -> int:
+        return 0 if self._heard is None else os.fstat(self._heard).st_size
+
+    def _since(self, start: int) -> bytes:
+        return b"" if self._heard is None else os.pread(self._heard, self._said() - start, start)
+
+
+_ear = _Ear()
+
+
+def listening(decode: Callable[[], Decoded]) -> tuple[Decoded, str]:
+    """What `decode` returns, and the first fault of the picture that it told on standard error."""
+    with _ear.listening(alone=False) as heard:
+        found = decode()
+        said = heard()
+    if not _FAULT.search(said):
+        return found, ""
+    with _ear.listening(alone=True) as heard:
+        found = decode()
+        fault = _FAULT.search(heard())
     return found, fault[1].decode("utf-8", "replace").removesuffix(
         " (libpng)"
     ).strip() if fault else ""

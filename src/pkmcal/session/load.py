@@ -16,19 +16,24 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.cameras import Camera, load_camera
+from pkmcal.cameras import Camera
+from pkmcal.cameras.files import camera_path, load_camera
 from pkmcal.errors import LONGEST_NAME, InputError
 from pkmcal.files import (
+    TOO_LARGE,
     CsvTable,
     Document,
     Keys,
+    any_unit,
     check_regular,
     closest,
+    no_such,
     read_csv,
     read_yaml,
     shown,
     validate,
     wanted_file,
+    with_unit,
 )
 from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
@@ -168,6 +173,12 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
     if measured or (folder / schema.joints.file).exists():
         path = _existing(folder, document, schema.joints.file, ("joints", "file"))
         table, noise = read_csv(path, label=schema.joints.file), schema.joints.noise
+        written = with_unit(document.data["joints"]["noise"])
+        if written and written.kind not in machine.joint_units:
+            raise InputError(
+                no_such(machine.joint_units[0], document.data["joints"]["noise"]),
+                where=document.where("joints", "noise"),
+            )
         warnings = check_readings(table, machine.joint_ranges, noise, machine.joint_units)
         if measured and not schema.stations:
             _check_redundant(document, machine)
@@ -398,14 +409,25 @@ def _stations(
         camera = camera_by_exif([(p.path, _inside(folder, p.path)) for p in photographs], label)
         camera_file = f"exif/{name}.yaml"
     else:
-        path = _existing(folder, document, station.camera, (*keys, "camera"))
-        camera, camera_file = load_camera(path, label=station.camera), station.camera
+        camera_file = station.camera
+        _, inside = camera_path(folder / camera_file)
+        _existing(folder, document, camera_file.removesuffix(f"#{inside}"), (*keys, "camera"))
+        camera = load_camera(folder / camera_file, label=camera_file)
     for photo in photographs:
         _check_size(folder, photo, camera, camera_file)
     T_camera_base = None
     if station.handheld:
         _check_handheld(document, name, station)
     if station.pose is not None:
+        away = max(map(abs, station.pose.position))
+        if away > TOO_LARGE and not any_unit(document.data):
+            raise InputError(
+                "the camera's place looks like millimetres",
+                where=document.where(*keys, "pose", "position"),
+                found=f"{away:g} m",
+                expected=f"metres, at most {TOO_LARGE:g} where no value has a unit",
+                next_step="Write it with its unit, such as 1250 mm, or divide by 1000",
+            )
         try:
             T_camera_base = look_at_pose(**station.pose.model_dump())
         except InputError as error:

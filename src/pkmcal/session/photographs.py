@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import glob
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from string import Formatter
 
 from pkmcal.errors import InputError
-from pkmcal.files import check_regular, closest, shown, stated_size
+from pkmcal.files import ENDINGS, check_regular, closest, shown, stated_size
 from pkmcal.wording import listed
 
 _FIELDS = ("configuration", "repeat")
@@ -168,12 +169,28 @@ def _none_found(folder: Path, wildcard: str, pattern: str, where: str) -> InputE
         entries = sorted(entry.name for entry in place.iterdir())
         others = f"{len(entries)} other entries, such as" if len(entries) > 1 else "only"
         found = f"{others} {entries[0]} in {place}" if entries else f"nothing in {place}"
+    ending = Path(pattern).suffix
+    alike = Counter(_endings(folder, wildcard.removesuffix(ending)))
+    others = [other for other, _ in alike.most_common() if other != ending]
     return InputError(
         "there is no photograph under this pattern",
         where=where,
         found=found,
         expected=f"files {pattern}",
+        next_step=f"Photographs there end in {others[0]}: write"
+        f" {pattern.removesuffix(ending)}{others[0]}"
+        if others
+        else None,
     )
+
+
+def _endings(folder: Path, wildcard: str) -> list[str]:
+    """Those of the photographs under a pattern without its ending, .JPG and the like."""
+    try:
+        names = glob.glob(f"{wildcard}.*", root_dir=folder)
+    except (OSError, ValueError):  # such as a name that no folder can have
+        return []
+    return [ending for name in names if (ending := Path(name).suffix).lower() in ENDINGS]
 
 
 def _stranger(

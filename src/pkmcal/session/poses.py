@@ -113,6 +113,8 @@ def read_poses(
     """
     table = read_csv(path, label=label)
     kind = _kind(table)
+    lengths, turns = dict.fromkeys(POINT, "m"), dict.fromkeys(VECTOR, "rad")
+    table.check_kinds([(lengths | turns).get(name, "") for name in table.columns])
     if kind == "poses" and rotation_noise is None:
         raise InputError(
             "the poses' orientations have no stated noise",
@@ -195,7 +197,7 @@ def _turn(table: CsvTable, column: dict[str, Array]) -> Array:
                 where=f"{table.where(int(bad[0]))}, columns {', '.join(VECTOR)}",
                 found=f"{size[bad[0]]:.4g}",
                 expected="radians, at most 3.1416",
-                next_step="If these are degrees, multiply them by pi/180",
+                next_step="If these are degrees, head the columns rx [deg], ry [deg], rz [deg]",
             )
         return rotation(vector)
     return np.broadcast_to(np.eye(3), (len(table.names), 3, 3))
@@ -217,5 +219,5 @@ def check_lengths(table: PoseTable, T_base_platform: Array) -> None:
         where=table.label,
         found=f"positions that vary by {spread:.4g}",
         expected=f"metres; the platform itself moves by {moved:.3g} by its readings",
-        next_step="Divide x, y and z by 1000",
+        next_step="Divide x, y and z by 1000, or head them x [mm], y [mm], z [mm]",
     )

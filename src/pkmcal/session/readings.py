@@ -22,8 +22,18 @@ _MARGIN = 0.05
 # a million, so more than this is movement.
 _ALIKE = 6.0
 _UNITS = {
-    "m": (1e-3, "millimetres", "metres", "Divide them by 1000"),
-    "rad": (pi / 180, "degrees", "radians", "Multiply them by pi/180"),
+    "m": (
+        1e-3,
+        "millimetres",
+        "metres",
+        "Divide them by 1000, or head the columns leg1 [mm] and so on",
+    ),
+    "rad": (
+        pi / 180,
+        "degrees",
+        "radians",
+        "Multiply them by pi/180, or head them motor1 [deg] and so on",
+    ),
 }
 
 
@@ -37,6 +47,7 @@ def check_readings(
     unless told.
     """
     _check_columns(table, len(ranges))
+    table.check_kinds(units or ["m"] * len(ranges))
     if len(table.names) < 2:
         raise InputError(
             "there is only one configuration",

@@ -6,11 +6,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
-from pkmcal.files import Schema, closest, shown
+from pkmcal.files import Metres, Point, Radians, Reading, Schema, closest, shown
 
 Body = Literal["base", "platform"]
 """What a board may be fixed to."""
 Vector = tuple[float, float, float]
+NOISE = Field(ge=1e-12, lt=10)
+"""m or rad; nothing measures better, nor is of any use that measures worse."""
 WORDS = ("legs", "board")
 """What a station can observe, in the order in which it is written back."""
 
@@ -19,7 +21,7 @@ class JointsDocument(Schema):
     """``joints``: where the readings are, and how good."""
 
     file: str = Field(description="the readings' file, for example joints.csv")
-    noise: Annotated[float, Field(gt=0)] = Field(
+    noise: Annotated[Reading, NOISE] = Field(
         description="the standard deviation of a reading in metres or radians, such as 3.0e-6"
     )
 
@@ -27,8 +29,8 @@ class JointsDocument(Schema):
 class PoseDocument(Schema):
     """``pose``: a rough camera pose, by hand, in metres in the base frame."""
 
-    position: Vector = Field(description="the camera's place in the base frame, [x, y, z] in m")
-    look_at: Vector = Field(description="a point in the image's middle, base frame, [x, y, z] in m")
+    position: Point = Field(description="the camera's place in the base frame, [x, y, z] in m")
+    look_at: Point = Field(description="a point in the image's middle, base frame, [x, y, z] in m")
     up: Vector = (0.0, 0.0, 1.0)
 
 
@@ -62,10 +64,10 @@ class StationDocument(Schema):
 class NoiseDocument(Schema):
     """``noise`` of a tracker, one standard deviation."""
 
-    position: Annotated[float, Field(gt=0)] = Field(
+    position: Annotated[Metres, NOISE] = Field(
         description="the standard deviation of a coordinate in metres, such as 2.0e-5"
     )
-    rotation: Annotated[float, Field(gt=0)] | None = Field(
+    rotation: Annotated[Radians, NOISE] | None = Field(
         default=None, description="the standard deviation of a turn in radians, such as 1.0e-4"
     )
 
@@ -111,10 +113,10 @@ def _board(value: Any) -> Any:
 class WorkspaceDocument(Schema):
     """``workspace``: where the tool is to be right."""
 
-    x: tuple[float, float] | None = Field(default=None, description="[lowest, highest] x in m")
-    y: tuple[float, float] | None = Field(default=None, description="[lowest, highest] y in m")
-    z: tuple[float, float] | None = Field(default=None, description="[lowest, highest] z in m")
-    turn: float | None = Field(
+    x: tuple[Metres, Metres] | None = Field(default=None, description="[lowest, highest] x in m")
+    y: tuple[Metres, Metres] | None = Field(default=None, description="[lowest, highest] y in m")
+    z: tuple[Metres, Metres] | None = Field(default=None, description="[lowest, highest] z in m")
+    turn: Radians | None = Field(
         default=None, description="how far the platform turns from home in rad, such as 0.26"
     )
 

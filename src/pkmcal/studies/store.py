@@ -25,7 +25,7 @@ from pkmcal.arrays import Array
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import InputError
-from pkmcal.files import alone_in, json_text, plain, write_bytes, write_text
+from pkmcal.files import alone_in, check_regular, json_text, plain, write_bytes, write_text
 from pkmcal.mechanisms import Machine
 from pkmcal.studies.tasks import Batch, Done, Key, Sample, Setting
 
@@ -75,11 +75,13 @@ class Store:
     def load(self, cell: int, number: int, batch: Batch) -> Done | None:
         """A finished batch; None where it is still to be done, or has another number of runs."""
         try:
-            content = io.BytesIO(self._path(cell, number).read_bytes())
+            path = self._path(cell, number)
+            check_regular(path, path.name)
+            content = io.BytesIO(path.read_bytes())
             with np.load(content, allow_pickle=False) as file:
                 runs, wall, cpu = file["done"].tolist()
                 arrays = {name: file[name] for name in file.files if name != "done"}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        except (InputError, OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
         if runs != batch.runs:
             return None

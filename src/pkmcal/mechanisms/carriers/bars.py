@@ -13,7 +13,7 @@ from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Schema
+from pkmcal.files import Point, Schema
 from pkmcal.geometry.batches import turned
 from pkmcal.geometry.rigid import axial, cross, dot, rotation, skew
 from pkmcal.mechanisms.carriers.contract import (
@@ -30,7 +30,7 @@ from pkmcal.mechanisms.carriers.contract import (
 )
 
 BarNumber = Annotated[int, Field(ge=1, description="the number of the side bar, from 1")]
-Point = Annotated[tuple[float, float, float], Field(description="a point [x, y, z] in metres")]
+Centre = Annotated[Point, Field(description="a point [x, y, z] in metres")]
 
 
 FOLDED = "its side bars lie on each other"
@@ -41,8 +41,8 @@ class BarDocument(Schema):
     """``{joint: bar, center: [0, 0.06, 0], hinge: [0.06, 0, 0], bar: 1}``: metres."""
 
     joint: Literal["bar"]
-    center: Point
-    hinge: Point
+    center: Centre
+    hinge: Centre
     bar: BarNumber
 
 
@@ -50,8 +50,8 @@ class HingedBarDocument(Schema):
     """``{joint: hinged-bar, center: [...], hinge: [...], axis: [0, 0, 1], bar: 1}``: metres."""
 
     joint: Literal["hinged-bar"]
-    center: Point
-    hinge: Point
+    center: Centre
+    hinge: Centre
     axis: Annotated[Direction, Field(description="the direction [x, y, z] of the hinge")]
     bar: BarNumber
 

@@ -25,7 +25,7 @@ from pydantic import AfterValidator
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Schema
+from pkmcal.files import Metres, Radians, Schema
 from pkmcal.geometry.rigid import apply, dot, skew
 
 SHORTEST = 1e-6
@@ -66,8 +66,10 @@ def _rising(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-Interval = Annotated[tuple[float, float], AfterValidator(_rising)]
-"""Smallest and largest reading of a motor."""
+Stroke = Annotated[tuple[Metres, Metres], AfterValidator(_rising)]
+"""Smallest and largest reading of a motor that goes, m."""
+Sweep = Annotated[tuple[Radians, Radians], AfterValidator(_rising)]
+"""Smallest and largest reading of a motor that turns, rad."""
 
 
 class ParameterKind(NamedTuple):

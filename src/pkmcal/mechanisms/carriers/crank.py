@@ -9,16 +9,16 @@ from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Schema
+from pkmcal.files import Metres, Point, Radians, Schema
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms.carriers.contract import (
     BaseCarrier,
     Chain,
     Direction,
-    Interval,
     NamedMotion,
     ParameterKind,
     Site,
+    Sweep,
     direction_by_frame,
     moved_direction,
     moved_point,
@@ -38,19 +38,19 @@ class CrankDocument(Schema):
 
     joint: Literal["crank"]
     center: Annotated[
-        tuple[float, float, float],
+        Point,
         Field(description="a point [x, y, z] on the crank's axis, metres, base frame"),
     ]
     axis: Annotated[
         Direction, Field(description="the direction [x, y, z] that the crank turns about")
     ]
-    arm: Annotated[float, Field(gt=0, description="the arm's length in metres")]
-    angle: float = 0.0
+    arm: Annotated[Metres, Field(gt=0, description="the arm's length in metres")]
+    angle: Radians = 0.0
     zero: Direction | None = None
-    along: float | None = None
-    radial: float | None = None
+    along: Metres | None = None
+    radial: Metres | None = None
     motor: Annotated[int, Field(ge=1)] | None = None
-    range: Interval | None = None
+    range: Sweep | None = None
 
 
 class _Frame(NamedTuple):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from pkmcal.errors import InputError
-from pkmcal.files import Schema
+from pkmcal.files import Point, Schema
 from pkmcal.mechanisms.carriers.contract import AxisRole, Direction, Site
 
 
@@ -17,7 +17,7 @@ class JointDocument(Schema):
     """``{joint: revolute, center: [x, y, z], axis: [x, y, z]}``: metres, the body's frame."""
 
     joint: Literal["spherical", "universal", "revolute"]
-    center: tuple[float, float, float]
+    center: Point
     axis: Direction | None = None
 
 

@@ -9,16 +9,16 @@ from pydantic import Field
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import Schema
+from pkmcal.files import Point, Schema
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms.carriers.contract import (
     IN_PLANE,
     BaseCarrier,
     Chain,
     Direction,
-    Interval,
     NamedMotion,
     Site,
+    Stroke,
     vectors,
 )
 
@@ -28,12 +28,12 @@ class SliderDocument(Schema):
 
     joint: Literal["slider"]
     center: Annotated[
-        tuple[float, float, float],
+        Point,
         Field(description="the joint's place [x, y, z] at reading zero, metres, base frame"),
     ]
     axis: Annotated[Direction, Field(description="the direction [x, y, z] of a growing reading")]
     motor: Annotated[int, Field(ge=1)] | None = None
-    range: Interval | None = None
+    range: Stroke | None = None
 
 
 @final

@@ -1,0 +1,106 @@
+"""Lengths, angles and shares with a unit, as people write them: 269.3 mm, 30 deg, 0.1 %.
+
+A number without a unit is in metres, radians or parts of one. :data:`Metres`, :data:`Radians`,
+:data:`Share` and :data:`Reading` are the types of such fields in a file's schema; in a table, a
+column's head may name its unit, ``leg1 [mm]``.
+"""
+
+from __future__ import annotations
+
+import re
+from decimal import Decimal
+from functools import cache, partial
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import BeforeValidator
+
+from pkmcal.files.documents import shown
+
+TOO_LARGE = 50.0
+"""m; a machine or a camera's place without a unit that is larger was written in millimetres."""
+_QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)\s*([A-Za-zµμ°%]{1,20})")
+_HEAD = re.compile(r"(.*\S)\s*(?:\[([A-Za-zµμ°%]{1,20})\]|\(([A-Za-zµμ°%]{1,20})\))")
+SHARES = ("%", "percent", "ppm")
+_ROOTS = {"meter": "m", "radian": "rad", "dimensionless": ""}
+_KINDS = {
+    "m": ("a length", "metres", "269.3 mm"),
+    "rad": ("an angle", "radians", "30 deg"),
+    "": ("a share", "parts of one", "0.1 %"),
+    "m or rad": ("a length or an angle", "metres or radians", "0.01 mm"),
+}
+
+
+class Unit(NamedTuple):
+    """What a number in it is multiplied by to be one of ``kind``: "m", "rad" or "" (parts of 1)."""
+
+    factor: float
+    kind: str
+
+
+@cache
+def unit(name: str) -> Unit | None:
+    """The unit of a name such as mm, in, deg or %; None for what is none of these quantities'."""
+    import pint
+
+    try:
+        factor, root = _registry().get_root_units(name)
+    except (pint.PintError, AssertionError):  # the latter for signs that stand alone
+        return None
+    kind = _ROOTS.get(str(root))
+    # without a dimension there are decibels and pi, too
+    if kind is None or (kind == "" and name not in SHARES):
+        return None
+    return Unit(float(factor), kind)
+
+
+@cache
+def _registry() -> Any:
+    import pint  # a third of a second: only where somebody writes a unit
+
+    return pint.UnitRegistry()
+
+
+def with_unit(value: object) -> Unit | None:
+    """The unit with which a file's value is written, or None."""
+    found = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
+    return unit(found[2]) if found else None
+
+
+def any_unit(data: object) -> bool:
+    """Whether any value of a file's content is written with its unit."""
+    if isinstance(data, dict | list):
+        return any(map(any_unit, data.values() if isinstance(data, dict) else data))
+    return with_unit(data) is not None
+
+
+def split_head(head: str) -> tuple[str, Unit | None]:
+    """A column's name, and the unit that its head names behind it."""
+    found = _HEAD.fullmatch(head)
+    known = unit(found[2] or found[3]) if found else None
+    return (found[1], known) if found and known else (head, None)
+
+
+def no_such(kind: str, found: object) -> str:
+    """A sentence about a value with a unit of another kind."""
+    what, plain, example = _KINDS[kind]
+    return f"{shown(found)} is not {what}; write it in {plain}, or with a unit, such as {example}"
+
+
+def _read(kind: str, value: Any) -> Any:
+    """A number in SI of a text with a unit; anything else is left to the schema to judge."""
+    found = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
+    if not found:
+        return value
+    known = unit(found[2])
+    if known is None or known.kind not in kind.split(" or "):
+        raise ValueError(no_such(kind, value))
+    # decimal, so that 269.3 mm is what 0.2693 is
+    return float(Decimal(found[1]) * Decimal(repr(known.factor)))
+
+
+Metres = Annotated[float, BeforeValidator(partial(_read, "m"))]
+Radians = Annotated[float, BeforeValidator(partial(_read, "rad"))]
+Share = Annotated[float, BeforeValidator(partial(_read, ""))]
+Reading = Annotated[float, BeforeValidator(partial(_read, "m or rad"))]
+Point = tuple[Metres, Metres, Metres]
+"""[x, y, z], each with or without a unit."""
