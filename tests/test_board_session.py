@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from pkmcal.boards.prints import Print
 from pkmcal.boards.views import Boards, StationBoard, find_boards
 from pkmcal.calibration.recognise import (
     boards_of,
@@ -24,7 +25,7 @@ from pkmcal.geometry.rigid import apply, inverse, pose, pose_difference, rotatio
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.session.load import load_session
 from pkmcal.simulation import board_for, load_truth
-from pkmcal.simulation.board import SIZE, Print, board_from_fields
+from pkmcal.simulation.board import SIZE, board_from_fields
 from pkmcal.simulation.scene import discs_of
 
 

@@ -29,8 +29,8 @@ from pkmcal.session.load import load_session
 from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
 
 COMMANDS = (
-    *("demo", "new", "check", "view", "camera", "plan", "calibrate", "validate", "servo"),
-    *("export", "watch", "simulate", "study", "reproduce"),
+    *("demo", "new", "check", "view", "board", "camera", "plan", "calibrate", "validate"),
+    *("servo", "export", "watch", "simulate", "study", "reproduce"),
 )
 
 

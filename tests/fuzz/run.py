@@ -30,7 +30,7 @@ INTERNALS = re.compile(
     r"|pydantic|Errno|validation error|\bstr\b|KeyError|IndexError|TypeError|ValueError|imdecode"
 )
 """What no person should be shown."""
-PROGRESS = re.compile(r"[A-Z][^:]* \(\d+%, \d+ s\)")
+PROGRESS = re.compile(r"[A-Z].* \(\d+%, \d+ s\)")
 """What a long command says off a terminal."""
 PLACE = re.compile(
     r"\bline \d+|\bcolumn |\bstation\d|\bat station |camera [\w/.]+:"

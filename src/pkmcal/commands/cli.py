@@ -17,6 +17,7 @@ import typer
 
 from pkmcal import __version__
 from pkmcal.commands import (
+    board,
     calibrate,
     camera,
     check,
@@ -50,6 +51,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "new": new.new,
     "check": check.check,
     "view": view.view,
+    "board": board.board,
     "camera": camera.camera,
     "plan": plan.plan,
     "calibrate": calibrate.calibrate,

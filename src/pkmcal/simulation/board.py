@@ -13,9 +13,9 @@ from typing import Any, final
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Integers
 from pkmcal.boards.board import Board, board_from_document
-from pkmcal.boards.find import dictionary, marker_bits
+from pkmcal.boards.prints import Print
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError
 from pkmcal.geometry.rigid import apply, cross, inverse, pose, rotation
@@ -53,75 +53,6 @@ BETTER_SEEN = {
     "platform": "put the stations on one side of the machine, or use one",
 }
 """What to do where a station sees less."""
-
-
-@dataclass(frozen=True)
-class Print:
-    """What is printed: cells between x (nx + 1,) and y (ny + 1,), m, board frame; dark (ny, nx)."""
-
-    x: Array
-    y: Array
-    dark: Booleans
-
-    @classmethod
-    def of(cls, board: Board) -> Print:
-        """A board's cells: squares, and inside them the modules of the markers."""
-        data = board.document
-        if board.type == "chessboard":
-            columns, rows = (n + 1 for n in board.counts)
-            i, j = np.mgrid[:rows, :columns]
-            edges = [data["square"] * (np.arange(n + 1) - 1.0) for n in (columns, rows)]
-            return cls(edges[0], edges[1], (i + j) % 2 == 0)
-        return _charuco(data) if board.type == "charuco" else _markers(data)
-
-    def dark_at(self, x: Array, y: Array) -> Booleans:
-        """Whether points (n,) of the board's plane are black; white outside the print."""
-        i, j = np.searchsorted(self.y, y) - 1, np.searchsorted(self.x, x) - 1
-        inside = (i >= 0) & (j >= 0) & (i < len(self.y) - 1) & (j < len(self.x) - 1)
-        return self.dark[i * inside, j * inside] & inside
-
-
-def _charuco(data: dict[str, Any]) -> Print:
-    columns, rows = data["squares"]
-    square, marker, bits = data["square"], data["marker"], marker_bits(data["dictionary"]) + 2
-    margin = (square - marker) / 2
-    cells = np.array([0.0, *(margin + marker * np.arange(bits + 1) / bits)])
-    parity = int(bool(data.get("legacy")) and rows % 2 == 0)
-    dark = np.zeros((rows, bits + 2, columns, bits + 2), dtype=bool)
-    number = 0
-    for i, j in np.ndindex(rows, columns):
-        if (i + j) % 2 == parity:
-            dark[i, :, j] = True
-        else:
-            dark[i, 1:-1, j, 1:-1] = _modules(data["dictionary"], number)
-            number += 1
-    x, y = (
-        np.append((np.arange(n)[:, None] * square + cells).ravel(), n * square)
-        for n in (columns, rows)
-    )
-    return Print(x, y, dark.reshape(rows * (bits + 2), -1))
-
-
-def _markers(data: dict[str, Any]) -> Print:
-    columns, rows = data["markers"]
-    bits = marker_bits(data["dictionary"]) + 2
-    cells = data["marker"] * np.arange(bits + 1) / bits
-    dark = np.zeros((rows, bits + 1, columns, bits + 1), dtype=bool)
-    for k, (i, j) in enumerate(np.ndindex(rows, columns)):
-        dark[i, :-1, j, :-1] = _modules(data["dictionary"], data.get("first_id", 0) + k)
-    step = data["marker"] + data["gap"]
-    x, y = (
-        np.append((np.arange(n)[:, None] * step + cells).ravel(), n * step) for n in (columns, rows)
-    )
-    return Print(x, y, dark.reshape(rows * (bits + 1), -1))
-
-
-def _modules(name: str, number: int) -> Booleans:
-    """A marker's modules, its black border included."""
-    import cv2
-
-    picture = cv2.aruco.generateImageMarker(dictionary(name), number, marker_bits(name) + 2)
-    return np.asarray(picture) < 128
 
 
 @final

@@ -35,7 +35,7 @@ BOARD = """\
 # The board on the platform: a ChArUco board printed on something stiff and flat. Other kinds, and
 # what each key means: docs/files.md, board.yaml.
 type: charuco
-squares: [9, 7]           # columns and rows of squares
+squares: [7, 5]           # columns and rows of squares
 square: 30 mm             # the side of a square: measure over all of them, and divide
 marker: 22 mm             # the side of a marker
 dictionary: DICT_5X5_100

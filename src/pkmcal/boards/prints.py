@@ -1,0 +1,236 @@
+"""A board's print: its black cells to the last module, and a sheet of paper with them.
+
+The sheet is a PDF page of plain rectangles in true size, which any printer prints to a tenth of a
+millimetre as long as nobody lets it "fit to page"; lines of a known length beside the board show
+whether somebody did.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+from pkmcal.boards.board import Board
+from pkmcal.boards.find import dictionary, marker_bits
+from pkmcal.errors import InputError
+from pkmcal.files import closest
+
+POINT = 0.0254 / 72
+"""m; PDF's unit of length."""
+PAPERS = {
+    "a4": (0.210, 0.297), "letter": (0.2159, 0.2794), "a3": (0.297, 0.420),
+    "tabloid": (0.2794, 0.4318), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189),
+}  # fmt: skip
+"""Width and height, m, upright."""
+BORDER, LETTERING = 0.008, 0.022
+"""m; what printers leave white at an edge, and the strip for ruler and words at the left and below:
+a board needs white paper round it as well."""
+RULERS = (0.2, 0.1, 0.05)
+"""m; lengths of the lines to measure, the longest that is no longer than the board."""
+LETTER = 8
+"""Points."""
+
+
+@dataclass(frozen=True)
+class Print:
+    """What is printed: cells between x (nx + 1,) and y (ny + 1,), m, board frame; dark (ny, nx)."""
+
+    x: Array
+    y: Array
+    dark: Booleans
+
+    @classmethod
+    def of(cls, board: Board) -> Print:
+        """A board's cells: squares, and inside them the modules of the markers."""
+        data = board.document
+        if board.type == "chessboard":
+            columns, rows = (n + 1 for n in board.counts)
+            i, j = np.mgrid[:rows, :columns]
+            edges = [data["square"] * (np.arange(n + 1) - 1.0) for n in (columns, rows)]
+            return cls(edges[0], edges[1], (i + j) % 2 == 0)
+        return _charuco(data) if board.type == "charuco" else _markers(data)
+
+    def dark_at(self, x: Array, y: Array) -> Booleans:
+        """Whether points (n,) of the board's plane are black; white outside the print."""
+        i, j = np.searchsorted(self.y, y) - 1, np.searchsorted(self.x, x) - 1
+        inside = (i >= 0) & (j >= 0) & (i < len(self.y) - 1) & (j < len(self.x) - 1)
+        return self.dark[i * inside, j * inside] & inside
+
+
+def _charuco(data: dict[str, Any]) -> Print:
+    columns, rows = data["squares"]
+    square, marker, bits = data["square"], data["marker"], marker_bits(data["dictionary"]) + 2
+    margin = (square - marker) / 2
+    cells = np.array([0.0, *(margin + marker * np.arange(bits + 1) / bits)])
+    parity = int(bool(data.get("legacy")) and rows % 2 == 0)
+    dark = np.zeros((rows, bits + 2, columns, bits + 2), dtype=bool)
+    number = 0
+    for i, j in np.ndindex(rows, columns):
+        if (i + j) % 2 == parity:
+            dark[i, :, j] = True
+        else:
+            dark[i, 1:-1, j, 1:-1] = _modules(data["dictionary"], number)
+            number += 1
+    x, y = (
+        np.append((np.arange(n)[:, None] * square + cells).ravel(), n * square)
+        for n in (columns, rows)
+    )
+    return Print(x, y, dark.reshape(rows * (bits + 2), -1))
+
+
+def _markers(data: dict[str, Any]) -> Print:
+    columns, rows = data["markers"]
+    bits = marker_bits(data["dictionary"]) + 2
+    cells = data["marker"] * np.arange(bits + 1) / bits
+    dark = np.zeros((rows, bits + 1, columns, bits + 1), dtype=bool)
+    for k, (i, j) in enumerate(np.ndindex(rows, columns)):
+        dark[i, :-1, j, :-1] = _modules(data["dictionary"], data.get("first_id", 0) + k)
+    step = data["marker"] + data["gap"]
+    x, y = (
+        np.append((np.arange(n)[:, None] * step + cells).ravel(), n * step) for n in (columns, rows)
+    )
+    return Print(x, y, dark.reshape(rows * (bits + 1), -1))
+
+
+def _modules(name: str, number: int) -> Booleans:
+    """A marker's modules, its black border included."""
+    import cv2
+
+    picture = cv2.aruco.generateImageMarker(dictionary(name), number, marker_bits(name) + 2)
+    return np.asarray(picture) < 128
+
+
+def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
+    """A PDF page with the board in true size, and the paper's name.
+
+    paper : one of PAPERS; the smallest ISO size that holds the board unless told. Besides the board
+    there are two lines of a stated length, and what the board is. Raises InputError where the
+    paper is too small.
+    """
+    printed = Print.of(board)
+    size = np.array([printed.x[-1] - printed.x[0], printed.y[-1] - printed.y[0]])
+    name, page = _page(size, paper)
+    corner = np.array([LETTERING, BORDER]) + (page - size - LETTERING - BORDER) / 2
+
+    def on_page(x: float, y: float) -> str:
+        """A point right of and below the page's upper left corner, m, as PDF counts."""
+        return f"{x / POINT:.4f} {(page[1] - y) / POINT:.4f}"
+
+    rectangles = [
+        f"{on_page(x0, y1)} {(x1 - x0) / POINT:.4f} {(y1 - y0) / POINT:.4f} re"
+        for x0, y0, x1, y1 in _rectangles(printed, corner)
+    ]
+    ruler = next((length for length in RULERS if length <= size.min()), RULERS[-1])
+    left, below = corner[0] - 0.6 * LETTERING, corner[1] + size[1] + 0.35 * LETTERING
+    lines = [
+        *_ruler(np.array([corner[0], below]), np.array([ruler, 0.0]), on_page),
+        *_ruler(np.array([left, corner[1] + size[1]]), np.array([0.0, -ruler]), on_page),
+    ]
+    words = [
+        f"{1e3 * ruler:.0f} mm here, along the ruler at the left as well: print in actual size"
+        " (100 %), not fitted to the page.",
+        f"{_described(board)}; over all {1e3 * size[0]:.2f} x {1e3 * size[1]:.2f} mm.",
+        "Fix it to something stiff and flat. Measure it over all, and correct board.yaml by what"
+        " you found.",
+    ]
+    text = [f"BT /F {LETTER} Tf {on_page(corner[0], below + 0.005)} Td 10 TL"]
+    text += [f"({_escaped(line)}) Tj T*" for line in words] + ["ET"]
+    # all in one path: no seams between neighbours where a viewer smoothes their borders
+    content = "\n".join(["0 g", *rectangles, "f", "0.4 w", *lines, "S", *text])
+    return _document(page / POINT, content), name
+
+
+def _page(size: Array, paper: str | None) -> tuple[str, Array]:
+    """The paper's name and its width and height, m, turned as the board is."""
+    if paper is not None and paper.lower() not in PAPERS:
+        raise InputError(
+            "no such paper",
+            where="--paper",
+            found=paper,
+            expected=closest(paper, PAPERS) or ", ".join(PAPERS),
+        )
+    names = [paper.lower()] if paper else [name for name in PAPERS if name.startswith("a")]
+    need = size + LETTERING + BORDER
+    for name in names:
+        short, long = PAPERS[name]
+        for page in (np.array([short, long]), np.array([long, short])):
+            if (page >= need).all():
+                return name, page
+    raise InputError(
+        "the board is larger than the paper",
+        where="--paper" if paper else None,
+        found=f"{1e3 * size[0]:.0f} x {1e3 * size[1]:.0f} mm, and a white border of"
+        f" {1e3 * (LETTERING + BORDER):.0f} mm",
+        expected=f"at most {names[-1]}",
+        next_step="Take a larger paper" if paper else "Choose smaller or fewer squares",
+    )
+
+
+def _rectangles(printed: Print, corner: Array) -> Iterator[tuple[float, float, float, float]]:
+    """Black rectangles (x0, y0, x1, y1), m: runs of dark cells in a row."""
+    x, y = printed.x - printed.x[0] + corner[0], printed.y - printed.y[0] + corner[1]
+    edges = np.diff(np.pad(printed.dark, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    starts, stops = np.argwhere(edges > 0), np.argwhere(edges < 0)
+    for (row, start), (_, stop) in zip(starts.tolist(), stops.tolist(), strict=True):
+        yield x[start], y[row], x[stop], y[row + 1]
+
+
+def _ruler(start: Array, along: Array, on_page: Any) -> list[str]:
+    """A line with a tick at both ends and each tenth."""
+    across = np.array([along[1], -along[0]]) / np.abs(along).max()
+    out = [f"{on_page(*start)} m {on_page(*(start + along))} l"]
+    for k in range(11):
+        at = start + along * k / 10
+        tick = (0.003 if k in (0, 10) else 0.0015) * np.abs(across)
+        out.append(f"{on_page(*(at - tick))} m {on_page(*(at + tick))} l")
+    return out
+
+
+def _described(board: Board) -> str:
+    """What the board is, for who finds the sheet."""
+    data = board.document
+    lengths = [
+        f"{key} {1e3 * data[key]:.6g} mm" for key in ("square", "marker", "gap") if key in data
+    ]
+    lettering = [data["dictionary"]] if "dictionary" in data else []
+    return f"pkmcal: {board.described}, {', '.join(lengths + lettering)}"
+
+
+def _escaped(line: str) -> str:
+    """Text between PDF's brackets."""
+    return line.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
+
+
+def _document(size: Array, content: str) -> bytes:
+    """A PDF 1.7 file (ISO 32000-1, 7.5) of one page of `size` points; printed as it is."""
+    stream = zlib.compress(content.encode("latin-1"))
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {size[0]:.4f} {size[1]:.4f}]"
+        " /Resources << /Font << /F 4 0 R >> >> /Contents 5 0 R >>".encode(),
+        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+        f"<< /Length {len(stream)} /Filter /FlateDecode >>\nstream\n".encode()
+        + stream
+        + b"\nendstream",
+        b"<< /Producer (pkmcal) >>",
+    ]
+    out, places = b"%PDF-1.7\n", []
+    for number, body in enumerate(objects, 1):
+        places.append(len(out))
+        out += f"{number} 0 obj\n".encode() + body + b"\nendobj\n"
+    table = "".join(f"{place:010d} 00000 n \n" for place in places)
+    count = len(objects) + 1
+    return (
+        out
+        + (
+            f"xref\n0 {count}\n0000000000 65535 f \n{table}"
+            f"trailer\n<< /Size {count} /Root 1 0 R /Info {count - 1} 0 R >>\n"
+            f"startxref\n{len(out)}\n%%EOF\n"
+        ).encode()
+    )

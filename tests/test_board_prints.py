@@ -1,0 +1,129 @@
+"""Boards on paper: what the PDF says is where the board's points are, and in true size."""
+
+from __future__ import annotations
+
+import re
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import run
+from pkmcal.boards.detect import detect_boards
+from pkmcal.boards.prints import PAPERS, sheet_pdf
+from pkmcal.errors import InputError
+from pkmcal.simulation.board import board_from_fields
+
+POINT = 25.4 / 72
+"""mm."""
+DPI = 300
+BOARDS = {
+    "charuco": {"type": "charuco", "squares": [9, 7], "square": 0.03, "marker": 0.022,
+                "dictionary": "DICT_5X5_100"},
+    "chessboard": {"type": "chessboard", "corners": [7, 6], "square": 0.02},
+    "aruco_grid": {"type": "aruco_grid", "markers": [4, 5], "marker": 0.03, "gap": 0.008,
+                   "dictionary": "DICT_4X4_50"},
+}  # fmt: skip
+
+
+def content_of(pdf):
+    """The page's size in mm, and what is drawn on it."""
+    size = np.array(re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf).groups(), dtype=float)
+    stream = re.search(rb"stream\n(.*?)\nendstream", pdf, re.DOTALL)[1]
+    return size * POINT, zlib.decompress(stream).decode("latin-1")
+
+
+def rectangles(text):
+    """(n, 4) x0, y0, x1, y1 in mm from the page's lower left corner."""
+    found = re.findall(r"([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re", text)
+    x, y, w, h = np.array(found, dtype=float).T * POINT
+    return np.stack([x, y, x + w, y + h], axis=-1)
+
+
+def rasterised(size, boxes):
+    """The page as a printer of DPI dots an inch sees it, top row first; partly black by area."""
+    scale = 4
+    dots = np.round(size / 25.4 * DPI).astype(int) * scale
+    fine = np.full((dots[1], dots[0]), 255, np.uint8)
+    at = np.round(boxes / 25.4 * DPI * scale).astype(int)
+    for x0, y0, x1, y1 in at:
+        fine[dots[1] - y1 : dots[1] - y0, x0:x1] = 0
+    rows, columns = dots[1] // scale, dots[0] // scale
+    return fine.reshape(rows, scale, columns, scale).mean(axis=(1, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", BOARDS)
+def test_the_printed_board_is_found_with_its_points_in_true_size(kind, tmp_path):
+    board = board_from_fields(BOARDS[kind])
+    pdf, _ = sheet_pdf(board)
+    size, text = content_of(pdf)
+    image = rasterised(size, rectangles(text))
+    cv2.imwrite(str(tmp_path / "page.png"), cv2.GaussianBlur(image, (0, 0), 1.0))
+    (seen,) = detect_boards([tmp_path / "page.png"], board)
+    assert seen.found, seen.reason
+    assert len(seen.ids) == len(board.points)
+    mm = seen.pixels * 25.4 / DPI
+    points = board.points[seen.ids, :2] * 1e3
+    # turned by nothing, enlarged by nothing
+    turn, *_ = np.linalg.lstsq(np.c_[points, np.ones(len(points))], mm, rcond=None)
+    np.testing.assert_allclose(turn[:2], np.eye(2), atol=2e-4)
+
+
+@pytest.mark.parametrize("paper", [None, *PAPERS])
+def test_everything_is_on_the_paper_and_the_rulers_are_as_long_as_they_say(paper):
+    board = board_from_fields(BOARDS["chessboard"])
+    pdf, name = sheet_pdf(board, paper)
+    size, text = content_of(pdf)
+    assert name == (paper or "a4")
+    np.testing.assert_allclose(sorted(size), sorted(np.array(PAPERS[name]) * 1e3), atol=0.01)
+    drawn = re.findall(r"([\d.-]+) ([\d.-]+) m ([\d.-]+) ([\d.-]+) l", text)
+    lines = np.array(drawn, dtype=float).reshape(-1, 2, 2) * POINT
+    boxes = rectangles(text)
+    for points in (lines.reshape(-1, 2), boxes.reshape(-1, 2)):
+        assert np.all(points > 5)
+        assert np.all(points < size - 5)
+    lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=-1)
+    said = float(re.search(r"\((\d+) mm here", text)[1])
+    assert sorted(lengths)[-2:] == pytest.approx([said, said], abs=0.01)
+    # neither touches the board
+    low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
+    inside = (lines > low - 2).all(axis=-1) & (lines < high + 2).all(axis=-1)
+    assert not inside.any()
+
+
+def test_the_file_is_a_pdf_whose_table_leads_to_its_objects():
+    pdf, _ = sheet_pdf(board_from_fields(BOARDS["charuco"]))
+    start = int(re.search(rb"startxref\n(\d+)\n%%EOF\n$", pdf)[1])
+    assert pdf[start:].startswith(b"xref\n0 7\n")
+    places = [int(place) for place in re.findall(rb"(\d{10}) 00000 n ", pdf[start:])]
+    for number, place in enumerate(places, 1):
+        assert pdf[place:].startswith(f"{number} 0 obj\n".encode())
+    assert b"/PrintScaling /None" in pdf
+
+
+def test_papers_too_small_and_papers_unknown():
+    board = board_from_fields(BOARDS["charuco"])
+    with pytest.raises(InputError, match="the board is larger than the paper; found 270 x 210 mm"):
+        sheet_pdf(board, "a4")
+    with pytest.raises(InputError, match="no such paper; found a5, expected a"):
+        sheet_pdf(board, "a5")
+    huge = board_from_fields(BOARDS["charuco"] | {"square": 0.3, "marker": 0.2})
+    with pytest.raises(InputError, match="expected at most a0"):
+        sheet_pdf(huge)
+
+
+def test_the_command(tmp_path):
+    run("new", tmp_path / "mine", "--board")
+    done = run("board", tmp_path / "mine")
+    assert done.code == 0
+    assert "mine/board.pdf, for paper of size a4" in " ".join(done.out.split())
+    assert (tmp_path / "mine" / "board.pdf").read_bytes().startswith(b"%PDF-1.7\n")
+    again = run("board", tmp_path / "mine" / "board.yaml", "--paper", "a2", "--json").json
+    assert again["paper"] == "a2"
+    (tmp_path / "my.pdf").write_bytes(b"%PDF my own")
+    refused = run("board", tmp_path / "mine", "-o", tmp_path / "my.pdf")
+    assert refused.code == 2
+    assert "stays as it is" in refused.err
+    assert (tmp_path / "my.pdf").read_bytes() == b"%PDF my own"
+    assert "no.yaml: the file does not exist" in run("board", tmp_path / "no.yaml").err
