@@ -31,8 +31,8 @@ from pkmcal.session.load import load_session
 from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
 
 COMMANDS = (
-    *("demo", "new", "check", "board", "camera", "plan", "calibrate", "validate", "servo"),
-    *("export", "watch", "diff", "simulate", "study", "reproduce"),
+    *("demo", "new", "check", "view", "board", "camera", "plan", "calibrate", "validate"),
+    *("servo", "export", "watch", "diff", "simulate", "study", "reproduce"),
 )
 
 
@@ -174,7 +174,7 @@ def test_demo_in_words(demo, tmp_path, monkeypatch, calibrated):
     monkeypatch.setattr("pkmcal.commands.demo.SESSION", str(demo.session))
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
-    monkeypatch.setattr("pkmcal.commands.demo._can_show", lambda: True)
+    monkeypatch.setattr("pkmcal.commands.console.can_show", lambda: True)
     done = run("demo", "-o", tmp_path / "out")
     assert done.code == 0
     assert "times nearer" in done.out
@@ -189,7 +189,7 @@ def test_demo_in_words(demo, tmp_path, monkeypatch, calibrated):
     [({"DISPLAY": ":0"}, True), ({"DISPLAY": ":0", "CI": "1"}, False), ({}, False)],
 )
 def test_a_browser_opens_for_people_only(variables, shown, monkeypatch):
-    from pkmcal.commands.demo import _can_show
+    from pkmcal.commands.console import can_show
 
     for name in ("CI", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -197,7 +197,7 @@ def test_a_browser_opens_for_people_only(variables, shown, monkeypatch):
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    assert _can_show() is shown
+    assert can_show() is shown
 
 
 def test_demo_replaces_only_a_demo(tmp_path):

@@ -16,6 +16,7 @@ from pkmcal.outcome import Verdict
 from pkmcal.report import parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
 from pkmcal.report.charts import ticks_between
+from pkmcal.report.drawn import CURVE
 from pkmcal.report.scene import enlargement
 from test_report_case import OUTWARD, RADIUS, Case, edges_of, make_case
 
@@ -196,7 +197,7 @@ def test_edges_are_drawn_where_the_camera_sees_them(tmp_path):
     assert len(edges) > 15
     for n, curve in enumerate(curves):
         leg, radius = edges.leg[n], np.array(RADIUS[int(edges.tube[n])])
-        along = np.linspace(*edges.span[n], pictures.SAMPLES)
+        along = np.linspace(*edges.span[n], CURVE)
         seen = contour_point(legs.a[leg], legs.u[leg], edges.normal[n], radius, along)
         np.testing.assert_allclose(curve, T.project(seen), atol=1e-6)
 

@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Thread
 
 import cv2
 import numpy as np
@@ -33,8 +34,11 @@ from pkmcal.report import page, pictures, scene
 from pkmcal.report import residuals as shown
 from pkmcal.report.calibration import save
 from pkmcal.report.plan import outcome_of
+from pkmcal.session.load import Session
 from pkmcal.simulation import EdgeNoise, load_truth, simulate_edges, simulate_session
 from pkmcal.simulation.demo import MECHANISM, SEED, SETTINGS, demo_camera
+from pkmcal.view.server import LOOPBACK, application, listening, new_token, serve
+from pkmcal.view.viewed import Viewed
 
 sys.path.insert(0, str(Path(__file__).parent))
 import drawings
@@ -49,11 +53,14 @@ REPEATS, EDGE_REPEATS = 12, 60
 
 @dataclass(frozen=True)
 class Shot:
-    """A page to be photographed: HTML and its size in pixels."""
+    """A page to be photographed: HTML and its size in pixels; or a session, as `pkmcal view` shows
+    it.
+    """
 
     html: str
     width: int
     height: int
+    session: Session | None = None
 
 
 def whole_page(body: str, width: int, height: int, more_style: str = "") -> Shot:
@@ -268,7 +275,8 @@ def photograph(shot: Shot, path: Path) -> None:
         command += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         command += ["--virtual-time-budget=8000"]
         command += [f"--window-size={shot.width},{shot.height}", f"--screenshot={target}"]
-        subprocess.run([*command, source.as_uri()], check=True, capture_output=True, timeout=120)
+        address = source.as_uri() if shot.session is None else served(shot.session)
+        subprocess.run([*command, address], check=True, capture_output=True, timeout=120)
         image = cv2.imread(str(target))
     # six bits a colour: sensor noise below them is not seen, and would double the file
     image = (image & 0xFC) | (image >> 6)
@@ -279,6 +287,15 @@ def photograph(shot: Shot, path: Path) -> None:
         sys.exit(f"{path} is larger than {LARGEST / 1e3:.0f} kB")
 
 
+def served(session: Session) -> str:
+    """The address at which a session is to be viewed, until this program ends."""
+    found, token = listening(0), new_token()
+    port = found.getsockname()[1]
+    app = application(Viewed(session, None), token, port)
+    Thread(target=serve, args=(app, found), daemon=True).start()
+    return f"http://{LOOPBACK}:{port}/{token}/"
+
+
 def plan(_case: Case) -> Shot:
     """Where a plan puts three cameras round a hexapod: the page's drawing in space."""
     machine = pkmcal.load_mechanism(MECHANISM)
@@ -287,6 +304,11 @@ def plan(_case: Case) -> Shot:
     kept = tuple(part for part in found.parts if part.name == "where")
     html = page.page_html(replace(found, parts=kept, findings=()))
     return Shot(html, 1000, 1390)
+
+
+def view(case: Case) -> Shot:
+    """A photograph of the session in `pkmcal view`, the drawing at the pose by hand."""
+    return Shot("", 1180, 640, case.session)
 
 
 PICTURES: dict[str, Callable[[Case], Shot]] = {
@@ -302,6 +324,7 @@ PICTURES: dict[str, Callable[[Case], Shot]] = {
         residuals,
         repeats,
         plan,
+        view,
     )
 }
 

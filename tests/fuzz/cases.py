@@ -38,6 +38,8 @@ class Task:
 
 QUICK = ("calibrate tracker", "check tracker", "validate", "watch", "export", "camera board/",
          "simulate OUT --plan", "read-camera")  # fmt: skip
+OF_OURS = ("read-camera", "look-at")
+"""No commands but what commands are made of."""
 FIRST = 1000
 """Cases of smaller numbers have quick tasks only, for tests that are run often."""
 OWN = ("session.yaml", "mechanism.yaml", "joints.csv", "cameras/*.yaml", "images/**/*.*")
@@ -86,6 +88,9 @@ TASKS = (
     Task("study 3-rpr --vary configurations=3 --runs 2 -o study",
          ("study/batches/study.json", "study/batches/*.npz"), "", 1),
     Task("read-camera FILE", ("cameras/*.*",), "", 10),
+    Task("look-at legs", LEGS, "", 2),
+    Task("look-at board", BOARD, "", 1),
+    Task("look-at hand", HAND, "", 1),
 )  # fmt: skip
 """Most often those that are quick, where most malformed files are refused."""
 FORMATS = ("c", "json", "mujoco", "yaml")
@@ -143,7 +148,7 @@ def make(number: int, bases: Path, place: Path) -> Case:
         if rng.random() < 0.1:
             (place / "out" / "mine.txt").write_text("nobody else's business")
     words = words.replace("OUT", "out").split()
-    if rng.random() < 0.4 and words[0] != "read-camera":
+    if rng.random() < 0.4 and words[0] not in OF_OURS:
         words.append("--json")
     return Case(number, tuple(words), out, tuple(spoilt))
 

@@ -115,17 +115,42 @@ def _forked(case: Case, place: Path, scratch: Path) -> tuple[int, float, int]:
 def _command(words: tuple[str, ...]) -> int:
     from pkmcal.commands.cli import main
 
-    if words[0] != "read-camera":
+    own = {"read-camera": _read_camera, "look-at": _look_at}
+    if words[0] not in own:
         return main(words)
-    from pkmcal.cameras.files import load_camera
     from pkmcal.errors import PkmcalError
 
     try:
-        load_camera(words[1])
+        own[words[0]](Path(words[1]))
     except PkmcalError as error:
         sys.stderr.write(f"Error: {error}\n")
         return error.exit_code
     return 0
+
+
+def _read_camera(path: Path) -> None:
+    from pkmcal.cameras.files import load_camera
+
+    load_camera(path)
+
+
+def _look_at(folder: Path) -> None:
+    """What the page of `pkmcal view` asks for of every station, without serving it."""
+    from pkmcal.session.load import load_session
+    from pkmcal.view.found import found
+    from pkmcal.view.overlay import overlay
+    from pkmcal.view.requests import LookRequest
+    from pkmcal.view.server import page_html
+    from pkmcal.view.viewed import Viewed
+
+    viewed = Viewed(load_session(folder), None)
+    page_html(viewed)
+    for k, station in enumerate(viewed.session.stations):
+        if station.photographs:
+            viewed.jpeg(k, 0)
+            look = LookRequest(station=k, photograph=0)
+            overlay(viewed, look)
+            found(viewed, look)
 
 
 def listing(place: Path) -> dict[str, tuple[int, ...]]:

@@ -32,6 +32,7 @@ from pkmcal.commands import (
     simulate,
     study,
     validate,
+    view,
     watch,
 )
 from pkmcal.commands.console import print_error
@@ -51,6 +52,7 @@ COMMANDS: dict[str, Callable[..., int]] = {
     "demo": demo.demo,
     "new": new.new,
     "check": check.check,
+    "view": view.view,
     "board": board.board,
     "camera": camera.camera,
     "plan": plan.plan,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import textwrap
 import threading
@@ -173,3 +174,12 @@ def _lines() -> Generator[Progress]:
 def counted(told: Progress, upto: float = 1.0) -> Callable[[int, int], None]:
     """A callback of photographs done and in all, told as a share of `upto`."""
     return lambda done, total: told(f"Photograph {done} of {total}", upto * done / total)
+
+
+def can_show() -> bool:
+    """Whether there is a person with a browser in front of a screen."""
+    if os.environ.get("CI") or not sys.stdout.isatty():
+        return False
+    if sys.platform.startswith("linux"):
+        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return True

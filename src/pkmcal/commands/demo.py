@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -82,7 +80,7 @@ def demo(
     code = answer(found, result, FILES, as_json=as_json)
     if not as_json:
         _tell_comparison(console.out(), comparison)
-        if not no_open and _can_show():
+        if not no_open and console.can_show():
             import webbrowser
 
             webbrowser.open((result / "report.html").resolve().as_uri())
@@ -130,12 +128,3 @@ def _tell_comparison(out: Console, found: AgainstTruth) -> None:
         " of their standard deviations of the truth; 95 % should."
     )
     console.print_points(out, [("[cyan]→[/]", said)])
-
-
-def _can_show() -> bool:
-    """Whether there is a person with a browser in front of a screen."""
-    if os.environ.get("CI") or not sys.stdout.isatty():
-        return False
-    if sys.platform.startswith("linux"):
-        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    return True

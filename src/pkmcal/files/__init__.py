@@ -14,6 +14,7 @@ from pkmcal.files.documents import (
     wanted_file,
     yaml_text,
 )
+from pkmcal.files.edits import with_numbers
 from pkmcal.files.exif import Exif, read_exif, with_exif
 from pkmcal.files.headers import ENDINGS, stated_size
 from pkmcal.files.locking import alone_in
@@ -86,6 +87,7 @@ __all__ = [
     "validate",
     "wanted_file",
     "with_exif",
+    "with_numbers",
     "with_unit",
     "write_bytes",
     "write_folder",

@@ -239,6 +239,14 @@ def parse_yaml(text: str, path: Path, label: str | None = None) -> Document:
     return _checked(Document(path, label, data, builder.lines))
 
 
+def compose_yaml(text: str) -> yaml.Node:
+    """The nodes of a text that `parse_yaml` has read, with the marks of where each stands."""
+    node = _Loader(text).get_single_node()
+    if node is None:
+        raise InputError("the file is empty", expected="keys and values")
+    return node
+
+
 def _checked(document: Document) -> Document:
     """The same, if all its texts can be written, and nothing in it is nested too deeply."""
     todo: list[tuple[Keys, Any]] = [((), document.data)]

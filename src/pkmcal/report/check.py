@@ -8,31 +8,24 @@ from __future__ import annotations
 import re
 from functools import cache
 from importlib import resources
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array
 from pkmcal.check.look import Look, StationLook
 from pkmcal.files import staged_folder
-from pkmcal.geometry.rigid import apply
-from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.outcome import Part
 from pkmcal.report import page
+from pkmcal.report.drawn import Drawn, Spot, laid_over
 from pkmcal.report.page import N_COLOURS
-from pkmcal.report.pictures import Drawn, Picture, Spot, jpeg, straightened
+from pkmcal.report.pictures import Picture, jpeg
 
-SAMPLES = 65
-"""Points of an edge's curve: where another leg hides it is found to a hundredth of a leg."""
 SHIFT = 4
 """Binary digits of a pixel to which cv2 draws."""
 BAR = 26
 """Height (px) of the line above each picture that says what it shows."""
-NUMBER = 0.04
-"""Width of a leg's number with its joint, in picture widths."""
 GAP = 6
 """Pixels between the two."""
 
@@ -90,47 +83,14 @@ def overlay(
     """Silhouettes of the drawing's tubes in photograph k, where no other leg hides them, and its
     joint centres.
     """
-    machine, camera = look.session.machine, station.photographs.camera
-    tubes = tubes_of(machine)
-    configuration = station.photographs.configuration[k : k + 1]
-    joints, poses = look.session.joints[configuration], look.poses[configuration]
-    legs = legs_in_camera(machine, laid.T_camera_base, poses, joints)
-    points = edge_points(machine, camera, legs, tubes, SAMPLES)
-    clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
-    edges: list[Drawn] = []
-    for e, (curve, seen) in enumerate(zip(points.pixel[0], clear, strict=True)):
-        leg, tip = int(tubes.leg[e]) + 1, f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
-        for start, stop in _runs(seen):
-            line = straightened(curve[start:stop])
-            edges.append(Drawn(leg, tuple((float(x), float(y)) for x, y in line), False, tip))
-    ends = limb_ends(machine.layout, machine.values, joints[0], poses[0])
-    both = camera.project(apply(laid.T_camera_base, np.stack([ends.a, ends.b])))
-    return tuple(edges), _spots(both, camera.in_image(both), camera.image_size[0])
-
-
-def _spots(pixel: Array, seen: Booleans, width: int) -> tuple[Spot, ...]:
-    """Joints (2, L) on base and platform; each leg's number at one of its own that is not beside
-    another number.
-    """
-    room, labels, spots = width * NUMBER, list[Array](), list[Spot]()
-    for j in range(pixel.shape[1]):
-        free = [min((np.hypot(*(p - q)) for q in labels), default=np.inf) for p in pixel[:, j]]
-        at = [end for end in (0, 1) if seen[end, j]]
-        # at the base, where there is room
-        best = max(at, key=lambda end: (min(free[end], room), -end), default=None)
-        for end in at:
-            x, y = pixel[end, j]
-            place = round(float(x), 1), round(float(y), 1)
-            spots.append(Spot(j + 1, ("base", "platform")[end], place, None, end == best))
-        if best is not None:
-            labels.append(pixel[best, j])
-    return tuple(spots)
-
-
-def _runs(seen: Booleans) -> list[tuple[int, int]]:
-    """Stretches (n,) of True that are longer than a point, first and one after the last."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
-    return [(a, b) for a, b in pairwise(ends.tolist()) if seen[a] and b - a > 1]
+    configuration = int(station.photographs.configuration[k])
+    return laid_over(
+        look.session.machine,
+        station.photographs.camera,
+        laid.T_camera_base,
+        look.session.joints[configuration],
+        look.poses[configuration],
+    )
 
 
 # ------------------------------------------------------------------ as files

@@ -12,16 +12,16 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import apply, dot, inverse
+from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
-from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.report import page
-from pkmcal.report.residuals import KEPT, SIDES, radius_positions, rms
+from pkmcal.report.drawn import Drawn, Spot, measured_curves, straightened
+from pkmcal.report.residuals import KEPT, SIDES, rms
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import Photograph
 from pkmcal.wording import count, number
@@ -29,45 +29,7 @@ from pkmcal.wording import count, number
 MOST = 12
 LARGEST_WIDTH = 640
 QUALITY = 70
-SAMPLES = 13
-"""Points of an edge's curve: a mirror bends an edge by less than a pixel between them."""
-STRAIGHT = 0.1
-"""Curves that stay within this many pixels of their chord are written as two points."""
 THREADS = 4
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A fitted edge as a polyline in pixels, (n, 2) in ``points``."""
-
-    leg: int
-    points: tuple[tuple[float, float], ...]
-    quiet: bool
-    tip: str
-
-    @property
-    def path(self) -> str:
-        """SVG path data."""
-        return "M" + "L".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
-
-
-@dataclass(frozen=True)
-class Spot:
-    """A joint centre in pixels: where the calibrated model sees it, and where the drawing does."""
-
-    leg: int
-    end: str
-    calibrated: tuple[float, float]
-    drawing: tuple[float, float] | None
-    labelled: bool
-
-    @property
-    def tip(self) -> str:
-        """What it is, and how far the two are apart."""
-        if self.drawing is None:
-            return f"Leg {self.leg}, {self.end} joint"
-        away = float(np.hypot(*np.subtract(self.calibrated, self.drawing)))
-        return f"Leg {self.leg}, {self.end} joint: drawing {number(away, 1)} px away"
 
 
 @dataclass(frozen=True)
@@ -238,34 +200,16 @@ def _drawn(
 def edge_curves(
     session: Session, edges: EdgeSet, estimate: Estimate, mine: Integers, s: int, k: int
 ) -> Array:
-    """Curves (n, SAMPLES, 2) px of the edges ``mine`` in the picture of station s.
-
-    The predicted contour's rays, each turned into the measured plane: r - (r . n) n.
-    """
-    machine, state = estimate.machine, estimate.state
-    legs = legs_in_camera(
-        machine, state.T_camera_base[s], state.T_base_platform[k], session.joints[k]
+    """Curves (n, CURVE, 2) px of the edges ``mine`` in the picture of station s."""
+    state = estimate.state
+    return measured_curves(
+        estimate.machine,
+        session.stations[s].camera,
+        state.T_camera_base[s],
+        state.T_base_platform[k],
+        session.joints[k],
+        edges.select(mine),
     )
-    part = edges.select(mine)
-    fraction = np.linspace(0, 1, SAMPLES)
-    along = part.span[:, :1] + (part.span[:, 1:] - part.span[:, :1]) * fraction
-    radius = machine.values[radius_positions(machine, part)]
-    axis = legs.a[part.leg][:, None] + along[..., None] * legs.u[part.leg][:, None]
-    normal = part.normal[:, None]
-    rays = axis + radius[:, None, None] * normal
-    rays = rays - dot(rays, normal)[..., None] * normal
-    return session.stations[s].camera.project(rays)
-
-
-def straightened(curve: Array) -> Array:
-    """The two ends (2, 2) of a curve (n, 2) that is straight, else the curve."""
-    if len(curve) < 3:
-        return curve
-    chord = curve[-1] - curve[0]
-    off = curve - curve[0]
-    area = chord[0] * off[:, 1] - chord[1] * off[:, 0]
-    straight = np.abs(area).max() <= STRAIGHT * np.hypot(*chord)
-    return curve[[0, -1]] if straight else curve
 
 
 def _spots(

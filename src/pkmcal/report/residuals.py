@@ -11,7 +11,6 @@ from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import EdgeSet
-from pkmcal.mechanisms import Machine
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Part
 from pkmcal.report import charts
@@ -24,6 +23,7 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
+from pkmcal.report.drawn import radius_positions
 from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
 
@@ -97,12 +97,6 @@ def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Int
     error -= edges.shift * state.edge_shift[camera[edges.station]][:, None]
     weighted = np.linalg.solve(edges.covariance, edges.shift[..., None])[..., 0]
     return dot(weighted, error) / dot(weighted, edges.shift)
-
-
-def radius_positions(machine: Machine, edges: EdgeSet) -> Integers:
-    """Where each edge's radius stands among the machine's parameters, (N,)."""
-    pairs = zip(edges.leg.tolist(), edges.tube.tolist(), strict=True)
-    return np.array([machine.layout.radius[j][t] for j, t in pairs], dtype=int)
 
 
 def rms(white: Array, weights: Array) -> float:

@@ -1,0 +1,66 @@
+"""``pkmcal view``: a session's photographs with the machine laid over, on a local page."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pkmcal.commands import console
+
+
+def view(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")],
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibration", metavar="DIR", help="SESSION/calibration, where it is, unless given."
+        ),
+    ] = None,
+    port: Annotated[
+        int, typer.Option("--port", metavar="N", min=0, max=65535, help="A free one unless given.")
+    ] = 0,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Print the address, and open nothing.")
+    ] = False,
+    as_json: console.Json = False,
+) -> int:
+    """Show photographs with the machine laid over; move it there."""
+    from pkmcal.errors import InputError
+    from pkmcal.session.load import load_session
+    from pkmcal.view.server import LOOPBACK, application, listening, new_token, serve
+    from pkmcal.view.viewed import Viewed
+
+    loaded = load_session(session)
+    if not loaded.stations:
+        raise InputError(
+            "there are no photographs to be shown",
+            where=f"{loaded.folder / 'session.yaml'}, stations",
+            expected="a station with a camera",
+        )
+    beside = loaded.folder / "calibration"
+    viewed = Viewed(
+        loaded, calibration or (beside if (beside / "calibration.json").is_file() else None)
+    )
+    if calibration is not None:
+        _ = viewed.saved  # a wrong one is told before a page stands
+    token = new_token()
+    with listening(port) as found:
+        port = found.getsockname()[1]
+        address = f"http://{LOOPBACK}:{port}/{token}/"
+        app = application(viewed, token, port)
+        if as_json:
+            console.print_json({"url": address})
+        else:
+            out = console.out()
+            out.print(f"The page is at\n\n  {address}\n", soft_wrap=True)
+            out.print("It is served to this computer only, until you press Ctrl-C.")
+        sys.stdout.flush()
+        if not no_browser and not as_json and console.can_show():
+            import webbrowser
+
+            webbrowser.open(address)
+        serve(app, found)
+    return 0

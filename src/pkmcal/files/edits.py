@@ -1,0 +1,206 @@
+"""A person's YAML file changed in one place: comments, order and all else stay byte for byte.
+
+What is written anew are the very characters of the numbers, found by the marks that the parser
+leaves; nothing goes through a writer, which would lay the file out its own way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from pkmcal.errors import InputError
+from pkmcal.files.documents import Document, compose_yaml, parse_yaml
+
+INDENT = 2
+"""Columns by which a new mapping stands in its parent."""
+
+
+class _Change(NamedTuple):
+    """Characters start to stop of a text, and what comes in their place."""
+
+    start: int
+    stop: int
+    text: str
+
+
+def with_numbers(
+    text: str, label: str, keys: tuple[str, ...], entry: Mapping[str, Sequence[float]]
+) -> str:
+    """The text of a YAML file in which the mapping at `keys` holds these lists of numbers.
+
+    text : with the file's own line ends. keys : its parent is there; the mapping need not be. Lists
+    that stand there are changed number by number, absent ones are added. Raises InputError where
+    that is not possible without touching anything else.
+    """
+    before = parse_yaml(text, Path(label), label)
+    edit = _Edit(text, before)
+    after = edit.done(keys, entry)
+    wanted = _with(before.data, keys, entry)
+    # whatever is odd about a file: no other value of it may change
+    if parse_yaml(after, Path(label), label).data != wanted:
+        raise edit.refused(keys, "it stands in a way that cannot be changed by itself")
+    return after
+
+
+def _with(data: Any, keys: tuple[str, ...], entry: Mapping[str, Sequence[float]]) -> Any:
+    """Plain data with the entry put in."""
+    if not keys:
+        return {**(data or {}), **{name: list(values) for name, values in entry.items()}}
+    return {**data, keys[0]: _with(data.get(keys[0]), keys[1:], entry)}
+
+
+@dataclass(frozen=True)
+class _Edit:
+    """One text and what it holds."""
+
+    text: str
+    document: Document
+
+    def done(self, keys: tuple[str, ...], entry: Mapping[str, Sequence[float]]) -> str:
+        """The text with the entry."""
+        root = compose_yaml(self.text)
+        shared = _shared(root)
+        parent = root
+        for key in keys[:-1]:
+            child = self._child(parent, key)
+            if child is None or id(child) in shared:
+                raise self.refused(keys, "it is merged or repeated (<<, &, *) from elsewhere")
+            parent = child
+        if not isinstance(parent, yaml.MappingNode):
+            raise self.refused(keys, "what should hold it is no mapping")
+        name, node = keys[-1], self._child(parent, keys[-1])
+        if node is None:
+            changes = self._added(parent, shared, name, entry)
+        elif any(id(part) in shared for part in _parts(node)):
+            raise self.refused(keys, "it is merged or repeated (<<, &, *) from elsewhere")
+        elif isinstance(node, yaml.MappingNode):
+            changes = self._changed(node, shared, keys, entry)
+        else:  # null, written or not
+            start, stop = _span(node)
+            changes = [_Change(start, stop, " " * (start == stop) + _flow(entry))]
+        text = self.text
+        for change in sorted(changes, reverse=True):
+            text = text[: change.start] + change.text + text[change.stop :]
+        return text
+
+    def _changed(
+        self,
+        node: yaml.MappingNode,
+        shared: set[int],
+        keys: tuple[str, ...],
+        entry: Mapping[str, Sequence[float]],
+    ) -> list[_Change]:
+        """Number by number where the lists stand, the others added."""
+        changes: list[_Change] = []
+        absent: dict[str, Sequence[float]] = {}
+        for name, values in entry.items():
+            child = self._child(node, name)
+            if child is None:
+                absent[name] = values
+            elif isinstance(child, yaml.SequenceNode) and len(child.value) == len(values):
+                pairs = zip(child.value, values, strict=True)
+                changes += [_Change(*_span(item), _number(value)) for item, value in pairs]
+            else:
+                raise self.refused((*keys, name), f"it is no list of {len(values)} numbers")
+        for name, values in absent.items():
+            changes += self._added(node, shared, name, values)
+        return changes
+
+    def _added(
+        self,
+        parent: yaml.MappingNode,
+        shared: set[int],
+        name: str,
+        value: Mapping[str, Sequence[float]] | Sequence[float],
+    ) -> list[_Change]:
+        """A new last entry of a mapping, in its own style."""
+        inner = _flow(value) if isinstance(value, Mapping) else _row(value)
+        if parent.flow_style:
+            stop = parent.end_mark.index - 1
+            start = _end(parent.value[-1][1]) if parent.value else stop
+            return [_Change(start, start, f"{', ' if parent.value else ''}{name}: {inner}")]
+        key, last = parent.value[-1]
+        indent = " " * parent.value[0][0].start_mark.column
+        lines = [f"{indent}{name}: {inner}"]
+        if isinstance(value, Mapping):
+            deeper = indent + " " * INDENT
+            rows = [f"{deeper}{each}: {_row(numbers)}" for each, numbers in value.items()]
+            lines = [f"{indent}{name}:", *rows]
+        eol = "\r\n" if "\r\n" in self.text else "\n"
+        # an alias has the marks of what it stands for
+        at = key.end_mark.index if id(last) in shared else _end(last)
+        if self.text[at - 1] in "\r\n":  # behind a block of text
+            return [_Change(at, at, "".join(line + eol for line in lines))]
+        ends = [k for k in (self.text.find(mark, at) for mark in "\r\n") if k >= 0]
+        end = min(ends, default=len(self.text))
+        return [_Change(end, end, "".join(eol + line for line in lines))]
+
+    def _child(self, node: yaml.Node, key: str) -> yaml.Node | None:
+        """A mapping's own value."""
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        return next((child for name, child in pairs if name.value == key), None)
+
+    def refused(self, keys: tuple[str, ...], why: str) -> InputError:
+        """The error about what cannot be changed by itself."""
+        return InputError(
+            f"this cannot be written without changing something else: {why}",
+            where=self.document.where(*keys),
+            next_step="Write it out by itself, as docs/files.md shows it",
+        )
+
+
+def _parts(node: yaml.Node) -> list[yaml.Node]:
+    """A node and all below it, each as often as it is reached."""
+    if isinstance(node, yaml.MappingNode):
+        below = [part for pair in node.value for part in pair]
+    else:
+        below = node.value if isinstance(node, yaml.SequenceNode) else []
+    return [node, *(part for child in below for part in _parts(child))]
+
+
+def _shared(root: yaml.Node) -> set[int]:
+    """Nodes that an alias repeats, by id; not what stands in them."""
+    seen: set[int] = set()
+    twice: set[int] = set()
+    todo = [root]
+    while todo:
+        node = todo.pop()
+        if id(node) in seen:
+            twice.add(id(node))
+            continue
+        seen.add(id(node))
+        if isinstance(node, yaml.MappingNode):
+            todo += [part for pair in node.value for part in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            todo += node.value
+    return twice
+
+
+def _span(node: yaml.Node) -> tuple[int, int]:
+    return node.start_mark.index, node.end_mark.index
+
+
+def _end(node: yaml.Node) -> int:
+    """Where a value's last character ends: a block's own mark stands behind its comments."""
+    block = isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value
+    if not block:
+        return node.end_mark.index
+    last = node.value[-1]
+    return _end(last[1] if isinstance(node, yaml.MappingNode) else last)
+
+
+def _number(value: float) -> str:
+    return repr(float(value) + 0.0)  # never -0.0
+
+
+def _row(values: Sequence[float]) -> str:
+    return "[" + ", ".join(_number(value) for value in values) + "]"
+
+
+def _flow(entry: Mapping[str, Sequence[float]]) -> str:
+    return "{" + ", ".join(f"{name}: {_row(values)}" for name, values in entry.items()) + "}"

@@ -1,0 +1,152 @@
+"""What is drawn over a photograph: silhouettes of legs and joint centres, in pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.cameras import Camera
+from pkmcal.geometry.rigid import apply, dot
+from pkmcal.measurements import EdgeSet
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.wording import number
+
+CURVE = 13
+"""Points of an edge's curve: a mirror bends an edge by less than a pixel between them."""
+STRAIGHT = 0.1
+"""Curves that stay within this many pixels of their chord are written as two points."""
+FINE = 65
+"""Points of an edge's curve: where another leg hides it is found to a hundredth of a leg."""
+NUMBER = 0.04
+"""Width of a leg's number with its joint, in picture widths."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A fitted edge as a polyline in pixels, (n, 2) in ``points``."""
+
+    leg: int
+    points: tuple[tuple[float, float], ...]
+    quiet: bool
+    tip: str
+
+    @property
+    def path(self) -> str:
+        """SVG path data."""
+        return "M" + "L".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A joint centre in pixels: where the calibrated model sees it, and where the drawing does."""
+
+    leg: int
+    end: str
+    calibrated: tuple[float, float]
+    drawing: tuple[float, float] | None
+    labelled: bool
+
+    @property
+    def tip(self) -> str:
+        """What it is, and how far the two are apart."""
+        if self.drawing is None:
+            return f"Leg {self.leg}, {self.end} joint"
+        away = float(np.hypot(*np.subtract(self.calibrated, self.drawing)))
+        return f"Leg {self.leg}, {self.end} joint: drawing {number(away, 1)} px away"
+
+
+def laid_over(
+    machine: Machine,
+    camera: Camera,
+    T_camera_base: Array,
+    joints: Array,
+    T_base_platform: Array,
+) -> tuple[tuple[Drawn, ...], tuple[Spot, ...]]:
+    """Silhouettes of a machine's tubes in a photograph, where no other leg hides them, and its
+    joint centres.
+
+    joints : (m,) readings. T_base_platform : (4, 4).
+    """
+    tubes = tubes_of(machine)
+    legs = legs_in_camera(machine, T_camera_base, T_base_platform[None], joints[None])
+    points = edge_points(machine, camera, legs, tubes, FINE)
+    clear = unobstructed(machine, camera, legs, tubes, points, 0.0)[0]
+    edges: list[Drawn] = []
+    for e, (curve, seen) in enumerate(zip(points.pixel[0], clear, strict=True)):
+        leg, tip = int(tubes.leg[e]) + 1, f"Leg {tubes.leg[e] + 1}, tube {tubes.tube[e] + 1}"
+        for start, stop in _runs(seen):
+            line = straightened(curve[start:stop])
+            edges.append(Drawn(leg, tuple((float(x), float(y)) for x, y in line), False, tip))
+    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    both = camera.project(apply(T_camera_base, np.stack([ends.a, ends.b])))
+    return tuple(edges), _spots(both, camera.in_image(both), camera.image_size[0])
+
+
+def measured_curves(
+    machine: Machine,
+    camera: Camera,
+    T_camera_base: Array,
+    T_base_platform: Array,
+    joints: Array,
+    edges: EdgeSet,
+) -> Array:
+    """Curves (n, CURVE, 2) px of measured edges in one photograph.
+
+    The predicted contour's rays, each turned into the measured plane: r - (r . n) n.
+    """
+    legs = legs_in_camera(machine, T_camera_base, T_base_platform, joints)
+    fraction = np.linspace(0, 1, CURVE)
+    along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * fraction
+    radius = machine.values[radius_positions(machine, edges)]
+    axis = legs.a[edges.leg][:, None] + along[..., None] * legs.u[edges.leg][:, None]
+    normal = edges.normal[:, None]
+    rays = axis + radius[:, None, None] * normal
+    rays = rays - dot(rays, normal)[..., None] * normal
+    return camera.project(rays)
+
+
+def radius_positions(machine: Machine, edges: EdgeSet) -> Integers:
+    """Where each edge's radius stands among the machine's parameters, (N,)."""
+    pairs = zip(edges.leg.tolist(), edges.tube.tolist(), strict=True)
+    return np.array([machine.layout.radius[j][t] for j, t in pairs], dtype=int)
+
+
+def straightened(curve: Array) -> Array:
+    """The two ends (2, 2) of a curve (n, 2) that is straight, else the curve."""
+    if len(curve) < 3:
+        return curve
+    chord = curve[-1] - curve[0]
+    off = curve - curve[0]
+    area = chord[0] * off[:, 1] - chord[1] * off[:, 0]
+    straight = np.abs(area).max() <= STRAIGHT * np.hypot(*chord)
+    return curve[[0, -1]] if straight else curve
+
+
+def _spots(pixel: Array, seen: Booleans, width: int) -> tuple[Spot, ...]:
+    """Joints (2, L) on base and platform; each leg's number at one of its own that is not beside
+    another number.
+    """
+    room, labels, spots = width * NUMBER, list[Array](), list[Spot]()
+    for j in range(pixel.shape[1]):
+        free = [min((np.hypot(*(p - q)) for q in labels), default=np.inf) for p in pixel[:, j]]
+        at = [end for end in (0, 1) if seen[end, j]]
+        # at the base, where there is room
+        best = max(at, key=lambda end: (min(free[end], room), -end), default=None)
+        for end in at:
+            x, y = pixel[end, j]
+            place = round(float(x), 1), round(float(y), 1)
+            spots.append(Spot(j + 1, ("base", "platform")[end], place, None, end == best))
+        if best is not None:
+            labels.append(pixel[best, j])
+    return tuple(spots)
+
+
+def _runs(seen: Booleans) -> list[tuple[int, int]]:
+    """Stretches (n,) of True that are longer than a point, first and one after the last."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]])))
+    return [(a, b) for a, b in pairwise(ends.tolist()) if seen[a] and b - a > 1]

@@ -1,0 +1,1 @@
+"""A session's photographs with the machine laid over, on a page of this computer."""

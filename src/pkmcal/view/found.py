@@ -1,0 +1,215 @@
+"""What is found in one photograph: edges of legs, those that are not, and a board's corners.
+
+The same looks as `calibrate` takes: of the drawing, each leg as a whole within a few pixels; of a
+calibrated machine, each edge by itself to sub-pixel. What the calibration made of it is read from
+its file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.measurements import EdgeSet, Rejection
+from pkmcal.observe import legs
+from pkmcal.observe.predict import TubeList, edge_points, legs_in_camera, plane_normals, tubes_of
+from pkmcal.report.drawn import CURVE, Drawn, measured_curves, radius_positions, straightened
+from pkmcal.view.overlay import moved, pane_of
+from pkmcal.view.requests import LookRequest
+from pkmcal.view.viewed import Pane, Viewed
+from pkmcal.wording import count, number
+
+KEPT = 0.5
+"""Weight in the estimate below which an edge counts as put aside."""
+SIGMAS = 2.0
+"""Standard deviations, of drawing and search, within which the middle edge has to lie."""
+SIDES = ("right", "left")
+"""The two edges of a leg as a picture shows them, looking along the leg from A to B."""
+
+
+class _Judged(NamedTuple):
+    """What a calibration made of an edge: weight and residuals (standard deviations)."""
+
+    weight: float
+    shift: float
+    tilt: float
+
+
+def found(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
+    """Edges with how far (px) they lie from the machine laid over, what was not found and why, the
+    board's corners, and all that in words.
+    """
+    pane = pane_of(viewed, look)
+    said: list[str] = []
+    out: dict[str, Any] = {"edges": [], "missed": [], "corners": [], "told": said, "median": None}
+    if "legs" in viewed.station(look.station).observe and len(tubes_of(pane.machine)):
+        _legs(viewed, look, pane, out)
+    detection = viewed.corners(look.station, look.photograph)
+    if detection is not None:
+        out["corners"] = np.round(detection.pixels, 1)
+        corners = count(len(detection.ids), "corner")
+        said.append(f"The board: {corners} found." if detection.found else
+                    f"The board is not found: {detection.reason}.")  # fmt: skip
+    return out
+
+
+def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) -> None:
+    """What is found of the legs, put into the answer."""
+    T_camera_base = moved(viewed, pane, look)
+    row = viewed.photograph(look.station, look.photograph).configuration
+    taken = legs.Photographs(
+        look.station,
+        pane.camera,
+        np.array([row]),
+        pane.joints[None],
+        [viewed.image(look.station, look.photograph)],
+    )
+    take = legs.measure if look.shown == "calibration" else legs.search
+    seen = take(taken, pane.machine, T_camera_base, pane.T_base_platform[None])
+    judged, reasons = _judged(viewed, look)
+    curves, away = _off(pane, T_camera_base, seen.edges)
+    for n, curve in enumerate(curves):
+        place = (int(seen.edges.leg[n]), int(seen.edges.tube[n]), int(seen.edges.side[n]))
+        tip = f"{_name(*place)}: {number(float(away[n]), 2, signed=True)} px outward"
+        quiet = False
+        if (of := judged.get(place)) is not None:
+            quiet = of.weight < KEPT
+            tip += (
+                f"; residual {number(of.shift, 1, signed=True)} σ across,"
+                f" {number(of.tilt, 1, signed=True)} σ tilt; weight {number(of.weight, 2)}"
+            )
+        if place in reasons:
+            quiet, tip = True, f"{tip}; {reasons[place]}"
+        line = straightened(curve[np.isfinite(curve).all(axis=-1)])
+        if len(line) > 1:
+            points = tuple((float(x), float(y)) for x, y in line)
+            drawn = Drawn(place[0] + 1, points, quiet, tip)
+            out["edges"].append({"leg": drawn.leg, "d": drawn.path, "quiet": quiet, "tip": tip})
+    missed = _missed(pane, T_camera_base, seen.edges, seen.rejected, reasons)
+    out["missed"] = missed
+    out["median"] = float(np.median(np.abs(away))) if len(away) else None
+    out["told"] += _words(pane, T_camera_base, look, len(curves), len(missed), out["median"])
+
+
+def _judged(
+    viewed: Viewed, look: LookRequest
+) -> tuple[dict[tuple[int, int, int], _Judged], dict[tuple[int, int, int], str]]:
+    """What the calibration says of a photograph's edges, and why some were left out, by leg, tube
+    and side from 0; -1 where all of them are meant.
+    """
+    if look.shown != "calibration":
+        return {}, {}
+    document, s = viewed.saved.document, viewed.number(look.station) + 1
+    k = viewed.photograph(look.station, look.photograph).configuration
+    rows = (document.get("residuals") or {}).get("edges") or []
+    judged = {
+        (int(leg) - 1, int(tube) - 1, int(side) - 1): _Judged(weight, shift, tilt)
+        for station, row, leg, tube, side, weight, shift, tilt in rows
+        if (station, row) == (s, k + 1)
+    }
+    own = [viewed.station(look.station).name, viewed.session.configurations[k]]
+    reasons = {
+        (leg - 1, tube - 1, side - 1): group["reason"]
+        for group in document.get("rejected") or []
+        for *where, leg, tube, side in group["cases"]
+        if where == own
+    }
+    return judged, reasons
+
+
+def _off(pane: Pane, T_camera_base: Array, edges: EdgeSet) -> tuple[Array, Array]:
+    """Measured edges as curves (n, CURVE, 2) px, and how far outward (n,) px of the machine's own
+    they lie in the middle.
+    """
+    if not len(edges):
+        return np.zeros((0, CURVE, 2)), np.zeros(0)
+    machine = pane.machine
+    axes = legs_in_camera(machine, T_camera_base, pane.T_base_platform, pane.joints)
+    radius = radius_positions(machine, edges)
+    start, stop = edges.span.T
+    each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
+    a, u = axes.a[edges.leg], axes.u[edges.leg]
+    own, _ = plane_normals(a, u, machine.values[radius], each)
+    predicted = replace(edges, normal=own)
+    measured, drawn = (
+        measured_curves(
+            machine, pane.camera, T_camera_base, pane.T_base_platform, pane.joints, part
+        )
+        for part in (edges, predicted)
+    )
+    # outward of the leg: away from where its axis is seen
+    axis = pane.camera.project(a + (edges.span.mean(axis=1))[:, None] * u)
+    middle = CURVE // 2
+    tangent = drawn[:, middle + 1] - drawn[:, middle - 1]
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal *= np.sign(np.sum(normal * (drawn[:, middle] - axis), axis=-1, keepdims=True))
+    return measured, np.sum(normal * (measured[:, middle] - drawn[:, middle]), axis=-1)
+
+
+def _missed(
+    pane: Pane,
+    T_camera_base: Array,
+    edges: EdgeSet,
+    rejected: tuple[Rejection, ...],
+    reasons: dict[tuple[int, int, int], str],
+) -> list[dict[str, Any]]:
+    """Edges of the machine that were looked for and not found, as they should lie, each with why;
+    those of which a part would be in the picture.
+    """
+    tubes = tubes_of(pane.machine)
+    axes = legs_in_camera(pane.machine, T_camera_base, pane.T_base_platform, pane.joints)
+    pixel = edge_points(pane.machine, pane.camera, axes, tubes, CURVE).pixel
+    seen = set(zip(edges.leg.tolist(), edges.tube.tolist(), edges.side.tolist(), strict=True))
+    now = {(r.leg, r.tube, r.side): r.reason for r in rejected}
+    out: list[dict[str, Any]] = []
+    for e, curve in enumerate(pixel):
+        place = (int(tubes.leg[e]), int(tubes.tube[e]), int(tubes.side[e]))
+        inside = curve[pane.camera.in_image(curve)]
+        if place in seen or len(inside) < 2:
+            continue
+        whole = (place[0], -1, -1)
+        why = reasons.get(place) or now.get(place) or reasons.get(whole) or now.get(whole)
+        points = tuple((float(x), float(y)) for x, y in straightened(inside))
+        leg, why = place[0] + 1, why or "too little of it is seen"
+        path = Drawn(leg, points, True, why).path
+        out.append({"leg": leg, "d": path, "tip": f"{_name(*place)}: {why}", "reason": why})
+    return out
+
+
+def _words(
+    pane: Pane,
+    T_camera_base: Array,
+    look: LookRequest,
+    seen: int,
+    missed: int,
+    median: float | None,
+) -> list[str]:
+    """How well the machine lies on what is seen."""
+    if seen + missed == 0:
+        return ["No leg of the machine would be in this photograph at this pose."]
+    said = f"{seen} of {seen + missed} edges of legs are found"
+    if median is None:
+        return [f"It does not fit: {said}."]
+    if look.shown == "calibration":
+        return [f"{said}; the middle one lies {number(median, 2)} px from the calibrated machine."]
+    tubes, tolerance = tubes_of(pane.machine), pane.machine.document.tolerance.center
+    axes = legs_in_camera(pane.machine, T_camera_base, pane.T_base_platform, pane.joints)
+    gain = edge_points(pane.machine, pane.camera, axes, tubes, 3).gain
+    allowed = tolerance * float(np.nanmedian(gain))
+    near = median < SIGMAS * np.hypot(allowed, legs.SEARCH_SIGMA)
+    # other things' edges lie near by chance, too, though not most of them
+    verdict = "It fits" if near and seen > missed else "It may fit" if near else "It does not fit"
+    # the search goes by whole pixels
+    off = f"{number(median, 1)} px" if median > legs.SEARCH_SIGMA / 2 else "less than half a pixel"
+    return [
+        f"{verdict}: {said}, and the middle one lies {off} from the drawing. The drawing's"
+        f" tolerance of {tolerance * 1e3:.3g} mm is {number(allowed, 1)} px here."
+    ]
+
+
+def _name(leg: int, tube: int, side: int) -> str:
+    return f"Leg {leg + 1}, tube {tube + 1}, {SIDES[side]} edge"

@@ -1,0 +1,54 @@
+"""A pose written back into session.yaml, of which nothing else changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from threading import Lock
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.files import with_numbers, write_bytes
+from pkmcal.session.load import FILE, Station
+from pkmcal.view.overlay import place_of
+
+
+class PoseFile:
+    """session.yaml as it was read when the page was opened, and written since."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = (folder / FILE).resolve()
+        self._known = self._path.read_bytes()
+        self._lock = Lock()
+
+    def write(self, station: Station, T_camera_base: Array) -> str:
+        """Write a station's pose; returns what was written, in words.
+
+        Raises InputError for a camera that is held by hand, for a file that somebody else has
+        changed meanwhile, and where the pose cannot be changed by itself.
+        """
+        keys = ("stations", station.entry, "pose")
+        if station.handheld:
+            raise InputError(
+                "a camera that is held by hand has no one pose to be written",
+                where=f"{FILE}, {'.'.join(keys[:2])}",
+                next_step="Every such photograph is placed when you calibrate",
+            )
+        with self._lock:
+            try:
+                now = self._path.read_bytes()
+            except OSError as error:
+                reason = error.strerror
+                raise InputError(f"cannot be read ({reason})", where=str(self._path)) from None
+            if now != self._known:
+                raise InputError(
+                    "the file was changed by somebody else since this page read it",
+                    where=str(self._path),
+                    next_step="Nothing was written. Start pkmcal view again, and put the machine"
+                    " there once more",
+                )
+            entry = {name: list(part) for name, part in vars(place_of(T_camera_base)).items()}
+            changed = with_numbers(now.decode("utf-8"), FILE, keys, entry).encode("utf-8")
+            if changed != now:
+                write_bytes(self._path, changed)
+            self._known = changed
+        return f"The pose of {station.name} is in {FILE}; nothing else in it changed."

@@ -1,0 +1,142 @@
+"""The machine laid over a photograph, and the pose that a hand gives it: one round trip a move.
+
+Here and in the modules beside, what the first picture can do without is imported when it is needed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.geometry.rigid import apply
+from pkmcal.report.drawn import CURVE, Drawn, laid_over, straightened
+from pkmcal.session.schema import Vector
+from pkmcal.view.gestures import aimed, farther, pinned, rolled, turned
+from pkmcal.view.requests import LookRequest, pose_of
+from pkmcal.view.viewed import Pane, Viewed
+
+if TYPE_CHECKING:
+    from pkmcal.simulation.placement import StationPlace
+
+DIGITS = 4
+"""Decimals of a metre that are written: nobody places a camera to a tenth of a millimetre."""
+
+
+def pane_of(viewed: Viewed, look: LookRequest) -> Pane:
+    """The machine that a request shows, before the camera where the files have it."""
+    take = viewed.calibrated if look.shown == "calibration" else viewed.drawn
+    return take(look.station, look.photograph)
+
+
+def overlay(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
+    """The pose after the gesture, and what it lays over the photograph, in pixels."""
+    pane = pane_of(viewed, look)
+    T_camera_base = moved(viewed, pane, look)
+    edges, spots = laid_over(
+        pane.machine, pane.camera, T_camera_base, pane.joints, pane.T_base_platform
+    )
+    lines = [*edges, *_bare_limbs(pane, T_camera_base)]
+    legs = sorted({edge.leg for edge in lines})
+    paths = [
+        {
+            "leg": leg,
+            "quiet": not pane.machine.document.legs[leg - 1].tubes,
+            "d": "".join(edge.path for edge in lines if edge.leg == leg),
+        }
+        for leg in legs
+    ]
+    joints = [
+        {
+            "leg": s.leg,
+            "end": s.end,
+            "x": s.calibrated[0],
+            "y": s.calibrated[1],
+            "number": s.labelled,
+        }
+        for s in spots
+    ]
+    return {
+        "pose": T_camera_base,
+        "place": vars(place_of(T_camera_base)),
+        "legs": paths,
+        "joints": joints,
+    }
+
+
+def start_of(pane: Pane) -> Array:
+    """Where a camera is taken to stand, T_camera_base (4, 4), before anybody has said it: before
+    the machine, far enough to have all of it in the picture.
+    """
+    if pane.T_camera_base is not None:
+        return pane.T_camera_base
+    from pkmcal.simulation.placement import default_stations
+
+    rng = np.random.default_rng(0)
+    return default_stations(pane.machine, (pane.camera,), rng)[0].T_camera_base()
+
+
+def moved(viewed: Viewed, pane: Pane, look: LookRequest) -> Array:
+    """T_camera_base (4, 4) after what the hand did."""
+    T_camera_base = pose_of(look)
+    if T_camera_base is None:
+        T_camera_base = start_of(pane)
+    camera, points = pane.camera, pane.points.reshape(-1, 3)
+    if look.pins:
+        pins = np.stack([_joint(viewed, look, k) for k in range(len(look.pins))])
+        pixels = np.array([pin.pixel for pin in look.pins], dtype=float)
+        T_camera_base = pinned(camera, T_camera_base, points, pins, pixels)
+    if look.gesture is not None:
+        start, end = (np.array(p, dtype=float) for p in (look.gesture.start, look.gesture.end))
+        match look.gesture.kind:
+            case "aim":
+                T_camera_base = aimed(camera, T_camera_base, start, end)
+            case "turn":
+                T_camera_base = turned(camera, T_camera_base, points, start, end)
+            case "roll":
+                T_camera_base = rolled(camera, T_camera_base, points, start, end)
+            case "distance":
+                factor = float(look.gesture.factor)
+                T_camera_base = farther(camera, T_camera_base, points, start, factor)
+    return T_camera_base
+
+
+def place_of(T_camera_base: Array) -> StationPlace:
+    """A pose as session.yaml has it, with as many digits as are written there."""
+    from pkmcal.simulation.placement import StationPlace
+
+    def rounded(part: Vector) -> Vector:
+        x, y, z = (round(value, DIGITS) + 0.0 for value in part)  # never -0.0
+        return x, y, z
+
+    place = StationPlace.of(T_camera_base)
+    return StationPlace(rounded(place.position), rounded(place.look_at), rounded(place.up))
+
+
+def _joint(viewed: Viewed, look: LookRequest, k: int) -> Array:
+    """A pinned joint's centre (3,), base frame, m, in its own photograph's configuration."""
+    pin = look.pins[k]
+    other = look.model_copy(update={"photograph": pin.photograph})
+    points = pane_of(viewed, other).points[0 if pin.end == "base" else 1]
+    if pin.leg > len(points):
+        raise InputError("there is no such leg", where=f"the page, pins[{k + 1}]", found=pin.leg)
+    return points[pin.leg - 1]
+
+
+def _bare_limbs(pane: Pane, T_camera_base: Array) -> list[Drawn]:
+    """Axes of the legs that show no tube."""
+    bare = [j for j, leg in enumerate(pane.machine.document.legs) if not leg.tubes]
+    if not bare:
+        return []
+    a, b = (part[bare, None] for part in pane.points)
+    pixel = pane.camera.project(
+        apply(T_camera_base, a + np.linspace(0, 1, CURVE)[:, None] * (b - a))
+    )
+    out: list[Drawn] = []
+    for j, curve in zip(bare, pixel, strict=True):
+        if np.isfinite(curve).all():
+            line = straightened(curve)
+            out.append(Drawn(j + 1, tuple((float(x), float(y)) for x, y in line), True, ""))
+    return out

@@ -1,0 +1,72 @@
+"""What the page asks for, checked as files are: a page may be older than the program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from pydantic import Field
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.files import Document, Schema, validate
+
+Pixel = tuple[float, float]
+Row4 = tuple[float, float, float, float]
+Shown = Literal["drawing", "calibration"]
+"""Which machine is laid over: the drawing's at the session's poses, or the calibrated one."""
+
+
+class Pin(Schema):
+    """A joint that was put to its place in a photograph; leg : from 1."""
+
+    photograph: int
+    end: Literal["base", "platform"]
+    leg: int = Field(ge=1)
+    pixel: Pixel
+
+
+class Gesture(Schema):
+    """A pull of the mouse from one pixel to another, or a turn of its wheel: ``factor`` times as
+    far away.
+    """
+
+    kind: Literal["aim", "turn", "roll", "distance"]
+    start: Pixel
+    end: Pixel
+    factor: float = Field(default=1.0, gt=0.01, lt=100)
+
+
+class LookRequest(Schema):
+    """One photograph with a machine laid over; pose : T_camera_base, where not the files' own."""
+
+    station: int
+    photograph: int
+    shown: Shown = "drawing"
+    pose: tuple[Row4, Row4, Row4, Row4] | None = None
+    gesture: Gesture | None = None
+    pins: tuple[Pin, ...] = ()
+    anywhere: bool = False
+
+
+Model = TypeVar("Model", bound=Schema)
+
+
+def checked(data: Any, model: type[Model]) -> Model:
+    """A request of the page. Raises InputError for anything else."""
+    if not isinstance(data, dict):
+        raise InputError("the request is no JSON object", where="the page")
+    return validate(Document(Path("the page"), "the page", data, {}), model)
+
+
+def pose_of(look: LookRequest) -> Array | None:
+    """T_camera_base (4, 4) that a request gives, if it does. Raises InputError for another map."""
+    if look.pose is None:
+        return None
+    pose = np.array(look.pose, dtype=float)
+    rot = pose[:3, :3]
+    rigid = np.allclose(rot @ rot.T, np.eye(3), atol=1e-6) and np.linalg.det(rot) > 0
+    if not rigid or not np.array_equal(pose[3], [0, 0, 0, 1]):
+        raise InputError("the pose is no rotation and translation", where="the page, pose")
+    return pose

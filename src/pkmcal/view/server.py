@@ -1,0 +1,194 @@
+"""The page's server: photographs, and what is asked about them, on the loopback."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from collections.abc import Callable
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+from pkmcal.errors import InputError, PkmcalError
+from pkmcal.files import plain
+from pkmcal.view.guard import Guard
+from pkmcal.view.keep import PoseFile
+from pkmcal.view.overlay import moved, overlay, pane_of
+from pkmcal.view.requests import LookRequest, checked
+from pkmcal.view.viewed import Viewed
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.responses import Response
+
+TOKEN_BYTES = 24
+LOOPBACK = "127.0.0.1"
+BACKLOG = 64
+CLOSING = 2
+"""Seconds that answers under way have when the program is ended."""
+
+
+def listening(port: int) -> socket.socket:
+    """A socket on the loopback, of a free port where ``port`` is 0. Raises InputError where the
+    port is taken.
+    """
+    # the protocol by its number: without it asyncio does not ask to send at once, and the second
+    # part of every answer waits 40 ms for the first one to be acknowledged
+    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        found.bind((LOOPBACK, port))
+    except OSError as error:
+        found.close()
+        raise InputError(
+            f"the page cannot be served on port {port} ({error.strerror or error})",
+            where="--port",
+            next_step="Name another port, or leave --port out for a free one",
+        ) from None
+    found.listen(BACKLOG)
+    return found
+
+
+def new_token() -> str:
+    """What nobody can guess."""
+    return secrets.token_urlsafe(TOKEN_BYTES)
+
+
+def application(viewed: Viewed, token: str, port: int) -> Guard:
+    """The ASGI application, of a page at /TOKEN/ and of what it asks for."""
+    from starlette.applications import Starlette
+    from starlette.responses import HTMLResponse, Response
+    from starlette.routing import Mount, Route
+
+    kept = PoseFile(viewed.session.folder)
+
+    def found(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
+        from pkmcal.view.found import found
+
+        return found(viewed, look)
+
+    def fit(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
+        from pkmcal.view.fit import fitted
+
+        return fitted(viewed, look)
+
+    def save(viewed: Viewed, look: LookRequest) -> dict[str, Any]:
+        pose = moved(viewed, pane_of(viewed, look), look)
+        return {"said": kept.write(viewed.station(look.station), pose)}
+
+    def asked(answer: Callable[[Viewed, LookRequest], dict[str, Any]]) -> Any:
+        async def endpoint(request: Request) -> Response:
+            body = await request.body()
+
+            def work() -> dict[str, Any]:
+                return answer(viewed, checked(_json(body), LookRequest))
+
+            return await _answered(work)
+
+        return endpoint
+
+    async def photograph(request: Request) -> Response:
+        s, k = request.path_params["s"], request.path_params["k"]
+        return await _answered(lambda: Response(viewed.jpeg(s, k), media_type="image/jpeg"))
+
+    async def page(_request: Request) -> Response:
+        return await _answered(lambda: HTMLResponse(page_html(viewed)))
+
+    async def script(_request: Request) -> Response:
+        return Response(_template("view.js"), media_type="text/javascript")
+
+    async def style(_request: Request) -> Response:
+        report = (resources.files("pkmcal.report") / "templates" / "style.css").read_text("utf-8")
+        return Response(report + _template("view.css"), media_type="text/css")
+
+    routes = [
+        Route("/", page),
+        Route("/view.js", script),
+        Route("/view.css", style),
+        Route("/photograph/{s:int}/{k:int}", photograph),
+        *(
+            Route(f"/{name}", asked(answer), methods=["POST"])
+            for name, answer in (
+                ("overlay", overlay), ("found", found), ("fit", fit), ("save", save),
+            )
+        ),
+    ]  # fmt: skip
+    return Guard(Starlette(routes=[Mount(f"/{token}", routes=routes)]), token, port)
+
+
+async def _answered(work: Callable[[], Any]) -> Response:
+    """What the work gives, or its error in words; never a traceback."""
+    from starlette.concurrency import run_in_threadpool
+    from starlette.responses import JSONResponse, Response
+
+    try:
+        done = await run_in_threadpool(work)
+    except PkmcalError as error:
+        return JSONResponse(error.as_dict(), 422)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        said = InputError(f"the operating system refused: {reason}", where=error.filename)
+        return JSONResponse(said.as_dict(), 422)
+    except Exception as error:  # noqa: BLE001 - the last resort, as at the command line
+        said = PkmcalError(
+            f"this is a defect of pkmcal, not of your session: {type(error).__name__}: {error}",
+            next_step="Report it",
+        )
+        return JSONResponse(said.as_dict(), 500)
+    return done if isinstance(done, Response) else JSONResponse(plain(done))
+
+
+def serve(app: Guard, found: socket.socket) -> None:
+    """Answer until the program is interrupted."""
+    from contextlib import suppress
+
+    import uvicorn
+
+    config = uvicorn.Config(
+        app, log_config=None, log_level="critical", access_log=False, lifespan="off", ws="none",
+        timeout_graceful_shutdown=CLOSING, server_header=False,
+    )  # fmt: skip
+    with suppress(KeyboardInterrupt):  # Ctrl-C is how this ends
+        uvicorn.Server(config).run(sockets=[found])
+
+
+def page_html(viewed: Viewed) -> str:
+    """The page itself; photographs and overlays are asked for by it."""
+    from pkmcal.report.page import environment
+
+    session = viewed.session
+    stations = [
+        {
+            "name": station.name,
+            "size": station.camera.image_size,
+            "legs": "legs" in station.observe,
+            "handheld": station.handheld,
+            "posed": station.T_camera_base is not None,
+            "photographs": [
+                " ".join([session.configurations[p.configuration], *filter(None, [p.repeat])])
+                for p in station.photographs
+            ],
+        }
+        for station in session.stations
+    ]
+    template = environment().from_string(_template("view.html.j2"))
+    return template.render(
+        name=session.folder.resolve().name,
+        folder=session.folder,
+        n_legs=session.machine.n_legs,
+        stations=stations,
+        calibrated=viewed.calibration is not None,
+        state={"stations": stations, "calibrated": viewed.calibration is not None},
+    )
+
+
+def _template(name: str) -> str:
+    return (resources.files("pkmcal.view") / "templates" / name).read_text("utf-8")
+
+
+def _json(body: bytes) -> Any:
+    import json
+
+    try:
+        return json.loads(body)
+    except ValueError:
+        raise InputError("the request is not valid JSON", where="the page") from None

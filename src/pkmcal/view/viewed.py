@@ -1,0 +1,175 @@
+"""What is shown: a session, photograph by photograph, and its calibration where there is one.
+
+Nothing is read or worked out of a photograph before somebody looks at it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.cameras import Camera, load_camera
+from pkmcal.errors import GeometryError, InputError
+from pkmcal.geometry.rigid import inverse
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.observe.images import decode
+from pkmcal.session.load import Session, Station
+from pkmcal.session.photographs import Photograph, label_of
+
+if TYPE_CHECKING:
+    from pkmcal.boards.board import Board, Detection
+    from pkmcal.calibration.results import SavedCalibration
+    from pkmcal.observe.stations import StationView
+
+KEPT = 16
+"""Decoded photographs that are kept: those that one goes back and forth between."""
+WIDEST = 1600
+"""px; a screen shows no more of a telephone's picture beside two columns."""
+QUALITY = 88
+
+
+@dataclass(frozen=True)
+class Pane:
+    """A machine before a camera: what is laid over one photograph.
+
+    joints : (m,) readings. T_base_platform : (4, 4). T_camera_base : (4, 4) where the camera stands
+    as far as files tell, None where they do not.
+    """
+
+    machine: Machine
+    camera: Camera
+    joints: Array
+    T_base_platform: Array
+    T_camera_base: Array | None
+
+    @property
+    def points(self) -> Array:
+        """Joint centres (2, L, 3) on base and platform, base frame, m."""
+        machine = self.machine
+        ends = limb_ends(machine.layout, machine.values, self.joints, self.T_base_platform)
+        return np.stack([ends.a, ends.b])
+
+
+class Viewed:
+    """A session and, where there is one, its calibration.
+
+    calibration : folder that `pkmcal calibrate` wrote; None for none.
+    """
+
+    def __init__(self, session: Session, calibration: Path | None) -> None:
+        self.session = session
+        self.calibration = calibration
+        self.image = lru_cache(KEPT)(self._image)
+        self.corners = lru_cache(KEPT)(self._corners)
+        self.views: dict[int, StationView] = {}
+
+    def station(self, s: int) -> Station:
+        """A station by its number. Raises InputError where there is none."""
+        if not 0 <= s < len(self.session.stations):
+            raise InputError("there is no such station", found=s + 1)
+        return self.session.stations[s]
+
+    def photograph(self, s: int, k: int) -> Photograph:
+        """A station's photograph by its number. Raises InputError where there is none."""
+        photographs = self.station(s).photographs
+        if not 0 <= k < len(photographs):
+            raise InputError(f"station {self.station(s).name} has no such photograph", found=k + 1)
+        return photographs[k]
+
+    def _image(self, s: int, k: int) -> Integers:
+        """A photograph as grey levels (height, width). Raises InputError as `decode`."""
+        path = self.photograph(s, k).path
+        return decode(path, self.station(s).camera.image_size, label_of(self.session.folder, path))
+
+    def jpeg(self, s: int, k: int) -> bytes:
+        """A photograph at a size for the screen."""
+        import cv2
+
+        image: Any = self.image(s, k)
+        height, width = image.shape
+        if width > WIDEST:
+            size = (WIDEST, max(1, round(height * WIDEST / width)))
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+
+    def drawn(self, s: int, k: int) -> Pane:
+        """The drawing's machine before a station's camera."""
+        row, station = self.photograph(s, k).configuration, self.station(s)
+        machine, joints = self.session.machine, self.session.joints[row]
+        pose = self.poses[row]
+        return Pane(machine, station.camera, joints, pose, station.T_camera_base)
+
+    @cached_property
+    def poses(self) -> Array:
+        """T_base_platform (K, 4, 4) by the drawing: the nearest ones, where it does not close."""
+        try:
+            return self.session.machine.forward_result(self.session.joints).T_base_platform
+        except GeometryError as error:  # the drawing is the user's: it is at fault
+            raise error.as_input(self.session.document["mechanism"]) from None
+
+    def calibrated(self, s: int, k: int) -> Pane:
+        """The calibrated machine, as the calibration left it, before the camera as it found it.
+
+        Raises InputError where the calibration is another session's, or has not this station.
+        """
+        saved, row, station = self.saved, self.photograph(s, k).configuration, self.station(s)
+        number = self.number(s)
+        T_camera_base = inverse(saved.stations[number].T_base_camera)
+        refined = saved.path.parent / f"camera-{Path(station.camera_file).stem}.yaml"
+        camera = load_camera(refined) if refined.is_file() else station.camera
+        excess = saved.document["stations"][number].get("focal_scale", 1.0) - 1.0
+        camera = replace(camera, parameters=camera.parameters + excess * camera.focal_part)
+        pose = saved.T_base_platform[row]
+        return Pane(saved.machine, camera, saved.joints[row], pose, T_camera_base)
+
+    @cached_property
+    def saved(self) -> SavedCalibration:
+        """The calibration. Raises InputError where there is none, or it is another session's."""
+        from pkmcal.calibration.results import load
+
+        if self.calibration is None:
+            raise InputError(
+                "there is no calibration of this session",
+                where=str(self.session.folder),
+                next_step="Run pkmcal calibrate, or name its folder with --calibration",
+            )
+        saved = load(self.calibration)
+        same = saved.configurations == self.session.configurations
+        if not same or not np.allclose(saved.joints, self.session.joints):
+            raise InputError(
+                "this is the calibration of another session, or the readings changed since",
+                where=str(saved.path),
+                expected=f"the configurations and readings of {self.session.folder}",
+                next_step="Calibrate again, or name another folder with --calibration",
+            )
+        return saved
+
+    def number(self, s: int) -> int:
+        """A station's number in the calibration, which may have left some out."""
+        names = [station.name for station in self.saved.stations]
+        if (name := self.station(s).name) not in names:
+            raise InputError(
+                f"the calibration has no station {name}: it was left out, or added since",
+                where=str(self.saved.path),
+            )
+        return names.index(name)
+
+    @cached_property
+    def _board(self) -> Board | None:
+        from pkmcal.boards.views import board_of
+
+        return board_of(self.session)
+
+    def _corners(self, s: int, k: int) -> Detection | None:
+        """The board in a photograph of a station that observes it; None of one that does not."""
+        from pkmcal.boards.find import detect_board
+
+        if self._board is None or "board" not in self.station(s).observe:
+            return None
+        return detect_board(self.image(s, k), self._board)
