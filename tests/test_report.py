@@ -85,7 +85,7 @@ def test_the_row_of_chi2_is_of_the_noise_as_stated(case):
     found = report_of(case.session, case.observation, estimate, refused)
     (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
     assert card.values == (("46.16", "χ² per degree of freedom"),)  # 0.94 * 49 + 0.1
-    assert "1.04 after the stated noise was multiplied, the edges' by 7.00" in card.note
+    assert "1.04 after the edges' stated noise was multiplied by 7.00" in card.note
     assert found.summary["figures"]["chi2_per_freedom"] == pytest.approx(46.16)
     plain = replace(noisy, noise_scale=1.0)
     found = report_of(case.session, case.observation, replace(estimate, statistics=plain), refused)

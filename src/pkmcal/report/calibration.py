@@ -295,7 +295,7 @@ def _fit(estimate: Estimate) -> Figure:
     """Chi-square per degree of freedom, of the noise as stated."""
     s = estimate.statistics
     scaled = [
-        f"the {what}' by {number(scale, 2)}"
+        f"the {what}' stated noise was multiplied by {number(scale, 2)}"
         for what, scale in (
             ("edges", s.noise_scale),
             ("poses", s.pose_scale),
@@ -308,11 +308,7 @@ def _fit(estimate: Estimate) -> Figure:
         "Does the model explain the data?",
         ((number(s.chi2_as_stated, 2), "χ² per degree of freedom"),),
         f"1 is expected of the noise as stated, over {count(s.dof, 'degree')} of freedom"
-        + (
-            f"; {number(found, 2)} after the stated noise was multiplied, {' and '.join(scaled)}"
-            if scaled
-            else ""
-        ),
+        + (f"; {number(found, 2)} after {' and '.join(scaled)}" if scaled else ""),
     )
 
 
