@@ -62,12 +62,12 @@ def camera_from_document(document: Document) -> Camera:
     if not isinstance(name, str) or name not in models:
         guess = closest(str(name), models)
         raise InputError(
-            what="no such camera model" if name else "the camera's model is missing",
+            what="no such camera model" if name is not None else "the camera's model is missing",
             where=document.where("model"),
             found=name,
             expected=f"{guess}" if guess else " or ".join(sorted(models)),
             next_step=None
-            if name
+            if name is not None
             else "OpenCV's files have camera_matrix, image_width and image_height; ROS's"
             " camera_matrix; Kalibr's camera_model under cam0",
         )

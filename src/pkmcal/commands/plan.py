@@ -151,17 +151,22 @@ def plan(
                 corner_noise,
                 seed,
             )
-        found = run(
-            source,
-            count=configurations,
-            index=index.value,
-            region=region,
-            together=together,
-            free_places=places,
-            best_of=best_of,
-            seed=seed,
-            told=lambda share: told("Choosing configurations", 0.1 + 0.85 * share),
-        )
+        try:
+            found = run(
+                source,
+                count=configurations,
+                index=index.value,
+                region=region,
+                together=together,
+                free_places=places,
+                best_of=best_of,
+                seed=seed,
+                told=lambda share: told("Choosing configurations", 0.1 + 0.85 * share),
+            )
+        except InputError as error:
+            if session is not None:
+                raise
+            raise error.located(str(camera or subject)) from None
     return finish(outcome_of(found), folder, files, over=over, as_json=as_json)
 
 

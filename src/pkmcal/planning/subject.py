@@ -164,8 +164,9 @@ def _seen(
     numbers = np.array([list(dict.fromkeys(map(id, cameras))).index(id(c)) for c in cameras])
     T_mount = None if T_platform_board is None else T_platform_board[None]
     return Rig(
-        machine, names, T_camera_base, numbers, joint_noise, tuple(instruments), mounts, T_mount
-    )
+        machine, names, T_camera_base, numbers, joint_noise, tuple(instruments), mounts, T_mount,
+        where="",
+    )  # fmt: skip
 
 
 def check_tubes(machine: Machine, where: str) -> None:

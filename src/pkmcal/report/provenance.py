@@ -64,7 +64,8 @@ def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
     """A station's place with its deviations (mm), and the deviation of its turn (degrees)."""
     found, covariance = estimate.state.T_camera_base[s], estimate.station_covariance[s]
     place = inverse(found)[:3, 3] * 1e3
-    sigma = np.sqrt(np.diag(base_camera_covariance(found, covariance))[3:]) * 1e3
+    variance = np.diag(base_camera_covariance(found, covariance))[3:]
+    sigma = np.sqrt(np.maximum(variance, 0.0)) * 1e3  # rounding may leave less than none
     turn = float(np.rad2deg(np.sqrt(np.trace(covariance[:3, :3]) / 3)))
     x, y, z = (
         f"{number(v, decimals(d))} ± {brief(d) if d < OPEN else 'open'}"

@@ -117,7 +117,8 @@ def usable(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     least = min(LEAST_SINGULAR, 0.4 * float(singularity(layout, values, at_home.by_pose)))
     good &= singularity(layout, values, c.by_pose) > least
     if jac.shape[-1] == jac.shape[-2]:
-        good &= np.sign(np.linalg.det(jac)) == np.sign(np.linalg.det(home_jac))
+        with np.errstate(invalid="ignore"):  # where there is no Jacobian, nothing is usable
+            good &= np.sign(np.linalg.det(jac)) == np.sign(np.linalg.det(home_jac))
     good &= T_base_platform[..., 2, 2] * np.sign(home[2, 2]) > np.cos(FARTHEST_TILT)
     good &= unfolded(machine, T_base_platform)
     return good & _legs_apart(machine, T_base_platform, joints)
