@@ -1,6 +1,7 @@
 """The report's views, numbers and overlays, against a case made by hand."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from pkmcal.calibration.results import base_camera_covariance
 from pkmcal.geometry.cylinders import contour_point
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, joint_centres
-from pkmcal.identify.tool import pose_by_parameters, tool_error
+from pkmcal.identify.tool import centres_and_tool, pose_by_parameters, tool_error
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
 from pkmcal.report import parameters, pictures, provenance, residuals
@@ -267,3 +268,18 @@ def test_expected_rms_holds_nineteen_of_twenty():
         low, high = residuals.expected_rms(n)
         found = np.sqrt(np.mean(rng.normal(size=(20000, n)) ** 2, axis=1))
         assert np.mean((found > low) & (found < high)) == pytest.approx(0.95, abs=0.01)
+
+
+def test_the_page_says_how_many_photographs_it_shows(case):
+    edges, estimate, session = case.observation.edges, case.estimate, case.session
+    centres, _ = centres_and_tool(session.machine, estimate, session.joints)
+    part = pictures.section(session, edges, estimate, np.zeros(len(edges)), centres)
+    shown = part.html.count('<figure class="picture">')
+    there = sum(len(station.photographs) for station in session.stations)
+    said = f"Here are {shown} of {there}: of each station"
+    assert (said in part.html) == (shown < there)
+
+
+def test_a_session_is_called_by_its_folder_or_the_one_around_it(case):
+    assert replace(case.session, folder=Path("/x/mine")).called == "session mine"
+    assert replace(case.session, folder=Path("/x/mine/session")).called == "session mine"

@@ -140,7 +140,7 @@ def report_of(
         command="calibrate",
         title=f"Calibration of {session.machine.name}",
         verdict=verdict,
-        kicker=f"session {session.folder.name}",
+        kicker=session.called,
         figures=cards(session, observation, estimate, centres, tool),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),

@@ -71,6 +71,7 @@ def section(
         "photographs.html.j2",
         n_legs=session.machine.n_legs,
         pictures=pictures(session, edges, estimate, shifts, centres),
+        total=sum(len({p.configuration for p in s.photographs}) for s in session.stations),
     )
     return Part("photographs", "Photographs", html=html)
 

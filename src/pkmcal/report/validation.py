@@ -42,7 +42,7 @@ def outcome_of(v: Validation) -> Outcome:
     return Outcome(
         command="validate",
         title=f"Validation of {v.calibration.machine.name}",
-        kicker=f"session {v.session.folder.resolve().name}",
+        kicker=v.session.called,
         verdict=v.verdict,
         stamp="Confirmed" if v.verdict.usable else "Not confirmed",
         figures=_cards(v.judged, v.session) if v.judged else (),

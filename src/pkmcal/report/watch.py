@@ -52,7 +52,7 @@ def outcome_of(w: Watch) -> Outcome:
     return Outcome(
         command="watch",
         title=f"Watch of {w.calibration.machine.name}",
-        kicker=f"session {w.session.folder.resolve().name}",
+        kicker=w.session.called,
         verdict=w.verdict,
         stamp=stamp(w),
         level=Level.WRONG if w.judged.changed else Level.DOUBTFUL,

@@ -137,6 +137,12 @@ class Session:
         return f"<Session {self.folder.resolve().name}: {self.machine.name}, {', '.join(parts)}>"
 
     @property
+    def called(self) -> str:
+        """``session mine`` by its folder, or by the one around it where it is called session."""
+        folder = self.folder.resolve()
+        return f"session {(folder if folder.name != 'session' else folder.parent).name}"
+
+    @property
     def station_names(self) -> tuple[str, ...]:
         """Names of all stations, trackers last, as measurements number them."""
         return tuple(station.name for station in (*self.stations, *self.trackers))
