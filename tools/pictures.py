@@ -346,7 +346,7 @@ def tutorial_validation(case: Case) -> Shot:
 def trouble_scale(case: Case) -> Shot:
     """The top of a refused report: one reading has another scale."""
     found = guide.calibrated(guide.wrong(case.work, "legs", "encoder's scale 1 %"))
-    return Shot(page.page_html(outcome_of_calibration(found)), 1180, 720)
+    return Shot(page.page_html(outcome_of_calibration(found)), 1180, 345)
 
 
 def trouble_columns(case: Case) -> Shot:
