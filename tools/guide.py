@@ -108,6 +108,15 @@ def wrong(work: Path, kind: str, name: str, spoil: Callable[[Path], None] | None
     return folder
 
 
+def numbered_from_another_leg(folder: Path) -> None:
+    """Each leg's readings two columns on, a third round the machine."""
+
+    def change(values: np.ndarray) -> None:
+        values[:] = np.roll(values, -2, axis=1)
+
+    _wrong_sessions().readings(folder, change)
+
+
 def two_columns_exchanged(folder: Path) -> None:
     """The readings of the first two legs under each other's heading."""
 

@@ -356,6 +356,13 @@ def trouble_columns(case: Case) -> Shot:
     return whole_page(guide.laid_over(folder), 1000, 410)
 
 
+def trouble_numbering(case: Case) -> Shot:
+    """The same where the legs are numbered from another one."""
+    spoil = guide.numbered_from_another_leg
+    folder = guide.wrong(case.work, "legs", "numbered from another leg", spoil)
+    return whole_page(guide.laid_over(folder), 1000, 410)
+
+
 PICTURES: dict[str, Callable[[Case], Shot]] = {
     f.__name__.replace("_", "-"): f
     for f in (
@@ -378,6 +385,7 @@ PICTURES: dict[str, Callable[[Case], Shot]] = {
         tutorial_validation,
         trouble_scale,
         trouble_columns,
+        trouble_numbering,
     )
 }
 
