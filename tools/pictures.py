@@ -32,6 +32,7 @@ from pkmcal.planning.plan import plan as make_plan
 from pkmcal.planning.subject import of_machine
 from pkmcal.report import page, pictures, scene
 from pkmcal.report import residuals as shown
+from pkmcal.report.calibration import outcome_of as outcome_of_calibration
 from pkmcal.report.calibration import save
 from pkmcal.report.plan import outcome_of
 from pkmcal.session.load import Session
@@ -42,6 +43,7 @@ from pkmcal.view.viewed import Viewed
 
 sys.path.insert(0, str(Path(__file__).parent))
 import drawings
+import guide
 from case import Case, simulated
 
 HERE = Path(__file__).resolve().parents[1]
@@ -311,6 +313,56 @@ def view(case: Case) -> Shot:
     return Shot("", 1180, 640, case.session)
 
 
+def tutorial_photographs(case: Case) -> Shot:
+    """A photograph from each place of the tutorial's session."""
+    return whole_page(guide.photographs(case.work), 1180, 330)
+
+
+def tutorial_check(case: Case) -> Shot:
+    """The drawing over one of them, by the pose by hand and by the pose found."""
+    return whole_page(guide.laid_over(guide.session(case.work)), 1000, 410)
+
+
+def tutorial_report(case: Case) -> Shot:
+    """The top of its report."""
+    return Shot(guide.report(case.work), 1180, 900)
+
+
+def tutorial_workspace(case: Case) -> Shot:
+    """The tool over the workspace, before and after."""
+    return Shot(guide.report_part(case.work, "workspace"), 1000, 880)
+
+
+def tutorial_residuals(case: Case) -> Shot:
+    """What is left between edges and model."""
+    return Shot(guide.report_part(case.work, "residuals"), 1000, 800)
+
+
+def tutorial_validation(case: Case) -> Shot:
+    """The page of what was held out."""
+    return Shot(guide.confirmed(case.work), 1000, 710)
+
+
+def trouble_scale(case: Case) -> Shot:
+    """The top of a refused report: one reading has another scale."""
+    found = guide.calibrated(guide.wrong(case.work, "legs", "encoder's scale 1 %"))
+    return Shot(page.page_html(outcome_of_calibration(found)), 1180, 345)
+
+
+def trouble_columns(case: Case) -> Shot:
+    """The drawing over a photograph whose readings stand in each other's columns."""
+    spoil = guide.two_columns_exchanged
+    folder = guide.wrong(case.work, "legs", "two columns exchanged", spoil)
+    return whole_page(guide.laid_over(folder), 1000, 410)
+
+
+def trouble_numbering(case: Case) -> Shot:
+    """The same where the legs are numbered from another one."""
+    spoil = guide.numbered_from_another_leg
+    folder = guide.wrong(case.work, "legs", "numbered from another leg", spoil)
+    return whole_page(guide.laid_over(folder), 1000, 410)
+
+
 PICTURES: dict[str, Callable[[Case], Shot]] = {
     f.__name__.replace("_", "-"): f
     for f in (
@@ -325,6 +377,15 @@ PICTURES: dict[str, Callable[[Case], Shot]] = {
         repeats,
         plan,
         view,
+        tutorial_photographs,
+        tutorial_check,
+        tutorial_report,
+        tutorial_workspace,
+        tutorial_residuals,
+        tutorial_validation,
+        trouble_scale,
+        trouble_columns,
+        trouble_numbering,
     )
 }
 

@@ -1,0 +1,140 @@
+"""Pictures of the tutorial and of what can go wrong: the pages that the commands themselves write.
+
+The tutorial's session is the one that its reader makes; the wrong ones are of
+benchmarks/wrong_sessions.py, number 1.
+"""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+import pkmcal
+from pkmcal.calibration.calibrate import Calibration
+from pkmcal.check.check import check_session
+from pkmcal.judge.validate import validate
+from pkmcal.outcome import Outcome
+from pkmcal.report import calibration, check, page, validation
+
+HERE = Path(__file__).resolve().parents[1]
+HELD_OUT = 6
+"""Configurations that the tutorial leaves out."""
+NUMBER = 1
+"""Of the wrong sessions."""
+
+
+@cache
+def session(work: Path) -> Path:
+    """The tutorial's session, made by its command where it is not there yet."""
+    folder = work / "session"
+    if not folder.exists():
+        command = [sys.executable, "-m", "pkmcal", "simulate", str(folder), "--seed", "1"]
+        subprocess.run(command, check=True, capture_output=True)
+    return folder
+
+
+@cache
+def calibrated(folder: Path, holdout: int = 0) -> Calibration:
+    """Its calibration."""
+    return pkmcal.calibrate(folder, holdout=holdout)
+
+
+def photographs(work: Path) -> str:
+    """The first photograph of each station."""
+    shots = [sorted(folder.iterdir())[0] for folder in sorted((session(work) / "images").iterdir())]
+    figures = "".join(
+        "<figure><img src='data:image/png;base64,"
+        f"{base64.b64encode(path.read_bytes()).decode()}'>"
+        f"<figcaption>{path.parent.name} / {path.stem}</figcaption></figure>"
+        for path in shots
+    )
+    return (
+        "<style>.row { display: flex; gap: 10px; padding: 6px } .row figure { margin: 0; flex: 1 }"
+        " .row img { width: 100%; border-radius: 6px } .row figcaption { font-size: 14px;"
+        f" color: #58626d }}</style><div class='row'>{figures}</div>"
+    )
+
+
+def report(work: Path) -> str:
+    """The report, whole."""
+    return page.page_html(calibration.outcome_of(calibrated(session(work), HELD_OUT)))
+
+
+def report_part(work: Path, name: str) -> str:
+    """One section of the report."""
+    return _only(calibration.outcome_of(calibrated(session(work), HELD_OUT)), name)
+
+
+def confirmed(work: Path) -> str:
+    """What `pkmcal validate` says of the configurations held out."""
+    out = work / "out"
+    if not (out / "calibration.json").exists():
+        calibration.save(calibrated(session(work), HELD_OUT), out)
+    return page.page_html(validation.outcome_of(validate(out, session(work))))
+
+
+def laid_over(folder: Path) -> str:
+    """The drawing over the first station's first photograph, by hand and as found."""
+    found = check_session(folder)
+    if found.look is None:
+        sys.exit(f"{folder}: nothing to look at")
+    few = replace(found.look, stations=found.look.stations[:1])
+    # the section shows up to three photographs of a station, each twice; one is enough
+    figures = str(check.with_pictures(few).html).split("<figure")[1:3]
+    style = "<style>.row { display: flex; gap: 10px; padding: 6px } .row figure { flex: 1 }</style>"
+    return style + "<div class='row'>" + "".join("<figure" + one for one in figures) + "</div>"
+
+
+def wrong(work: Path, kind: str, name: str, spoil: Callable[[Path], None] | None = None) -> Path:
+    """A session with the wrong fact of that name, or spoilt by hand."""
+    module = _wrong_sessions()
+    right = module.simulated(kind, NUMBER, work)
+    folder = work / name.replace(" ", "-") / f"{kind}-{NUMBER}"
+    if not folder.exists():
+        shutil.copytree(right, folder)
+        if spoil:
+            spoil(folder)
+        else:
+            module.FACTS[name].make(folder, np.random.default_rng(NUMBER))
+    return folder
+
+
+def numbered_from_another_leg(folder: Path) -> None:
+    """Each leg's readings two columns on, a third round the machine."""
+
+    def change(values: np.ndarray) -> None:
+        values[:] = np.roll(values, -2, axis=1)
+
+    _wrong_sessions().readings(folder, change)
+
+
+def two_columns_exchanged(folder: Path) -> None:
+    """The readings of the first two legs under each other's heading."""
+
+    def change(values: np.ndarray) -> None:
+        values[:, :2] = values[:, [1, 0]]
+
+    _wrong_sessions().readings(folder, change)
+
+
+def _wrong_sessions() -> ModuleType:
+    sys.path.insert(0, str(HERE / "benchmarks"))
+    import wrong_sessions
+
+    return wrong_sessions
+
+
+def _only(found: Outcome, name: str) -> str:
+    kept = tuple(part for part in found.parts if part.name == name)
+    html = page.page_html(replace(found, parts=kept, findings=(), figures=()))
+    hidden = "header.top, .verdict, .note { display: none !important; }"
+    return html.replace("</style>", hidden + "</style>", 1)
