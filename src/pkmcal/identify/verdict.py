@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -286,7 +287,8 @@ def _harmless(sentences: tuple[Sentence, ...]) -> list[str]:
     harmless = sum(not s.matters for s in sentences)
     if not harmless:
         return []
-    what = sentences[[s.matters for s in sentences].index(False)].text.partition(".")[0]
+    first = sentences[[s.matters for s in sentences].index(False)].text
+    what = re.split(r"\.(?=\s|$)", first)[0]  # not at the point of a number
     more = f" ({harmless - 1} more in the report)" if harmless > 1 else ""
     return [f"Open, without effect on the platform: {what[0].lower()}{what[1:]}{more}."]
 
