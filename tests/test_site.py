@@ -74,3 +74,8 @@ def test_the_page_of_python_has_every_public_name(site):
             assert f'id="pkmcal.{name}"' in text, name
     # what stands in docstrings, and not names alone
     assert "Read a camera file of pkmcal, OpenCV, ROS or Kalibr" in text
+
+
+def test_every_page_stands_in_the_menu_once():
+    pages = re.findall(r"[\w-]+\.md", (ROOT / "mkdocs.yml").read_text("utf-8").partition("nav:")[2])
+    assert sorted(pages) == sorted(path.name for path in (ROOT / "docs").glob("*.md"))
