@@ -147,7 +147,7 @@ def test_readings_in_millimetres(session):
     refused(
         session,
         "joints.csv, line 2, column leg1: the readings look like millimetres",
-        "expected metres, between 0.345 and 0.485. Divide them by 1000.",
+        "expected metres, between 0.345 and 0.485. Divide them by 1000, or head the columns leg1",
     )
 
 

@@ -233,8 +233,9 @@ def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
     if 2 < len(names) == len(np.unique(names)):
         for step in (1, -1):
             yield Hypothesis(replace(view, configuration=np.roll(names, step)), _shifted(step))
-    # thin legs of few pixels are as likely to be thinner still: only where nothing else explains
-    if not station.found.good:
+    # thin legs of few pixels are as likely to be thinner still, and two photographs of right ones
+    # can fit so by chance: only where nothing else explains
+    if not station.found.good and len(names) > 2:
         values = view.machine.values.copy()
         values[np.unique(view.tubes.radius)] /= 2
         yield Hypothesis(replace(view, machine=view.machine.with_values(values)), _diameters())
