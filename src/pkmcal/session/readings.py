@@ -257,8 +257,8 @@ def wrong_reading(column: str, unit: str, configuration: str) -> Departure:
             f"The reading of {column} in configuration {configuration} is off: what was seen tells"
             f" {amount(abs(value[0]), unit)} {'more' if value[0] > 0 else 'less'}, to"
             f" {amount(sigma[0], unit)}",
-            "Look it up where readings are logged, and whether this photograph bears the right"
-            " name, or leave the configuration out",
+            "Look it up where readings are logged, and look at its photograph: whether it bears the"
+            " right name, and the edges found lie on the legs; or leave the configuration out",
         )
 
     return Departure("reading", f"{column}, {configuration}", says)
