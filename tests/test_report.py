@@ -1,5 +1,9 @@
 """The report's views, numbers and overlays, against a case made by hand."""
 
+import base64
+import csv
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -283,3 +287,24 @@ def test_the_page_says_how_many_photographs_it_shows(case):
 def test_a_session_is_called_by_its_folder_or_the_one_around_it(case):
     assert replace(case.session, folder=Path("/x/mine")).called == "session mine"
     assert replace(case.session, folder=Path("/x/mine/session")).called == "session mine"
+
+
+def test_the_table_can_be_taken_along(case):
+    estimate, drawing = case.estimate, case.session.machine
+    html = str(parameters.section(drawing, estimate).html)
+    found = dict(re.findall(r'<a download="([\w.]+)" href="data:[^"]*;base64,([\w+/=]+)"', html))
+    texts = {name: base64.b64decode(packed).decode("utf-8") for name, packed in found.items()}
+    assert set(texts) == {"parameters.csv", "parameters.tex", "parameters.json"}
+    rows = list(csv.DictReader(texts["parameters.csv"].splitlines()))
+    table = estimate.machine.parameters
+    assert [row["parameter"] for row in rows] == list(table.names)
+    assert [float(row["calibrated"]) for row in rows] == estimate.machine.values.tolist()
+    assert [float(row["drawing"]) for row in rows] == drawing.values.tolist()
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    np.testing.assert_allclose([float(row["sigma"]) for row in rows], sigma, atol=1e-9)
+    again = json.loads(texts["parameters.json"])["parameters"]
+    assert [row["sigma"] for row in again] == [float(row["sigma"]) for row in rows]
+    lines = texts["parameters.tex"].splitlines()
+    assert len(lines) == len(table) + 3
+    assert all(line.endswith(r" \\") and line.count("&") == 5 for line in lines[2:-1])
+    assert all(line.isascii() for line in lines)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import csv
+import io
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.files import json_text
 from pkmcal.identify.decided import EXACT, Decider, decided_by
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import Findings
@@ -28,6 +34,11 @@ from pkmcal.wording import (
 TIGHT = 0.95
 """Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""
 MOST_PAIRS = 6
+TEX = {
+    "%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "−": "$-$", "–": "--", "µ": r"\textmu ",
+    "°": r"$^\circ$", "σ": r"$\sigma$", "\N{NARROW NO-BREAK SPACE}": r"\,",
+}  # fmt: skip
+"""Signs that LaTeX reads as something else, or not."""
 SOURCES = {
     "data": "the photographs decide",
     "drawing": "the drawing decides more than the photographs",
@@ -79,13 +90,72 @@ class ParameterGroup:
 def section(drawing: Machine, estimate: Estimate) -> Part:
     """The table."""
     seen = estimate.edge_weights.size or estimate.pose_weights.size
+    groups = parameter_groups(drawing, estimate)
     html = page.render(
         "parameters.html.j2",
-        groups=parameter_groups(drawing, estimate),
+        groups=groups,
+        downloads={
+            "parameters.csv": _as_link("text/csv", parameters_csv(drawing, estimate)),
+            "parameters.tex": _as_link("application/x-tex", parameters_tex(groups)),
+            "parameters.json": _as_link("application/json", parameters_json(drawing, estimate)),
+        },
         gauge=estimate.gauge,
         told="photographs" if seen else "readings",
     )
     return Part("parameters", "Parameters", html=html)
+
+
+def _columns(drawing: Machine, estimate: Estimate) -> dict[str, list[Any]]:
+    """What the table holds, in SI and in full, by column."""
+    table, variance = estimate.machine.parameters, np.diagonal(estimate.covariance)
+    return {
+        "parameter": list(table.names),
+        "unit": list(table.units),
+        "drawing": drawing.values.tolist(),
+        "calibrated": estimate.machine.values.tolist(),
+        "sigma": np.sqrt(np.where(variance > EXACT**2, variance, 0.0)).tolist(),
+        "source": list(decided_by(table, estimate.covariance, estimate.data_share)),
+    }
+
+
+def parameters_csv(drawing: Machine, estimate: Estimate) -> str:
+    """The table for a spreadsheet: SI, all digits."""
+    stream, columns = io.StringIO(), _columns(drawing, estimate)
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return stream.getvalue()
+
+
+def parameters_json(drawing: Machine, estimate: Estimate) -> str:
+    """The same for programs; calibration.json has it all, covariance included."""
+    columns = _columns(drawing, estimate)
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return json_text({"parameters": rows})
+
+
+def parameters_tex(groups: Sequence[ParameterGroup]) -> str:
+    """The table for a paper, as a tabular: rounded as on the page."""
+    lines = [
+        r"\begin{tabular}{rlrrrl}",
+        r"Leg & Parameter & Drawing & Calibrated & $\sigma$ & Unit \\ \hline",
+    ]
+    for row in (row for group in groups for row in group.rows):
+        cells = (str(row.leg or ""), row.label, row.drawing, row.calibrated, row.sigma, row.unit)
+        lines.append(" & ".join(map(_for_tex, cells)) + r" \\")
+    return "\n".join([*lines, r"\end{tabular}"]) + "\n"
+
+
+def _for_tex(text: str) -> str:
+    for sign, command in TEX.items():
+        text = text.replace(sign, command)
+    return text
+
+
+def _as_link(kind: str, text: str) -> str:
+    """Text as an address that holds it."""
+    packed = base64.b64encode(text.encode("utf-8")).decode("ascii")
+    return f"data:{kind};charset=utf-8;base64,{packed}"
 
 
 def parameter_groups(drawing: Machine, estimate: Estimate) -> tuple[ParameterGroup, ...]:
