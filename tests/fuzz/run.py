@@ -40,7 +40,7 @@ PLACE = re.compile(
 place of its own, or a photograph's name; or what kind of machine it is that a command does not
 take."""
 
-ELSEWHERE = re.compile(r"(^|: )/[\w/.-]+, line \d+")
+ELSEWHERE = re.compile(r"(^|: )/[\w/.-]+(, line \d+|: )")
 
 
 @dataclass(frozen=True)
