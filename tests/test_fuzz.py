@@ -18,7 +18,7 @@ from fuzz.run import judged
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="cases are forked")
 TESTS = Path(__file__).parent
-FEW, MANY = 120, 10_000
+FEW, MANY = 300, 10_000
 
 
 def fuzzed(count, first=0):
@@ -32,7 +32,7 @@ def fuzzed(count, first=0):
     return done.stdout
 
 
-def test_a_hundred_malformed_sessions():
+def test_a_few_hundred_malformed_sessions():
     said = fuzzed(FEW)
     assert f"{FEW} cases" in said
     assert "with faults 0" in said

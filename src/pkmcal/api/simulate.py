@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from pkmcal.cameras import Camera, load_camera
-from pkmcal.errors import InputError, PkmcalError
+from pkmcal.errors import InputError
 from pkmcal.files import closest
 from pkmcal.mechanisms import Machine, load_mechanism
 from pkmcal.session.load import Session, load_session
-from pkmcal.simulation import Settings, simulate_session, with_forearms
+from pkmcal.simulation import Settings, simulate_session, to_simulate
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.wording import listed
 
@@ -68,10 +68,6 @@ def simulate(
             )
     drawing = mechanism if isinstance(mechanism, Machine) else load_mechanism(mechanism)
     eye = camera if isinstance(camera, Camera) else load_camera(camera) if camera else demo_camera()
-    try:
-        machine = with_forearms(drawing)
-        machine.home()
-    except PkmcalError as error:  # it cannot be put together: the drawing is at fault
-        raise error.as_input(drawing.name) from None
+    machine = to_simulate(drawing, drawing.name)
     simulate_session(folder, machine, eye, Settings(**settings), seed=seed, progress=progress)
     return load_session(folder)

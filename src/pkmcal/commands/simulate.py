@@ -13,7 +13,7 @@ import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.numbers import check_positive
-from pkmcal.errors import InputError, PkmcalError
+from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
     from pkmcal.cameras import Camera
@@ -102,7 +102,7 @@ def simulate(
     """Simulate a session with photographs and known truth."""
     from pkmcal.cameras import load_camera
     from pkmcal.mechanisms import load_mechanism
-    from pkmcal.simulation import Sensor, Settings, board_for, simulate_session, with_forearms
+    from pkmcal.simulation import Sensor, Settings, board_for, simulate_session, to_simulate
     from pkmcal.simulation.demo import camera_of_size
     from pkmcal.simulation.rehearsal import rehearsal_of
 
@@ -110,11 +110,7 @@ def simulate(
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
     planned = rehearsal_of(plan) if plan else None
     drawing = planned.machine if planned else load_mechanism(mechanism, label=None)
-    try:
-        machine = with_forearms(drawing)
-        machine.home()
-    except PkmcalError as error:  # it cannot be put together: the drawing is at fault
-        raise error.as_input(str(plan or mechanism)) from None
+    machine = to_simulate(drawing, str(plan or mechanism))
     place = "platform" if on_platform else "base"
     settings = Settings(
         stations=stations,

@@ -27,7 +27,6 @@ from pkmcal.files.quantities import (
     Share,
     any_unit,
     no_such,
-    split_head,
     with_unit,
 )
 from pkmcal.files.regular import check_regular
@@ -81,7 +80,6 @@ __all__ = [
     "remove_folder",
     "settle",
     "shown",
-    "split_head",
     "staged_folder",
     "stated_size",
     "validate",

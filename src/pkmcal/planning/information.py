@@ -197,7 +197,7 @@ def _check_seen(rig: Rig, candidates: Candidates, measurements: Measurements) ->
     names = [rig.names[s] for s in candidates.groups[lost[0]]]
     raise InputError(
         f"from {listed(names)} nothing is seen in any configuration",
-        where=f"{rig.where}{names[0]}",
+        where=None if rig.where is None else rig.where + names[0],
         found="no leg, or board, in the picture",
         expected="a camera that looks at the machine",
         next_step="Check its pose, or let places be chosen: --places 3",

@@ -190,7 +190,7 @@ class Rig:
     (S,) number of each one's camera. joint_noise : of a reading. instruments : what they measure.
     mounts : what boards and targets are fixed to, with their places T_mount (M, 4, 4). shading :
     px, standard deviation of what the edges of one side of a tube at one station have in common.
-    where : what precedes a station's name in messages about it.
+    where : what precedes a station's name in messages about it; None where no file names it.
     """
 
     machine: Machine
@@ -202,7 +202,7 @@ class Rig:
     mounts: tuple[Mount, ...] = ()
     T_mount: Array | None = None
     shading: float = SHADING_SIGMA
-    where: str = "session.yaml, stations."
+    where: str | None = "session.yaml, stations."
 
     __repr__ = short_repr
 

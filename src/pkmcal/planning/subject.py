@@ -165,7 +165,7 @@ def _seen(
     T_mount = None if T_platform_board is None else T_platform_board[None]
     return Rig(
         machine, names, T_camera_base, numbers, joint_noise, tuple(instruments), mounts, T_mount,
-        where="",
+        where=None,
     )  # fmt: skip
 
 

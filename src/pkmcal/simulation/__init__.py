@@ -8,7 +8,7 @@ demo holds the demonstration's settings.
 """
 
 from pkmcal.simulation.board import board_for
-from pkmcal.simulation.drives import with_forearms
+from pkmcal.simulation.drives import to_simulate, with_forearms
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.simulation.render import Sensor
@@ -26,6 +26,7 @@ __all__ = [
     "load_truth",
     "simulate_edges",
     "simulate_session",
+    "to_simulate",
     "true_machine",
     "with_forearms",
 ]

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine, machine_from_document
 from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
@@ -174,6 +174,18 @@ def side_bars(machine: Machine) -> tuple[Integers, ...]:
     """Legs of each body of an articulated platform, in the order of their numbers."""
     on = bodies(machine.document)
     return tuple(np.flatnonzero(on == body) for body in range(on.max(initial=-1) + 1))
+
+
+def to_simulate(drawing: Machine, where: str) -> Machine:
+    """The drawing :func:`with_forearms`, if it can be put together at home; else InputError, with
+    where the drawing is from.
+    """
+    try:
+        machine = with_forearms(drawing)
+        machine.home()
+    except PkmcalError as error:
+        raise error.as_input(where) from None
+    return machine
 
 
 def with_forearms(machine: Machine) -> Machine:
