@@ -297,8 +297,8 @@ def test_the_table_can_be_taken_along(case):
     assert set(texts) == {"parameters.csv", "parameters.tex", "parameters.json"}
     rows = list(csv.DictReader(texts["parameters.csv"].splitlines()))
     table = estimate.machine.parameters
-    assert [row["parameter"] for row in rows] == list(table.names)
-    assert [float(row["calibrated"]) for row in rows] == estimate.machine.values.tolist()
+    assert [row["name"] for row in rows] == list(table.names)
+    assert [float(row["value"]) for row in rows] == estimate.machine.values.tolist()
     assert [float(row["drawing"]) for row in rows] == drawing.values.tolist()
     sigma = np.sqrt(np.diag(estimate.covariance))
     np.testing.assert_allclose([float(row["sigma"]) for row in rows], sigma, atol=1e-9)

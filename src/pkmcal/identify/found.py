@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, overload
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
+COLUMNS = (
+    "name", "unit", "drawing", "value", "change", "sigma", "data_share", "decided_by",
+)  # fmt: skip
 SHOWN = 12
 """Rows of the table that its repr shows."""
 
@@ -82,9 +85,11 @@ class FoundParameters(Sequence[FoundParameter]):
                 "this table as a DataFrame needs pandas",
                 next_step="Install it with: pip install pandas",
             ) from None
-        columns = ["unit", "drawing", "value", "change", "sigma", "data_share", "decided_by"]
-        rows = [{**asdict(row), "change": row.change} for row in self.rows]
-        return pd.DataFrame(rows, columns=["name", *columns]).set_index("name")
+        return pd.DataFrame(self.records(), columns=list(COLUMNS)).set_index("name")
+
+    def records(self) -> list[dict[str, str | float]]:
+        """One mapping a row, by COLUMNS."""
+        return [{name: getattr(row, name) for name in COLUMNS} for row in self.rows]
 
     def __str__(self) -> str:
         return self._text(len(self.rows))

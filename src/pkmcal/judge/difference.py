@@ -335,7 +335,13 @@ def _judged(d: MachineDifference) -> MachineDifference:
             f" {d.found.dof} degrees of freedom."
         )
     advice: tuple[str, ...] = ()
-    if d.changed and d.a.saved and d.b.saved:
+    if d.changed and d.a.saved and d.b.saved and d.shared == int(d.a.saved.used.sum()):
+        advice = (
+            "Both are of the same photographs: what differs is what was found in them, which the"
+            f" random search (seeds {d.a.saved.seed} and {d.b.saved.seed}) or the settings decide."
+            " Where that matters, more photographs are needed.",
+        )
+    elif d.changed and d.a.saved and d.b.saved:
         advice = (
             "If nothing was done to the machine in between, something that the model leaves out"
             " differs between the two: see pkmcal validate of each on the other's session.",

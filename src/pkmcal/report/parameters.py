@@ -8,7 +8,6 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from pkmcal.arrays import Array
 from pkmcal.files import json_text
 from pkmcal.identify.decided import EXACT, Decider, decided_by
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.found import FoundParameters, found_parameters
 from pkmcal.identify.unidentified import Findings
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part
@@ -91,13 +91,18 @@ def section(drawing: Machine, estimate: Estimate) -> Part:
     """The table."""
     seen = estimate.edge_weights.size or estimate.pose_weights.size
     groups = parameter_groups(drawing, estimate)
+    found = found_parameters(
+        drawing.values, estimate.machine, estimate.covariance, estimate.data_share
+    )
     html = page.render(
         "parameters.html.j2",
         groups=groups,
         downloads={
-            "parameters.csv": _as_link("text/csv", parameters_csv(drawing, estimate)),
+            "parameters.csv": _as_link("text/csv", parameters_csv(found)),
             "parameters.tex": _as_link("application/x-tex", parameters_tex(groups)),
-            "parameters.json": _as_link("application/json", parameters_json(drawing, estimate)),
+            "parameters.json": _as_link(
+                "application/json", json_text({"parameters": found.records()})
+            ),
         },
         gauge=estimate.gauge,
         told="photographs" if seen else "readings",
@@ -105,33 +110,13 @@ def section(drawing: Machine, estimate: Estimate) -> Part:
     return Part("parameters", "Parameters", html=html)
 
 
-def _columns(drawing: Machine, estimate: Estimate) -> dict[str, list[Any]]:
-    """What the table holds, in SI and in full, by column."""
-    table, variance = estimate.machine.parameters, np.diagonal(estimate.covariance)
-    return {
-        "parameter": list(table.names),
-        "unit": list(table.units),
-        "drawing": drawing.values.tolist(),
-        "calibrated": estimate.machine.values.tolist(),
-        "sigma": np.sqrt(np.where(variance > EXACT**2, variance, 0.0)).tolist(),
-        "source": list(decided_by(table, estimate.covariance, estimate.data_share)),
-    }
-
-
-def parameters_csv(drawing: Machine, estimate: Estimate) -> str:
+def parameters_csv(found: FoundParameters) -> str:
     """The table for a spreadsheet: SI, all digits."""
-    stream, columns = io.StringIO(), _columns(drawing, estimate)
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
+    stream, rows = io.StringIO(), found.records()
+    writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     return stream.getvalue()
-
-
-def parameters_json(drawing: Machine, estimate: Estimate) -> str:
-    """The same for programs; calibration.json has it all, covariance included."""
-    columns = _columns(drawing, estimate)
-    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    return json_text({"parameters": rows})
 
 
 def parameters_tex(groups: Sequence[ParameterGroup]) -> str:
