@@ -305,6 +305,7 @@ WRONG_PRINTERS = {
     changed(CFG, "height0_pos = ", "height0_pos = x"): "height0_pos does not tell where",
     "M665 L270 R1.0.5 H300 B90\n": "a value of this line is no number that a printer can have",
     "M665 R105 H300 B90\n": "M665 has no value L that could be used",
+    printers.printer_cfg(SAYS, np.tile(SAYS.homed + 2, (7, 1))): "stepper_a 2.0 mm above it",
     printers.printer_cfg(SAYS): "nothing tells where the bed is",
     printers.printer_cfg(SAYS, np.tile(SAYS.homed - 200, (6, 1))): "too few points of the bed",
 }

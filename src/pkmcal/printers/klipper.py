@@ -122,7 +122,7 @@ def _number(
         raise InputError(
             f"this value of the printer is missing: {name}",
             where=f"{label}, [{section}]",
-            expected=f"{name}: a number, in mm",
+            expected=f"{name}: a number",
             next_step="If it stands in a file that this one includes, copy it here",
         )
     text, where = found[section][name]

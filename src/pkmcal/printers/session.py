@@ -110,6 +110,15 @@ def _enough(printer: Printer, touches: Touches | None) -> Touches:
             found=count(len(touches.heights), "point"),
             expected=f"{FEWEST} or more, spread to the edge of the bed",
         )
+    above = touches.carriages.max(axis=0) - printer.homed
+    if above.max() > 0:
+        motor = int(np.argmax(above))
+        raise InputError(
+            "a carriage would have been above its end switch when the bed was felt",
+            where=touches.origin,
+            found=f"{printer.motors[motor]} {above[motor]:.1f} mm above it",
+            expected=f"points that belong to the values in {printer.label}",
+        )
     return touches
 
 
