@@ -15,6 +15,7 @@ from pkmcal.calibration.calibrate import calibrate
 from pkmcal.calibration.results import load
 from pkmcal.calibration.source import Source, load_source
 from pkmcal.errors import InputError
+from pkmcal.export import reprap
 from pkmcal.export.contract import export
 from pkmcal.export.klipper import Klipper
 from pkmcal.geometry.rigid import pose
@@ -271,6 +272,45 @@ def test_a_step_is_what_the_motor_makes_of_it(true, tmp_path):
     for kind in (text, geared, fine, first):
         found = read_printer(said(tmp_path, kind, "printer.cfg"))
         np.testing.assert_allclose(found.touches.carriages, readings, atol=1e-5)
+
+
+def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
+    """config.g and heightmap.csv to M665 and M666, which put Z 0 on the bed; no file of ours is
+    read in between."""
+    config = said(tmp_path, "M665 L270 R105 H300 B90\nM666 X0 Y0 Z0\n", "config.g")
+    x, y = (v.ravel() for v in np.meshgrid(np.linspace(-60, 60, 5), np.linspace(-60, 60, 5)))
+    z = np.zeros(25)
+    for _ in range(8):  # lowered until it touches
+        readings = SAYS.carriages(np.column_stack([x, y, z]))
+        z = z - 1e3 * true.forward(1e-3 * readings)[:, 2, 3]
+    z = z + NOISE * np.random.default_rng(3).normal(size=25)
+    rows = "".join(", ".join(f"{h:.3f}" for h in row) + "\n" for row in z.reshape(5, 5))
+    text = (
+        "RepRapFirmware height map file v2 generated at 2026-11-23 10:00, min error -0.9\n"
+        "axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1\n"
+        f"X,Y,-60.00,60.00,-60.00,60.00,90.00,30.00,30.00,5,5\n{rows}"
+    )
+    probed = said(tmp_path, text, "heightmap.csv")
+    done = run("new", tmp_path / "kit", "--printer", config, "--probed", probed)
+    assert done.code == 0, done.err
+    assert "--to reprap" in (tmp_path / "kit" / "session.yaml").read_text()
+    for words in (("calibrate", "kit"), ("export", "kit/calibration", "--to", "reprap")):
+        done = run(words[0], tmp_path / words[1], *words[2:])
+        assert done.code == 0, done.out + done.err
+    (path,) = (tmp_path / "kit" / "export-reprap").iterdir()
+    words = reprap.read_words(path.read_text())
+    told = np.column_stack([0.7 * x + 3, 0.8 * y - 2, 0 * x])
+    travel = reprap.homed_carriages(words) - reprap.linear_motors(words, told)
+    there = 1e3 * true.forward(1e-3 * (SAYS.homed - travel))[:, 2, 3]
+    assert np.abs(z).max() > 0.3
+    assert np.sqrt(np.mean(there**2)) < NOISE
+
+
+def test_heights_predict_no_readings(kit):
+    """Of a pose that only its height was measured of, the rest is its readings' own."""
+    done = run("calibrate", kit, "-o", kit.parent / "held", "--holdout", "5")
+    assert done.code == 1
+    assert "heights tell none" in done.err
 
 
 def test_a_board_on_a_printers_tool(cfg):

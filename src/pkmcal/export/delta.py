@@ -457,12 +457,12 @@ def about(
         for name, factor in zip(names, scales_of(fit), strict=True)
         if abs(factor - 1) > TOLD
     ]
-    tip = "Z is 0 where a height of 0 was measured."
-    if delta.bed is None:
-        tip = (
-            "The point that moves is the platform frame's origin; a tool's length below it is not"
-            " in these values."
-        )
+    tip = (
+        "The point that moves is the platform frame's origin; a tool's length below it is not in"
+        " these values."
+    )
+    if delta.bed is not None and abs(fit.T_firmware_base[2, 3] + delta.bed) < ROUNDING:
+        tip = "Z is 0 where a height of 0 was measured."
     sort = "Towers" if fit.kind == "linear" else "Arms' angles above the horizontal"
     return [
         *source.header(),
