@@ -325,7 +325,13 @@ def _fit(estimate: Estimate) -> Figure:
         )
         if np.isfinite(scale) and abs(scale - 1) > 0.005
     ]
-    found = s.chi2 / s.dof if s.dof > 0 else float("nan")
+    if s.dof <= 0:
+        return Figure(
+            "Does the model explain the data?",
+            (("–", "χ² per degree of freedom"),),
+            "as many unknowns as measurements: nothing is left over that could tell",
+        )
+    found = s.chi2 / s.dof
     return Figure(
         "Does the model explain the data?",
         ((number(s.chi2_as_stated, 2), "χ² per degree of freedom"),),
