@@ -89,7 +89,7 @@ def judge(
     left = [f"{s.text} {s.advice}" for s in large]
     if findings and bed:
         left = _bed_unknown(bed)
-        hints = (*_not_by_heights(bed, findings), *hints)
+        hints = (*_not_by_heights(estimate, bed, findings), *hints)
     elif findings is None and (undecided := _undecided(estimate)):
         left = [
             f"The data hardly say more than the drawing about {listed(undecided, 4)}: more"
@@ -110,7 +110,7 @@ def judge(
     elif bed:
         headline = (
             f"Calibrated for a flat bed: the tool's height above it to {bed.sigma * 1e3:.2g} mm"
-            f" (standard deviation), {bed.radius * 1e3:.0f} mm about its middle. Along x and y"
+            f" (standard deviation) within {bed.radius * 1e3:.0f} mm of its middle. Along x and y"
             " nothing is promised."
         )
     else:
@@ -154,7 +154,7 @@ def _bed_unknown(bed: Bed) -> list[str]:
     ]
 
 
-def _not_by_heights(bed: Bed, findings: Findings) -> list[str]:
+def _not_by_heights(estimate: Estimate, bed: Bed, findings: Findings) -> list[str]:
     """What heights leave to the drawing, in figures, and the largest cause in words."""
     told = [
         f"Heights do not tell x and y: these are known to {bed.sideways * 1e3:.2g} mm, and sizes to"
@@ -166,6 +166,11 @@ def _not_by_heights(bed: Bed, findings: Findings) -> list[str]:
         first = max(matter, key=lambda s: s.moves_platform)
         more = f" ({len(matter) - 1} more in the report)" if len(matter) > 1 else ""
         told.append(f"{first.text}{more}")
+    if estimate.statistics.dof <= 0:
+        told.append(
+            "So few heights leave nothing over that could show a wrong one, or a bed that is not"
+            " flat: probe fifteen or more."
+        )
     return told
 
 
