@@ -57,7 +57,7 @@ def new(
     ] = None,
     as_json: console.Json = False,
 ) -> int:
-    """Write a commented session to fill in, or that of a printer and its heights."""
+    """Write a commented session to fill in."""
     from pkmcal.session.starter import write_session
 
     if printer is not None or probed is not None:
