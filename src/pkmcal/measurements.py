@@ -230,7 +230,8 @@ class Measurements:
     those units from the calibration's values. poses : of boards or targets, each on one of the
     ``mounts``. shaded : each side of a tube has, at each station, a shift of its own, as shading
     gives edges in photographs. breathing_at : (S,) excess of the stations' focal lengths at which
-    they were measured, in BREATHING_SIGMA; empty where none breathes.
+    they were measured, in BREATHING_SIGMA; empty where none breathes. level : (S,) stations whose z
+    axis is the base's, exactly; empty where there is none.
     """
 
     edges: EdgeSet
@@ -244,6 +245,7 @@ class Measurements:
     mounts: tuple[Mount, ...] = ()
     shaded: bool = False
     breathing_at: Array = field(default_factory=lambda: np.zeros(0))
+    level: Booleans = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     __repr__ = short_repr
 

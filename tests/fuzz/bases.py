@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+import printers
 from fuzz import pictures
 from pkmcal.cameras import load_camera
 from pkmcal.cameras.files import FORMATS, foreign_text
@@ -51,8 +52,31 @@ def make(folder: Path) -> None:
         (folder / "machines").mkdir(exist_ok=True)
         (folder / "machines" / f"{name}.yaml").write_text(text)
     cameras(folder / "cameras")
+    delta_printers(folder / "printers")
     pictures_of(folder / "pictures", (folder / "legs/images/station1/0000.png").read_bytes())
     results(folder)
+
+
+def delta_printers(folder: Path) -> None:
+    """What firmwares say of a printer and of its bed."""
+    folder.mkdir()
+    places = printers.bed(8)
+    (folder / "printer.cfg").write_text(printers.workshop() + "[probe]\nz_offset: 1.2\n")
+    (folder / "config.g").write_text(
+        "G90 ; absolute\nM665 L270:270.1:269.9 R105 H300 B90 X0.1 Y0 Z-0.1\nM666 X0.2 Y0 Z-0.2\n"
+    )
+    lines = [f"// probe at {x:.3f},{y:.3f} is z=1.{k}" for k, (x, y) in enumerate(places)]
+    (folder / "console.txt").write_text("\n".join(lines))
+    lines = [f"G30 P{k} X{x:.1f} Y{y:.1f} Z-99999" for k, (x, y) in enumerate(places)]
+    (folder / "bed.g").write_text("\n".join([*lines, f"G32 bed probe heights:{' 0.1' * 8}, mean"]))
+    rows = "".join("0, 0.01, -0.02, 0.030\n" for _ in range(4))
+    (folder / "heightmap.txt").write_text(
+        "RepRapFirmware height map file v2 generated at 2026-11-23 10:00\n"
+        "axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1\n"
+        f"X,Y,-40.00,40.00,-40.00,40.00,60.00,26.67,26.67,4,4\n{rows}"
+    )
+    heads, points = ("x [mm]", "y [mm]", "z [mm]"), np.pad(places, ((0, 0), (0, 1)))
+    (folder / "points.csv").write_text(csv_text(heads, [*"abcdefgh"], points))
 
 
 EVERYTHING = """\

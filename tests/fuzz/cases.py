@@ -37,7 +37,7 @@ class Task:
 
 
 QUICK = ("calibrate tracker", "check tracker", "validate", "watch", "export", "camera board/",
-         "simulate OUT --plan", "read-camera")  # fmt: skip
+         "simulate OUT --plan", "read-camera", "new")  # fmt: skip
 OF_OURS = ("read-camera", "look-at")
 """No commands but what commands are made of."""
 FIRST = 1000
@@ -51,6 +51,7 @@ TRACKER = tuple(
 LATER = tuple(f"later/{n}" for n in ("session.yaml", "mechanism.yaml", "joints.csv", "poses.csv"))
 BOARD = ("board/session.yaml", "board/board.yaml", "board/cameras/camera.yaml", "board/joints.csv",
          "board/images/*.png")  # fmt: skip
+POINTS = tuple(f"printers/{n}" for n in ("console.txt", "bed.g", "heightmap.txt", "points.csv"))
 RESULT = ("calibration/calibration.json",)
 TASKS = (
     Task("calibrate legs -o OUT", LEGS, "calibration", 6),
@@ -88,6 +89,8 @@ TASKS = (
     Task("study 3-rpr --vary configurations=3 --runs 2 -o study",
          ("study/batches/study.json", "study/batches/*.npz"), "", 1),
     Task("read-camera FILE", ("cameras/*.*",), "", 10),
+    Task("new OUT --printer FILE", ("printers/printer.cfg", "printers/config.g"), "", 4),
+    Task("new OUT --printer printers/printer.cfg --probed FILE", POINTS, "", 4),
     Task("look-at legs", LEGS, "", 2),
     Task("look-at board", BOARD, "", 1),
     Task("look-at hand", HAND, "", 1),
@@ -95,7 +98,7 @@ TASKS = (
 """Most often those that are quick, where most malformed files are refused."""
 FORMATS = ("c", "json", "mujoco", "yaml")
 """That take every machine."""
-ALONE = ("machines/", "cameras/")
+ALONE = ("machines/", "cameras/", "printers/")
 """Bases of which a task takes one file only."""
 
 

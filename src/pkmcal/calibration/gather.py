@@ -211,6 +211,10 @@ def measurements_of(
         camera_of_station=np.array(number, dtype=int),
         poses=concatenate(sets),
         mounts=tuple(mounts),
+        level=np.array(
+            [False] * len(session.stations) + [table.level for table in session.trackers],
+            dtype=bool,
+        ),
     )
     if cameras is None or not cameras.files:
         return measurements

@@ -175,6 +175,7 @@ def document_of(
     over the workspace, or why there is no map of it.
     """
     session, estimate = calibration.session, calibration.estimate
+    bed = calibration.findings and calibration.findings.bed
     document = {
         FORMAT_KEY: FORMAT,
         "conventions": CONVENTIONS,
@@ -194,6 +195,7 @@ def document_of(
         "configurations": _configurations(calibration),
         "statistics": asdict(estimate.statistics),
         "tool": {"why_not": over} if isinstance(over, str) else over and over.document(),
+        "bed": bed and asdict(bed),
         "holdout": holdout,
         "residuals": _residuals(calibration),
         "rejected": _rejected(calibration),
@@ -269,12 +271,14 @@ def _stations(calibration: Calibration) -> list[dict[str, Any]]:
 
 def _station_covariance(calibration: Calibration) -> dict[str, Any]:
     """Stations that a camera may be left in, by name, and their rows (6 k, P + 6 k) of the joint
-    covariance of all parameters and these stations, (omega, tau) of T_base_camera.
+    covariance of all parameters and these stations, (omega, tau) of T_base_camera. What felt
+    heights stands nowhere along the bed.
     """
     session, estimate = calibration.session, calibration.estimate
-    by_hand = {station.name for station in session.stations if station.handheld}
+    nowhere = {station.name for station in session.stations if station.handheld}
+    nowhere |= {table.name for table in session.trackers if table.kind == "heights"}
     names = session.station_names
-    kept = np.array([k for k, name in enumerate(names) if name not in by_hand], dtype=int)
+    kept = np.array([k for k, name in enumerate(names) if name not in nowhere], dtype=int)
     n = len(estimate.machine.parameters)
     rows = _joint_rows(n, kept)
     joint = _turned(

@@ -37,7 +37,8 @@ class Source:
     station's camera is missing where its file was not found.
     headline : the calibration's verdict in a sentence. usable : False for a refused one; reasons
     : why. origin : where it was read. calibrated : False for a drawing. frames : the gauge.
-    sigma_camera : (6,) by station, of T_base_camera, rad and m, base axes.
+    sigma_camera : (6,) by station, of T_base_camera, rad and m, base axes. bed : z (m, base frame)
+    of the platform's origin on a bed that was felt, None where none was.
     """
 
     machine: Machine
@@ -52,6 +53,7 @@ class Source:
     calibrated: bool = False
     frames: str = "as in the mechanism file"
     sigma_camera: Mapping[str, Array] = field(default_factory=lambda: MappingProxyType({}))
+    bed: float | None = None
 
     def sigma_of(self, name: str) -> float | None:
         """A parameter's standard deviation, m or rad; None where it is not known."""
@@ -146,6 +148,7 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> Source:
         reasons=() if saved.verdict.usable else saved.verdict.reasons,
         calibrated=True,
         frames=saved.gauge,
+        bed=(saved.document.get("bed") or {}).get("z"),
     )
 
 

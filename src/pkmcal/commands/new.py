@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +21,13 @@ WHAT = {
     "board.yaml": "the board on the platform",
     "joints.csv": "one row of readings for each configuration",
 }
+FELT = {
+    "session.yaml": "how good the probe is: see whether it is yours",
+    "mechanism.yaml": "the printer by its firmware: see whether its tolerances are right",
+    "joints.csv": "the carriages when the bed was felt",
+    "poses.csv": "the tool's height above the bed there",
+}
+"""Of a session that is whole."""
 PHOTOGRAPHS = "where the photographs go"
 
 
@@ -36,26 +44,81 @@ def new(
         int | None,
         typer.Option(metavar="N", min=1, max=20, help="Places that the camera stands in. [1]"),
     ] = None,
+    printer: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A delta printer's printer.cfg, or config.g with M665: its drawing and heights.",
+        ),
+    ] = None,
+    probed: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="What the printer said while it probed its bed."),
+    ] = None,
     as_json: console.Json = False,
 ) -> int:
     """Write a commented session to fill in."""
     from pkmcal.session.starter import write_session
 
+    if printer is not None or probed is not None:
+        others = {"--machine": machine, "--legs": legs, "--probed": probed if board else None}
+        return _of_printer(folder, printer, probed, board, places or 1, others, as_json)
     seen: Seen | None = "both" if board and legs else "board" if board else "legs" if legs else None
     plain = machine is None and seen is None and places is None
     if plain and not as_json and on_terminal():
         machine, seen, places = _asked()
     names = write_session(folder, machine, seen, places or 1)
+    return _told(folder, names, as_json)
+
+
+def _of_printer(
+    folder: Path,
+    printer: Path | None,
+    probed: Path | None,
+    board: bool,
+    places: int,
+    others: Mapping[str, object],
+    as_json: bool,
+) -> int:
+    """A printer's session; others : what else was asked, which does not go with it."""
+    from pkmcal.errors import InputError
+    from pkmcal.printers.session import write_printer_session
+
+    if printer is None:
+        raise InputError(
+            "points of a bed are read with the printer's own values",
+            where="--probed",
+            expected="--printer FILE besides: its printer.cfg, or its config.g with M665",
+        )
+    if extra := [name for name, given in others.items() if given]:
+        raise InputError(
+            "a printer's session is of its heights, or with --board of a board on its tool",
+            where="--printer",
+            found=" and ".join(extra) + " besides",
+            expected="neither --machine nor --legs, and --probed or --board",
+        )
+    names = write_printer_session(folder, printer, probed, "board" if board else None, places)
+    return _told(folder, names, as_json, done=not board)
+
+
+def _told(folder: Path, names: Sequence[str], as_json: bool, done: bool = False) -> int:
+    """What was written; done : nothing is missing in it."""
     if as_json:
         console.print_json({"folder": str(folder), "files": names})
         return 0
     out = console.out()
-    out.print("A session to fill in:\n", style="bold")
-    known = [name for name in WHAT if name in names]
+    out.print("A session:\n" if done else "A session to fill in:\n", style="bold")
+    what = {**WHAT, **(FELT if done else {})}
+    known = [name for name in what if name in names]
     others = sorted(set(names) - set(known))
-    rows = [(name, WHAT[name]) for name in known] + [(name, PHOTOGRAPHS) for name in others]
+    rows = [(name, what[name]) for name in known] + [(name, PHOTOGRAPHS) for name in others]
     console.print_files(out, [(str(folder / name), what) for name, what in rows])
-    out.print(f"\nWhat is still missing: pkmcal check {console.escaped(str(folder))}")
+    place = console.escaped(str(folder))
+    out.print(
+        f"\nNext: pkmcal calibrate {place}"
+        if done
+        else f"\nWhat is still missing: pkmcal check {place}"
+    )
     return 0
 
 

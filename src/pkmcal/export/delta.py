@@ -66,7 +66,8 @@ class Delta:
     (carriage height in mm, or angle above the horizontal in degrees) is rate * reading + zero, for
     an ideal machine. ends : (3,) readings at the upper end of the range.
     positions : (n, 3) m, T_base_platform's, over the workspace. readings : (n, 3), by leg.
-    by_reading : (n, 3, 3) m of the platform's position by the legs' readings.
+    by_reading : (n, 3, 3) m of the platform's position by the legs' readings. bed : z of the
+    platform's origin on a bed that was felt, m; None where none was.
     """
 
     machine: Machine
@@ -81,6 +82,7 @@ class Delta:
     poses: Array
     readings: Array
     by_reading: Array
+    bed: float | None = None
 
     @property
     def positions(self) -> Array:
@@ -88,10 +90,10 @@ class Delta:
         return self.poses[:, :3, 3]
 
 
-def delta_of(machine: Machine, program: str) -> Delta:
+def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
     """The machine as a delta; InputError with a sentence where it is none.
 
-    program : who asks, for the sentence.
+    program : who asks, for the sentence. bed : as of :class:`Delta`.
     """
     limbs, motion = limbs_of(machine), machine.document.motion
     if motion != "translation" or set(limbs.drive) not in ({SLIDE}, {TURN}):
@@ -129,6 +131,7 @@ def delta_of(machine: Machine, program: str) -> Delta:
         poses=poses,
         readings=readings,
         by_reading=by_reading,
+        bed=bed,
     )
 
 
@@ -379,7 +382,11 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
 
 
 def _lift(delta: Delta) -> float:
-    """How far, mm, the firmware's Z is above the base's z: not, or so that no Z is negative."""
+    """How far, mm, the firmware's Z is above the base's z: so that it is 0 on a bed that was felt;
+    else not, or so that no Z is negative.
+    """
+    if delta.bed is not None:
+        return -MM * delta.bed
     lowest = float(MM * delta.positions[:, 2].min())
     return 0.0 if lowest >= 0 else float(np.ceil(-lowest))
 
@@ -450,6 +457,12 @@ def about(
         for name, factor in zip(names, scales_of(fit), strict=True)
         if abs(factor - 1) > TOLD
     ]
+    tip = (
+        "The point that moves is the platform frame's origin; a tool's length below it is not in"
+        " these values."
+    )
+    if delta.bed is not None and abs(fit.T_firmware_base[2, 3] + delta.bed) < ROUNDING:
+        tip = "Z is 0 where a height of 0 was measured."
     sort = "Towers" if fit.kind == "linear" else "Arms' angles above the horizontal"
     return [
         *source.header(),
@@ -457,8 +470,7 @@ def about(
         *motors,
         *factors,
         *([correcting] if factors else []),
-        "The firmware's frame: p_firmware = firmware_from_base p_base, mm. The point that moves is"
-        " the platform frame's origin; a tool's length below it is not in these values.",
+        f"The firmware's frame: p_firmware = firmware_from_base p_base, mm. {tip}",
         *rows,
         f"{error_sentence(fit, program)} Compared over {len(delta.poses)} poses of the workspace.",
         "End switches are taken to be at the upper end of each motor's range in the mechanism"
@@ -520,6 +532,20 @@ def tool_difference(text: str, delta: Delta, fit: Fit, inverse: Inverse, zero: A
         # the fit is judged to first order, so a large error may be a fiftieth larger
         1.02 * told + ROUNDING,
     )
+
+
+def redo(source: Source) -> tuple[Finding, ...]:
+    """What a firmware has to measure again once it has these values; nothing of a drawing."""
+    if not source.calibrated:
+        return ()
+    home = "the tool's tip and the bed are not in these values: set the Z offset, level the bed"
+    if source.bed is not None:
+        home = "its Z is 0 on the bed that was felt, to the probe's error: check the first layer"
+    text = (
+        f"Keep the printer's own print radius. Then home: {home}. Measure the bed's mesh anew: the"
+        " old one belongs to the old values."
+    )
+    return (Finding(Level.NOTE, text),)
 
 
 def follows(fit: Fit, program: str) -> Finding:

@@ -236,7 +236,7 @@ def genhexkins(hal: str, pose: Array) -> Array:
 
 
 def _fit(source: Source) -> tuple[Delta, Fit]:
-    delta = delta_of(source.machine, PROGRAM)
+    delta = delta_of(source.machine, PROGRAM, source.bed)
     return delta, fitted(delta, LINEAR if delta.kind == "linear" else ROTARY, PROGRAM)
 
 

@@ -31,6 +31,7 @@ from pkmcal.export.delta import (
     follows,
     mm,
     reach,
+    redo,
     tool_difference,
 )
 from pkmcal.outcome import Finding
@@ -43,7 +44,7 @@ _WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
 
 
 def _fit(source: Source) -> tuple[Delta, Fit]:
-    delta = delta_of(source.machine, PROGRAM)
+    delta = delta_of(source.machine, PROGRAM, source.bed)
     return delta, fitted(delta, Freedoms(NOMINAL), PROGRAM)
 
 
@@ -75,9 +76,9 @@ class RepRap(Exporter):
         return [tool_difference(text, delta, fit, lambda points: move(words, points), homed - ends)]
 
     def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
-        """How well the settings follow the machine."""
+        """How well the settings follow the machine, and what to do after they are in."""
         del files
-        return (follows(_fit(source)[1], PROGRAM),)
+        return (follows(_fit(source)[1], PROGRAM), *redo(source))
 
 
 def _linear(delta: Delta, fit: Fit) -> list[str]:

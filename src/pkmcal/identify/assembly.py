@@ -19,6 +19,8 @@ from pkmcal.mechanisms import Machine
 
 SHIFT_SIGMA = 0.3
 """Standard deviation (px) of a camera's constant edge shift before any data: errata, B."""
+LEVEL_SIGMA = 1e-6
+"""rad, of a bed that is level by definition: a tenth of a micrometre over a printer's bed."""
 
 Numbers = TypeVar("Numbers", Array, Integers)
 
@@ -54,7 +56,7 @@ class Assembled:
     seen : (K,) configurations with at least one edge, or pose of a board on the platform, or all
     without a station; only they are in the problem. places : where each kind's measurements stand
     among the seen ones. priors : names of the kinds of the prior rows, (c,): drawing, camera,
-    shading, breathing, size, mount or gauge.
+    shading, breathing, size, mount, level or gauge.
     """
 
     problem: Problem
@@ -106,6 +108,7 @@ def assemble(
         use_drawing=use_drawing,
         radius_prior=radius_prior,
         on_platform=measurements.on_platform,
+        level=measurements.level,
     )
     if measurements.intrinsics_at.size:
         camera = np.array([kind == "camera" for kind in kinds])
@@ -274,12 +277,14 @@ def prior_rows(
     use_drawing: bool,
     radius_prior: bool = True,
     on_platform: Booleans | None = None,
+    level: Booleans | None = None,
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Rows (c, na) on the shared unknowns, their targets (c,) and kinds.
 
     Without the drawing the frames are free, so the gauge's constraints stand in as rows: they
     can be met exactly, hence fix the frames and pull on nothing else. Intrinsics, shading,
-    breathing and sizes stand in units of their prior. on_platform : (M,) mounts.
+    breathing and sizes stand in units of their prior. on_platform : (M,) mounts. level : (S,)
+    stations that do not tilt against the base.
 
     What is on a platform is as near its start as the machine is large. Where a platform turns about
     one axis, nothing tells along it how high the board sits; its tilt by a tenth of a degree then
@@ -293,6 +298,8 @@ def prior_rows(
     lines = np.ones(u.n_lines)
     moving = np.flatnonzero(np.zeros(0, dtype=bool) if on_platform is None else on_platform)
     places = (u.mounts.start + 6 * moving[:, None] + [3, 4, 5]).ravel()
+    upright = np.flatnonzero(np.zeros(0, dtype=bool) if level is None else level)
+    tilts = (u.stations.start + 6 * upright[:, None] + [0, 1]).ravel()
     known = (
         ("drawing", held, tolerance[held]),
         ("camera", u.columns("optics"), optics),
@@ -300,6 +307,7 @@ def prior_rows(
         ("breathing", u.columns("breathing"), np.ones(u.n_breathing)),
         ("size", u.columns("sizes"), np.ones(u.n_sizes)),
         ("mount", places, np.full(len(places), _size(machine) if len(places) else 1.0)),
+        ("level", tilts, np.full(len(tilts), LEVEL_SIGMA)),
     )
     rows: list[Array] = []
     kinds: list[str] = []

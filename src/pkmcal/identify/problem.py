@@ -351,6 +351,9 @@ class Problem:
         x[:, u.sizes] = state.sizes
         mounts = x[:, u.mounts].reshape(len(x), -1, 6)  # of which only places are known
         mounts[..., 3:] = state.T_mount[..., :3, 3]
+        # of stations only that they are level: where the base's z axis points, that turns them
+        stations, up = x[:, u.stations].reshape(len(x), -1, 6), state.T_camera_base[..., :3, 2]
+        stations[..., 0], stations[..., 1] = -up[..., 1], up[..., 0]
         return x @ self.prior.T
 
     def _edges(self, state: BatchState, c: Closure) -> EdgeRows:

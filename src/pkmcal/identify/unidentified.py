@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
+from pkmcal.identify.bed import Bed, bed_of
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.motions import Motion, Situation, all_radii, candidates
@@ -68,7 +69,8 @@ class Findings:
     and of what they know ``HARDLY``. weak : what the drawing knows better. by_drawing : how far
     (m, as ``Sentence.moves_platform``) the platform moves when all parameters are as wrong as the
     drawing's tolerances let expect. conventional : held parameters for which any value would
-    do; also_conventional : combinations of the other held ones.
+    do; also_conventional : combinations of the other held ones. bed : how flat it will be, where
+    nothing but heights was measured.
     """
 
     told: Identifiability
@@ -78,6 +80,7 @@ class Findings:
     conditions: tuple[Condition, ...] = ()
     conventional: tuple[str, ...] = ()
     also_conventional: int = 0
+    bed: Bed | None = None
 
     __repr__ = short_repr
 
@@ -116,6 +119,7 @@ def explain(
         conditions,
         conventional,
         others,
+        bed_of(estimate) if only_heights(estimate) else None,
     )
 
 

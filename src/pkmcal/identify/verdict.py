@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.identify.bed import Bed
 from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.decided import decided_by
@@ -40,8 +41,9 @@ LARGE = 0.3
 WORTH_SAYING = 0.5
 """Part of the platform's deviation from which on what makes it is worth a warning; half of it makes
 the whole larger by an eighth."""
-
-
+BED_LEFT = 0.5
+"""Part of what the drawing's tolerances let the bed bend that heights may leave: below a half the
+result is flatter than the drawing almost for sure; above, new values are not worth their risk."""
 EXACT_SHARE = 1e-9
 """Part of a variance below which it is rounding."""
 POOR = 1.3
@@ -82,9 +84,13 @@ def judge(
         stations, legs = len(estimate.state.T_camera_base), estimate.machine.n_legs
         seen = seen_legs(observation.edges, estimate.edge_weights, stations, legs)
         findings = explain(told, estimate, seen)
-    large, small = _left_open(estimate, findings) if findings else ((), ())
+    bed = findings.bed if findings else None
+    large, small = _left_open(estimate, findings) if findings and not bed else ((), ())
     left = [f"{s.text} {s.advice}" for s in large]
-    if findings is None and (undecided := _undecided(estimate)):
+    if findings and bed:
+        left = _bed_unknown(bed)
+        hints = (*_not_by_heights(estimate, bed, findings), *hints)
+    elif findings is None and (undecided := _undecided(estimate)):
         left = [
             f"The data hardly say more than the drawing about {listed(undecided, 4)}: more"
             " configurations, with legs that point elsewhere, are needed."
@@ -101,6 +107,12 @@ def judge(
     )
     if reasons:
         headline = "This calibration should not be used."
+    elif bed:
+        headline = (
+            f"Calibrated for a flat bed: the tool's height above it to {bed.sigma * 1e3:.2g} mm"
+            f" (standard deviation) within {bed.radius * 1e3:.0f} mm of its middle. Along x and y"
+            " nothing is promised."
+        )
     else:
         headline = _headline(observation, estimate)
     return Verdict(
@@ -129,6 +141,37 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
         f"Calibrated: joint centres to {centre * 1e3:.2g} mm and offsets to {offset * 1e3:.2g} mm"
         " (standard deviations)."
     )
+
+
+def _bed_unknown(bed: Bed) -> list[str]:
+    """Why heights are of no use, if they are not."""
+    if bed.sigma <= BED_LEFT * bed.by_drawing:
+        return []
+    return [
+        f"The heights leave the tool's height above the bed known to {bed.sigma * 1e3:.2g} mm, and"
+        f" the drawing's tolerances alone to {bed.by_drawing * 1e3:.2g} mm: that is no gain. Probe"
+        " more points, spread to the edge of the bed, or with a probe that repeats better."
+    ]
+
+
+def _not_by_heights(estimate: Estimate, bed: Bed, findings: Findings) -> list[str]:
+    """What heights leave to the drawing, in figures, and the largest cause in words."""
+    told = [
+        f"Heights do not tell x and y: these are known to {bed.sideways * 1e3:.2g} mm, and sizes to"
+        f" {bed.size:.2%}, by the drawing's tolerances. Measure a printed part, or"
+        " a board on the tool (observe: board), where dimensions matter."
+    ]
+    matter = [s for s in (*findings.unidentified, *findings.weak) if s.matters]
+    if matter:
+        first = max(matter, key=lambda s: s.moves_platform)
+        more = f" ({len(matter) - 1} more in the report)" if len(matter) > 1 else ""
+        told.append(f"{first.text}{more}")
+    if estimate.statistics.dof <= 0:
+        told.append(
+            "So few heights leave nothing over that could show a wrong one, or a bed that is not"
+            " flat: probe fifteen or more."
+        )
+    return told
 
 
 def _platform_sigma(estimate: Estimate) -> float:

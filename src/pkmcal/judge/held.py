@@ -185,7 +185,7 @@ def too_little() -> ResultError:
     """What is said where readings would be predicted from themselves."""
     return ResultError(
         "too little was seen to predict readings: some poses follow from their own readings alone",
-        expected="legs, or a board in several more configurations",
+        expected="legs, a board or whole poses in several more configurations; heights tell none",
         next_step="Photograph more configurations from each station",
     )
 

@@ -16,6 +16,7 @@ from pkmcal.calibration.results import REPORT, check_output, texts_of
 from pkmcal.calibration.toolmap import ToolMap
 from pkmcal.errors import PkmcalError
 from pkmcal.files import write_folder
+from pkmcal.identify.bed import Bed
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import ToolError, centres_and_tool
@@ -141,7 +142,7 @@ def report_of(
         title=f"Calibration of {session.machine.name}",
         verdict=verdict,
         kicker=session.called,
-        figures=cards(session, observation, estimate, centres, tool),
+        figures=cards(session, observation, estimate, centres, tool, findings and findings.bed),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
         summary={"figures": numbers(observation, estimate, centres, tool)},
@@ -157,8 +158,11 @@ def cards(
     estimate: Estimate,
     centres: tuple[Centres, ...],
     tool: ToolError,
+    bed: Bed | None = None,
 ) -> tuple[Figure, ...]:
-    """The cards in their order; those that have nothing to tell are left out."""
+    """The cards in their order; those that have nothing to tell are left out. bed : where nothing
+    but heights was measured.
+    """
     sigma = np.concatenate([side.sigma for side in centres]) * 1e3
     worst = int(np.argmax(sigma))
     joints = Figure(
@@ -176,6 +180,7 @@ def cards(
         f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
     )
     found = (
+        bed and _flat(bed, tool),
         joints if len(observation.edges) else None,
         _tool_sigma(session, estimate, tool),
         moved,
@@ -228,6 +233,23 @@ def _tool_sigma(session: Session, estimate: Estimate, tool: ToolError) -> Figure
         f"1σ from the geometry's uncertainty, mean over {count(len(tool.position), 'pose')}; "
         f"worst {brief(tool.position.max() * 1e3)} mm (configuration {where})"
         f"{_turned(float(tool.orientation.max()))}",
+    )
+
+
+def _flat(bed: Bed, tool: ToolError) -> Figure:
+    """What heights are good for, and how the drawing bent the bed."""
+    there = tool.T_base_platform[:, :2, 3]
+    known = np.isfinite(tool.off_position)
+    plane = np.column_stack([np.ones(int(known.sum())), there[known]])
+    off = tool.off[known, 5]
+    bent = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
+    return Figure(
+        "How flat will the bed be?",
+        ((brief(bed.sigma * 1e3), "mm"),),
+        f"1σ of the tool's height over a disc of {brief(bed.radius * 1e3)} mm radius, the bed's"
+        f" own tilt and height aside; by the drawing's tolerances {brief(bed.by_drawing * 1e3)}"
+        f" mm. The drawing bent it by {brief(float(np.sqrt(np.mean(bent**2))) * 1e3)} mm where it"
+        f" was probed. Along x and y {brief(bed.sideways * 1e3)} mm, by the drawing",
     )
 
 
@@ -303,7 +325,13 @@ def _fit(estimate: Estimate) -> Figure:
         )
         if np.isfinite(scale) and abs(scale - 1) > 0.005
     ]
-    found = s.chi2 / s.dof if s.dof > 0 else float("nan")
+    if s.dof <= 0:
+        return Figure(
+            "Does the model explain the data?",
+            (("–", "χ² per degree of freedom"),),
+            "as many unknowns as measurements: nothing is left over that could tell",
+        )
+    found = s.chi2 / s.dof
     return Figure(
         "Does the model explain the data?",
         ((number(s.chi2_as_stated, 2), "χ² per degree of freedom"),),

@@ -16,7 +16,7 @@ from pkmcal.files import json_text
 from pkmcal.identify.decided import EXACT, Decider, decided_by
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.found import FoundParameters, found_parameters
-from pkmcal.identify.unidentified import Findings
+from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.mechanisms import Machine, ParameterTable
 from pkmcal.outcome import Part
 from pkmcal.report import page
@@ -105,7 +105,7 @@ def section(drawing: Machine, estimate: Estimate) -> Part:
             ),
         },
         gauge=estimate.gauge,
-        told="photographs" if seen else "readings",
+        told="heights" if only_heights(estimate) else "photographs" if seen else "readings",
     )
     return Part("parameters", "Parameters", html=html)
 

@@ -143,6 +143,12 @@ class Session:
         return f"session {(folder if folder.name != 'session' else folder.parent).name}"
 
     @property
+    def heights_alone(self) -> bool:
+        """Whether nothing but heights of a bed was measured."""
+        felt = bool(self.trackers) and all(table.kind == "heights" for table in self.trackers)
+        return felt and not self.stations
+
+    @property
     def station_names(self) -> tuple[str, ...]:
         """Names of all stations, trackers last, as measurements number them."""
         return tuple(station.name for station in (*self.stations, *self.trackers))
@@ -218,7 +224,8 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
         noise = given.noise.position, given.noise.rotation
         if measured or (folder / given.poses).exists():
             path = _existing(folder, document, given.poses, keys)
-            trackers.append(read_poses(path, given.poses, table.names, *noise, name))
+            read = read_poses(path, given.poses, table.names, *noise, name, level=given.level)
+            trackers.append(read)
         else:
             trackers.append(PoseTable.to_come(name, given.poses, *noise))
     if measured:

@@ -44,7 +44,7 @@ class PoseTable:
 
     name : of the station. kind : of the table. configuration : (N,) rows of the session's readings.
     T : (N, 4, 4) T_tracker_target; a point's turn, and all but a height's z, mean nothing.
-    position, rotation : standard deviations, m and rad.
+    position, rotation : standard deviations, m and rad. level : its z axis is the base's, exactly.
     """
 
     name: str
@@ -54,6 +54,7 @@ class PoseTable:
     T: Array
     position: float
     rotation: float | None
+    level: bool = False
 
     __repr__ = short_repr
 
@@ -107,11 +108,13 @@ def read_poses(
     position: float,
     rotation_noise: float | None,
     name: str = "tracker",
+    *,
+    level: bool = False,
 ) -> PoseTable:
     """Read a table; every fault is an InputError with line and column.
 
     names : the session's configurations. position, rotation_noise : standard deviations. name :
-    of the station.
+    of the station. level : as of :class:`PoseTable`.
     """
     table = read_csv(path, label=label)
     kind = _kind(table)
@@ -137,7 +140,15 @@ def read_poses(
     nothing = np.zeros(len(rows))
     t = np.stack([column.get(axis, nothing) for axis in POINT], axis=-1)
     T = pose(_turn(table, column), t)
-    return PoseTable(name, label, kind, rows, T, position, rotation_noise)
+    if level and kind != "heights":
+        raise InputError(
+            "only of heights can be said that the bed is level",
+            where=label,
+            found=f"columns {', '.join(table.columns)}",
+            expected="configuration and z",
+            next_step="Leave level out: how such a tracker stands is found out",
+        )
+    return PoseTable(name, label, kind, rows, T, position, rotation_noise, level)
 
 
 def _kind(table: CsvTable) -> Kind:

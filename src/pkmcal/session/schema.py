@@ -77,6 +77,7 @@ class TrackerDocument(Schema):
 
     poses: str = Field(description="the table of what it measured, for example poses.csv")
     noise: NoiseDocument = Field(description="noise: {position: 2.0e-5, rotation: 1.0e-4}")
+    level: bool = False
 
 
 class TrackerStationDocument(Schema):

@@ -79,6 +79,11 @@ def write_session(
     in, one after another. Raises InputError for a folder that is not empty, and for legs that
     cannot be seen.
     """
+    return write_texts(folder, session_texts(machine, seen, places))
+
+
+def write_texts(folder: Path | str, texts: dict[str, str]) -> tuple[str, ...]:
+    """Write a session's files, by their names, into a new or empty folder, whole or not at all."""
     folder = Path(folder)
     if entries(folder):
         raise InputError(
@@ -87,7 +92,6 @@ def write_session(
             expected="a new or empty folder",
             next_step="Name another folder; nothing was written into this one",
         )
-    texts = session_texts(machine, seen, places)
     with staged_folder(folder) as stage:
         for name, text in texts.items():
             (stage / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,1 @@
+"""Delta printers: sessions made of what their firmware already holds."""

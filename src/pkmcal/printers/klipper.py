@@ -1,0 +1,219 @@
+"""Klipper's printer.cfg: the delta's values, and the bed as DELTA_CALIBRATE felt it.
+
+Meaning: Klipper's configuration reference, klippy/kinematics/delta.py and
+klippy/extras/delta_calibrate.py. SAVE_CONFIG writes into lines that begin with ``#*#``, which count
+more than those above. ``heightN_pos`` are steps of the three motors since their end switches,
+``heightN`` the height of the nozzle above the bed there.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container
+from configparser import ConfigParser
+from functools import partial
+from itertools import count
+from math import prod
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.export.klipper import STEPPERS, homed, linear_motors
+from pkmcal.files import shown
+from pkmcal.printers.printer import LARGEST, Printer, Touches
+
+NOMINAL = (210.0, 330.0, 90.0)
+SAVED = "#*#"
+FULL_STEPS = 200.0
+"""Steps a turn of a motor whose section says nothing else, as in Klipper."""
+MOST_STEPS = 1e9
+"""From an end switch: kilometres of a carriage's way."""
+_SECTION = re.compile(r"\[\s*([^\]]+?)\s*\]")
+_ENTRY = re.compile(r"([A-Za-z_]\w*)\s*[:=]\s*(.*)")
+
+Sections = dict[str, dict[str, tuple[str, str]]]
+"""Entries by section and name: their text, and where it stands."""
+
+
+def is_one(text: str) -> bool:
+    """Whether a text is a Klipper configuration."""
+    return "printer" in sections(text, "")
+
+
+def printer(text: str, label: str) -> Printer:
+    """The printer of a printer.cfg, checked field by field."""
+    found = sections(text, label)
+    kinematics = found["printer"].get("kinematics", ("", f"{label}, [printer]"))
+    if kinematics[0] != "delta":
+        raise InputError(
+            "heights of a bed are read of linear deltas",
+            where=kinematics[1],
+            found=shown(kinematics[0]),
+            expected="kinematics: delta",
+        )
+    radius = _number(found, label, "printer", "delta_radius")
+    each = {
+        name: [_of_tower(found, label, k, name) for k in range(3)]
+        for name in ("arm_length", "position_endstop")
+    }
+    each["angle"] = [
+        _number(found, label, f"stepper_{s}", "angle", default)
+        for s, default in zip(STEPPERS, NOMINAL, strict=True)
+    ]
+    config = ConfigParser()
+    config.read_dict(
+        {
+            "printer": {"kinematics": "delta", "delta_radius": repr(radius)},
+            **{
+                f"stepper_{s}": {name: repr(values[k]) for name, values in each.items()}
+                for k, s in enumerate(STEPPERS)
+            },
+        }
+    )
+    rod = np.array(each["arm_length"])
+    with np.errstate(invalid="ignore"):
+        ends = homed(config)
+    return Printer(
+        program="Klipper",
+        label=label,
+        motors=("stepper_a", "stepper_b", "stepper_c"),
+        radius=radius,
+        angle=np.array(each["angle"]),
+        rod=rod,
+        homed=ends,
+        reach=_number(found, label, "printer", "print_radius", radius),
+        carriages=partial(linear_motors, config),
+        offset=_probe(found, label),
+        touches=_touches(found, label, ends),
+    )
+
+
+def sections(text: str, label: str) -> Sections:
+    """What a configuration says: what SAVE_CONFIG wrote stands last, and replaces what is above."""
+    lines = [(n, line.rstrip()) for n, line in enumerate(text.splitlines(), 1)]
+    own = [(n, line) for n, line in lines if not line.startswith(SAVED)]
+    saved = [(n, line.removeprefix(SAVED).strip()) for n, line in lines if line.startswith(SAVED)]
+    out: Sections = {}
+    section = ""
+    for n, line in (*own, *saved):
+        plain = re.split(r"(?:^|\s)[#;]", line)[0].rstrip()
+        if head := _SECTION.fullmatch(plain.strip()):
+            section = head[1]
+            out.setdefault(section, {})
+        elif section and (entry := _ENTRY.fullmatch(plain)):
+            out[section][entry[1].lower()] = entry[2].strip(), f"{label}, line {n}, [{section}]"
+    return out
+
+
+def _of_tower(found: Sections, label: str, k: int, name: str) -> float:
+    """A tower's value; the second and the third have the first's unless they say otherwise."""
+    first = _number(found, label, "stepper_a", name)
+    return _number(found, label, f"stepper_{STEPPERS[k]}", name, first)
+
+
+def _number(
+    found: Sections, label: str, section: str, name: str, default: float | None = None
+) -> float:
+    """A value of a section; raises InputError where it is no number, or absent without default."""
+    if name not in found.get(section, {}):
+        if default is not None:
+            return default
+        raise InputError(
+            f"this value of the printer is missing: {name}",
+            where=f"{label}, [{section}]",
+            expected=f"{name}: a number",
+            next_step="If it stands in a file that this one includes, copy it here",
+        )
+    text, where = found[section][name]
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not abs(value) <= LARGEST:
+        raise InputError(
+            f"{name} is no number that a printer can have",
+            where=where,
+            found=shown(text),
+            expected="a number in mm, or degrees",
+        )
+    return value
+
+
+def _probe(found: Sections, label: str) -> tuple[float, float, float]:
+    """Where a probe is from the nozzle, mm; nowhere else where there is none."""
+    for section, entries in found.items():
+        if "z_offset" in entries:
+            x, y = (_number(found, label, section, f"{c}_offset", 0.0) for c in "xy")
+            return x, y, _number(found, label, section, "z_offset")
+    return 0.0, 0.0, 0.0
+
+
+def _touches(found: Sections, label: str, ends: Array) -> Touches | None:
+    """The points that DELTA_CALIBRATE kept, and those entered by hand."""
+    section = "delta_calibrate"
+    entries = found.get(section, {})
+    names = [
+        f"{kind}{k}"
+        for kind in ("height", "manual_height")
+        for k in _while_there(kind, entries.keys())
+    ]
+    if not names:
+        return None
+    way = np.array([_step(found, label, f"stepper_{s}") for s in STEPPERS])
+    heights = [_number(found, label, section, name) for name in names]
+    steps = [_three(entries, label, f"{name}_pos") for name in names]
+    origin = f"{label}, [{section}]"
+    return Touches(ends - np.array(steps) * way, np.array(heights), origin)
+
+
+def _while_there(kind: str, names: Container[str]) -> list[int]:
+    """Numbers from 0 on, as far as there are entries of them."""
+    out: list[int] = []
+    for k in count():
+        if f"{kind}{k}" not in names:
+            return out
+        out.append(k)
+    return out
+
+
+def _step(found: Sections, label: str, section: str) -> float:
+    """Mm of a carriage for a step of its motor."""
+    own = {**found.get("stepper_a", {}), **found.get(section, {})}
+    both = {section: own}
+    turn = _number(both, label, section, "rotation_distance")
+    micro = _number(both, label, section, "microsteps")
+    full = _number(both, label, section, "full_steps_per_rotation", FULL_STEPS)
+    text, where = own.get("gear_ratio", ("1:1", ""))
+    try:
+        pairs = [[float(x) for x in part.split(":")] for part in text.split(",") if part.strip()]
+        gears = prod(a / b for a, b in pairs)
+    except (ValueError, ZeroDivisionError):
+        raise InputError(
+            "the gears cannot be read", where=where, found=shown(text), expected="such as 80:20"
+        ) from None
+    if not full * micro * gears > 0:
+        raise InputError(
+            "a motor's step has no length",
+            where=f"{label}, [{section}]",
+            found=f"{full:g} steps a turn, {micro:g} microsteps",
+            expected="positive numbers",
+        )
+    return turn / (full * micro * gears)
+
+
+def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[float]:
+    """Three numbers with commas between them."""
+    text, where = entries.get(name, ("", f"{label}, [delta_calibrate]"))
+    try:
+        values = [float(x) for x in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(abs(x) <= MOST_STEPS for x in values):
+        raise InputError(
+            f"{name} does not tell where the three motors were",
+            where=where,
+            found=shown(text),
+            expected="three numbers, as SAVE_CONFIG wrote them",
+        )
+    return values

@@ -1,0 +1,144 @@
+"""Points of a bed as a printer's console or files tell them: where the tool was told to be.
+
+- Klipper's ``PROBE`` answers ``probe at X,Y is z=Z``, the tool's place when the probe triggered;
+  newer ones ``probe: at X,Y bed will contact at z=Z``, the bed's place below the probe and the
+  tool's height when the nozzle would touch it.
+- RepRapFirmware's ``G29`` writes heightmap.csv, and a sequence of ``G30 Pn X Y Z-99999`` that ends
+  with S-1 answers ``G32 bed probe heights: ...``: heights to which the tool is told to go to touch.
+- A table ``configuration,x [mm],y [mm],z [mm]`` of such places, from wherever.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.files import listed, read_csv, read_text
+from pkmcal.printers.printer import LARGEST, Printer, Touches
+
+FEWEST = 7
+"""Points that leave something to be known besides the bed's own height and tilt; DELTA_CALIBRATE
+probes as many."""
+MAP = "RepRapFirmware height map file"
+MM = 1e3
+_NUMBER = r"(-?\d+(?:\.\d+)?)"
+_TRIGGERED = re.compile(rf"probe at {_NUMBER},{_NUMBER} is z={_NUMBER}")
+_CONTACT = re.compile(rf"probe: at {_NUMBER},{_NUMBER} bed will contact at z={_NUMBER}")
+_G30 = re.compile(r"^\s*G30\b([^;\n]*)", re.MULTILINE | re.IGNORECASE)
+_WORD = re.compile(rf"([PXY])\s*{_NUMBER}", re.IGNORECASE)
+_HEIGHTS = re.compile(rf"bed probe heights:((?:\s+{_NUMBER})+)", re.IGNORECASE)
+
+
+def read_touches(path: Path, printer: Printer) -> Touches:
+    """The points of a file by what stands in it, each place once, by its mean.
+
+    The printer's values have to be those in force while it probed. Raises InputError for a file
+    without points, and for points out of its reach.
+    """
+    label = path.name
+    text = read_text(path)
+    dx, dy, dz = printer.offset
+    if text.startswith("configuration,"):
+        points, heights = _table(path, label), 0.0
+    elif text.startswith(MAP):
+        points, heights = _map(text, label), 0.0
+    elif found := _TRIGGERED.findall(text):
+        points, heights = _together(np.array(found, dtype=float)), dz
+    elif found := _CONTACT.findall(text):
+        points, heights = _together(np.array(found, dtype=float)) - [dx, dy, 0.0], 0.0
+    elif found := _HEIGHTS.findall(text):
+        points, heights = _sequence(text, label, found[-1][0]), 0.0
+    else:
+        raise InputError(
+            "there is no point of a bed in this file",
+            where=label,
+            expected="Klipper's lines 'probe at X,Y is z=Z', RepRapFirmware's heightmap.csv or"
+            " 'bed probe heights:' with the lines G30 P0 X Y Z-99999, or a table"
+            " configuration,x [mm],y [mm],z [mm]",
+        )
+    with np.errstate(all="ignore"):
+        carriages = printer.carriages(points)
+    bad = np.flatnonzero(~(np.abs(carriages) <= LARGEST).all(axis=1))
+    if bad.size:
+        x, y, z = points[bad[0]]
+        raise InputError(
+            "the printer does not reach this point",
+            where=label,
+            found=f"x {x:g}, y {y:g}, z {z:g} mm",
+            expected="the tool's own places, in mm, of the printer described in " + printer.label,
+        )
+    return Touches(carriages, np.full(len(points), heights), label)
+
+
+def _table(path: Path, label: str) -> Array:
+    """A table's points, mm; heads without a unit are metres, as in every table."""
+    table = read_csv(path, label=label, columns=("x", "y", "z"))
+    table.check_kinds(["m", "m", "m"])
+    return MM * table.values[:, [table.columns.index(c) for c in "xyz"]]
+
+
+def _together(points: Array) -> Array:
+    """Points (n, 3) with those of one place as their mean, in the order in which they were felt."""
+    places = list(dict.fromkeys(map(tuple, points[:, :2].tolist())))
+    return np.array([points[(points[:, :2] == place).all(axis=1)].mean(axis=0) for place in places])
+
+
+def _map(text: str, label: str) -> Array:
+    """The points of heightmap.csv; a plain 0 was not probed."""
+    lines = [line for line in text.splitlines()[1:] if line.strip()]
+    names = [word.strip() for word in (lines[0] if lines else "").split(",")]
+    values = [word.strip() for word in (lines[1] if len(lines) > 1 else "").split(",")]
+    known = dict(zip(names, values, strict=False))
+
+    def value(*called: str) -> float:
+        text = next((known[name] for name in called if name in known), "")
+        try:
+            return float(text)
+        except ValueError:
+            raise InputError(
+                "the height map does not tell its grid",
+                where=f"{label}, line 3",
+                found=", ".join(values) or "nothing",
+                expected=f"a number under {called[0]}",
+            ) from None
+
+    x0, y0 = value("xmin", "min0"), value("ymin", "min1")
+    dx, dy = value("xspacing", "spacing0", "spacing"), value("yspacing", "spacing1", "spacing")
+    out: list[tuple[float, float, float]] = []
+    for row, line in enumerate(lines[2:]):
+        for column, word in enumerate(line.split(",")):
+            if word.strip() in ("0", ""):
+                continue
+            try:
+                out.append((x0 + column * dx, y0 + row * dy, float(word)))
+            except ValueError:
+                raise InputError(
+                    "a height is no number",
+                    where=f"{label}, row {row + 1} of heights",
+                    found=word.strip(),
+                    expected="millimetres",
+                ) from None
+    return np.array(out).reshape(-1, 3)
+
+
+def _sequence(text: str, label: str, heights: str) -> Array:
+    """The points of lines G30 P, and the heights of the last answer."""
+    z = [float(word) for word in heights.split()]
+    places: dict[int, tuple[float, float]] = {}
+    for words in _G30.findall(text):
+        found = {letter.upper(): float(number) for letter, number in _WORD.findall(words)}
+        if found.keys() >= {"P", "X", "Y"}:
+            places[int(found["P"])] = found["X"], found["Y"]
+    if sorted(places) != list(range(len(z))):
+        raise InputError(
+            "heights and points do not belong together",
+            where=label,
+            found=f"{len(z)} heights, and lines G30 of the points"
+            f" {listed([str(p) for p in sorted(places)]) or 'none'}",
+            expected=f"lines G30 P0 to P{len(z) - 1} with X and Y, as in bed.g",
+        )
+    return np.array([(*places[k], height) for k, height in enumerate(z)])

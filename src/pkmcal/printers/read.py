@@ -1,0 +1,54 @@
+"""Which firmware a printer's configuration is of, and whether a delta can be built of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pkmcal.errors import InputError
+from pkmcal.files import read_text, shown
+from pkmcal.printers import klipper, reprap
+from pkmcal.printers.printer import Printer
+
+
+def checked(printer: Printer) -> Printer:
+    """The printer; raises InputError where no such delta can be built."""
+    if not 0 < printer.radius < printer.rod.min():
+        raise InputError(
+            "a rod has to be longer than the delta radius",
+            where=printer.label,
+            found=f"rods of {printer.rod.min():g} mm, a radius of {printer.radius:g} mm",
+            expected="both in mm, as the firmware has them",
+        )
+    apart = np.sort(np.mod(printer.angle, 360))
+    gaps = np.diff(np.append(apart, apart[0] + 360))
+    if gaps.min() < 60:
+        raise InputError(
+            "two towers stand in nearly one direction",
+            where=printer.label,
+            found=", ".join(f"{a:g}" for a in printer.angle) + " degrees",
+            expected="three directions about 120 degrees apart",
+        )
+    return printer
+
+
+def read_printer(path: Path) -> Printer:
+    """A printer of its printer.cfg (Klipper), or config.g or config-override.g (RepRapFirmware).
+
+    Raises InputError for another file, and for a printer that is no linear delta.
+    """
+    label = path.name
+    text = read_text(path)
+    if klipper.is_one(text):
+        return checked(klipper.printer(text, label))
+    if reprap.is_one(text):
+        return checked(reprap.printer(text, label))
+    first = next((line.strip() for line in text.splitlines() if line.strip()), "an empty file")
+    raise InputError(
+        "this is neither a Klipper nor a RepRapFirmware configuration of a delta",
+        where=label,
+        found=shown(first),
+        expected="a printer.cfg with a section [printer], or G-code with a line M665",
+        next_step="Name the file that holds these values; files that it includes are not followed",
+    )

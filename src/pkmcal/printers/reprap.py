@@ -1,0 +1,88 @@
+"""RepRapFirmware's M665 and M666, of config.g or of config-override.g, which M500 writes.
+
+Meaning: as told in :mod:`pkmcal.export.reprap`.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.export.reprap import NOMINAL, homed_carriages, linear_motors, read_words
+from pkmcal.files import shown
+from pkmcal.printers.printer import LARGEST, Printer
+
+_M665 = re.compile(r"^\s*M665\b", re.MULTILINE)
+_OURS = re.compile(r"\s*M66[56]\b")
+
+
+def is_one(text: str) -> bool:
+    """Whether a text is G-code of a delta."""
+    return bool(_M665.search(text))
+
+
+def printer(text: str, label: str) -> Printer:
+    """The printer of a file with M665 and M666; what stands later counts."""
+    words = _numbers(text, label)
+    rod, radius, height, reach = (
+        _words(words, label, "665" + letter, size)
+        for letter, size in (("L", 3), ("R", 1), ("H", 1), ("B", 1))
+    )
+    filled = dict(words)
+    filled["665L"] = rod
+    for name in ("665X", "665Y", "665Z", "666X", "666Y", "666Z", "666A", "666B"):
+        filled.setdefault(name, np.zeros(1))
+    filled["665R"], filled["665H"] = radius[:1], height[:1]
+    with np.errstate(invalid="ignore"):
+        ends = homed_carriages(filled)
+    corrections = np.array([filled[f"665{letter}"][0] for letter in "XYZ"])
+    return Printer(
+        program="RepRapFirmware",
+        label=label,
+        motors=("X", "Y", "Z"),
+        radius=float(radius[0]),
+        angle=np.array(NOMINAL) + corrections,
+        rod=rod,
+        homed=ends,
+        reach=float(reach[0]),
+        carriages=partial(linear_motors, filled),
+    )
+
+
+def _numbers(text: str, label: str) -> dict[str, Array]:
+    """Values by command and letter, of M665 and M666 alone."""
+    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if _OURS.match(line)]
+    words: dict[str, Array] = {}
+    for n, line in lines:
+        try:
+            found = read_words(line)
+        except ValueError:
+            found = {"": np.array([np.inf])}
+        if any(np.abs(values).max() > LARGEST for values in found.values()):
+            raise InputError(
+                "a value of this line is no number that a printer can have",
+                where=f"{label}, line {n}",
+                found=shown(line.strip()),
+                expected="numbers in mm, or degrees",
+            )
+        words.update({name.upper(): values for name, values in found.items()})
+    return words
+
+
+def _words(words: dict[str, Array], label: str, name: str, size: int) -> Array:
+    """A command's values (size,), of which one may stand for all."""
+    values = words.get(name, np.zeros(0))
+    if len(values) not in (1, size):
+        raise InputError(
+            f"M{name[:-1]} has no value {name[-1]} that could be used",
+            where=label,
+            found=f"{len(values)} numbers",
+            expected="one, or one for each tower" if size > 1 else "one",
+            next_step="Name the file in which M665 has L, R, H and B: after M500 that is"
+            " config-override.g",
+        )
+    return np.broadcast_to(values, (size,)).copy()

@@ -1,0 +1,166 @@
+"""The session of a delta printer: its drawing by the firmware, and its heights or a board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.errors import InputError
+from pkmcal.files import csv_text
+from pkmcal.printers.printer import Printer, Touches
+from pkmcal.printers.probed import FEWEST, read_touches
+from pkmcal.printers.read import read_printer
+from pkmcal.session.starter import session_texts, write_texts
+from pkmcal.wording import count
+
+MM = 1e3
+MARGIN = 5.0
+"""mm that carriages may go below what the bed's edge needs: for beds that hang lower than said."""
+DRAWING = """\
+# {name}, a linear delta, by the values in {label}. A firmware knows only the difference
+# of the towers' radius and the tool's, so the rods' lower ends stand in the platform's origin, the
+# nozzle. Readings are the carriages' heights by these values, their range ends at the end switches.
+name: {name}
+motion: translation
+legs:
+{legs}
+home: {{position: [0, 0, {home} mm]}}
+# Standard deviations of the firmware's values: of radius, towers and end switches, and of rods.
+# Rods measured to 0.1 mm, hole to hole, tell the more of sizes along x and y.
+tolerance: {{center: 1 mm, offset: 0.5 mm, axis: 0.3 deg, scale: 0.05 %}}
+"""
+LEG = """\
+  - base:
+      joint: slider
+      center: [{x} mm, {y} mm, 0]
+      axis: [0, 0, 1]
+      range: [{low} mm, {high} mm]
+    platform: {{joint: spherical, center: [0, 0, 0]}}
+    length: {{actuated: false, constant: {rod} mm}}"""
+FIRMWARE = """\
+# What the firmware can hold: towers upright, motors that go as far as it says.
+fixed: ["legs[*].platform.center", "legs[*].base.axis", "legs[*].scale"]
+"""
+HELD = """\
+fixed: ["legs[*].platform.center"]
+"""
+SESSION = """\
+# The bed of a delta printer, felt at {n} points; where they come from: {origin}.
+# pkmcal calibrate, and then pkmcal export --to {to}.
+pkmcal: 1
+mechanism: mechanism.yaml
+
+joints:
+  file: joints.csv            # the carriages when the bed was felt
+  noise: 0.004 mm             # a step of 1/80 mm, of which a carriage is anywhere
+
+stations:
+  probe:
+    tracker:
+      poses: poses.csv        # the tool's height above the bed
+      # Standard deviation of the probe: Klipper's PROBE_ACCURACY tells it. A bed that is not flat
+      # to that counts as well: what is found is told.
+      noise: {{position: 0.02 mm}}
+      level: true             # the firmware's Z is counted from the bed
+"""
+
+
+def write_printer_session(
+    folder: Path | str,
+    printer: Path,
+    probed: Path | None = None,
+    seen: Literal["board"] | None = None,
+    places: int = 1,
+) -> tuple[str, ...]:
+    """Write a printer's session into a new or empty folder; returns its files.
+
+    printer : its configuration. probed : points of its bed; without them those that its
+    configuration keeps. seen : None of heights, or ``board``, then from so many places. Raises
+    InputError for files that do not tell what is needed.
+    """
+    found = read_printer(printer)
+    if seen is None:
+        touches = found.touches if probed is None else read_touches(probed, found)
+        texts = heights_texts(found, _enough(found, touches))
+    else:
+        texts = session_texts("linear-delta", "board", places)
+        texts["mechanism.yaml"] = drawing_text(found) + HELD
+    return write_texts(folder, texts)
+
+
+def _enough(printer: Printer, touches: Touches | None) -> Touches:
+    """Raises InputError where too little of the bed was felt."""
+    if touches is None:
+        raise InputError(
+            "nothing tells where the bed is",
+            where=printer.label,
+            expected="a section [delta_calibrate] with height0 and height0_pos, which Klipper's"
+            " DELTA_CALIBRATE and SAVE_CONFIG write",
+            next_step="Name what the printer's console said while it probed with --probed FILE; or"
+            " --board, for a session with a camera",
+        )
+    if len(touches.heights) < FEWEST:
+        raise InputError(
+            "too few points of the bed",
+            where=touches.origin,
+            found=count(len(touches.heights), "point"),
+            expected=f"{FEWEST} or more, spread to the edge of the bed",
+        )
+    above = touches.carriages.max(axis=0) - printer.homed
+    if above.max() > 0:
+        motor = int(np.argmax(above))
+        raise InputError(
+            "a carriage would have been above its end switch when the bed was felt",
+            where=touches.origin,
+            found=f"{printer.motors[motor]} {above[motor]:.1f} mm above it",
+            expected=f"points that belong to the values in {printer.label}",
+        )
+    return touches
+
+
+def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
+    """The files of a session of heights."""
+    names = [f"{k + 1:03d}" for k in range(len(touches.heights))]
+    to = "klipper" if printer.program == "Klipper" else "reprap"
+    heads = [f"{motor} [mm]" for motor in printer.motors]
+    return {
+        "session.yaml": SESSION.format(n=len(names), origin=touches.origin, to=to),
+        "mechanism.yaml": drawing_text(printer, touches) + FIRMWARE,
+        "joints.csv": csv_text(heads, names, touches.carriages.round(6)),
+        "poses.csv": csv_text(["z [mm]"], names, touches.heights[:, None]),
+    }
+
+
+def drawing_text(printer: Printer, touches: Touches | None = None) -> str:
+    """The printer's drawing, without what it holds fixed."""
+    angle = np.deg2rad(printer.angle)
+    towers = printer.radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    edge = printer.reach * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    with np.errstate(invalid="ignore"):
+        lowest = _lowest([printer.carriages(s * edge) for s in (-1.0, 1.0)], touches)
+    top = float((printer.homed - np.sqrt(printer.rod**2 - printer.radius**2)).min())
+    legs = [
+        LEG.format(x=_mm(x), y=_mm(y), low=_mm(lowest), high=_mm(high), rod=_mm(rod))
+        for (x, y), high, rod in zip(towers, printer.homed, printer.rod, strict=True)
+    ]
+    return DRAWING.format(
+        name=printer.program.lower() + "-delta",
+        label=printer.label,
+        legs="\n".join(legs),
+        home=_mm(top / 2),
+    )
+
+
+def _lowest(at_edge: Sequence[Array], touches: Touches | None) -> float:
+    """Where carriages go down to, mm: for the bed's edge, and for what was felt."""
+    reached = [*at_edge] if touches is None else [*at_edge, touches.carriages]
+    return float(np.nanmin(np.concatenate(reached))) - MARGIN
+
+
+def _mm(value: float) -> str:
+    """A length in mm, to a tenth of a micrometre."""
+    return f"{value:.4f}".rstrip("0").rstrip(".")

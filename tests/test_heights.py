@@ -1,0 +1,426 @@
+"""Heights of a delta printer's bed: what they are accepted for, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import printers
+from conftest import run
+from pkmcal.calibration.calibrate import calibrate
+from pkmcal.calibration.results import load
+from pkmcal.calibration.source import Source, load_source
+from pkmcal.errors import InputError
+from pkmcal.export import reprap
+from pkmcal.export.contract import export
+from pkmcal.export.klipper import Klipper
+from pkmcal.geometry.rigid import pose
+from pkmcal.printers import klipper
+from pkmcal.printers.probed import read_touches
+from pkmcal.printers.read import read_printer
+from pkmcal.printers.session import write_printer_session
+
+SAYS = printers.Settings()
+BUILT = printers.Settings(radius=105.6, angle=(210.3, 329.8, 90.0), rod=(270.3, 269.8, 270.1))
+ENDS = (0.8, -0.5, 0.4)
+NOISE = 0.015
+
+
+@pytest.fixture(scope="module")
+def true():
+    return printers.machine(BUILT, endstops=ENDS)
+
+
+@pytest.fixture(scope="module")
+def kit(true, tmp_path_factory):
+    """A session of nineteen points from printer.cfg, and its calibration on disk."""
+    folder = tmp_path_factory.mktemp("printer")
+    readings = printers.felt(true, printers.bed(19), NOISE, np.random.default_rng(1))
+    (folder / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
+    done = run("new", folder / "kit", "--printer", folder / "printer.cfg")
+    assert done.code == 0, done.err
+    assert "Next: pkmcal calibrate" in done.out
+    done = run("calibrate", folder / "kit")
+    assert done.code == 0, done.out + done.err
+    return folder / "kit"
+
+
+def flat(true, told, says=SAYS):
+    """Heights (n,) mm over places that nobody probed, where a firmware with values commands Z 0."""
+    rng = np.random.default_rng(9)
+    r, a = 90 * np.sqrt(rng.uniform(size=200)), rng.uniform(0, 2 * np.pi, 200)
+    points = np.column_stack([r * np.cos(a), r * np.sin(a), np.zeros(200)])
+    readings = says.homed - (told.homed - told.carriages(points))
+    return 1e3 * true.forward(1e-3 * readings)[:, 2, 3]
+
+
+def pasted(text):
+    """Settings of an exported text."""
+    found = klipper.sections(text, "x")
+    rows = [found[f"stepper_{s}"] for s in "abc"]
+    names = ("angle", "arm_length", "position_endstop")
+    each = [tuple(float(row[name][0]) for row in rows) for name in names]
+    return printers.Settings(float(found["printer"]["delta_radius"][0]), *each)
+
+
+def test_the_session_says_what_the_printer_felt(kit, true):
+    printer = read_printer(kit.parent / "printer.cfg")
+    np.testing.assert_allclose(printer.homed, SAYS.homed, atol=1e-9)
+    assert printer.touches is not None
+    # the file keeps steps to a thousandth
+    there = true.forward(1e-3 * printer.touches.carriages)[:, :3, 3]
+    np.testing.assert_allclose(1e3 * there[:, :2], printers.bed(19), atol=1e-4)
+    assert np.std(there[:, 2]) == pytest.approx(1e-3 * NOISE, rel=0.5)
+    assert calibrate(kit).session.heights_alone
+
+
+def test_it_is_accepted_for_the_bed_and_says_what_it_is_not_good_for(kit):
+    saved = load(kit / "calibration")
+    assert saved.verdict.usable
+    bed = saved.document["bed"]
+    assert bed["sigma"] < 0.02e-3 < 0.1e-3 < bed["by_drawing"]
+    assert bed["size"] > 5e-4
+    assert "Along x and y nothing is promised" in saved.verdict.headline
+    assert any("Heights do not tell x and y" in text for text in saved.verdict.advice)
+    # nineteen heights of nine values leave some over
+    assert not any("nothing over that could show" in text for text in saved.verdict.advice)
+    page = (kit / "calibration" / "report.html").read_text(encoding="utf-8")
+    assert "How flat will the bed be?" in page
+
+
+def test_what_is_pasted_puts_z_0_on_the_bed(kit, true):
+    """Flat where nobody probed, and neither tilted nor high: as well as the noise lets it be."""
+    made = export(load_source(kit / "calibration"), "klipper")
+    (text,) = made.files.values()
+    before, after = flat(true, SAYS), flat(true, pasted(text))
+    assert np.sqrt(np.mean(before**2)) > 0.3
+    # three numbers of a plane from nineteen points, and what bends: of the noise no more than half
+    assert np.sqrt(np.mean(after**2)) < NOISE
+    sigma = 1e3 * load(kit / "calibration").document["bed"]["sigma"]
+    assert np.std(after) < 2.2 * sigma
+    assert any("Measure the bed's mesh anew" in note.text for note in made.notes)
+    assert any("Z is 0 on the bed" in note.text for note in made.notes)
+    (lines,) = export(load_source(kit / "calibration"), "reprap").files.values()
+    assert re.search(r"^M665 L[\d.:]+ R105\.", lines, re.MULTILINE)
+
+
+def test_a_level_bed_stays_level(kit):
+    found = calibrate(kit)
+    up = found.estimate.state.T_camera_base[0, :3, 2]
+    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
+    text = (kit / "session.yaml").read_text()
+    other = kit.parent / "tilted"
+    other.mkdir()
+    for name in ("mechanism.yaml", "joints.csv", "poses.csv"):
+        (other / name).write_text((kit / name).read_text())
+    (other / "session.yaml").write_text(text.replace("level: true", "level: false"))
+    free = calibrate(other)
+    # end switches off by a millimetre on a circle of 105 mm
+    assert np.linalg.norm(free.estimate.state.T_camera_base[0, :2, 2]) > 2e-3
+
+
+def test_deviations_of_the_bed_hold(tmp_path):
+    """Fifteen printers: flatness over its deviation, and sizes over theirs."""
+    rng = np.random.default_rng(5)
+    bend, size = [], []
+    for run_ in range(15):
+        off = replace(
+            SAYS,
+            radius=105 + rng.normal(),
+            angle=tuple(np.array(SAYS.angle) + np.rad2deg(rng.normal(size=3) / 105)),
+            rod=tuple(270 + 0.5 * rng.normal(size=3)),
+        )
+        true = printers.machine(off, endstops=tuple(rng.normal(size=3)))
+        readings = printers.felt(true, printers.bed(13), 0.02, rng)
+        (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
+        write_printer_session(tmp_path / str(run_), tmp_path / "printer.cfg")
+        found = calibrate(tmp_path / str(run_))
+        bed = found.findings.bed
+        (text,) = Klipper().files(Source(found.machine, bed=bed.z)).values()
+        z = 1e-3 * flat(true, pasted(text))
+        bend.append(np.std(z) / bed.sigma)
+        xy = printers.bed(30)
+        T = pose(np.eye(3), 1e-3 * np.column_stack([xy, np.zeros(30)]))
+        there = true.forward(found.machine.inverse(T))[:, :2, 3]
+        plane = np.column_stack([1e-3 * xy, np.ones(30)])
+        slope = np.linalg.lstsq(plane, there, rcond=None)[0]
+        size.append((np.trace(slope[:2]) / 2 - 1) / bed.size)
+    # 15 values of about one degree of freedom each: 4 of their deviations
+    assert np.mean(np.square(bend)) == pytest.approx(1, abs=4 * np.sqrt(2 / 15))
+    assert np.mean(np.square(size)) == pytest.approx(1, abs=4 * np.sqrt(2 / 15))
+
+
+def test_a_crumb_under_the_nozzle_does_not_bend_the_bed(true, tmp_path):
+    """One touch 0.3 mm too high of nineteen is given up, and the bed is as flat as without it."""
+    readings = printers.felt(true, printers.bed(19), NOISE, np.random.default_rng(1))
+    readings[9] += 0.3
+    (tmp_path / "printer.cfg").write_text(printers.printer_cfg(SAYS, readings))
+    write_printer_session(tmp_path / "kit", tmp_path / "printer.cfg")
+    found = calibrate(tmp_path / "kit")
+    assert np.flatnonzero(found.estimate.pose_weights < 0.5).tolist() == [9]
+    bed = found.findings.bed
+    (text,) = Klipper().files(Source(found.machine, bed=bed.z)).values()
+    assert np.std(flat(true, pasted(text))) < 2.2e3 * bed.sigma
+    assert found.verdict.usable
+
+
+def test_heights_that_are_no_gain_are_refused(true, tmp_path):
+    """Seven points within a centimetre in one corner: nothing is told of the bed's edge."""
+    places = np.array([60.0, 0.0]) + printers.bed(7, 8.0)
+    readings = printers.felt(true, places, NOISE, np.random.default_rng(2))
+    cfg = printers.printer_cfg(SAYS, readings)
+    (tmp_path / "printer.cfg").write_text(cfg)
+    write_printer_session(tmp_path / "kit", tmp_path / "printer.cfg")
+    done = run("calibrate", tmp_path / "kit", "--json")
+    assert done.code == 1
+    (reason,) = done.json["verdict"]["reasons"]
+    assert "that is no gain" in reason
+    assert "Probe more points" in reason
+    refused = run("export", tmp_path / "kit" / "calibration", "--to", "klipper")
+    assert refused.code == 1
+
+
+# ------------------------------------------------------------------ what printers say
+
+
+def said(folder, text, name="console.txt"):
+    (folder / name).write_text(text)
+    return folder / name
+
+
+@pytest.fixture
+def cfg(tmp_path):
+    """A printer.cfg without heights, whose probe is aside of the nozzle."""
+    text = printers.printer_cfg(SAYS) + "[probe]\nx_offset: 12\ny_offset: -5.5\nz_offset: 1.25\n"
+    return said(tmp_path, text, "printer.cfg")
+
+
+PLACES = printers.bed(8)
+Z = np.linspace(-0.3, 0.4, 8)
+
+
+def test_points_of_klippers_console(cfg):
+    """Both of its sentences tell the same points; several touches of one place count by their
+    mean."""
+    printer, folder = read_printer(cfg), cfg.parent
+    old = [f"// probe at {x:.3f},{y:.3f} is z={z + 1.25 + d:.6f}"
+           for (x, y), z in zip(PLACES, Z, strict=True) for d in (-0.01, 0.01)]  # fmt: skip
+    new = [f"// probe: at {x + 12:.3f},{y - 5.5:.3f} bed will contact at z={z:.6f}"
+           for (x, y), z in zip(PLACES, Z, strict=True)]  # fmt: skip
+    want = SAYS.carriages(np.column_stack([PLACES, Z]))
+    one = read_touches(said(folder, "Send: PROBE\n" + "\n".join(old)), printer)
+    other = read_touches(said(folder, "\n".join(new)), printer)
+    np.testing.assert_allclose(one.carriages - 1.25, want, atol=1e-3)
+    np.testing.assert_allclose(one.heights, 1.25)
+    np.testing.assert_allclose(other.carriages, want, atol=1e-3)
+    np.testing.assert_allclose(other.heights, 0.0)
+
+
+REPRAP = """\
+M669 K3
+M665 L270.0 R105.0 H300.0 B90.0 X0.2 Y-0.1 Z0.3 ; delta
+M666 X0.5 Y-0.3 Z-0.2 A0.1 B-0.2
+"""
+
+
+def reprap_settings():
+    return printers.Settings(105.0, (210.2, 329.9, 90.3), (270.0,) * 3, (300.5, 299.7, 299.8))
+
+
+def test_points_of_reprapfirmware(tmp_path):
+    printer = read_printer(said(tmp_path, REPRAP, "config.g"))
+    settings = reprap_settings()
+    np.testing.assert_allclose(printer.homed, settings.homed, atol=1e-9)
+    tilt = (0.1 * PLACES[:, 0] - 0.2 * PLACES[:, 1]) / 100
+    want = settings.carriages(np.column_stack([PLACES, Z])) + tilt[:, None]
+    lines = [f"G30 P{k} X{x:.3f} Y{y:.3f} Z-99999" for k, (x, y) in enumerate(PLACES)]
+    lines[-1] += " S-1"
+    heights = " ".join(f"{z:.3f}" for z in Z)
+    text = "\n".join([*lines, f"G32 bed probe heights: {heights}, mean 0.05, deviation 0.2"])
+    found = read_touches(said(tmp_path, text), printer)
+    np.testing.assert_allclose(found.carriages, want, atol=2e-3)
+
+
+def test_points_of_a_height_map(tmp_path):
+    """Rows go along y, a plain 0 was not probed, a height of 0.000 was."""
+    printer = read_printer(said(tmp_path, REPRAP.replace(" A0.1 B-0.2", ""), "config.g"))
+    text = (
+        "RepRapFirmware height map file v2 generated at 2026-11-23 10:00, min error -0.1\n"
+        "axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1\n"
+        "X,Y,-40.00,40.00,-30.00,30.00,50.00,40.00,30.00,3,3\n"
+        "      0,  0.010,      0\n  0.020,  0.000, -0.030\n  0.040,  0.050,      0\n"
+    )
+    found = read_touches(said(tmp_path, text, "heightmap.csv"), printer)
+    points = [(0, -30, 0.01), (-40, 0, 0.02), (0, 0, 0), (40, 0, -0.03), (-40, 30, 0.04),
+              (0, 30, 0.05)]  # fmt: skip
+    want = reprap_settings().carriages(np.array(points, dtype=float))
+    np.testing.assert_allclose(found.carriages, want, atol=1e-9)
+    old = text.replace("axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1",
+                       "xmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum")  # fmt: skip
+    old = old.replace("X,Y,-40", "-40")
+    same = read_touches(said(tmp_path, old, "heightmap.csv"), printer)
+    np.testing.assert_allclose(same.carriages, want, atol=1e-9)
+
+
+def test_a_table_of_points(cfg):
+    rows = "\n".join(f"{k},{x:.4f},{y:.4f},{0.002 * x:.4f}" for k, (x, y) in enumerate(PLACES))
+    path = said(cfg.parent, "configuration,x [mm],y [mm],z [mm]\n" + rows, "points.csv")
+    done = run("new", cfg.parent / "kit", "--printer", cfg, "--probed", path, "--json")
+    assert done.code == 0, done.err
+    assert sorted(done.json["files"]) == [
+        "joints.csv", "mechanism.yaml", "poses.csv", "session.yaml",
+    ]  # fmt: skip
+    assert run("check", cfg.parent / "kit").code == 0
+
+
+def test_a_step_is_what_the_motor_makes_of_it(true, tmp_path):
+    """Gears, full steps and microsteps; a tower without its own has the first's."""
+    readings = printers.felt(true, printers.bed(7), 0.0, np.random.default_rng(0))
+    text = printers.printer_cfg(SAYS, readings)
+    geared = text.replace("rotation_distance: 40", "rotation_distance: 160\ngear_ratio: 80:20")
+    fine = text.replace("microsteps: 16", "microsteps: 8\nfull_steps_per_rotation: 400")
+    head, tail = text.split("[stepper_b]", 1)
+    first = head + "[stepper_b]" + tail.replace("microsteps: 16\nrotation_distance: 40\n", "")
+    for kind in (text, geared, fine, first):
+        found = read_printer(said(tmp_path, kind, "printer.cfg"))
+        np.testing.assert_allclose(found.touches.carriages, readings, atol=1e-5)
+
+
+def test_a_reprapfirmware_printer_from_its_height_map(true, tmp_path):
+    """config.g and heightmap.csv to M665 and M666, which put Z 0 on the bed; no file of ours is
+    read in between."""
+    config = said(tmp_path, "M665 L270 R105 H300 B90\nM666 X0 Y0 Z0\n", "config.g")
+    x, y = (v.ravel() for v in np.meshgrid(np.linspace(-60, 60, 5), np.linspace(-60, 60, 5)))
+    z = np.zeros(25)
+    for _ in range(8):  # lowered until it touches
+        readings = SAYS.carriages(np.column_stack([x, y, z]))
+        z = z - 1e3 * true.forward(1e-3 * readings)[:, 2, 3]
+    z = z + NOISE * np.random.default_rng(3).normal(size=25)
+    rows = "".join(", ".join(f"{h:.3f}" for h in row) + "\n" for row in z.reshape(5, 5))
+    text = (
+        "RepRapFirmware height map file v2 generated at 2026-11-23 10:00, min error -0.9\n"
+        "axis0,axis1,min0,max0,min1,max1,radius,spacing0,spacing1,num0,num1\n"
+        f"X,Y,-60.00,60.00,-60.00,60.00,90.00,30.00,30.00,5,5\n{rows}"
+    )
+    probed = said(tmp_path, text, "heightmap.csv")
+    done = run("new", tmp_path / "kit", "--printer", config, "--probed", probed)
+    assert done.code == 0, done.err
+    assert "--to reprap" in (tmp_path / "kit" / "session.yaml").read_text()
+    for words in (("calibrate", "kit"), ("export", "kit/calibration", "--to", "reprap")):
+        done = run(words[0], tmp_path / words[1], *words[2:])
+        assert done.code == 0, done.out + done.err
+    (path,) = (tmp_path / "kit" / "export-reprap").iterdir()
+    words = reprap.read_words(path.read_text())
+    told = np.column_stack([0.7 * x + 3, 0.8 * y - 2, 0 * x])
+    travel = reprap.homed_carriages(words) - reprap.linear_motors(words, told)
+    there = 1e3 * true.forward(1e-3 * (SAYS.homed - travel))[:, 2, 3]
+    assert np.abs(z).max() > 0.3
+    assert np.sqrt(np.mean(there**2)) < NOISE
+
+
+def test_heights_predict_no_readings(kit):
+    """Of a pose that only its height was measured of, the rest is its readings' own."""
+    done = run("calibrate", kit, "-o", kit.parent / "held", "--holdout", "5")
+    assert done.code == 1
+    assert "heights tell none" in done.err
+
+
+def test_a_board_on_a_printers_tool(cfg):
+    """The drawing is the printer's; all that a board tells is free."""
+    done = run("new", cfg.parent / "kit", "--printer", cfg, "--board")
+    assert done.code == 0, done.err
+    text = (cfg.parent / "kit" / "mechanism.yaml").read_text()
+    assert "constant: 270 mm" in text
+    assert "base.axis" not in text.partition("fixed:")[2]
+    assert (cfg.parent / "kit" / "board.yaml").is_file()
+    assert "What is still missing" in done.out
+
+
+# ------------------------------------------------------------------ what cannot be read
+
+
+def changed(text, old, new):
+    assert old in text
+    return text.replace(old, new)
+
+
+CFG = printers.printer_cfg(SAYS, np.tile(SAYS.homed - 200, (7, 1)))
+WRONG_PRINTERS = {
+    "G28\nG29\n": "neither a Klipper nor a RepRapFirmware configuration",
+    changed(CFG, "kinematics: delta", "kinematics: corexy"): "heights of a bed are read of linear",
+    changed(CFG, "delta_radius: 105.0", ""): "this value of the printer is missing: delta_radius",
+    changed(CFG, "arm_length: 270.0", "arm_length: long"): "arm_length is no number",
+    changed(CFG, "delta_radius: 105.0", "delta_radius: 300"): "longer than the delta radius",
+    changed(CFG, "angle: 330.0", "angle: 220"): "two towers stand in nearly one direction",
+    changed(CFG, "microsteps: 16", "microsteps: 0"): "a motor's step has no length",
+    changed(CFG, "microsteps: 16", "microsteps: 16\ngear_ratio: 3"): "the gears cannot be read",
+    changed(CFG, "height0_pos = ", "height0_pos = x"): "height0_pos does not tell where",
+    "M665 L270 R1.0.5 H300 B90\n": "a value of this line is no number that a printer can have",
+    "M665 R105 H300 B90\n": "M665 has no value L that could be used",
+    printers.printer_cfg(SAYS, np.tile(SAYS.homed + 2, (7, 1))): "stepper_a 2.0 mm above it",
+    printers.printer_cfg(SAYS): "nothing tells where the bed is",
+    printers.printer_cfg(SAYS, np.tile(SAYS.homed - 200, (6, 1))): "too few points of the bed",
+}
+
+
+@pytest.mark.parametrize("text", WRONG_PRINTERS, ids=WRONG_PRINTERS.values())
+def test_a_printers_file_that_tells_too_little(text, tmp_path):
+    path = said(tmp_path, text, "printer.cfg")
+    done = run("new", tmp_path / "kit", "--printer", path)
+    assert done.code == 2
+    assert WRONG_PRINTERS[text] in " ".join(done.err.split())
+    assert not (tmp_path / "kit").exists()
+
+
+MAP = "RepRapFirmware height map file v2\nxmin,xmax,ymin,ymax,radius,xspacing,yspacing,xnum,ynum\n"
+WRONG_POINTS = {
+    "ok\n": "there is no point of a bed in this file",
+    "probe at 300.000,0.000 is z=0.1\n": "the printer does not reach this point",
+    MAP + "-10,10\n0.1\n": "the height map does not tell its grid",
+    MAP + "-10,10,-10,10,-1,10,10,3,3\n0.1,high,0.2\n": "a height is no number",
+    "G30 P0 X0 Y0 Z-99999\nG32 bed probe heights: 0.1 0.2, mean 0.1\n": "do not belong together",
+}
+
+
+@pytest.mark.parametrize("text", WRONG_POINTS, ids=WRONG_POINTS.values())
+def test_points_that_cannot_be_read(text, cfg):
+    path = said(cfg.parent, text)
+    done = run("new", cfg.parent / "kit", "--printer", cfg, "--probed", path)
+    assert done.code == 2
+    assert WRONG_POINTS[text] in " ".join(done.err.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--probed", "x"), "read with the printer's own values"),
+        (("--printer", "x"), "the file does not exist"),
+        (("--printer", "x", "--machine", "delta"), "--machine besides"),
+        (("--printer", "x", "--board", "--probed", "y"), "--probed besides"),
+    ],
+)
+def test_options_that_do_not_go_together(words, told, tmp_path):
+    done = run("new", tmp_path / "kit", *words)
+    assert done.code == 2
+    assert told in " ".join(done.err.split())
+
+
+def test_only_a_bed_is_level(kit, tmp_path):
+    folder = tmp_path / "kit"
+    folder.mkdir()
+    for name in ("mechanism.yaml", "joints.csv", "session.yaml"):
+        (folder / name).write_text((kit / name).read_text())
+    rows = "".join(f"{k + 1:03d},0,0,0\n" for k in range(19))
+    (folder / "poses.csv").write_text("configuration,x,y,z\n" + rows)
+    with pytest.raises(InputError, match="only of heights can be said that the bed is level"):
+        calibrate(folder)
+
+
+def test_what_calibrate_tells_programs(kit):
+    document = json.loads((kit / "calibration" / "calibration.json").read_text())
+    assert document["bed"].keys() == {"radius", "sigma", "by_drawing", "sideways", "size", "z"}
+    assert document["station_covariance"]["stations"] == []
