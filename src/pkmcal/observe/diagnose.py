@@ -15,7 +15,6 @@ from itertools import combinations, islice
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
@@ -245,6 +244,8 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
     """Photographs under the names that fit each of them best; where the machine was not recognised,
     mirrored ones.
     """
+    from scipy.optimize import linear_sum_assignment
+
     view, T_camera_base = station.view, station.found.T_camera_base
     names = view.configuration
     if not station.found.good:

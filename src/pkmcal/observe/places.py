@@ -239,5 +239,5 @@ def _scores(
         number = np.floor(((normal + angle) % np.pi) * (DIRECTIONS / np.pi)).astype(np.intp)
         cells = ((photograph * DIRECTIONS + number % DIRECTIONS) * n + at[..., 1]) * n + at[..., 0]
         for s, step in enumerate(shift):
-            out[:, turn, s] = np.einsum("pn,pn->p", flat[cells + step], weight)
+            out[:, turn, s] = np.einsum("pn,pn->p", flat.take(cells + step), weight)
     return out
