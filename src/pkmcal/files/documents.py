@@ -438,14 +438,17 @@ _WIDEST = 160
 
 def plain(value: Any) -> Any:
     """Arrays, tuples and NumPy numbers as JSON has them; what is not finite becomes null."""
+    if value is None or isinstance(value, str | int):  # most values; of Python's own types
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        known = value.dtype.kind != "f" or bool(np.isfinite(value).all())
+        return value.tolist() if known and value.dtype.kind in "fiub" else plain(value.tolist())
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
     return str(value) if isinstance(value, Path) else value
 
 
@@ -455,12 +458,12 @@ def json_text(value: Any) -> str:
 
 
 def _text(value: Any, indent: str) -> str:
-    line = _line(value)
     if not isinstance(value, dict | list) or _is_row(value):
-        return line
-    nested = any(isinstance(item, dict | list) for item in _items(value))
-    if len(line) <= _WIDEST and not nested:
-        return line
+        return _line(value)
+    if not any(isinstance(item, dict | list) for item in _items(value)):
+        line = _line(value)
+        if len(line) <= _WIDEST:
+            return line
     inner = indent + " "
     parts = [_text(item, inner) for item in _items(value)]
     if isinstance(value, dict):
