@@ -18,7 +18,7 @@ from fuzz.run import judged
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="cases are forked")
 TESTS = Path(__file__).parent
-FEW, MORE, MANY = 120, 300, 10_000
+FEW, MANY = 300, 10_000
 
 
 def fuzzed(count, first=0):
@@ -32,10 +32,9 @@ def fuzzed(count, first=0):
     return done.stdout
 
 
-@pytest.mark.parametrize("count", [FEW, pytest.param(MORE, marks=pytest.mark.slow)])
-def test_malformed_sessions(count):
-    said = fuzzed(count)
-    assert f"{count} cases" in said
+def test_a_few_hundred_malformed_sessions():
+    said = fuzzed(FEW)
+    assert f"{FEW} cases" in said
     assert "with faults 0" in said
 
 
