@@ -443,9 +443,12 @@ def _segment_profiles(
     count = weight.sum(axis=-1)
     full = count >= FEWEST_SHARE * weight.shape[-1]
     kept, weight = grey[full], weight[full][..., None]
-    mean = np.sum(kept * weight, axis=-2) / count[full][:, None]
+    number = count[full][:, None]
+    mean = np.sum(kept * weight, axis=-2) / number
+    square = np.sum(kept**2 * weight, axis=-2) / number - mean**2
+    error = np.sqrt(np.maximum(square, profiles.GREY_NOISE**2) / number)
     saturated = np.any((kept >= profiles.SATURATED) & weight, axis=-2)
-    cut = profiles.cut_of(saturated, half_width[full])
+    cut = profiles.cut_of(mean, error, saturated, half_width[full])
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
 
 
