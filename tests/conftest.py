@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import os
@@ -18,6 +19,7 @@ from pkmcal.commands.cli import main
 from rendered import once
 
 if TYPE_CHECKING:
+    from pkmcal.calibration.calibrate import Calibration
     from pkmcal.check.check import SessionCheck
 
 
@@ -41,6 +43,14 @@ def run(*words) -> Run:
     with redirect_stdout(out), redirect_stderr(err):
         code = main([str(word) for word in words])
     return Run(code, out.getvalue(), err.getvalue())
+
+
+def pytest_collection_finish():
+    """What was imported stays to the end, so that nobody looks through it for what may go: that
+    took one second in thirty.
+    """
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 20)
 
 
 @pytest.fixture(autouse=True)
@@ -81,12 +91,28 @@ def demo(tmp_path_factory) -> Demo:
     return Demo(root / "demo" / "out", Run(**json.loads((said / "run.json").read_text())))
 
 
+@dataclass(frozen=True)
+class Calibrated:
+    """The demonstration's session, calibrated, and the progress that was told."""
+
+    found: Calibration
+    told: list[tuple[str, float]]
+
+
 @pytest.fixture(scope="session")
-def calibrated(demo):
+def calibrating(demo) -> Calibrated:
     """The demonstration's session, calibrated from Python."""
     from pkmcal.calibration.calibrate import calibrate
 
-    return calibrate(demo.session)
+    told: list[tuple[str, float]] = []
+    found = calibrate(demo.session, progress=lambda text, share: told.append((text, share)))
+    return Calibrated(found, told)
+
+
+@pytest.fixture(scope="session")
+def calibrated(calibrating) -> Calibration:
+    """What was found by it."""
+    return calibrating.found
 
 
 @dataclass(frozen=True)

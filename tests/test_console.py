@@ -1,6 +1,7 @@
 """What commands say of their progress where there is no terminal."""
 
 import re
+import sys
 import threading
 import time
 from contextlib import redirect_stderr
@@ -60,8 +61,17 @@ def test_nothing_is_said_before_there_is_anything_to_say(monkeypatch):
         assert not heard.written.wait(0.2)
 
 
-def test_a_calibration_tells_what_it_does(demo, tmp_path, monkeypatch):
+def test_a_calibration_tells_what_it_does(demo, calibrating, tmp_path, monkeypatch):
+    def again(*_, progress, **_more):
+        for text, share in dict(calibrating.told).items():
+            progress(text, share)
+            deadline = time.monotonic() + 60
+            while text not in sys.stderr.getvalue() and time.monotonic() < deadline:
+                time.sleep(0.005)
+        return calibrating.found
+
     monkeypatch.setattr(console, "EVERY", 0.01)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", again)
     said = run("calibrate", demo.session, "-o", tmp_path / "told")
     assert said.code == 0
     steps = dict.fromkeys(re.sub(r" \(\d+%, \d+ s\)", "", x) for x in said.err.splitlines())

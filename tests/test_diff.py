@@ -24,7 +24,7 @@ from test_identify_scene import make_scene
 
 # ------------------------------------------------------------------ what chance does
 
-PAIRS = 24
+PAIRS = 12
 
 
 def of_configurations(measurements, keep):
@@ -62,7 +62,7 @@ def changes(pairs):
 
 @pytest.mark.parametrize("kind", ["new data", "half of the data", "all data of the smaller"])
 def test_the_stated_spread_is_that_of_unchanged_machines(pairs, kind):
-    """Of 24 pairs with 47 degrees of freedom chi-square over those has a deviation of 0.042."""
+    """Of 12 pairs with 47 degrees of freedom chi-square over those has a deviation of 0.06."""
     found = changes(pairs[kind])
     dof = sum(c.dof for c in found)
     assert sum(c.chi2 for c in found) / dof == pytest.approx(1, abs=0.2)
@@ -118,7 +118,7 @@ def test_what_changed_is_found_where_it_changed(pairs, name, times):
         z = np.abs(found.change) / np.maximum(found.sigma, 1e-9)
         hits += z[k] > 3.5
         assert found.chi2 > quiet.chi2
-    assert hits >= PAIRS - 2
+    assert hits >= PAIRS - 1
 
 
 def test_a_drawing_is_taken_at_its_word(pairs):

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from pkmcal.simulation.demo import camera_of_size
+
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
@@ -86,12 +88,13 @@ def test_the_notebook_is_small_and_names_no_place_of_one_computer():
 
 
 def test_the_notebook_runs(tmp_path, monkeypatch):
-    """Its cells one after the other, as Jupyter would; what they show is not compared to the digit,
-    for that differs from one computer to the next.
+    """Its cells one after the other, as Jupyter would, on smaller photographs; what they show is
+    not compared to the digit, for that differs from one computer to the next.
     """
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("pkmcal.api.simulate.demo_camera", lambda: camera_of_size((480, 360)))
     namespace: dict[str, object] = {}
     for cell in BOOK["cells"]:
         if cell["cell_type"] == "code":

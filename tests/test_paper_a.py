@@ -189,12 +189,16 @@ def test_groups_of_parameters():
     assert max(s.error for s in found.values()) == 0
 
 
+@pytest.fixture(scope="module")
+def near():
+    return study(runs=30, seed=5)
+
+
 @pytest.mark.parametrize("error", [0.005, 0.02])
-def test_thirty_of_thirty_starts(error):
+def test_thirty_of_thirty_starts(near, error):
     """Without the four steps: stations a few degrees, parameters up to 20 mm off."""
     found = study(runs=30, start_error=error, seed=5)
     assert converged(found) == 30
-    near = study(runs=30, seed=5)
     for name in (*GROUPS, *EFFECTOR):
         there, here = (s.of("joint")[name] for s in (found, near))
         assert there.value == pytest.approx(here.value, rel=1e-5)

@@ -426,12 +426,13 @@ def test_parquet(tmp_path, alone, monkeypatch):
 
 # ------------------------------------------------------------------ stopped and resumed
 
-COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "600")
-BATCHES = 18
+COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "300")
+BATCHES = 9
+LONGER = (*COMMAND[:-1], "600")
 
 
-def started(out: Path, *more: str) -> subprocess.Popen[bytes]:
-    words = [sys.executable, "-m", "pkmcal", "study", *COMMAND, "-o", str(out), *more]
+def started(out: Path, command: tuple[str, ...] = COMMAND) -> subprocess.Popen[bytes]:
+    words = [sys.executable, "-m", "pkmcal", "study", *command, "-o", str(out)]
     quiet = subprocess.DEVNULL
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
@@ -485,8 +486,8 @@ class Counting:
     doing = "Counting"
     quantities = {"x": tasks.Quantity("mean")}  # noqa: RUF012 - a test's
 
-    def __init__(self, fails: str = "") -> None:
-        self.fails = fails
+    def __init__(self, fails: str = "", takes: float = 0.0) -> None:
+        self.fails, self.takes = fails, takes
 
     def populations(self, runs):
         return [Population("numbers", runs, 5)]
@@ -502,7 +503,7 @@ class Counting:
         return {ESTIMATE: data}
 
     def judge(self, batch, data, found):
-        time.sleep(0.02)
+        time.sleep(self.takes)
         return {ESTIMATE: Sample({"x": found[ESTIMATE]})}
 
 
@@ -525,12 +526,12 @@ def test_workers_that_die_are_replaced(monkeypatch):
             begun[0].kill()
 
     setting = JointByAxes(replace(JointByAxes().axes, poses=4, batch=2))
-    counting = Counting()
-    many = engine.run(counting, 3000, 1, told)
+    # long enough for the one in its place to begin, too
+    many = engine.run(Counting(takes=0.02), 3000, 1, told)
     assert len(done) == 600
     assert len(begun) == 2  # beside this process one, and the one in its place
     monkeypatch.setattr(workers, "cores", lambda: 1)
-    one = engine.run(counting, 3000, 1)
+    one = engine.run(Counting(), 3000, 1)
     np.testing.assert_array_equal(*(r.values("x", *ESTIMATE) for r in (many, one)))
     assert engine.run(setting, 4, 0).values("position", *ESTIMATE).shape == (4,)
 
@@ -572,13 +573,13 @@ def test_what_is_kept_is_what_was_done(tmp_path):
 
 def test_two_studies_do_not_work_in_one_folder_at_once(tmp_path, alone):
     """Neither another one nor the same again; once the first has ended, its command goes on."""
-    first = started(tmp_path)
+    first = started(tmp_path, LONGER)
     deadline = time.monotonic() + 120
     while not list(tmp_path.glob("batches/*.npz")):
         assert first.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    for words in (COMMAND, ("a", "--runs", "4")):
+    for words in (LONGER, ("a", "--runs", "4")):
         done = run("study", *words, "-o", tmp_path)
         assert done.code == 2
         assert "another study works in this folder. Wait until it has ended" in done.err
@@ -667,10 +668,10 @@ def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, alone):
                 killed.append(next(iter(local.workers.values())).pid)
                 os.kill(killed[0], signal.SIGKILL)
 
-        many = study("a", ["configurations=5"], runs=600, scheduler=local.scheduler_address,
+        many = study("a", ["configurations=5"], runs=300, scheduler=local.scheduler_address,
                      out=tmp_path / "cluster", progress=told)  # fmt: skip
     assert killed
-    one = study("a", ["configurations=5"], runs=600)
+    one = study("a", ["configurations=5"], runs=300)
     assert runs_bytes(many, "study.csv") == runs_bytes(one, "study.csv")
     assert str(document_of(many)) == str(document_of(one))
 

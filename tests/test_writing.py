@@ -153,7 +153,9 @@ def count_down(event, values):
 def again_and_again(outcome, folder, files, **named):
     # Calibration and page are made once, and written again and again, with less and less time.
     global left
+    # The page is cut short: megabytes, copied a hundred times.
     made = end.contents(outcome, files)
+    made["report.html"] = made["report.html"][:10_000]
     end.contents = lambda *_: made
     for left in itertools.count():
         shutil.rmtree(out)
@@ -179,7 +181,8 @@ def test_a_result_is_the_old_or_the_new_wherever_calibrate_is_killed(demo, sessi
     out, keep, new = session / "calibration", tmp_path / "killed", tmp_path / "new"
     shutil.copytree(demo.calibration, out)
     for path in out.iterdir():  # an old result that differs in every file, and has one more
-        path.write_text(path.read_text().replace("hexapod", "hexapod-before").replace("0.1", "0.2"))
+        text = path.read_text()[: 10_000 if path.suffix == ".html" else None]
+        path.write_text(text.replace("hexapod", "hexapod-before").replace("0.1", "0.2"))
     (out / "camera-front.yaml").write_text("model: pinhole\n")
     done = subprocess.run(
         [sys.executable, "-c", KILLED, session, new, keep],

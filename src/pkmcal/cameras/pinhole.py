@@ -11,7 +11,7 @@ from pydantic import Field
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
-from pkmcal.geometry.rigid import dot
+from pkmcal.geometry.rigid import dot, of_components
 
 _NEWTON_STEPS = 20
 _TABLE = 513
@@ -29,19 +29,15 @@ def distort(xy: Array, k: Array) -> tuple[Array, Array]:
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial = slope * (x dx + y dy)
-    out = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
+    out = of_components(
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
     )
-    by_xy = np.empty((*xy.shape, 2))
-    by_xy[..., 0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
-    by_xy[..., 0, 1] = x * y * slope + 2 * p1 * x + 2 * p2 * y
-    by_xy[..., 1, 0] = x * y * slope + 2 * p1 * x + 2 * p2 * y
-    by_xy[..., 1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return out, by_xy
+    by_xy = np.empty((2, 2, *x.shape))
+    by_xy[0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    by_xy[0, 1] = by_xy[1, 0] = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    by_xy[1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return out, np.moveaxis(by_xy, (0, 1), (-2, -1))
 
 
 def distort_by_coefficients(xy: Array) -> Array:
@@ -91,7 +87,7 @@ def unfolded(xy: Array, by_xy: Array, k: Array) -> Booleans:
     singular, a little nearer on one side.
     """
     det = by_xy[..., 0, 0] * by_xy[..., 1, 1] - by_xy[..., 0, 1] * by_xy[..., 1, 0]
-    return (det > 0) & (np.sum(xy * xy, axis=-1) < _fold(k))
+    return (det > 0) & (dot(xy, xy) < _fold(k))
 
 
 def _undistort_radially(target: Array, k: Array) -> Array:
@@ -181,21 +177,27 @@ class Pinhole(Camera):
 
     def _pixels(self, good: Booleans, distorted: Array) -> Array:
         focal, center = self.parameters[:2], self.parameters[2:4]
-        return np.where(good[..., None], focal * distorted + center, np.nan)
+        return of_components(
+            *(np.where(good, focal[i] * distorted[..., i] + center[i], np.nan) for i in (0, 1))
+        )
 
     def _by_point(self, points: Array, xy: Array, good: Booleans, by_xy: Array) -> Array:
         """Derivatives (..., 2, 3): x/z and y/z have 1/z by x and by y, and -(x/z, y/z)/z by z."""
-        out = np.empty((*points.shape[:-1], 2, 3))
-        out[..., :2] = by_xy
-        out[..., 2] = -dot(by_xy, xy[..., None, :])
-        scale = self.parameters[:2] / np.where(good, points[..., 2], np.nan)[..., None]
-        return scale[..., None] * out
+        z = np.where(good, points[..., 2], np.nan)
+        out = np.empty((2, 3, *z.shape))
+        for row, own, focal in zip(out, (0, 1), self.parameters[:2], strict=True):
+            scale = focal / z
+            row[0] = scale * by_xy[..., own, 0]
+            row[1] = scale * by_xy[..., own, 1]
+            row[2] = scale * -dot(by_xy[..., own, :], xy)
+        return np.moveaxis(out, (0, 1), (-2, -1))
 
     def _imaged(self, points: Array) -> tuple[Array, Booleans, Array, Array]:
         """x/z and y/z (..., 2), where they have an image (...), and :func:`distort` of them."""
         z = points[..., 2]
         front = z > 1e-9
-        xy = points[..., :2] / np.where(front, z, 1.0)[..., None]
+        z = np.where(front, z, 1.0)
+        xy = of_components(points[..., 0] / z, points[..., 1] / z)
         distorted, by_xy = distort(xy, self.parameters[4:])
         good = front & unfolded(xy, by_xy, self.parameters[4:])
         return xy, good, distorted, by_xy

@@ -50,6 +50,17 @@ def dot(a: Array, b: Array) -> Array:
     return out
 
 
+def of_components(*parts: Array) -> Array:
+    """The array (..., k) of its k components, each (...), which broadcast.
+
+    In memory the components are slowest, so that NumPy runs along many vectors at once.
+    """
+    out = np.empty((len(parts), *np.broadcast_shapes(*(part.shape for part in parts))))
+    for k, part in enumerate(parts):
+        out[k] = part
+    return out.transpose(*range(1, out.ndim), 0)
+
+
 def rotation(omega: Array) -> Array:
     """Rotation matrices Exp(omega) of rotation vectors (rad), (..., 3) -> (..., 3, 3).
 

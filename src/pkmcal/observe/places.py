@@ -96,13 +96,13 @@ def _seen_spread(camera: Camera, tables: DistanceTables) -> Breadth:
     ok = np.isfinite(rays).all(axis=(1, 2))
     rays, share = rays[ok], tables.moving[y[ok], x[ok]]
     area = np.cross(rays[:, 1] - rays[:, 0], rays[:, 2] - rays[:, 0])
-    return _spread(rays[:, 0], share * np.sqrt(dot(area, area)))
+    weight = share * np.sqrt(dot(area, area))
+    return _spread(weight @ rays[:, 0], weight.sum())
 
 
-def _spread(rays: Array, weight: Array) -> Breadth:
-    """Of rays (..., n, 3), not all of unit weight (..., n)."""
-    mean = np.sum(weight[..., None] * rays, axis=-2)
-    mean /= np.maximum(weight.sum(axis=-1), 1e-300)[..., None]
+def _spread(total: Array, weight: Array) -> Breadth:
+    """Of unit rays whose weighted sum is (..., 3), and that of their weights (...)."""
+    mean = total / np.maximum(weight, 1e-300)[..., None]
     length = np.sqrt(dot(mean, mean))
     middle = np.where(length[..., None] > 0, mean, [0.0, 0.0, 1.0])  # nothing moves: anywhere
     middle = middle / np.sqrt(dot(middle, middle))[..., None]
@@ -139,9 +139,12 @@ def _places(
     direction = sphere(PLACES)
     distance = size * np.geomspace(NEAREST, FURTHEST, DISTANCES)
     place = centre + direction[:, None] * distance[:, None]
-    ray = point - place[:, :, None]
-    square = dot(ray, ray)
-    spread = _spread(ray / np.sqrt(square)[..., None], weight / square)
+    # one component after the other, and no ray by itself: there are a million of them
+    square = sum((point[:, k] - place[..., k, None]) ** 2 for k in range(3))
+    near = weight / square
+    share = near / np.sqrt(square)
+    total = share @ point - share.sum(axis=-1)[..., None] * place
+    spread = _spread(total, near.sum(axis=-1))
     nearest = [
         np.abs(np.log(spread.width) - np.log(width / wider)).argmin(axis=1) for wider in WIDER
     ]
@@ -236,5 +239,5 @@ def _scores(
         number = np.floor(((normal + angle) % np.pi) * (DIRECTIONS / np.pi)).astype(np.intp)
         cells = ((photograph * DIRECTIONS + number % DIRECTIONS) * n + at[..., 1]) * n + at[..., 0]
         for s, step in enumerate(shift):
-            out[:, turn, s] = np.einsum("pn,pn->p", flat[cells + step], weight)
+            out[:, turn, s] = np.einsum("pn,pn->p", flat.take(cells + step), weight)
     return out

@@ -7,6 +7,7 @@ leg, side 0 then side 1.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +15,9 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.geometry.cylinders import SIDE_SIGNS, line_through
-from pkmcal.geometry.rigid import apply, cross, dot
+from pkmcal.geometry.rigid import apply, cross, dot, of_components
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.mechanisms.closure import base_ends, platform_ends
 from pkmcal.mechanisms.kinematics import inverse_result
 
 JOINT_MARGIN = 0.006
@@ -74,9 +75,10 @@ def legs_in_camera(
     layout, internal = machine.layout, None
     if layout.n_internal:
         internal = inverse_result(layout, machine.values, T_base_platform)[1]
-    ends = limb_ends(layout, machine.values, joints, T_base_platform, internal)
     camera = T_camera_base[..., None, :, :]
-    a, b = apply(camera, ends.a), apply(camera, ends.b)
+    a = apply(camera, base_ends(layout, machine.values, joints).a)
+    b = apply(camera, platform_ends(layout, machine.values, T_base_platform, internal).b)
+    a, b = np.broadcast_arrays(a, b)
     return LegsInCamera(a, b, line_through(a, b)[0])
 
 
@@ -113,17 +115,18 @@ def edge_points(
 ) -> EdgePoints:
     """``samples`` points spaced evenly along every edge; leading axes as ``legs`` has them."""
     radius = machine.values[tubes.radius]
-    a, b, u = (v[..., tubes.leg, :] for v in (legs.a, legs.b, legs.u))
+    a, b, u = of_edges(legs, tubes)
     normal, ok = plane_normals(a, u, radius, tubes)
     first, last = visible_stretch(a, b, tubes)
     fraction = (np.arange(samples) + 0.5) / samples
     along = first[:, None] + np.maximum(last - first, 0.0)[..., None] * fraction
-    point = (a + radius[:, None] * normal)[..., None, :] + along[..., None] * u[..., None, :]
+    base = a + radius[:, None] * normal
+    point = of_components(*(base[..., None, k] + along * u[..., None, k] for k in range(3)))
     pixel, by_point = camera.project_by_point(point)
-    tangent = dot(by_point, u[..., None, None, :])
-    outward = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    x, y = (dot(by_point[..., k, :], u[..., None, :]) for k in (0, 1))
     with np.errstate(invalid="ignore", divide="ignore"):
-        outward /= np.sqrt(dot(outward, outward))[..., None]
+        length = np.sqrt(y * y + x * x)
+        outward = of_components(-y / length, x / length)
     across = outward[..., :1] * by_point[..., 0, :] + outward[..., 1:] * by_point[..., 1, :]
     gain = dot(across, normal[..., None, :])
     sign = np.sign(gain)[..., None]
@@ -131,6 +134,12 @@ def edge_points(
     return EdgePoints(
         normal, along, point, pixel, outward * sign, across * sign, np.abs(gain), valid
     )
+
+
+def of_edges(legs: LegsInCamera, tubes: TubeList) -> Iterator[Array]:
+    """The legs' ends a, b and directions u for every edge, (..., E, 3)."""
+    for vectors in (legs.a, legs.b, legs.u):
+        yield of_components(*(vectors[..., k].take(tubes.leg, axis=-1) for k in range(3)))
 
 
 def plane_normals(a: Array, u: Array, radius: Array, tubes: TubeList) -> tuple[Array, Booleans]:

@@ -23,13 +23,14 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import cross, dot, inverse, perturb, pose, rotation
+from pkmcal.geometry.rigid import cross, dot, inverse, of_components, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.places import anywhere
 from pkmcal.observe.predict import (
     TubeList,
     edge_points,
     legs_in_camera,
+    of_edges,
     plane_normals,
     visible_stretch,
 )
@@ -304,19 +305,18 @@ def score(
     legs = legs_in_camera(
         view.machine, T_camera_base[:, None], view.poses[photographs], view.joints[photographs]
     )
-    a, b, u = (v[..., tubes.leg, :] for v in (legs.a, legs.b, legs.u))
+    a, b, u = of_edges(legs, tubes)
     radius = view.machine.values[tubes.radius]
     normal, ok = plane_normals(a, u, radius, tubes)
     first, last = visible_stretch(a, b, tubes)
     base = a + radius[:, None] * normal
-    ends = np.stack(
-        [base + first[:, None] * u, base + last[..., None] * u], axis=-2
-    )  # (H, K, E, 2, 3)
-    pixel = view.camera.project(ends)
-    chord = pixel[..., 1, :] - pixel[..., 0, :]
-    direction = view.tables.direction(np.stack([-chord[..., 1], chord[..., 0]], axis=-1))
+    begin, end = (view.camera.project(base + at[..., None] * u) for at in (first, last))
+    chord = end - begin
+    direction = view.tables.direction(of_components(-chord[..., 1], chord[..., 0]))
     fraction = (np.arange(samples) + 0.5) / samples
-    points = pixel[..., :1, :] + fraction[:, None] * chord[..., None, :]
+    points = of_components(
+        *(begin[..., None, k] + fraction * chord[..., None, k] for k in (0, 1))
+    )  # (H, K, E, n, 2)
     number = np.arange(len(view.configuration))[photographs][:, None, None]
     found, inside = view.tables.look(direction[..., None], points, number)
     cost = np.where(inside & ok[..., None], np.minimum(found, reach) / reach, 1.0)
@@ -561,9 +561,11 @@ def _look(view: StationView, candidates: Array, photographs: Integers, samples: 
     behind, _ = view.tables.look_smooth(direction, points.pixel - step, number)
     slope = np.clip((ahead - behind) / 2, -1, 1)
     inside = inside & points.valid
+    slope = np.where(inside, slope, 0.0) / view.tables.scale
     # the pixel moves outward by across . (omega x P + tau) for a motion of the camera frame
-    motion = np.concatenate([cross(points.point, points.across), points.across], axis=-1)
-    jac = np.where(inside[..., None], slope[..., None] * motion / view.tables.scale, 0.0)
+    turn = cross(points.point, points.across)
+    motion = [part[..., k] for part in (turn, points.across) for k in range(3)]
+    jac = np.where(inside[..., None], of_components(*(slope * m for m in motion)), 0.0)
     found = np.where(inside, found, 0.0)
     chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
     length = np.nan_to_num(np.sqrt(dot(chord, chord)) / (view.tables.scale * (samples - 1)))
