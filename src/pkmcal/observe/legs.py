@@ -387,7 +387,8 @@ def _measured(
     photographs: Photographs, seen: _Seen, blur: float, refine_camera: bool
 ) -> tuple[StationEdges, Array]:
     """One window's part of :func:`measure`, and how far (px) each place was from its prediction."""
-    tubes, places, full, across = seen.tubes, seen.places, seen.full, seen.across
+    tubes, places, full = seen.tubes, seen.places, seen.full
+    across = profiles.without_highlights(seen.across)
     curves = profiles.residual_curves(across, blur)
     about = _leg_lines(profiles.likelihood(across, curves), places.along, full, tubes)
     at = profiles.locate(across, curves, about)
@@ -443,12 +444,9 @@ def _segment_profiles(
     count = weight.sum(axis=-1)
     full = count >= FEWEST_SHARE * weight.shape[-1]
     kept, weight = grey[full], weight[full][..., None]
-    number = count[full][:, None]
-    mean = np.sum(kept * weight, axis=-2) / number
-    square = np.sum(kept**2 * weight, axis=-2) / number - mean**2
-    error = np.sqrt(np.maximum(square, profiles.GREY_NOISE**2) / number)
+    mean = np.sum(kept * weight, axis=-2) / count[full][:, None]
     saturated = np.any((kept >= profiles.SATURATED) & weight, axis=-2)
-    cut = profiles.cut_of(mean, error, saturated, half_width[full])
+    cut = profiles.cut_of(saturated, half_width[full])
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
 
 

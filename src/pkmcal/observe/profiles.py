@@ -12,7 +12,7 @@ residual over a grid of positions is a matrix product, and its minimum is the ed
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -151,41 +151,42 @@ class Profiles:
         return np.maximum(np.ptp(self.grey, axis=-1), 1e-3)
 
 
-def cut_of(grey: Array, error: Array, saturated: Booleans, half_width: Array) -> Integers:
-    """Samples (N,) to leave out at the inner end of averaged profiles ``grey`` (N, samples), of
-    standard error ``error`` (N, samples).
+def cut_of(saturated: Booleans, half_width: Array) -> Integers:
+    """Samples (N,) to leave out at the inner end of profiles.
 
-    Up to the outermost saturated one of ``saturated`` (N, samples), what lies deeper than the limb
-    of a leg of ``half_width`` (N,) px, and what lies deeper than the limb's own brightness goes on:
-    a highlight is none of the model's, and with its far side in the profile its near border is the
-    likelier edge.
+    Up to the outermost saturated one of ``saturated`` (N, samples), and what lies deeper than the
+    limb of a leg of ``half_width`` (N,) px.
     """
-    n_samples = grey.shape[-1]
-    last = n_samples - np.argmax(saturated[..., ::-1], axis=-1)
+    count = saturated.shape[-1]
+    last = count - np.argmax(saturated[..., ::-1], axis=-1)
     depth = np.maximum(LIMB * half_width, LEAST_INSIDE)
     beyond = np.sum(profile_offsets() < -depth[:, None] - 1e-9, axis=-1)
-    cut = np.maximum(np.where(saturated.any(axis=-1), last, 0), beyond)
-    return np.maximum(cut, _turned_at(grey, error))
+    return np.maximum(np.where(saturated.any(axis=-1), last, 0), beyond)
 
 
-def _turned_at(grey: Array, error: Array) -> Integers:
-    """The sample (N,) at which a profile's departure from its background is largest before, further
-    in, it is less by more than noise and the model's error explain; 0 where it never is.
+def without_highlights(profiles: Profiles) -> Profiles:
+    """Profiles without what lies deeper than a highlight's middle.
+
+    A lamp's picture in polished metal, some way inside the limb, is none of the model's, and with
+    its far side in the profile its near border is the likelier edge. Its middle is where the
+    departure from the background is largest before, further in, it is less by more than diffuse
+    light allows, whose cosine changes by LIMB down to that depth, and by more than noise.
     """
     offsets = profile_offsets()
-    outside = offsets >= CLEAR_OUTSIDE
-    background, plain = (np.median(x[:, outside], axis=1, keepdims=True) for x in (grey, error))
+    noise = np.hypot(_noise(profiles), MODEL_ERROR)
+    grey = profiles.grey
+    background = np.median(grey[:, offsets >= CLEAR_OUTSIDE], axis=1, keepdims=True)
     inside = np.flatnonzero(offsets <= -STEP)[::-1]  # from the limb inwards
     away = np.abs(grey[:, inside] - background)
     most = np.maximum.accumulate(away, axis=1)
-    # of a difference of two samples, as the background has it: a highlight scatters along the leg
-    noise = np.hypot(np.sqrt(2) * plain, MODEL_ERROR * most)
-    less = most - away > TURNED * noise
-    # the largest before it was less: the last place that was its own largest
+    noise = (noise * profiles.contrast())[:, None]
+    less = most - away > np.maximum(TURNED * noise, LIMB * most)
+    # the last place that was its own largest before it was less
     before = np.arange(len(inside)) < np.argmax(less, axis=1)[:, None]
     largest = len(inside) - 1 - np.argmax(((away == most) & before)[:, ::-1], axis=1)
-    least = np.searchsorted(offsets, -LEAST_INSIDE - 1e-9)
-    return np.where(less.any(axis=1), np.minimum(inside[largest], least), 0)
+    middle = np.minimum(inside[largest], np.searchsorted(offsets, -LEAST_INSIDE - 1e-9))
+    cut = np.where(less.any(axis=1), middle, 0)
+    return replace(profiles, cut=np.maximum(profiles.cut, cut))
 
 
 def residual_curves(profiles: Profiles, blur: float) -> Array:
