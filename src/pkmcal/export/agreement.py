@@ -59,11 +59,7 @@ def _forward(model: ReadModel, machine: Machine) -> tuple[float, float, int]:
     readings, and at how many poses.
     """
     poses, readings = samples(machine, POSES)
-    drives = np.isin(np.arange(model.key.size), model.actuated)
-    x = np.tile(model.key, (len(poses), 1))
-    x[:, model.actuated] = readings / model.gear
-    # the legs follow the platform to where the machine's is; then the loops alone hold it
-    x = model.closed(model.closed(x, drives, poses), drives)
+    x = model.at(readings, poses)
     away: Array = pose_difference(model.places(x)["platform"], poses)
     away[np.abs(model.gaps(x)).max(axis=1) > ROUNDING] = np.nan
     return largest(away[:, :3]), largest(away[:, 3:]), len(poses)

@@ -71,6 +71,15 @@ class RoundBar:
             np.linalg.norm(self.stop - self.start) < self.radius / 10
         )
 
+    @property
+    def drawn(self) -> tuple[Array, float, Array]:
+        """Its middle (3,) and length, m, and roll, pitch and yaw (3,) that lay z along it."""
+        if self.stop is None:
+            return self.start, 0.0, np.zeros(3)
+        x, y, z = line = self.stop - self.start
+        turned = np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
+        return (self.start + self.stop) / 2, float(np.linalg.norm(line)), turned
+
 
 @dataclass(frozen=True)
 class TreeBody:

@@ -117,6 +117,22 @@ class ReadModel:
             out.append(off[..., None])
         return np.concatenate(out, axis=-1)
 
+    @property
+    def names(self) -> dict[str, int]:
+        """The freedom of each joint, by name; a free body's are left out."""
+        joints = [j for body in self.bodies for j in body.joints if j.kind != "free"]
+        return {j.name: j.dof for j in reversed(joints)}
+
+    def at(self, readings: Array, T_base_platform: Array) -> Array:
+        """States (n, d) closed at readings (n, m), of the assembly that has the platform near poses
+        (n, 4, 4); the readings alone decide where it ends.
+        """
+        drives = np.isin(np.arange(self.key.size), self.actuated)
+        x = np.tile(self.key, (len(readings), 1))
+        x[:, self.actuated] = readings / self.gear
+        # the legs follow the platform; then the loops alone hold it
+        return self.closed(self.closed(x, drives, T_base_platform), drives)
+
     def closed(self, x: Array, held: Booleans, goal: Array | None = None) -> Array:
         """States (n, d) with their loops closed by Gauss-Newton; held : (d,) freedoms that stay.
 
