@@ -84,7 +84,7 @@ class UrdfExporter(Exporter):
         return (
             Finding(
                 Level.DOUBTFUL,
-                f"A URDF is a tree: {tree} has every leg, fastened to the base alone. What closes"
+                f"A URDF is a tree: {tree} holds every leg at the base alone. What closes"
                 f" the machine stands in {loops}, for programs that take loops beside a URDF.",
             ),
             Finding(
