@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-import cv2
 import numpy as np
 
 from pkmcal.arrays import Array
@@ -174,6 +173,8 @@ def _tubes(
 
 def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     """A station's photograph with what was found in it, and the calibrated machine's contour."""
+    import cv2
+
     at, session, estimate = k + 1, c.session, c.estimate
     station = session.stations[s]
     path = ("machine", "cameras", station.name, "image")
