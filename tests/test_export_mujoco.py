@@ -14,7 +14,7 @@ from mujoco_machines import ALL, CATALOGUE, LOUD, MADE, TURNED, Simulated, machi
 from pkmcal.calibration.source import Source
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.export.contract import exporters
-from pkmcal.export.mujoco_model import home_state
+from pkmcal.export.home import home_state
 from pkmcal.export.mujoco_read import read
 from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import pose_difference
@@ -166,8 +166,8 @@ WRONG = {
     "joint centres on the base": r'(<body name="leg2_rod" pos=")[^ ]+',
     "joint centres on the platform": r'(<site name="leg2_platform" pos=")[^ ]+',
     "ends of the rods": r'(<body name="leg1_piston" pos=")[^ ]+',
-    "loops in the keyframe": r'(<key name="home" qpos="(?:[^ ]+ ){8})[^ ]+',
-    "readings in the keyframe": r'(<key name="home" qpos=".*ctrl=")[^ ]+',
+    "loops at home": r'(<key name="home" qpos="(?:[^ ]+ ){8})[^ ]+',
+    "readings at home": r'(<key name="home" qpos=".*ctrl=")[^ ]+',
     "radii": r'(<geom type="cylinder" [^>]*size=")[^"]+(?="[^>]*name="leg3_tube1")',
     "place": r'(<connect name="leg4" [^>]*anchor=")[^ ]+',
 }  # fmt: skip

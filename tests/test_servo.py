@@ -427,6 +427,24 @@ def test_a_study_that_is_well(eye):
     assert np.all(np.abs(settled - np.log(50)) < 1.0)
 
 
+def test_how_far_a_platform_leaves_its_way(eye):
+    """By hand millimetres beside it, which neither its end nor the time tells; and by definition
+    nothing with the true geometry.
+    """
+    found = study(scene_of(eye), Plan(SHORT, runs=6))
+    true, identified, _, hand = (o.astray for o in found.outcomes)
+    assert true.max() == 0
+    assert 1e-3 < np.median(hand) < 10e-3
+    assert np.median(identified) < np.median(hand) / 10
+    # of a run by itself: the farthest of its samples from all of the true one's
+    runs, ideal = (found.outcome(name).runs.T_base_platform[0] for name in ("hand", "true"))
+    machine = eye.true.machine
+    here, there = (platform_joints(machine, T) for T in (runs, ideal))
+    nearest = [min(np.sqrt(np.mean(np.sum((p - q) ** 2, axis=-1))) for q in there) for p in here]
+    assert hand[0] == pytest.approx(max(nearest), rel=1e-12)
+    assert any("beside its way" in text for text in judgement(found).warnings)
+
+
 def test_the_seed_decides(eye):
     legs = (0, 2, 3, 4)
     loop = replace(SHORT, duration=1.0, noise=EdgeNoise(0.1, 0.1))

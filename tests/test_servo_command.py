@@ -34,6 +34,9 @@ def test_a_built_in_machine(studied):
     assert sorted(p.name for p in folder.iterdir()) == ["servo.html", "servo.json"]
     document = json.loads((folder / "servo.json").read_text())
     assert document["estimates"] == done.json["estimates"]
+    found = document["estimates"]
+    assert found["true"]["astray_largest"] == 0
+    assert found["hand"]["astray_median"] > 5 * found["identified"]["astray_median"] > 0
     assert document["settings"]["legs"] == [1, 2, 3, 4, 5, 6]
     curves = document["curves"]
     assert {len(values) for values in curves.values()} == {48}

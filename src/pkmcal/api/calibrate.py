@@ -11,14 +11,15 @@ from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.calibrate import calibrate as run
 from pkmcal.calibration.results import SavedCalibration, load
 from pkmcal.report.calibration import save
+from pkmcal.report.rrd import write_rrd
 from pkmcal.session.load import Session
 
 
 @dataclass(frozen=True, repr=False)
 class CalibrationResult(Calibration):
     """A calibration that can be saved: ``summary()``, ``parameters``, ``machine``, ``verdict``,
-    ``tool_error(poses)``, ``plot_residuals()``, ``plot_parameters()``, ``plot_tool()`` and
-    ``save(folder)``. Covariances and residuals are in ``estimate``.
+    ``tool_error(poses)``, ``plot_residuals()``, ``plot_parameters()``, ``plot_tool()``,
+    ``save(folder)`` and ``record(path)``. Covariances and residuals are in ``estimate``.
     """
 
     def save(self, folder: Path | str, *, force: bool = False) -> Path | None:
@@ -30,6 +31,15 @@ class CalibrationResult(Calibration):
         anything else, or cannot be written.
         """
         return save(self, folder, force=force)
+
+    def record(self, path: Path | str) -> None:
+        """Write a recording, NAME.rrd, of photographs, edges, poses and the result, which rerun's
+        viewer plays (``rerun NAME.rrd``).
+
+        Needs ``pip install 'pkmcal[rerun]'``. Raises InputError without it, or where the file
+        cannot be written or a photograph not be read any more.
+        """
+        write_rrd(self, path)
 
 
 def calibrate(

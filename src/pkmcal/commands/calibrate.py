@@ -60,6 +60,10 @@ def calibrate(
         bool,
         typer.Option("--force", help="Replace an earlier result; otherwise it is kept, dated."),
     ] = False,
+    rrd: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a recording for rerun's viewer as well."),
+    ] = None,
     as_json: console.Json = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Say nothing if it is well.")
@@ -70,7 +74,11 @@ def calibrate(
     from pkmcal.calibration.kept import keep_earlier
     from pkmcal.calibration.results import check_output
     from pkmcal.report.calibration import outcome_of
+    from pkmcal.report.rrd import check_rrd, write_rrd
     from pkmcal.session.load import load_session
+
+    if rrd is not None:
+        check_rrd(rrd)
 
     loaded = load_session(session, model)
     folder = out or loaded.folder / "calibration"
@@ -87,4 +95,13 @@ def calibrate(
         told("Writing the report", 0.97)
         outcome = outcome_of(found)
     kept = None if force else keep_earlier(folder, outcome.texts)
-    return finish(outcome, folder, FILES, over=over, kept=kept, as_json=as_json, quiet=quiet)
+
+    def recording() -> dict[str, str]:
+        if rrd is None:
+            return {}
+        write_rrd(found, rrd)
+        return {str(rrd.absolute()): "rerun opens it"}
+
+    return finish(
+        outcome, folder, FILES, over=over, kept=kept, more=recording, as_json=as_json, quiet=quiet
+    )

@@ -29,7 +29,7 @@ def export(
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help="c, json, klipper, linuxcnc, mujoco, reprap, ros or yaml.",
+            help="c, json, klipper, linuxcnc, mujoco, reprap, ros, sdf, urdf or yaml.",
         ),
     ],
     out: Annotated[

@@ -15,13 +15,14 @@ class Paper(StrEnum):
     """A paper that can be reproduced."""
 
     A = "a"
+    B = "b"
     C = "c"
 
 
 def reproduce(
     papers: Annotated[
         list[Paper] | None,
-        typer.Argument(metavar="[a|c]...", help="Which papers; all unless given."),
+        typer.Argument(metavar="[a|b|c]...", help="Which papers; all unless given."),
     ] = None,
     runs: Annotated[
         int, typer.Option(metavar="N", min=2, max=100_000, help="Simulated runs.")

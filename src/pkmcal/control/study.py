@@ -27,10 +27,11 @@ from pkmcal.control.simulation import (
     Stillness,
     loop_factor,
     one_image,
+    platform_joints,
     simulate,
 )
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import apply, inverse, perturb, pose, register, rotation
+from pkmcal.geometry.rigid import apply, dot, inverse, perturb, pose, register, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import closure, limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
@@ -181,7 +182,9 @@ class Trials:
 
     overshoot : (R,) largest part of its way by which a platform was beyond the goal. rise : (R,)
     largest rise of the norm of e above an earlier value, as a part of its start's. settling : (R,)
-    s after which the platform is within SETTLED of its way, NaN where it never is.
+    s after which the platform is within SETTLED of its way, NaN where it never is. astray : (R,) m,
+    root mean square of the platform's joints, by which the platform left the way that it takes with
+    the true geometry, at most.
     """
 
     estimate: Belief
@@ -189,6 +192,7 @@ class Trials:
     overshoot: Array
     rise: Array
     settling: Array
+    astray: Array
 
     @property
     def reached(self) -> int:
@@ -255,7 +259,8 @@ def study(
         # the same noise for all, so that differences are the estimates'
         rng = np.random.default_rng(seeds[3])
         runs = simulate(eye, belief.seen, starts, goals, plan.loop, rng, told)
-        outcomes.append(outcome(belief, runs))
+        ideal = outcomes[0].runs if outcomes else runs
+        outcomes.append(outcome(eye.true.machine, belief, runs, ideal))
     progress("Looking for other equilibria", 0.87)
     ends, joints = np.concatenate([starts, goals]), np.nan_to_num(scene.machine.inverse(goals))
     rng, loop = np.random.default_rng(seeds[4]), plan.loop
@@ -294,8 +299,8 @@ def check_loop(loop: LoopSettings) -> None:
     )
 
 
-def outcome(estimate: Belief, runs: Runs) -> Trials:
-    """The figures of an estimate's runs."""
+def outcome(true: Machine, estimate: Belief, runs: Runs, ideal: Runs) -> Trials:
+    """The figures of an estimate's runs. ideal : the same with the true machine's geometry."""
     last = np.arange(len(runs.time)) <= runs.last[:, None]
     past = np.where(last, runs.past, 0.0)
     lowest = np.minimum.accumulate(runs.error, axis=1)
@@ -306,7 +311,21 @@ def outcome(estimate: Belief, runs: Runs) -> Trials:
         overshoot=np.maximum(past.max(axis=1), 0.0),
         rise=np.max((runs.error - lowest) / first, axis=1),
         settling=_settling(runs),
+        astray=_astray(true, runs, ideal),
     )
+
+
+def _astray(machine: Machine, runs: Runs, ideal: Runs) -> Array:
+    """How far (R,) m the platform's joints were from their nearest place on the ideal way."""
+    out = np.zeros(len(runs.end))
+    for r, (last, end) in enumerate(zip(runs.last, ideal.last, strict=True)):
+        here, there = (
+            platform_joints(machine, one.T_base_platform[r, : n + 1])
+            for one, n in ((runs, last), (ideal, end))
+        )
+        off = here[:, None] - there
+        out[r] = np.sqrt(np.mean(dot(off, off), axis=-1).min(axis=1).max())
+    return out
 
 
 def _settling(runs: Runs) -> Array:

@@ -14,6 +14,8 @@ HIDDEN = 0.05
 """Part of the poses at which a leg may stand behind another without a warning."""
 OVERSHOOT = 0.05
 """Part of the way by which a platform may pass its goal without a word."""
+ASTRAY = 0.01
+"""Part of the way by which a platform may leave it without a word."""
 COARSE = 0.02
 """Noise at the goal, as a part of the usual way, that deserves a word."""
 
@@ -128,6 +130,16 @@ def _by_hand(found: Study) -> tuple[str, ...]:
             f"With the camera's place by hand {failed} of {n} runs fail; most often {worst.what}."
         )
     good = hand.runs.reached
+    off, own = (
+        float(np.median(o.astray[o.runs.reached])) if o.reached else 0.0
+        for o in (hand, found.outcome("identified"))
+    )
+    if off > max(ASTRAY * float(np.median(hand.runs.way[:, 0])), 2 * own):
+        text.append(
+            "With the camera's place by hand the platform gets there beside its way, by"
+            f" {1e3 * off:.2g} mm in half of the runs and up to"
+            f" {1e3 * float(hand.astray[good].max()):.2g} mm; identified, by {1e3 * own:.2g} mm."
+        )
     over = float(hand.overshoot[good].max(initial=0.0))
     if over > max(OVERSHOOT, 2 * float(found.outcome("identified").overshoot.max(initial=0.0))):
         text.append(

@@ -4,23 +4,13 @@ from __future__ import annotations
 
 from typing import ClassVar, final
 
-import numpy as np
-
-from pkmcal.arrays import Array
 from pkmcal.calibration.source import Source
-from pkmcal.export.contract import Difference, Exporter, largest
+from pkmcal.export.agreement import differences
+from pkmcal.export.contract import Difference, Exporter
+from pkmcal.export.markup import file_name
 from pkmcal.export.mujoco_model import mjcf
-from pkmcal.export.mujoco_read import ReadModel, read
-from pkmcal.export.samples import samples
-from pkmcal.geometry.rigid import pose_difference
-from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.export.mujoco_read import read
 from pkmcal.outcome import Finding, Level
-
-POSES = 8
-ROUNDING = 1e-12
-FORWARD = 1e-9
-"""m, rad: rounding of 1e-14 in a length, told through the poses' nearness to singular ones."""
 
 
 @final
@@ -32,27 +22,11 @@ class MujocoExporter(Exporter):
 
     def files(self, source: Source) -> dict[str, str]:
         """The model's text."""
-        kept = "".join(c if c.isalnum() or c in "-_" else "-" for c in source.machine.name)
-        return {f"{kept.strip('-') or 'machine'}.xml": mjcf(source)}
+        return {f"{file_name(source.machine.name)}.xml": mjcf(source)}
 
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
-        """Joint centres in the keyframe, loops there and at other poses, radii."""
-        model, machine = read(next(iter(files.values()))), source.machine
-        turned, shifted, n = _forward(model, machine)
-        known = {
-            f"leg{j + 1}_tube{t + 1}": float(radius)
-            for j, radii in enumerate(machine.radii())
-            for t, radius in enumerate(radii)
-        }
-        found = [model.radii.get(name, np.nan) for name in known]
-        loops = largest(model.gaps(model.key))
-        return [
-            *_centres(model, machine),
-            Difference("loops in the keyframe", loops, ROUNDING),
-            Difference("tubes' radii", largest(found, list(known.values())), ROUNDING),
-            Difference(f"platform's place at {n} poses", shifted, FORWARD),
-            Difference(f"platform's turn at {n} poses", turned, FORWARD, "rad"),
-        ]
+        """By the text's own bodies, joints and loops."""
+        return differences(read(next(iter(files.values()))), source.machine)
 
     def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
         """What the model does not know."""
@@ -62,35 +36,3 @@ class MujocoExporter(Exporter):
             "kinematics. Gravity and contacts are off."
         )
         return (Finding(Level.NOTE, text),)
-
-
-def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
-    """Limbs' ends in the keyframe beside the machine's at the keyframe's pose and readings."""
-    T = model.places(model.key)["platform"]
-    found = machine.forward_result(model.ctrl, T)
-    ends = limb_ends(machine.layout, machine.values, model.ctrl, T, found.internal)
-    places = model.site_places(model.key)
-    told = {"base": "joint centres on the base", "platform": "joint centres on the platform"}
-    told["tip"] = "ends of the rods"
-    out: list[Difference] = []
-    for site, what in told.items():
-        read_again = np.array([places[f"leg{j + 1}_{site}"] for j in range(machine.n_legs)])
-        gap = largest(read_again, ends.a if site == "base" else ends.b)
-        out.append(Difference(f"{what} in the keyframe", gap, ROUNDING))
-    readings = largest(model.gear * model.key[model.actuated], model.ctrl)
-    return [*out, Difference("readings in the keyframe", readings, ROUNDING)]
-
-
-def _forward(model: ReadModel, machine: Machine) -> tuple[float, float, int]:
-    """How far, rad and m, the model's platform is from the machine's where both have the same
-    readings, and at how many poses.
-    """
-    poses, readings = samples(machine, POSES)
-    drives = np.isin(np.arange(model.key.size), model.actuated)
-    x = np.tile(model.key, (len(poses), 1))
-    x[:, model.actuated] = readings / model.gear
-    # the legs follow the platform to where the machine's is; then the loops alone hold it
-    x = model.closed(model.closed(x, drives, poses), drives)
-    away: Array = pose_difference(model.places(x)["platform"], poses)
-    away[np.abs(model.gaps(x)).max(axis=1) > ROUNDING] = np.nan
-    return largest(away[:, :3]), largest(away[:, 3:]), len(poses)

@@ -103,12 +103,20 @@ def write_text(path: Path | str, text: str) -> None:
 
 def write_bytes(path: Path | str, content: bytes) -> None:
     """Write a file, whole or not at all; its folder is made where missing."""
+    with staged_file(path) as part:
+        part.write_bytes(content)
+
+
+@contextmanager
+def staged_file(path: Path | str) -> Generator[Path]:
+    """Give a name to write to; on leaving without an error, that file is at `path`. The folder is
+    made where missing.
+    """
     path = Path(path)
     part = _beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("xb") as stream:
-            stream.write(content)
+        yield part
         _to_disk(part)
         part.replace(path)
     except OSError as error:

@@ -122,6 +122,23 @@ def from_quaternion(q: Array) -> Array:
     return np.eye(3) + 2 * (w * k + k @ k)
 
 
+def roll_pitch_yaw(rot: Array) -> Array:
+    """Angles (3,) of a rotation (3, 3), rad: R = Rz(yaw) Ry(pitch) Rx(roll), as URDF and SDF have
+    them; |pitch| is 90 degrees at most, and there the roll takes the yaw's share.
+    """
+    across = float(np.hypot(rot[0, 0], rot[1, 0]))
+    yaw = float(np.arctan2(rot[1, 0], rot[0, 0])) if across > 1e-12 else 0.0
+    s, c = np.sin(yaw), np.cos(yaw)
+    roll = np.arctan2(s * rot[0, 2] - c * rot[1, 2], c * rot[1, 1] - s * rot[0, 1])
+    return np.array([roll, np.arctan2(-rot[2, 0], across), yaw])
+
+
+def from_roll_pitch_yaw(angles: Array) -> Array:
+    """Rotation (3, 3) of roll, pitch and yaw (3,), rad."""
+    x, y, z = (rotation(angle * axis) for angle, axis in zip(angles, np.eye(3), strict=True))
+    return z @ y @ x
+
+
 def pose(rot: Array, t: Array) -> Array:
     """4x4 poses from rotations (..., 3, 3) and translations (..., 3)."""
     shape = np.broadcast_shapes(rot.shape[:-2], t.shape[:-1])

@@ -32,10 +32,6 @@ from pkmcal.wording import brief, number
 
 MOST_CHOICES = 2
 """Choices of legs told of each number of them."""
-SLIGHT = 0.01
-"""Part of the way by which noise may bring a platform beyond its goal."""
-LONG = 100.0
-"""m of a way that count as much as passing the goal by all of it."""
 COLOURS = {"true": "--quiet", "identified": "--drawing", "cad": "--good", "hand": "--calibrated"}
 SHADES = {"identified": "rgba(0,104,168,.16)", "hand": "rgba(194,72,12,.16)"}
 FRAMES = 60
@@ -193,15 +189,11 @@ def document_of(subject: Controlled, found: Study, verdict: Verdict) -> dict[str
 
 
 def shown_run(found: Study) -> int:
-    """The run that is drawn: the one whose estimate by hand passes its goal farthest, of those that
-    all estimates bring there.
+    """The run that is drawn: the one whose estimate by hand leaves the way farthest, of those that
+    all estimates bring to their goal.
     """
     everywhere = np.all([o.runs.reached for o in found.outcomes], axis=0)
-    hand = found.outcome("hand")
-    # where nobody passes the goal, the longest way shows most
-    passed = np.where(hand.overshoot > SLIGHT, hand.overshoot, 0.0)
-    marks = passed + hand.runs.way[:, 0] / LONG
-    return int(np.argmax(np.where(everywhere, marks, -1.0)))
+    return int(np.argmax(np.where(everywhere, found.outcome("hand").astray, -1.0)))
 
 
 def cards(found: Study) -> tuple[Figure, ...]:
@@ -220,6 +212,12 @@ def cards(found: Study) -> tuple[Figure, ...]:
             ((_seconds(good), "s"),),
             f"until the platform stays within 2 % of its way, median; by hand {_seconds(hand)} s,"
             f" an exponential {np.log(50) / s.plan.loop.gain:.1f} s",
+        ),
+        Figure(
+            "How far does it leave its way?",
+            ((_mm(good.astray, good), "mm"),),
+            f"at most, median of the runs, beside the way with the true geometry; by hand"
+            f" {_mm(hand.astray, hand)} mm, and {_mm(hand.astray, hand, np.max)} mm in the worst",
         ),
         Figure(
             "Does it pass its goal?",
@@ -244,11 +242,11 @@ def outcome_table(found: Study) -> Table:
             o.estimate.title,
             (
                 f"{o.reached} of {len(o.runs.end)}",
-                _percent(o.overshoot, o, np.median),
+                _mm(o.astray, o),
+                _mm(o.astray, o, np.max),
                 _percent(o.overshoot, o),
                 _percent(o.rise, o),
                 _seconds(o),
-                _last(o),
             ),
         )
         for o in found.outcomes
@@ -258,17 +256,18 @@ def outcome_table(found: Study) -> Table:
         (
             "Geometry",
             "Reached",
-            "Passed goal, %",
+            "Off its way, mm",
             "at most",
+            "Passed goal, %",
             "Error rose, %",
             "Settled, s",
-            "Left, mm",
         ),
         tuple(rows),
-        "Passed goal: part of its way by which the platform was beyond the goal, median and"
-        " largest. Error rose: the largest rise of the error's norm above an earlier value."
-        " Settled: within 2 % of the way for good, median. Left: distance of the platform's joints"
-        " at the end, median. All of runs that reached the goal.",
+        "Off its way: how far the platform's joints were from the way that they take with the true"
+        " geometry, median and largest of the runs. Passed goal: part of its way by which the"
+        " platform was beyond the goal, and error rose, the rise of the error's norm above an"
+        " earlier value: the largest."
+        " Settled: within 2 % of the way for good, median. All of runs that reached the goal.",
     )
 
 
@@ -366,14 +365,16 @@ def _outcome_document(o: Trials) -> dict[str, Any]:
         "title": o.estimate.title,
         "reached": o.reached,
         "ends": {end.word: n for end, n in o.ends.items()},
+        "astray_median": _over(o.astray, o, np.median),
+        "astray_largest": _over(o.astray, o, np.max),
         "overshoot_median": _over(o.overshoot, o, np.median),
         "overshoot_largest": _over(o.overshoot, o, np.max),
         "error_rise_largest": _over(o.rise, o, np.max),
         "settling_median": _settled(o),
         "runs": [
-            {"end": end.word, "way": way, "overshoot": over, "settling": settling}
-            for end, way, over, settling in zip(
-                o.runs.end, o.runs.way[:, 0], o.overshoot, o.settling, strict=True
+            {"end": end.word, "way": way, "astray": off, "overshoot": over, "settling": settling}
+            for end, way, off, over, settling in zip(
+                o.runs.end, o.runs.way[:, 0], o.astray, o.overshoot, o.settling, strict=True
             )
         ],
     }
@@ -390,6 +391,12 @@ def _percent(values: Any, o: Trials, of: Callable[[Any], Any] = np.max) -> str:
     return "–" if value is None else brief(100 * value) if value > 5e-4 else "0"
 
 
+def _mm(values: Array, o: Trials, of: Callable[[Any], Any] = np.median) -> str:
+    """Metres, of the runs that reached the goal, as millimetres."""
+    value = _over(values, o, of)
+    return "–" if value is None else _magnitude(1e3 * value)
+
+
 def _settled(o: Trials) -> float | None:
     """Median time (s) of the runs that came to rest at the goal, of which there may be none."""
     known = o.settling[np.isfinite(o.settling)]
@@ -399,11 +406,6 @@ def _settled(o: Trials) -> float | None:
 def _seconds(o: Trials) -> str:
     time = _settled(o)
     return "–" if time is None else f"{time:.1f}"
-
-
-def _last(o: Trials) -> str:
-    way = o.runs.way[o.runs.reached][:, -max(1, o.runs.way.shape[1] // 10) :]
-    return brief(1e3 * float(np.median(way.mean(axis=1)))) if len(way) else "–"
 
 
 def _magnitude(value: float) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,6 +87,7 @@ Found = StudyResult[HexapodByAxes]
 
 def reproduce(options: Options) -> Outcome:
     """The whole reproduction."""
+    began = perf_counter()
     measured, done = None, 0.0
     if options.photographs:
         from pkmcal.studies.paper_a_photographs import measured_noise
@@ -110,7 +112,8 @@ def reproduce(options: Options) -> Outcome:
         by_poses[poses] = found if same else run(setting, options.runs, options.seed, told)
         done = upto
     figures = figures_compared(found)
-    words = _words(found, narrow, figures, measured)
+    elapsed = perf_counter() - began
+    words = _words(found, narrow, figures, measured, elapsed)
     return words.reproduction(
         (
             words.part("noise", table_1(measured), more=["measured"] if measured else []),
@@ -129,7 +132,7 @@ def reproduce(options: Options) -> Outcome:
         ),
         checks=checks(found),
         remarks=[name for name in REMARKS if words.values.get(name, True)],
-        numbers={**_numbers(found, narrow, figures, by_poses), **_noise(measured)},
+        numbers={**_numbers(found, narrow, figures, by_poses, elapsed), **_noise(measured)},
     )
 
 
@@ -168,7 +171,11 @@ def _depth_as_printed(s: Found) -> float:
 
 
 def _words(
-    s: Found, narrow: Found, figures: list[Compared], measured: MeasuredNoise | None
+    s: Found,
+    narrow: Found,
+    figures: list[Compared],
+    measured: MeasuredNoise | None,
+    elapsed: float,
 ) -> Words:
     """All that is said, with the figures that it names; differences from the prototype too."""
 
@@ -182,6 +189,7 @@ def _words(
     return Words.of(
         "a",
         s,
+        elapsed=elapsed,
         after=(Shown(1e3 * AFTER[0]), Shown(DEGREE * AFTER[1])),
         joint_over_bound=over(JOINT, BOUND),
         corrected_over_joint=over(CORRECTED, JOINT),
@@ -423,7 +431,11 @@ def _series(
 
 
 def _numbers(
-    s: Found, narrow: Found, figures: list[Compared], by_poses: dict[int, Found]
+    s: Found,
+    narrow: Found,
+    figures: list[Compared],
+    by_poses: dict[int, Found],
+    elapsed: float,
 ) -> dict[str, Any]:
     """Everything for programs, m and rad."""
     names = thirty(study_machine()).names
@@ -433,7 +445,7 @@ def _numbers(
         "poses_per_station": s.setting.poses,
         "converged": converged(s),
         "chi2_per_dof": s.of(JOINT)["chi2"].value,
-        "seconds": {"wall": s.solving, "cpu": s.cpu, "workers": s.workers},
+        "seconds": {"wall": elapsed, "solving": s.solving, "cpu": s.cpu, "workers": s.workers},
         "paper": {
             "mean_error": MEAN_ERRORS,
             "before": dict(zip(("displacement", "orientation"), BEFORE, strict=True)),

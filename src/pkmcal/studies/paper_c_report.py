@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import Outcome, Row, Table
+from pkmcal.outcome import AXIS as OF_PLOTS
+from pkmcal.outcome import LOOKS, Outcome, Row, Table
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_c import (
     AXIS,
@@ -78,7 +80,11 @@ def reproduced(found: Found) -> Outcome:
     words = _words(found, start)
     return words.reproduction(
         (
-            words.part("accuracy", *_accuracy_tables(found)),
+            words.part(
+                "accuracy",
+                *_accuracy_tables(found),
+                plots={"tool": {"figure": _accuracy_plot(found), "height": 430, "width": 760}},
+            ),
             words.part("table-2", *_tables_2(found)),
             words.part(
                 "before",
@@ -91,7 +97,9 @@ def reproduced(found: Found) -> Outcome:
                     ),
                 ),
             ),
-            words.part("table-3", _table_3(found)),
+            words.part(
+                "table-3", _table_3(found), plots={"motors": {"figure": _residual_plot(found)}}
+            ),
             words.part("table-4", _table_4(found), _square_table(found)),
             words.part("axis", _axis_table(found)),
             words.part("ranks", _ranks_table(found)),
@@ -250,6 +258,73 @@ def _ranks_table(s: Found) -> Table:
         for (name, method), (rank, count) in ranks(s).items()
     ]
     return Table("Ranks", ("", "unknowns", "rank", "estimated"), tuple(rows))
+
+
+# ------------------------------------------------------------------ plots
+
+
+def _accuracy_plot(s: Found) -> dict[str, Any]:
+    """The tool's error over the larger workspace by truth, model and method, mm; the prototype's
+    beside it, whose workspace fits that one.
+    """
+    data: list[dict[str, Any]] = []
+    printed: dict[str, float] = {}
+    for kind, models in PLAN.items():
+        bars: dict[str, float] = {}
+        for name, methods in models.items():
+            for method in methods:
+                where = f"{MODELS[kind]} ← {MODELS[name]}, {LABELS[method]}"
+                bars[where] = 1e3 * s.of(kind, name, method)["larger_shift"].value
+                known = PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
+                if known:
+                    printed[where] = float(known)
+        colour = {"design": "--drawing", "calibration": "--calibrated", "rods": "--leg3"}[kind]
+        data.append(_series("bar", TRUTHS[kind], bars, colour))
+    dots = _series("scatter", "independent prototype", printed, "--ink")
+    marks = {"color": "--ink", "size": 9, "symbol": "diamond-open"}
+    data.append({**dots, "mode": "markers", "marker": marks})
+    layout = _plane("mm", {"l": 58, "r": 8, "t": 34, "b": 200})
+    layout["xaxis"] |= {"tickangle": -55, "showgrid": False}
+    layout["yaxis"] |= {"type": "log", "tickvals": [0.05, 0.1, 0.2, 0.5, 1, 2, 5]}
+    return {"data": data, "layout": layout, "config": {}}
+
+
+def _residual_plot(s: Found) -> dict[str, Any]:
+    """[C] Table 3 after the calibration: root mean square residuals of the motors, mrad."""
+    data: list[dict[str, Any]] = []
+    colours = {"design": "--drawing", "calibration": "--calibrated"}
+    motors = [f"q{sign}" for sign in "₁₂₃₄"]
+    for label, which, key in VALIDATED[1:]:
+        ours = 1e3 * each_rms(s.values("control_rms", "design", *which))
+        paper = dict(zip(motors, (1e3 * v for v in TABLE_3[key][1]), strict=True))
+        found = dict(zip(motors, ours.tolist(), strict=True))
+        bars = _series("bar", f"{label}: the paper", paper, colours[key])
+        data.append({**bars, "marker": {"color": colours[key], "opacity": 0.35}})
+        data.append(_series("bar", f"{label}: found", found, colours[key]))
+    layout = _plane("mrad", {"l": 58, "r": 8, "t": 34, "b": 40})
+    return {"data": data, "layout": layout, "config": {}}
+
+
+def _series(kind: str, name: str, values: Mapping[str, float], colour: str) -> dict[str, Any]:
+    return {
+        "type": kind,
+        "name": name,
+        "x": list(values),
+        "y": [round(v, 4) for v in values.values()],
+        "marker": {"color": colour},
+        "hovertemplate": "%{x}: %{y:.3g}",
+    }
+
+
+def _plane(unit: str, margin: dict[str, int]) -> dict[str, Any]:
+    return {
+        **LOOKS,
+        "margin": margin,
+        "barmode": "group",
+        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
+        "xaxis": {**OF_PLOTS, "fixedrange": True},
+        "yaxis": {**OF_PLOTS, "fixedrange": True, "title": {"text": unit}},
+    }
 
 
 # ------------------------------------------------------------------ for programs

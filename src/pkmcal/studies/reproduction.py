@@ -21,7 +21,7 @@ from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Key, Setting
 from pkmcal.wording import brief, number
 
-PAPERS = ("a", "c")
+PAPERS = ("a", "b", "c")
 PrintedFigures = Mapping[Key, Mapping[str, str]]
 """A prototype's figures as it prints them, by what was estimated how and by quantity."""
 ASIDE = ", its Monte-Carlo error aside"

@@ -1,0 +1,65 @@
+"""A model of bodies read again, beside the machine it was made of."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.export.contract import Difference, largest
+from pkmcal.export.read_model import ReadModel
+from pkmcal.export.samples import samples
+from pkmcal.geometry.rigid import pose_difference
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import limb_ends
+
+POSES = 8
+ROUNDING = 1e-12
+FORWARD = 1e-9
+"""m, rad: rounding of 1e-14 in a length, told through the poses' nearness to singular ones."""
+
+
+def differences(model: ReadModel, machine: Machine) -> list[Difference]:
+    """Joint centres at home, loops there and at other poses, radii."""
+    turned, shifted, n = _forward(model, machine)
+    known = {
+        f"leg{j + 1}_tube{t + 1}": float(radius)
+        for j, radii in enumerate(machine.radii())
+        for t, radius in enumerate(radii)
+    }
+    found = [model.radii.get(name, np.nan) for name in known]
+    loops = largest(model.gaps(model.key))
+    return [
+        *_centres(model, machine),
+        Difference("loops at home", loops, ROUNDING),
+        Difference("tubes' radii", largest(found, list(known.values())), ROUNDING),
+        Difference(f"platform's place at {n} poses", shifted, FORWARD),
+        Difference(f"platform's turn at {n} poses", turned, FORWARD, "rad"),
+    ]
+
+
+def _centres(model: ReadModel, machine: Machine) -> list[Difference]:
+    """Limbs' ends at home beside the machine's at the keyframe's pose and readings."""
+    T = model.places(model.key)["platform"]
+    found = machine.forward_result(model.ctrl, T)
+    ends = limb_ends(machine.layout, machine.values, model.ctrl, T, found.internal)
+    places = model.site_places(model.key)
+    told = {"base": "joint centres on the base", "platform": "joint centres on the platform"}
+    told["tip"] = "ends of the rods"
+    out: list[Difference] = []
+    for site, what in told.items():
+        read_again = np.array([places[f"leg{j + 1}_{site}"] for j in range(machine.n_legs)])
+        gap = largest(read_again, ends.a if site == "base" else ends.b)
+        out.append(Difference(f"{what} at home", gap, ROUNDING))
+    readings = largest(model.gear * model.key[model.actuated], model.ctrl)
+    return [*out, Difference("readings at home", readings, ROUNDING)]
+
+
+def _forward(model: ReadModel, machine: Machine) -> tuple[float, float, int]:
+    """How far, rad and m, the model's platform is from the machine's where both have the same
+    readings, and at how many poses.
+    """
+    poses, readings = samples(machine, POSES)
+    x = model.at(readings, poses)
+    away: Array = pose_difference(model.places(x)["platform"], poses)
+    away[np.abs(model.gaps(x)).max(axis=1) > ROUNDING] = np.nan
+    return largest(away[:, :3]), largest(away[:, 3:]), len(poses)

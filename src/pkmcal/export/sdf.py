@@ -1,0 +1,198 @@
+"""SDF: the machine's bodies, and its loops as joints between links of two branches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar, final
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
+from pkmcal.export.agreement import differences
+from pkmcal.export.bodies import (
+    COLOURS,
+    BodyJoint,
+    BodyTree,
+    Loop,
+    RoundBar,
+    TreeBody,
+    body_tree,
+)
+from pkmcal.export.contract import Difference, Exporter
+from pkmcal.export.home import SAME
+from pkmcal.export.markup import comment, document, file_name, numbers
+from pkmcal.export.sdf_read import NAMESPACE, read
+from pkmcal.geometry.rigid import pose, roll_pitch_yaw
+from pkmcal.outcome import Finding, Level
+
+VERSION = "1.11"
+"""The first with joints that follow others (``mimic``)."""
+MODEL = "__model__"
+CONVENTIONS = (
+    "Units: m, rad. The model's frame is the machine's base frame, the link 'platform' has the"
+    " platform frame; its pose is T_base_platform at home, where all is drawn.",
+    "Joints count from home. Of those that a motor moves, leg1, leg2, … (motor1, … where it moves"
+    " several rods), the value is scale * (reading - home): the elements pkmcal:reading have both"
+    " numbers, which SDF has no word for. All other joints have an effort of 0: no motor.",
+    "Joints legN_loop close the loops, as SDF has them: joints between links of two branches, drawn"
+    " closed. Not every program that reads SDF closes them: see docs/export.md.",
+    "NOT KNOWN: masses and inertias, since photographs weigh nothing. Where SDF finds none it takes"
+    " 1 kg and 1 kg m2 for each link, which is not this machine's: the model is for kinematics, and"
+    " gravity is off.",
+)
+
+
+@final
+class SdfExporter(Exporter):
+    """One file, ``<name>.sdf``."""
+
+    name: ClassVar = "sdf"
+    title: ClassVar = "SDF model with closed loops"
+
+    def files(self, source: Source) -> dict[str, str]:
+        """The model's text."""
+        name = file_name(source.machine.name)
+        return {f"{name}.sdf": _sdf(body_tree(source.machine), source, name)}
+
+    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+        """By the text's own links and joints."""
+        return differences(read(next(iter(files.values()))), source.machine)
+
+    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+        """What the model does not know, and what its readers may not do."""
+        del files, source
+        return (
+            Finding(
+                Level.DOUBTFUL,
+                "The loops are joints, as SDF has them; a program that reads SDF may leave them"
+                " open or refuse them.",
+            ),
+            Finding(
+                Level.NOTE,
+                "Links have no masses, since photographs weigh nothing, and SDF takes 1 kg for"
+                " each: the model is for kinematics. Gravity is off.",
+            ),
+        )
+
+
+def _sdf(tree: BodyTree, source: Source, name: str) -> str:
+    root = Element("sdf", {"version": VERSION, "xmlns:pkmcal": NAMESPACE})
+    model = SubElement(root, "model", name=name)
+    for k, reading in enumerate(tree.home.readings):
+        known = {"joint": tree.home.reading_name(k), "home": numbers(reading)}
+        SubElement(model, "pkmcal:reading", known, scale=numbers(tree.home.scale(k)))
+    for body in tree.bodies:
+        if body.said:
+            comment(model, body.said)
+        _chain(model, body, tree)
+        node = SubElement(model, "link", name=body.name)
+        if body.parent is not None:
+            _pose(node, body.T_parent_body, body.parent.name)
+        SubElement(node, "gravity").text = "false"
+        for k, shape in enumerate(body.shapes):
+            _visual(node, shape, shape.name or f"shape{k + 1}")
+        for point, place in body.points.items():
+            if not point.endswith("_base"):  # a rod's own origin
+                frame = SubElement(model, "frame", {"name": point, "attached_to": body.name})
+                _pose(frame, pose(np.eye(3), place))
+    for loop in tree.loops:
+        _loop(model, loop)
+    return document(root, source, CONVENTIONS)
+
+
+def _chain(model: Element, body: TreeBody, tree: BodyTree) -> None:
+    """The joints that lead to a body, with a link of no size between two of them."""
+    if body.parent is None:
+        _joint(model, "base_fixed", ("world", body.name), "fixed")
+        return
+    if body.free:
+        return
+    last = body.parent.name
+    steps = list(_steps(body.joints))
+    if not steps:
+        _joint(model, f"{body.name}_fixed", (last, body.name), "fixed")
+    for k, joints in enumerate(steps):
+        own = joints[0].name.removesuffix("_first")
+        link = body.name if k == len(steps) - 1 else f"{own}_link"
+        kind = "prismatic" if joints[0].kind == "slide" else "revolute"
+        out = _joint(model, own, (last, link), kind if len(joints) == 1 else "universal")
+        for tag, joint in zip(("axis", "axis2"), joints, strict=False):
+            _axis(out, tag, joint, tree)
+        if link != body.name:
+            between = SubElement(model, "link", name=link)
+            _pose(between, body.T_parent_body, body.parent.name)
+            SubElement(between, "gravity").text = "false"
+        last = link
+
+
+def _steps(joints: list[BodyJoint]) -> Iterator[tuple[BodyJoint, ...]]:
+    """Joints, of which two hinges in a row that are square to one another are a universal one."""
+    k = 0
+    while k < len(joints):
+        pair = tuple(joints[k : k + 2])
+        turns = [joint.kind == "hinge" for joint in pair]
+        square = turns == [True, True] and abs(float(pair[0].axis @ pair[1].axis)) < SAME
+        yield pair if square else pair[:1]
+        k += 2 if square else 1
+
+
+def _joint(model: Element, name: str, links: tuple[str, str], kind: str) -> Element:
+    out = SubElement(model, "joint", name=name, type=kind)
+    SubElement(out, "parent").text, SubElement(out, "child").text = links
+    return out
+
+
+def _axis(parent: Element, tag: str, joint: BodyJoint, tree: BodyTree) -> None:
+    """A joint's axis in the joint's own frame, its limits, and what it follows."""
+    out = SubElement(parent, tag)
+    SubElement(out, "xyz").text = numbers(joint.axis)
+    limit = SubElement(out, "limit")
+    if joint.column < 0:
+        SubElement(limit, "effort").text = "0"  # or readers take a motor for what has no limit
+    else:
+        known = np.sort(tree.home.values(joint.column)[1:] - joint.value)
+        for end, value in zip(("lower", "upper"), known, strict=True):
+            if np.isfinite(value):
+                SubElement(limit, end).text = numbers(value)
+    for coupling in tree.couplings:
+        if coupling.follower == joint.name:
+            mimic = SubElement(out, "mimic", joint=coupling.leader, axis="axis")
+            for word, value in (("multiplier", "-1"), ("offset", "0"), ("reference", "0")):
+                SubElement(mimic, word).text = value
+
+
+def _loop(model: Element, loop: Loop) -> None:
+    """The joint that closes a leg: a ball, or what turns about its own axes."""
+    kind = ("ball", "revolute", "universal")[len(loop.hinges)]
+    out = _joint(model, f"{loop.name}_loop", (loop.tip.name, loop.held.name), kind)
+    _pose(out, np.eye(4), f"{loop.name}_platform")
+    for tag, (_, axis) in zip(("axis", "axis2"), loop.hinges, strict=False):
+        node = SubElement(out, tag)
+        SubElement(node, "xyz", expressed_in=MODEL).text = numbers(axis)
+        SubElement(SubElement(node, "limit"), "effort").text = "0"
+
+
+def _pose(parent: Element, T: Array, relative_to: str = "") -> None:
+    out = SubElement(parent, "pose")
+    if relative_to:
+        out.set("relative_to", relative_to)
+    out.text = numbers(T[:3, 3], roll_pitch_yaw(T[:3, :3]))
+
+
+def _visual(link: Element, shape: RoundBar, name: str) -> None:
+    """What is drawn of a link; cylinders lie along their own z."""
+    if shape.flat:
+        return
+    out = SubElement(link, "visual", name=name)
+    middle, length, turned = shape.drawn
+    SubElement(out, "pose").text = numbers(middle, turned)
+    geometry = SubElement(out, "geometry")
+    form = SubElement(geometry, "sphere" if shape.stop is None else "cylinder")
+    SubElement(form, "radius").text = numbers(shape.radius)
+    if shape.stop is not None:
+        SubElement(form, "length").text = numbers(length)
+    material = SubElement(out, "material")
+    for light in ("ambient", "diffuse"):
+        SubElement(material, light).text = COLOURS[shape.look]

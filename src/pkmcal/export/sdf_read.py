@@ -1,0 +1,160 @@
+"""An SDF model read again, as its specification tells links, frames and joints, as far as
+:mod:`pkmcal.export.sdf` uses them.
+"""
+
+from __future__ import annotations
+
+from xml.etree.ElementTree import Element, fromstring
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.export.read_model import ReadBody, ReadCoupling, ReadJoint, ReadLoop, ReadModel
+from pkmcal.geometry.rigid import from_roll_pitch_yaw, inverse, pose
+
+NAMESPACE = "urn:pkmcal"
+MODEL, WORLD = "__model__", "world"
+AXES = {"revolute": ("axis",), "prismatic": ("axis",), "universal": ("axis", "axis2")}
+LOOP = "_loop"
+
+
+def read(text: str) -> ReadModel:
+    """The model of a text whose joints named ``…_loop`` close what the others leave open."""
+    model = fromstring(text)[0]
+    made = _Links(model)
+    for link in made.links:
+        made.put(link)
+    loops = [made.loop(name) for name in made.joints if name.endswith(LOOP)]
+    sites = {
+        name: (made.numbers[node.attrib["attached_to"]], _pose(node)[:3, 3])
+        for name, node in made.frames.items()
+    }
+    for link in made.links:  # a rod stands on its base joint
+        if link.endswith("_rod"):
+            sites[f"{link.removesuffix('rod')}base"] = (made.numbers[link], np.zeros(3))
+    return ReadModel(
+        bodies=tuple(made.bodies),
+        loops=tuple(loops),
+        couplings=tuple(
+            ReadCoupling(made.known[name].dof, made.known[mimic.attrib["joint"]].dof, *_way(mimic))
+            for name, node in made.joints.items()
+            if (mimic := node.find("axis/mimic")) is not None
+        ),
+        sites=sites,
+        radii={
+            node.attrib["name"]: float(node.findtext("geometry/cylinder/radius", "nan"))
+            for node in model.iter("visual")
+        },
+        actuated=np.array([made.known[name].dof for name in made.readings], dtype=int),
+        gear=np.array([1 / float(told["scale"]) for told in made.readings.values()]),
+        ctrl=np.array([float(told["home"]) for told in made.readings.values()]),
+        key=np.array(made.key),
+    )
+
+
+class _Links:
+    """A model's links, made into bodies one after the other, each after what it stands on.
+
+    known : joints by name, of the first axis. key : the state as drawn.
+    """
+
+    def __init__(self, model: Element) -> None:
+        self.links = _named(model, "link")
+        self.frames = _named(model, "frame")
+        self.joints = _named(model, "joint")
+        self.readings = {
+            node.attrib["joint"]: node.attrib for node in model.findall(f"{{{NAMESPACE}}}reading")
+        }
+        self.above = {
+            _end(node, "child"): name
+            for name, node in self.joints.items()
+            if not name.endswith(LOOP)
+        }
+        self.bodies = [ReadBody(WORLD, 0, np.eye(4), ())]
+        self.numbers = {WORLD: 0}
+        self.known: dict[str, ReadJoint] = {}
+        self.key: list[float] = []
+
+    def drawn(self, name: str) -> Array:
+        """Where a link or a frame is drawn, (4, 4), in the model's frame."""
+        if name in ("", MODEL, WORLD):
+            return np.eye(4)
+        if name in self.frames:
+            return self.drawn(self.frames[name].attrib["attached_to"]) @ _pose(self.frames[name])
+        node = self.links[name].find("pose")
+        above = "" if node is None else node.get("relative_to", "")
+        return self.drawn(above) @ _pose(self.links[name])
+
+    def put(self, link: str) -> int:
+        """The number of a link's body."""
+        if link in self.numbers:
+            return self.numbers[link]
+        if link in self.above:
+            name = self.above[link]
+            parent = _end(self.joints[name], "parent")
+            number = self.put(parent)
+            place = inverse(self.drawn(parent)) @ self.drawn(link)
+            body = ReadBody(link, number, place, self._axes(name, self.drawn(link)))
+        else:  # nothing holds it but loops
+            joint = ReadJoint(link, "free", np.zeros(3), len(self.key), 0.0)
+            body = ReadBody(link, 0, self.drawn(link), (joint,))
+            self.key.extend([0.0] * 6)
+        self.bodies.append(body)
+        self.numbers[link] = len(self.bodies) - 1
+        return self.numbers[link]
+
+    def loop(self, name: str) -> ReadLoop:
+        """A joint between two links that have their places; what turns about axes has a body of
+        its own on the parent, which the child is fastened to.
+        """
+        node = self.joints[name]
+        parent, child = _end(node, "parent"), _end(node, "child")
+        placed = node.find("pose")
+        relative = child if placed is None else placed.get("relative_to", child)
+        at = self.drawn(relative) @ _pose(node)
+        frames = inverse(self.drawn(child)) @ at, inverse(self.drawn(parent)) @ at
+        joints = self._axes(name, at)
+        numbers = self.numbers[child], self.numbers[parent]
+        if joints:
+            self.bodies.append(ReadBody(name, numbers[1], frames[1], joints))
+            numbers, frames = (numbers[0], len(self.bodies) - 1), (frames[0], np.eye(4))
+        return ReadLoop(bool(joints), numbers, frames)
+
+    def _axes(self, name: str, at: Array) -> tuple[ReadJoint, ...]:
+        """A joint's axes in its own frame, which is drawn at a place (4, 4)."""
+        node, told = self.joints[name], self.readings.get(name)
+        # a reading's joint counts from home, its state here from reading zero
+        ref = 0.0 if told is None else float(told["scale"]) * float(told["home"])
+        kind = "slide" if node.attrib["type"] == "prismatic" else "hinge"
+        out: list[ReadJoint] = []
+        for tag in AXES.get(node.attrib["type"], ()):
+            xyz = node.find(f"{tag}/xyz")
+            axis = np.array([] if xyz is None else (xyz.text or "").split(), dtype=float)
+            if xyz is not None and xyz.get("expressed_in") == MODEL:
+                axis = at[:3, :3].T @ axis
+            out.append(ReadJoint(name, kind, axis, len(self.key), ref))
+            self.key.append(ref)
+        if out:
+            self.known[name] = out[0]
+        return tuple(out)
+
+
+def _named(model: Element, tag: str) -> dict[str, Element]:
+    return {node.attrib["name"]: node for node in model.findall(tag)}
+
+
+def _way(mimic: Element) -> tuple[float, float]:
+    """Ratio and offset of multiplier * (leader - reference) + offset."""
+    ratio, offset, zero = (
+        float(mimic.findtext(word, "nan")) for word in ("multiplier", "offset", "reference")
+    )
+    return ratio, offset - ratio * zero
+
+
+def _end(joint: Element, which: str) -> str:
+    return joint.findtext(which, "").strip()
+
+
+def _pose(node: Element) -> Array:
+    values = np.array([float(v) for v in node.findtext("pose", "0 0 0 0 0 0").split()])
+    return pose(from_roll_pitch_yaw(values[3:]), values[:3])

@@ -1,0 +1,256 @@
+"""URDF: the machine's bodies as a tree, and beside it what closes it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, ClassVar, final
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+import yaml
+
+from pkmcal.arrays import Array
+from pkmcal.calibration.source import Source
+from pkmcal.export.agreement import differences
+from pkmcal.export.bodies import (
+    COLOURS,
+    BodyJoint,
+    BodyTree,
+    Loop,
+    RoundBar,
+    TreeBody,
+    body_tree,
+)
+from pkmcal.export.contract import Difference, Exporter, commented
+from pkmcal.export.markup import comment, document, file_name, numbers
+from pkmcal.export.urdf_read import read
+from pkmcal.geometry.rigid import pose, roll_pitch_yaw, rotation
+from pkmcal.outcome import Finding, Level
+
+REACH = 2.0
+"""Rods' mean lengths about home, of limits that URDF demands and nobody knows."""
+POSE_JOINTS = ("x", "y", "z", "yaw", "pitch", "roll")
+CONVENTIONS = (
+    "Units: m, rad. The link 'base' has the machine's base frame, the link 'platform' the platform"
+    " frame.",
+    "Joints leg1, leg2, … (motor1, … where a motor moves several rods) have scale * reading: a"
+    " rod's length is that + offset, a crank's angle that + angle.",
+    "NOT IN HERE: THE LOOPS. A URDF is a tree, so no leg is fastened to the platform. The machine"
+    " is closed where each leg's links legN_tip and legN_platform coincide; which of them do so in"
+    " their origins alone, and the values of all joints at home, stand in {loops}. Joint values"
+    " have to come from a closed machine: nothing in this file holds them together.",
+    "NO PARTS OF THE MACHINE: the joints platform_x and so on, by which the tree holds the"
+    " platform. {pose}",
+    "NOT KNOWN: masses and inertias, since photographs weigh nothing; no link has any, so this file"
+    " is for kinematics and pictures. URDF demands limits: an effort and a velocity of 0 stand for"
+    " not known, and slides without a range have {reach:g} of the rods' mean lengths to either side"
+    " of home.",
+)
+POSE = (
+    "Their values are its pose: T_base_platform = Trans(platform_x, platform_y, platform_z)"
+    " Rz(platform_yaw) Ry(platform_pitch) Rx(platform_roll)."
+)
+RESTRICTED = "They leave it the machine's motion; what holds it so in the machine is not drawn."
+LOOPS = (
+    "Loops that the URDF beside this cannot hold. frames: the origins of these two links coincide,"
+    " or, where coincide is pose, their axes as well.",
+    "readings: the joint's value is scale * reading. home: all joints' values where the machine is"
+    " closed, m and rad; joints that mimic others are left out.",
+)
+
+
+@final
+class UrdfExporter(Exporter):
+    """``<name>.urdf``, and ``<name>.loops.yaml``."""
+
+    name: ClassVar = "urdf"
+    title: ClassVar = "URDF (a tree), and the loops that it cannot hold"
+
+    def files(self, source: Source) -> dict[str, str]:
+        """The tree's text, and the loops'."""
+        tree, name = body_tree(source.machine), file_name(source.machine.name)
+        loops = f"{name}.loops.yaml"
+        return {f"{name}.urdf": _urdf(tree, source, name, loops), loops: _loops(tree, source)}
+
+    def check(self, files: dict[str, str], source: Source) -> list[Difference]:
+        """By the text's own links and joints, its loops closed as the other text says."""
+        tree, loops = files.values()
+        return differences(read(tree, loops), source.machine)
+
+    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+        """What the tree does not hold."""
+        del source
+        tree, loops = files
+        return (
+            Finding(
+                Level.DOUBTFUL,
+                f"A URDF is a tree: {tree} holds every leg at the base alone. What closes"
+                f" the machine stands in {loops}, for programs that take loops beside a URDF.",
+            ),
+            Finding(
+                Level.NOTE,
+                "Links have no masses, since photographs weigh nothing: for kinematics and"
+                " pictures, not for a simulator.",
+            ),
+        )
+
+
+def _urdf(tree: BodyTree, source: Source, name: str, loops: str) -> str:
+    root = Element("robot", name=name)
+    for look, rgba in COLOURS.items():
+        SubElement(SubElement(root, "material", name=look), "color", rgba=rgba)
+    for body in tree.bodies:
+        if body.said:
+            comment(root, body.said)
+        last = "" if body.parent is None else body.parent.name
+        for link, joint, origin in _steps(body):
+            _joint(root, joint, (last, link), origin, tree)
+            last = link
+            if link != body.name:
+                SubElement(root, "link", name=link)
+        node = SubElement(root, "link", name=body.name)
+        for shape in body.shapes:
+            _visual(node, shape)
+    for loop in tree.loops:
+        _ends(root, loop, tree)
+    told = {"loops": loops, "pose": POSE if tree.platform.free else RESTRICTED, "reach": REACH}
+    return document(root, source, [line.format(**told) for line in CONVENTIONS])
+
+
+def _steps(body: TreeBody) -> Iterator[tuple[str, BodyJoint | None, Array]]:
+    """The link after each joint that leads to a body, the joint, and its place (4, 4) in the link
+    before: where its value is zero, as URDF counts; no joint where it is fixed.
+    """
+    if body.parent is None:
+        return
+    joints, origin = list(body.joints), body.T_parent_body
+    if body.free:  # its pose's own numbers, which count from the base's frame
+        joints = _pose_joints(body.T_parent_body)
+    if not joints:
+        yield body.name, None, origin
+    for k, joint in enumerate(joints):
+        back = -joint.value * joint.axis
+        hinge = joint.kind == "hinge"
+        zero = pose(rotation(back), np.zeros(3)) if hinge else pose(np.eye(3), back)
+        link = body.name if k == len(joints) - 1 else f"{joint.name}_link"
+        yield link, joint, np.eye(4) if body.free else origin @ zero
+        origin = np.eye(4)
+
+
+def _pose_joints(T: Array) -> list[BodyJoint]:
+    """Joints that take a body from the base's frame to a place (4, 4), one freedom each."""
+    axes = np.eye(3)[[0, 1, 2, 2, 1, 0]]
+    values = [*T[:3, 3], *roll_pitch_yaw(T[:3, :3])[::-1]]
+    return [
+        BodyJoint(f"platform_{name}", "slide" if name in "xyz" else "hinge", axis, float(value))
+        for name, axis, value in zip(POSE_JOINTS, axes, values, strict=True)
+    ]
+
+
+def _joint(
+    root: Element, joint: BodyJoint | None, links: tuple[str, str], T: Array, tree: BodyTree
+) -> None:
+    """A joint between two links, or what fixes them to one another."""
+    limits = _limits(joint, tree)
+    kind = "fixed"
+    if joint is not None:
+        turns = "continuous" if limits is None else "revolute"
+        kind = "prismatic" if joint.kind == "slide" else turns
+    name = f"{links[1]}_fixed" if joint is None else joint.name
+    out = SubElement(root, "joint", name=name, type=kind)
+    _origin(out, T)
+    SubElement(out, "parent", link=links[0])
+    SubElement(out, "child", link=links[1])
+    if joint is not None:
+        SubElement(out, "axis", xyz=numbers(joint.axis))
+    if limits is not None:
+        low, high = (numbers(limit) for limit in limits)
+        SubElement(out, "limit", lower=low, upper=high, effort="0", velocity="0")
+    for coupling in tree.couplings:
+        if joint is not None and coupling.follower == joint.name:
+            values = {j.name: j.value for body in tree.bodies for j in body.joints}
+            offset = numbers(values[coupling.follower] + values[coupling.leader])
+            SubElement(out, "mimic", joint=coupling.leader, multiplier="-1", offset=offset)
+
+
+def _limits(joint: BodyJoint | None, tree: BodyTree) -> Array | None:
+    """(2,) m or rad, of the drawing, or, of a slide that has none, what it will not reach."""
+    if joint is None:
+        return None
+    if joint.column >= 0:
+        known = tree.home.values(joint.column)[1:]
+        if np.isfinite(known).all():
+            return np.sort(known)
+    if joint.kind == "slide":
+        return joint.value + REACH * tree.home.size * np.array([-1.0, 1.0])
+    return None
+
+
+def _ends(root: Element, loop: Loop, tree: BodyTree) -> None:
+    """Two links that coincide where a leg is closed, with the joint's own hinges before them."""
+    at = pose(np.eye(3), loop.end)
+    last = loop.tip.name
+    comment(root, f"Loop: {loop.name}_tip and {loop.name}_platform coincide{_how(loop)}.")
+    for kind, axis in loop.hinges:
+        name = f"{loop.name}_{kind}"
+        _joint(root, BodyJoint(name, "hinge", axis), (last, f"{name}_link"), at, tree)
+        SubElement(root, "link", name=f"{name}_link")
+        last, at = f"{name}_link", np.eye(4)
+    turned = loop.held.T_base_body[:3, :3].T if loop.hinges else np.eye(3)
+    for end, body, T in (
+        ("tip", last, at),
+        ("platform", loop.held.name, pose(turned, loop.point)),
+    ):
+        name = f"{loop.name}_{end}"
+        _joint(root, None, (body, name), T, tree)
+        SubElement(root, "link", name=name)
+
+
+def _how(loop: Loop) -> str:
+    return ", axes as well" if loop.hinges else " in their origins: a ball"
+
+
+def _origin(parent: Element, T: Array) -> None:
+    SubElement(parent, "origin", xyz=numbers(T[:3, 3]), rpy=numbers(roll_pitch_yaw(T[:3, :3])))
+
+
+def _visual(link: Element, shape: RoundBar) -> None:
+    """What is drawn of a link; cylinders lie along their own z."""
+    if shape.flat:
+        return
+    out = SubElement(link, "visual")
+    if shape.name:
+        out.set("name", shape.name)
+    middle, length, turned = shape.drawn
+    SubElement(out, "origin", xyz=numbers(middle), rpy=numbers(turned))
+    geometry, radius = SubElement(out, "geometry"), numbers(shape.radius)
+    if shape.stop is None:
+        SubElement(geometry, "sphere", radius=radius)
+    else:
+        SubElement(geometry, "cylinder", radius=radius, length=numbers(length))
+    SubElement(out, "material", name=shape.look)
+
+
+def _loops(tree: BodyTree, source: Source) -> str:
+    home = tree.home
+    following = {coupling.follower for coupling in tree.couplings}
+    joints = [joint for body in tree.bodies for _, joint, _ in _steps(body) if joint is not None]
+    hinges = {f"{loop.name}_{kind}": 0.0 for loop in tree.loops for kind, _ in loop.hinges}
+    values = {j.name: j.value for j in joints if j.name not in following} | hinges
+    document: dict[str, Any] = {
+        "loops": [
+            {
+                "name": loop.name,
+                "frames": [f"{loop.name}_platform", f"{loop.name}_tip"],
+                "coincide": "pose" if loop.hinges else "point",
+            }
+            for loop in tree.loops
+        ],
+        "readings": [
+            {"joint": home.reading_name(k), "scale": home.scale(k), "home": float(reading)}
+            for k, reading in enumerate(home.readings)
+        ],
+        "home": values,
+    }
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=96)
+    return commented(source.header(*LOOPS), "#") + text

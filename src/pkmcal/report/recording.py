@@ -1,0 +1,229 @@
+"""A calibration as a recording: what was photographed, found and made of it, configuration after
+configuration, for a viewer that plays it.
+
+Nothing here knows the viewer; :mod:`pkmcal.report.rrd` writes what stands here for rerun.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import apply, inverse
+from pkmcal.identify.centres import Centres
+from pkmcal.identify.tool import centres_and_tool
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.observe.images import decode
+from pkmcal.report import poses
+from pkmcal.report.drawn import laid_over
+from pkmcal.report.pictures import edge_curves
+from pkmcal.report.residuals import KEPT, SIDES, rms
+from pkmcal.session.photographs import label_of
+from pkmcal.wording import number
+
+if TYPE_CHECKING:
+    from pkmcal.calibration.calibrate import Calibration
+
+Kind = Literal[
+    "world", "transform", "pinhole", "photograph", "lines2d", "lines3d", "points3d",
+    "numbers", "text", "clear",
+]  # fmt: skip
+CORNER = 0.5
+"""px: pixel centres are at integers here, and half a pixel further where a picture begins with its
+first pixel's corner, as in viewers."""
+QUALITY = 85
+LEGS = (
+    (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66),
+    (0, 114, 178), (213, 94, 0), (204, 121, 167), (140, 140, 140),
+)  # fmt: skip
+"""Colours that all eyes can tell apart (Okabe and Ito), by leg."""
+GREY, WHITE = (150, 150, 150), (255, 255, 255)
+THIN = 0.002
+"""m, radius of a leg of which the drawing has no tube."""
+
+
+class Logged(NamedTuple):
+    """One thing that is recorded.
+
+    path : names from the root on. at : the configuration, from 1; None for all of them.
+    values : by the kind's own names; lengths in m, places in pictures in px from the corner.
+    """
+
+    path: tuple[str, ...]
+    kind: Kind
+    values: dict[str, Any]
+    at: int | None = None
+
+
+def recorded(calibration: Calibration) -> Iterator[Logged]:
+    """What there is of a calibration, in the order of time.
+
+    Raises InputError where a photograph cannot be read any more.
+    """
+    centres, _ = centres_and_tool(
+        calibration.session.machine, calibration.estimate, calibration.session.joints
+    )
+    yield Logged(("machine",), "world", {})
+    yield from _result(calibration)
+    yield from _stations(calibration)
+    for k in range(len(calibration.session.configurations)):
+        yield from _configuration(calibration, centres, k)
+
+
+def _result(c: Calibration) -> Iterator[Logged]:
+    """The verdict and the parameters, as pages."""
+    yield Logged(("result", "summary"), "text", {"text": f"```\n{c.summary()}\n```"})
+    rows = ["| parameter | unit | drawing | value | σ | decided by |", "|---|---|---|---|---|---|"]
+    rows += [
+        f"| {p.name} | {p.unit} | {p.drawing:.7g} | {p.value:.7g} | {p.sigma:.2g}"
+        f" | {p.decided_by} |"
+        for p in c.parameters
+    ]
+    yield Logged(("result", "parameters"), "text", {"text": "\n".join(rows)})
+
+
+def _stations(c: Calibration) -> Iterator[Logged]:
+    """Where the cameras stand, and what a viewer can know of their lenses."""
+    for s, station in enumerate(c.session.stations):
+        T_base_camera = inverse(c.estimate.state.T_camera_base[s])
+        at = ("machine", "cameras", station.name)
+        yield Logged(at, "transform", {"T": T_base_camera})
+        camera = station.camera
+        if camera.model == "pinhole":
+            fx, fy, cx, cy = camera.parameters[:4]
+            k = np.array([[fx, 0, cx + CORNER], [0, fy, cy + CORNER], [0, 0, 1]])
+            yield Logged((*at, "image"), "pinhole", {"k": k, "size": camera.image_size})
+
+
+def _configuration(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[Logged]:
+    """Everything of one configuration; what it has not is cleared, or the last one's would stay."""
+    at, session, estimate = k + 1, c.session, c.estimate
+    name = session.configurations[k]
+    yield Logged(("result", "configuration"), "text", {"text": f"## {name}"}, at)
+    for j, reading in enumerate(session.joints[k].tolist()):
+        yield Logged(("readings", f"joint{j + 1}"), "numbers", {"value": reading}, at)
+    if estimate.configurations[k]:
+        yield from _machine(c, centres, k)
+        for j, off in enumerate(estimate.joint_residuals[k].tolist()):
+            path = ("residuals", "readings", f"joint{j + 1}")
+            yield Logged(path, "numbers", {"value": off}, at)
+    else:
+        for part in ("platform", "calibrated", "drawing", "measured"):
+            yield Logged(("machine", part), "clear", {}, at)
+    for s in range(len(session.stations)):
+        yield from _photograph(c, s, k)
+
+
+def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[Logged]:
+    """The machine as calibrated and as drawn, laid over it by all joint centres, and where boards
+    and trackers' targets were.
+    """
+    at, state, joints = k + 1, c.estimate.state, c.session.joints[k]
+    pose = state.T_base_platform[k]
+    yield Logged(("machine", "platform"), "transform", {"T": pose}, at)
+    machine = c.estimate.machine
+    base, platform = (side.T_calibrated_drawing for side in centres)
+    old = inverse(base) @ pose @ platform
+    for name, of, T, move in (
+        ("calibrated", machine, pose, np.eye(4)),
+        ("drawing", c.session.machine, old, base),
+    ):
+        strips, radii, legs = _tubes(of, joints, T)
+        strips = [apply(move, strip) for strip in strips]
+        colours = [LEGS[j % len(LEGS)] if name == "calibrated" else GREY for j in legs]
+        told = {"strips": strips, "radii": radii, "colours": colours}
+        labels = [f"leg {j + 1}" for j in legs]
+        yield Logged(("machine", name), "lines3d", {**told, "labels": labels}, at)
+    ends = limb_ends(machine.layout, machine.values, joints, pose)
+    points = np.concatenate([ends.a, ends.b])
+    labels = [f"leg {j + 1}, {e}" for e in ("base", "platform") for j in range(machine.n_legs)]
+    path = ("machine", "calibrated", "centres")
+    yield Logged(path, "points3d", {"points": points, "labels": labels, "colour": WHITE}, at)
+    if len(c.observation.poses):
+        points, configuration = poses.places(c.observation, c.estimate)
+        points = points[configuration == k]
+        told = {"points": points, "labels": [], "colour": LEGS[0]}
+        yield Logged(("machine", "measured"), "points3d", told, at)
+
+
+def _tubes(
+    machine: Machine, joints: Array, T_base_platform: Array
+) -> tuple[list[Array], list[float], list[int]]:
+    """Axes (2, 3), m, and radii of all tubes, with their legs from 0; thin lines for the others."""
+    ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
+    strips, radii, legs = list[Array](), list[float](), list[int]()
+    for j, known in enumerate(machine.radii()):
+        line = ends.b[j] - ends.a[j]
+        length = float(np.linalg.norm(line))
+        for radius, tube in zip(known, machine.document.legs[j].tubes, strict=True):
+            share = np.array([tube.start, min(tube.stop, length)]) / length
+            strips.append(ends.a[j] + share[:, None] * line)
+            radii.append(float(radius))
+            legs.append(j)
+        if not len(known):
+            strips.append(np.stack([ends.a[j], ends.b[j]]))
+            radii.append(THIN)
+            legs.append(j)
+    return strips, radii, legs
+
+
+def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
+    """A station's photograph with what was found in it, and the calibrated machine's contour."""
+    import cv2
+
+    at, session, estimate = k + 1, c.session, c.estimate
+    station = session.stations[s]
+    path = ("machine", "cameras", station.name, "image")
+    photo = next((p for p in station.photographs if p.configuration == k), None)
+    if photo is None:
+        for part in ("photograph", "edges", "aside", "contour"):
+            yield Logged((*path, part), "clear", {}, at)
+        return
+    label = label_of(session.folder, photo.path)
+    grey: Any = decode(photo.path, station.camera.image_size, label)
+    coded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+    yield Logged((*path, "photograph"), "photograph", {"jpeg": coded}, at)
+    edges = c.observation.edges
+    mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
+    curves = edge_curves(session, edges, estimate, mine, s, k)
+    used = estimate.edge_weights[mine] >= KEPT
+    for part, chosen in (("edges", used), ("aside", ~used)):
+        rows = np.flatnonzero(chosen)
+        strips = [curves[n][np.isfinite(curves[n]).all(axis=-1)] + CORNER for n in rows]
+        own = edges.select(mine[rows])
+        told = {
+            "strips": strips,
+            "colours": [LEGS[j % len(LEGS)] if part == "edges" else GREY for j in own.leg],
+            "labels": [_tip(c, int(n)) for n in mine[rows]],
+        }
+        yield Logged((*path, part), "lines2d", told, at)
+    if estimate.configurations[k]:
+        drawn, _ = laid_over(
+            estimate.machine,
+            station.camera,
+            estimate.state.T_camera_base[s],
+            session.joints[k],
+            estimate.state.T_base_platform[k],
+        )
+        strips = [np.array(edge.points) + CORNER for edge in drawn]
+        labels = [edge.tip for edge in drawn]
+        told = {"strips": strips, "colours": [WHITE] * len(strips), "labels": labels}
+        yield Logged((*path, "contour"), "lines2d", told, at)
+    if len(mine):
+        level = rms(estimate.edge_residuals[mine], estimate.edge_weights[mine])
+        yield Logged(("residuals", "edges", station.name), "numbers", {"value": level}, at)
+
+
+def _tip(c: Calibration, n: int) -> str:
+    """An edge in words."""
+    edges, estimate = c.observation.edges, c.estimate
+    across, tilt = estimate.edge_residuals[n].tolist()
+    return (
+        f"leg {edges.leg[n] + 1}, tube {edges.tube[n] + 1}, {SIDES[edges.side[n]]} edge: residual"
+        f" {number(across, 1, signed=True)} σ across, {number(tilt, 1, signed=True)} σ tilt;"
+        f" weight {number(float(estimate.edge_weights[n]), 2)}"
+    )

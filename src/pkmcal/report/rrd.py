@@ -1,0 +1,128 @@
+"""A calibration for rerun's viewer, which is an extra: ``pip install 'pkmcal[rerun]'``.
+
+The SDK is imported only here, when somebody asks for a recording.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pkmcal.errors import InputError
+from pkmcal.files import check_writable, staged_file
+from pkmcal.report.recording import Logged, recorded
+
+if TYPE_CHECKING:
+    from pkmcal.calibration.calibrate import Calibration
+
+APPLICATION = "pkmcal"
+TIMELINE = "configuration"
+ENDING = ".rrd"
+
+
+def check_rrd(path: Path | str) -> None:
+    """Raise InputError where no recording could be written; call it before the work."""
+    path = Path(path)
+    if path.suffix != ENDING:
+        raise InputError(
+            "a recording has another ending", where="--rrd", found=path.name, expected="NAME.rrd"
+        )
+    if path.is_dir():
+        raise InputError("a folder stands where the recording should go", where=str(path))
+    check_writable(path.parent)
+    if find_spec("rerun") is None:
+        raise InputError(
+            "recordings need rerun, which is not installed",
+            where="--rrd",
+            next_step="Install it with: pip install 'pkmcal[rerun]'",
+        )
+
+
+def write_rrd(calibration: Calibration, path: Path | str) -> None:
+    """Write a recording that ``rerun PATH`` opens, whole or not at all.
+
+    Raises InputError where rerun is not installed, where the file cannot be written, and where a
+    photograph cannot be read any more.
+    """
+    check_rrd(path)
+    rr: Any = import_module("rerun")
+    session = calibration.session
+    stream = rr.RecordingStream(APPLICATION)
+    with staged_file(path) as part:
+        stream.save(part, default_blueprint=_blueprint(session.station_names))
+        stream.send_recording_name(session.folder.resolve().name)
+        for one in recorded(calibration):
+            what = _archetype(rr, one)
+            if one.at is not None:
+                stream.set_time(TIMELINE, sequence=one.at)
+            stream.log(list(one.path), what, static=one.at is None)
+        stream.disconnect()  # which waits for the file
+
+
+def _archetype(rr: Any, one: Logged) -> Any:
+    """What rerun calls it."""
+    v = one.values
+    match one.kind:
+        case "world":
+            return rr.ViewCoordinates.RIGHT_HAND_Z_UP
+        case "transform":
+            return rr.Transform3D(translation=v["T"][:3, 3], mat3x3=v["T"][:3, :3])
+        case "pinhole":
+            return rr.Pinhole(
+                image_from_camera=v["k"], resolution=v["size"], camera_xyz=rr.ViewCoordinates.RDF
+            )
+        case "photograph":
+            return rr.EncodedImage(contents=v["jpeg"], media_type="image/jpeg")
+        case "lines2d":
+            return rr.LineStrips2D(
+                v["strips"], colors=v["colours"], labels=v["labels"], show_labels=False
+            )
+        case "lines3d":
+            return rr.LineStrips3D(
+                v["strips"],
+                radii=v["radii"],
+                colors=v["colours"],
+                labels=v["labels"],
+                show_labels=False,
+            )
+        case "points3d":
+            return rr.Points3D(
+                v["points"], labels=v["labels"], colors=v["colour"], show_labels=False
+            )
+        case "numbers":
+            return rr.Scalars(v["value"])
+        case "text":
+            return rr.TextDocument(v["text"], media_type="text/markdown")
+        case "clear":
+            return rr.Clear(recursive=True)
+
+
+def _blueprint(stations: tuple[str, ...]) -> Any:
+    """The machine in space, the photographs beside it, below them numbers and words."""
+    rr: Any = import_module("rerun")
+    rrb: Any = import_module("rerun.blueprint")
+    photographs = [
+        rrb.Spatial2DView(
+            origin=rr.new_entity_path(["machine", "cameras", name, "image"]), name=name
+        )
+        for name in stations
+    ]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Spatial3DView(origin="/machine", name="Machine"),
+            rrb.Vertical(
+                rrb.Tabs(*photographs) if photographs else rrb.TextDocumentView(),
+                rrb.TimeSeriesView(origin="/residuals", name="Residuals, standard deviations"),
+                rrb.Tabs(
+                    rrb.TextDocumentView(origin="/result/summary", name="Result"),
+                    rrb.TextDocumentView(origin="/result/parameters", name="Parameters"),
+                    rrb.TextDocumentView(origin="/result/configuration", name="Configuration"),
+                    rrb.TimeSeriesView(origin="/readings", name="Readings"),
+                ),
+            ),
+        ),
+        rrb.TimePanel(timeline=TIMELINE),
+        collapse_panels=True,
+    )

@@ -1,0 +1,361 @@
+"""[B] V computed again: Figs. 6, 7, 8 and 10, 12 mm and 8 mm, beside the paper's figures."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import apply, inverse, register
+from pkmcal.mechanisms.closure import limb_ends
+from pkmcal.outcome import AXIS, LOOKS, Outcome, Part, Row, Table
+from pkmcal.studies.engine import StudyResult, run
+from pkmcal.studies.paper_b import (
+    CASES,
+    CONTROLLED,
+    HUBER,
+    JOINT,
+    MEDIAN,
+    MIRROR,
+    PERSPECTIVE,
+    PLAIN,
+    POINT_NOISE,
+    POINTS,
+    RATIO,
+    ROBUST,
+    SCALE,
+    TUKEY,
+    VIEWS,
+    HexapodByLegs,
+    study_machine,
+    views,
+)
+from pkmcal.studies.paper_b_control import E1, E2, ControlledHexapod, controlled
+from pkmcal.studies.paper_b_expected import CAD, PROTOTYPE, checks, figures_compared
+from pkmcal.studies.reproduction import Column, Options, Words, accuracy_rows
+from pkmcal.wording import number
+
+LABELS = {
+    PLAIN: "least squares",
+    HUBER: "Huber",
+    TUKEY: "Tukey",
+    MEDIAN: "least median",
+    ROBUST: "median, Tukey, EIV",
+    RATIO: "eq. 16's scale",
+    SCALE: "similarity",
+    JOINT: "joint estimate",
+}
+TITLES = {MIRROR: "Through the mirror", PERSPECTIVE: "Before the camera"}
+CASE_NAMES = {
+    "right": "Right edges",
+    "shifted": "0.1 px outside",
+    "radius": "Radius 1 % wrong",
+    **{f"{n} % wrong": f"{n} % wrong edges" for n in (5, 20, 35)},
+}
+COLUMNS = [
+    Column("centre", 3, 3),
+    Column("depth", 3, 3),
+    Column("pixel", 3, 3),
+    Column("cad", 1, 1),
+]
+ENLARGED = 10.0
+"""Times that errors are drawn enlarged."""
+RUNS_SHOWN = 0
+"""The run whose joints are drawn: the first, not the best."""
+CURVES = {
+    "true": ("True geometry", "--quiet", "dot"),
+    E1: ("E1: drawing, fitted", "--good", "dash"),
+    E2: ("E2: linear", "--drawing", "solid"),
+    "hand": ("E3: by hand, 3 cm and 3°", "--calibrated", "solid"),
+    "coarse": ("E3: 10 cm and 10°", "--leg7", "dash"),
+}
+COLOURS = {PLAIN: "--quiet", HUBER: "--leg1", TUKEY: "--leg3", MEDIAN: "--leg4",
+           ROBUST: "--drawing", JOINT: "--calibrated"}  # fmt: skip
+
+Found = StudyResult[HexapodByLegs]
+
+
+def reproduce(options: Options) -> Outcome:
+    """The whole reproduction."""
+    began = perf_counter()
+    found = run(HexapodByLegs(), options.runs, options.seed, options.within(0.0, 0.9))
+    options.told("Control by the edges", 0.9)
+    ran = controlled(found.values("centres", CONTROLLED, CONTROLLED, ROBUST), options.seed)
+    return reproduced(found, ran, perf_counter() - began)
+
+
+def reproduced(found: Found, ran: ControlledHexapod, elapsed: float) -> Outcome:
+    """The reproduction that a study and the controlled runs give. elapsed : s, of both."""
+    words = _words(found, ran, elapsed)
+    return words.reproduction(
+        (
+            words.part("accuracy", *_tables(found), plots={"shares": {"figure": _shares(found)}}),
+            words.part("figure-6", plots={"mirror": {"figure": _picture(found, MIRROR)}}),
+            _geometry_part(words, found),
+            words.part("figure-8", plots={"camera": {"figure": _picture(found, PERSPECTIVE, ran)}}),
+            words.part(
+                "figure-10",
+                _control_table(ran),
+                plots={
+                    "error": {"figure": _errors(ran), "height": 380},
+                    "beside": {"figure": _beside(ran), "height": 320},
+                },
+            ),
+            words.part("how"),
+        ),
+        checks=checks(found, ran),
+        remarks=("accuracy", "scale", "overshoot", "alike"),
+        numbers=_numbers(found, ran, elapsed),
+    )
+
+
+def _words(s: Found, ran: ControlledHexapod, elapsed: float) -> Words:
+    """All that is said, with the figures that it names."""
+    true, estimated = _joints(s, MIRROR)
+    project = views()[MIRROR].camera.project
+    seen = ran.eye.camera.project
+    by_hand = np.linalg.norm(seen(ran.centres["hand"]) - seen(ran.centres["true"]), axis=-1)
+    astray = {
+        f"{name}_astray": 1e3 * float(np.median(trial.astray)) for name, trial in ran.trials.items()
+    }
+    return Words.of(
+        "b",
+        s,
+        elapsed=elapsed,
+        each=len(s.values("centre", MIRROR, "right", ROBUST)),
+        controlled=len(ran.centres[E2]),
+        points=POINTS,
+        noise=POINT_NOISE,
+        mirror_pixel=float(np.linalg.norm(project(estimated) - project(true), axis=-1).max()),
+        mirror_off=1e3 * float(np.linalg.norm(estimated - true, axis=-1).max()),
+        hand_pixel=float(np.median(by_hand)),
+        **astray,
+    )
+
+
+# ------------------------------------------------------------------ tables
+
+
+def _tables(s: Found) -> list[Table]:
+    """A table a camera."""
+    out: list[Table] = []
+    for view in VIEWS:
+        rows = [Row("The paper", ("", "", "", number(1e3 * CAD[view], 0)), "paper")]
+        for case, tried in CASES.items():
+            for method in tried.methods:
+                key, name = (view, case, method), f"{CASE_NAMES[case]}: {LABELS[method]}"
+                rows += accuracy_rows(s, key, name, COLUMNS, PROTOTYPE.get(key), errors=False)
+        heads = ("", "mm", "depth, mm", "px", "drawing, mm")
+        note = "Pictures of joints that have collapsed into the camera have no place."
+        out.append(Table(TITLES[view], heads, tuple(rows), note))
+    return out
+
+
+def _control_table(ran: ControlledHexapod) -> Table:
+    """[B] Fig. 10 in figures."""
+    rows = [
+        Row(
+            title,
+            (
+                f"{t.reached} of {len(t.runs.end)}",
+                number(1e3 * float(np.median(t.astray)), 2),
+                number(100 * float(t.overshoot.max()), 2),
+                number(100 * float(t.rise.max()), 2),
+                number(float(np.nanmedian(t.settling)), 1) if t.reached else "–",
+            ),
+        )
+        for name, (title, _, _) in CURVES.items()
+        for t in [ran.trials[name]]
+    ]
+    heads = ("", "reached", "off its way, mm", "passed goal, %", "error rose, %", "settled, s")
+    note = (
+        "Off its way: the farthest from the way with the true geometry, median of the runs; passed"
+        " goal and error rose: the largest; settled: within 2 % of the way, median."
+    )
+    return Table("What is believed of the base", heads, tuple(rows), note)
+
+
+# ------------------------------------------------------------------ plots
+
+
+def _joints(s: Found, view: str, case: str = "shifted") -> tuple[Array, Array]:
+    """True and linearly estimated base joints (L, 3) of the run that is drawn, camera frame, m."""
+    key = (view, case, ROBUST)
+    return s.values("truth", *key)[RUNS_SHOWN], s.values("centres", *key)[RUNS_SHOWN]
+
+
+def _shares(s: Found) -> dict[str, Any]:
+    """Error by the share of wrong edges, through the mirror."""
+    data: list[dict[str, Any]] = []
+    for method, colour in COLOURS.items():
+        cases = {
+            share: 1e3 * s.of(MIRROR, case, method)["centre"].value
+            for case, share in (("right", 0), ("5 % wrong", 5), ("20 % wrong", 20),
+                                ("35 % wrong", 35))
+            if method in CASES[case].methods
+        }  # fmt: skip
+        trace = _trace(LABELS[method], list(cases), list(cases.values()), colour, "lines+markers")
+        data.append({**trace, "hovertemplate": "%{y:.3g} mm with %{x} %"})
+    layout = _plane("wrong edges, %", "error of a joint, mm")
+    layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
+    return {"data": data, "layout": layout, "config": {}}
+
+
+def _picture(s: Found, view: str, ran: ControlledHexapod | None = None) -> dict[str, Any]:
+    """[B] Figs. 6 and 8: joints in the picture, and the legs of the drawing at home; ran : where
+    joints by hand are drawn, too.
+    """
+    camera, T = views()[view]
+    machine = study_machine()
+    home = machine.home()
+    ends = limb_ends(machine.layout, machine.values, machine.inverse(home), home)
+    along = ends.a[:, None] + np.linspace(0, 1, 25)[:, None] * (ends.b - ends.a)[:, None]
+    pixels = camera.project(apply(T, along))
+    gap = np.full((1, 2), np.nan)
+    legs = np.concatenate([np.concatenate([leg, gap]) for leg in pixels])
+    true, estimated = (camera.project(points) for points in _joints(s, view))
+    data = [_trace("legs at home", legs[:, 0], legs[:, 1], "--rule", "lines")]
+    if ran is None:
+        data.append(_marks("true joints", true, "--ink", "x-thin", 11))
+    else:
+        data.append(_marks("true joints", true, "--ink", "circle", 4))
+        # of the machine that is controlled, laid where this run's is by its own true joints
+        off = camera.project(ran.centres["hand"][RUNS_SHOWN]) - camera.project(
+            ran.centres["true"][RUNS_SHOWN]
+        )
+        data.append(_marks("by hand", true + off, "--calibrated", "x-thin", 11))
+    data.append(_marks("estimated joints", estimated, "--drawing", "circle-open", 13))
+    width, height = camera.image_size
+    layout = _plane("pixels", "")
+    layout["xaxis"] |= {"range": [-0.5, width - 0.5]}
+    layout["yaxis"] |= {"range": [height - 0.5, -0.5], "scaleanchor": "x", "scaleratio": 1}
+    return {"data": data, "layout": layout, "config": {}}
+
+
+def _geometry_part(words: Words, s: Found) -> Part:
+    """[B] Fig. 7."""
+    drawing = study_machine().base_centers()
+    sets: list[tuple[str, Array, str, str, float]] = [("drawing", drawing, "--ink", "square", 8)]
+    for view, colour in ((MIRROR, "--calibrated"), (PERSPECTIVE, "--leg7")):
+        true, estimated = _joints(s, view)
+        # the run's own machine is the drawing's here, so that its errors are the method's alone
+        fitted = register(true, estimated)
+        off = apply(inverse(fitted), estimated) - true
+        turned = views()[view].T_camera_base[:3, :3]
+        sets.append((view, drawing + ENLARGED * off @ turned, colour, "circle-open", 10))
+    plots: dict[str, dict[str, Any]] = {}
+    for name, axes in (("lateral", (0, 2)), ("top", (0, 1))):
+        data = [
+            _marks(title, points[:, axes], colour, symbol, size)
+            for title, points, colour, symbol, size in sets
+        ]
+        layout = _plane("xyz"[axes[0]] + ", m", "xyz"[axes[1]] + ", m")
+        layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
+        figure = {"data": data, "layout": layout, "config": {}}
+        plots[name] = {"figure": figure, "height": 300 if name == "lateral" else 420}
+    return words.part("figure-7", plots=plots)
+
+
+def _errors(ran: ControlledHexapod) -> dict[str, Any]:
+    """[B] Fig. 10: the norm of e against time."""
+    data: list[dict[str, Any]] = []
+    for name, (title, colour, dash) in CURVES.items():
+        runs = ran.trials[name].runs
+        share = np.median(runs.error / runs.error[:, :1], axis=0)
+        trace = _trace(title, runs.time, np.maximum(share, 1e-5), colour, "lines")
+        trace["line"] |= {"dash": dash, "width": 2}
+        data.append(trace)
+    layout = _plane("time, s", "error / error at the start")
+    layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
+    return {"data": data, "layout": layout, "config": {}}
+
+
+def _beside(ran: ControlledHexapod) -> dict[str, Any]:
+    """How far the platform is from where the true geometry has it, against time."""
+    ideal = ran.trials["true"].runs
+    points = study_machine().platform_centers()
+    there = apply(ideal.T_base_platform[:, :, None], points)
+    data: list[dict[str, Any]] = []
+    for name, (title, colour, dash) in CURVES.items():
+        here = apply(ran.trials[name].runs.T_base_platform[:, :, None], points)
+        off = np.sqrt(np.mean(np.sum((here - there) ** 2, axis=-1), axis=-1))
+        trace = _trace(title, ideal.time, 1e3 * np.median(off, axis=0), colour, "lines")
+        trace["line"] |= {"dash": dash, "width": 2}
+        data.append(trace)
+    return {"data": data, "layout": _plane("time, s", "mm"), "config": {}}
+
+
+def _trace(name: str, x: Any, y: Any, colour: str, mode: str) -> dict[str, Any]:
+    return {
+        "type": "scatter",
+        "mode": mode,
+        "name": name,
+        "x": _plain(x),
+        "y": _plain(y),
+        "line": {"color": colour, "width": 1.5},
+        "marker": {"color": colour, "size": 7},
+        "connectgaps": False,
+    }
+
+
+def _marks(name: str, points: Array, colour: str, symbol: str, size: float) -> dict[str, Any]:
+    look = {"color": colour, "size": size, "symbol": symbol, "line": {"color": colour, "width": 2}}
+    return {**_trace(name, points[:, 0], points[:, 1], colour, "markers"), "marker": look}
+
+
+def _plain(values: Any) -> list[float | None]:
+    return [float(f"{v:.5g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
+
+
+def _plane(x: str, y: str) -> dict[str, Any]:
+    return {
+        **LOOKS,
+        "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
+        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
+        "xaxis": {**AXIS, "title": {"text": x}},
+        "yaxis": {**AXIS, "title": {"text": y}},
+    }
+
+
+# ------------------------------------------------------------------ for programs
+
+
+def _numbers(s: Found, ran: ControlledHexapod, elapsed: float) -> dict[str, Any]:
+    """Everything for programs, m, px and s."""
+    return {
+        "runs": s.runs,
+        "seed": s.seed,
+        "seconds": {"wall": elapsed, "solving": s.solving, "cpu": s.cpu, "workers": s.workers},
+        "paper": {"from_drawing": CAD},
+        "accuracy": [
+            {
+                **dict(zip(("view", "case", "method"), key, strict=True)),
+                **{q: _told(s.of(*key)[q].value) for q in ("centre", "depth", "cad", "pixel")},
+                "centre_error": _told(s.of(*key)["centre"].error),
+                "runs": len(s.values("centre", *key)),
+                "prototype": PROTOTYPE.get(key, {}).get("centre"),
+            }
+            for key in s.samples
+        ],
+        "prototype": [
+            {"key": f.key, "found": f.found.value, "expected": f.expected, "held": f.held}
+            for f in figures_compared(s)
+        ],
+        "control": {
+            name: {
+                "reached": t.reached,
+                "runs": len(t.runs.end),
+                "astray": float(np.median(t.astray)),
+                "overshoot": float(t.overshoot.max()),
+                "error_rise": float(t.rise.max()),
+                "settling": _told(float(np.nanmedian(t.settling))) if t.reached else None,
+            }
+            for name, t in ran.trials.items()
+        },
+    }
+
+
+def _told(value: float) -> float | None:
+    return value if np.isfinite(value) else None
