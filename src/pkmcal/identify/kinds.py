@@ -26,13 +26,16 @@ class KindSums(NamedTuple):
     With Q of the own Jacobian in a configuration and its reduced rows A, Q_k and A_k those of a
     kind: own sum_c tr(Q_k^T Q_k Q_l^T Q_l) (B, 3, 3), trace sum_c tr Q_k^T Q_k (B, 3), cross
     sum_c (Q_k^T A_k)^T Q_l^T A_l (B, 3, 3, na, na), normal sum_c A_k^T A_k (B, 3, na, na).
-    chi2 : (B, 3). value : (B, K, r) residuals, zero where nothing can be predicted or is there.
+    every : sum_c A^T A (B, na, na) of all rows, those that are of no kind, as of rods of constant
+    length, among them. chi2 : (B, 3). value : (B, K, r) residuals, zero where nothing can be
+    predicted or is there.
     """
 
     own: Array
     trace: Array
     cross: Array
     normal: Array
+    every: Array
     chi2: Array
     value: Array
 
@@ -42,7 +45,7 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
     n_runs, na, memory = len(state.z), problem.unknowns.count, Memory()
     own, trace = np.zeros((n_runs, 3, 3)), np.zeros((n_runs, 3))
     cross, normal = np.zeros((n_runs, 3, 3, na, na)), np.zeros((n_runs, 3, na, na))
-    chi2, values = np.zeros((n_runs, 3)), []
+    every, chi2, values = np.zeros((n_runs, na, na)), np.zeros((n_runs, 3)), []
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading
@@ -50,6 +53,8 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
         values.append(rows.value)
         for run in range(n_runs):
             for piece in eliminated(rows, run, q[run], rows.value[run], memory):
+                flat = piece.rest.reshape(-1, na)
+                every[run] += piece.strips_normal + flat.T @ flat
                 kinds = _of_kinds(part, piece, q[run], by_reading[run])
                 for k, (squares, along, square) in enumerate(kinds):
                     trace[run, k] += np.einsum("cii->", squares)
@@ -58,7 +63,7 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
                         own[run, k, m] += np.sum(squares * others)
                         cross[run, k, m] += along.reshape(-1, na).T @ beside.reshape(-1, na)
             chi2[run] += _chi2(part, rows.value[run], by_reading[run])
-    return KindSums(own, trace, cross, normal, chi2, np.concatenate(values, axis=1))
+    return KindSums(own, trace, cross, normal, every, chi2, np.concatenate(values, axis=1))
 
 
 def _of_kinds(

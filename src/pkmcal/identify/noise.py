@@ -107,7 +107,7 @@ def components(info: Information, weight: Kinds[Array]) -> Components:
     nothing fixes has no part in it. With G_k = [Q S]_k^T [Q S]_k, tr(H_kl H_lk) = tr(G_k G_l).
     """
     problem, prior, sums = info.problem, info.problem.prior, info.by_kind
-    half = normal_root(sums.normal.sum(axis=1) + prior.T @ prior, UNKNOWN, loose=False)
+    half = normal_root(sums.every + prior.T @ prior, UNKNOWN, loose=False)
     n_readings = float(info.state.T_base_platform.shape[1] * problem.layout.n_readings)
     count = np.stack([*counts(problem, weight), np.full(len(half), n_readings)], axis=-1)
     shared = half.mT[:, None] @ sums.normal @ half[:, None]
