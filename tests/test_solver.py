@@ -26,7 +26,6 @@ from pkmcal.solver import (
     of_runs,
     own_factors,
     put,
-    reduced_normal,
     soft_weights,
     stacked,
     take,
@@ -89,6 +88,12 @@ def test_damped_step_equals_dense_marquardt():
         np.testing.assert_allclose(
             np.concatenate([shared[run], own[run].ravel()]), step, atol=1e-10
         )
+
+
+def reduced_normal(reduced) -> np.ndarray:
+    """Normal matrices (B, na, na) of the configurations' reduced rows."""
+    rows = reduced.rows.reshape(len(reduced.rows), -1, reduced.rows.shape[-1])
+    return rows.mT @ rows
 
 
 def test_reduced_normal_is_the_schur_complement():

@@ -376,12 +376,6 @@ def divisions(count: int, rows: int) -> list[slice]:
     return [slice(first, min(first + each, count)) for first in range(0, count, each)]
 
 
-def reduced_normal(reduced: Reduced) -> Array:
-    """Normal matrix of the shared unknowns by the configurations' rows, (B, na, na)."""
-    rows = _flat(reduced.rows)
-    return rows.mT @ rows
-
-
 class _Part(NamedTuple):
     """The normal equations of some configurations' rows, their own unknowns eliminated, and what a
     step needs of them once the rows are forgotten.
