@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -26,6 +25,8 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from solver import most_megabytes
 
 import pkmcal
 from pkmcal.calibration.outvoted import outvoted
@@ -105,7 +106,7 @@ def measured(kind: str, count: int) -> dict[str, float]:
         begin = time.process_time()
         work()
         found[name] = time.process_time() - begin
-    found[f"{kind}: MB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    found[f"{kind}: MB"] = most_megabytes()
     return found
 
 
