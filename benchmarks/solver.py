@@ -1,10 +1,14 @@
-"""How fast the joint solve is: beside SciPy's, by size, in studies, and beside another version.
+"""How fast the joint solve is: beside SciPy's and Ceres's, by size, in studies, and beside another
+version.
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/solver.py [--configurations 30 300 3000]
         [--against ../other/src]
 
 First our solve against SciPy's trust-region method on the same residuals, from the same start: as
 one dense vector, once with our Jacobian and once with finite differences, columns scaled.
+
+Then against Ceres in C++ (``benchmarks/ceres``), where that can be built: the same problem, dumped,
+brought to the same cost, one thread each, in turns, the least processor seconds of each.
 
 Then, each in a process of its own: the solve and the whole robust estimate of a hexapod seen by
 three cameras, and the joint estimates of [A] 4.3 as a study makes them. Processor seconds, as other
@@ -18,9 +22,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -47,6 +51,16 @@ from test_identify_scene import guess, make_scene
 RUNS = 25
 """Runs of a study that are solved at once, as its own batches."""
 REPEATS = 3
+AS_LOW = 1e-9
+"""Relative difference of costs between us and Ceres."""
+CERES = (
+    ("Ceres, block an edge", "1e10", "edge"),
+    ("Ceres, block a view", "1e10", "view"),
+)
+"""How Ceres is set: first trust region, and what is a block of residuals. Its default region, 1e4,
+takes eight times the steps."""
+MANY = 1000
+"""Configurations from which on a measurement is not repeated within a process."""
 SAME = 1e-6
 """Relative difference of costs, and of stated deviations: what is left of a search, and half of the
 digits of a normal matrix."""
@@ -93,6 +107,12 @@ def timed(work: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
     return result, float(best[0]), float(best[1])
 
 
+def most_megabytes() -> float:
+    """The greatest memory of this program alone; getrusage counts that of who started it, too."""
+    status = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    return next(float(line.split()[1]) / 1024 for line in status if line.startswith("VmHWM"))
+
+
 def session(count: int) -> tuple[Any, Any, Any, Problem, BatchState]:
     """A hexapod's machine, measurements and start, and the problem that they make."""
     rng = np.random.default_rng(0)
@@ -121,6 +141,102 @@ def against_scipy(count: int) -> bool:
     return bool(np.allclose([r[3] for r in rows], rows[0][3], rtol=1e-4))
 
 
+def dumped(problem: Problem, start: BatchState) -> dict[str, np.ndarray]:
+    """The arrays of benchmarks/ceres/README.md: legs between two joints with two tubes each."""
+    layout, blocks, data, u = problem.layout, problem.blocks, problem.data, problem.unknowns
+    theta, radius = problem.theta(start)[0], np.array(layout.radius)
+    leg = np.concatenate([layout.a_index, layout.b_index, radius], axis=1)
+    rod = np.stack([layout.rod, layout.scale], axis=1)
+    rows, columns = np.nonzero(problem.prior)
+    sigma = np.empty(u.count)
+    sigma[columns] = 1 / problem.prior[rows, columns]
+    k, g = np.nonzero(blocks.present)
+    of_leg, station = np.broadcast_to(blocks.leg, blocks.present.shape)[k, g], blocks.station[k, g]
+    tube = np.argmax(radius[of_leg] == blocks.radius[k, g][:, None], axis=1)
+    index = [k, station, of_leg, tube, blocks.side[k, g, 0], blocks.camera[k, g]]
+    return {
+        "T_base_platform": start.T_base_platform[0],
+        "T_camera_base": start.T_camera_base[0],
+        "legs": theta[leg],
+        "rods": theta[rod],
+        "drawn_legs": problem.drawing[leg],
+        "drawn_rods": problem.drawing[rod],
+        "leg_tolerances": sigma[u.machine][leg],
+        "rod_tolerances": sigma[u.machine][rod],
+        "shifts": start.optics[0, :, 0],
+        "shift_sigma": sigma[u.optics][:1],
+        "readings": data.joints[0],
+        "reading_noise": problem.joint_noise,
+        "edge_index": np.stack(index, axis=1),
+        "edge_basis": data.basis[0, k, g, 0],
+        "edge_whiten": data.whiten[0, k, g],
+        "edge_shift": data.optics[0, k, g, :, 0],
+    }
+
+
+def dump(count: int, path: Path) -> None:
+    """Write a hexapod's problem to a file, in the format of benchmarks/ceres/README.md."""
+    *_, problem, start = session(count)
+    with path.open("wb") as file:
+        file.write(b"pkmcal least squares 1\n")
+        for name, array in dumped(problem, start).items():
+            file.write(" ".join([name, *map(str, array.shape)]).encode() + b"\n")
+            file.write(np.ascontiguousarray(array, dtype="<f8").tobytes())
+
+
+def ceres() -> Path | None:
+    """The C++ program, built where it is not; None where it cannot be."""
+    root = Path(__file__).resolve().parents[1]
+    try:
+        done = subprocess.run(
+            ["make", "-s", "-C", str(root / "benchmarks" / "ceres")],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    except FileNotFoundError:
+        say("no Ceres: there is no make")
+        return None
+    if done.returncode:
+        reasons = [line for line in done.stderr.splitlines() if "error" in line]
+        say(f"no Ceres: {reasons[0] if reasons else 'it cannot be built'}")
+        return None
+    return root / "build" / "ceres" / "solve"
+
+
+def against_ceres(program: Path, count: int) -> bool:
+    """Print the comparison; False where costs differ."""
+    found: dict[str, dict[str, float]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "dump"
+        dump(count, path)
+        for _ in range(REPEATS):
+            for name, *options in CERES:
+                words = [str(program), str(path), *options, str(REPEATS if count < MANY else 1)]
+                _kept(found, name, words, {})
+            words = [sys.executable, __file__, "--one", "solve", str(count)]
+            _kept(found, "pkmcal", words, {})
+    ours, best = found["pkmcal"], min(found[name]["cpu"] for name, *_ in CERES)
+    same = True
+    for name, m in found.items():
+        off = m["answer"] / ours["answer"] - 1
+        same &= abs(off) < AS_LOW
+        say(
+            f"{count:6d} {name:24s}{m['cpu']:10.4f} s{m['steps']:4.0f} steps{m['MB']:7.0f} MB"
+            f"  cost {off:+.0e}  x {m['cpu'] / best:.2f}"
+        )
+    return same
+
+
+def _kept(
+    found: dict[str, dict[str, float]], name: str, words: list[str], environment: dict[str, str]
+) -> None:
+    """The best of what a command measured so far, kept under a name."""
+    done = subprocess.run(
+        words, env={**os.environ, **environment}, capture_output=True, text=True, check=True
+    )
+    now, before = json.loads(done.stdout), found.get(name, {})
+    found[name] = {key: min(x, before.get(key, np.inf)) for key, x in now.items()}
+
+
 def measured(what: str, count: int) -> dict[str, float]:
     """One measurement in this process: seconds, steps, an answer to compare, megabytes."""
     if what == "study":
@@ -143,15 +259,14 @@ def measured(what: str, count: int) -> dict[str, float]:
             def answer(found: Any) -> tuple[float, float]:
                 return found.statistics.steps, float(np.sum(np.diag(found.covariance)))
 
-    found, cpu, wall = timed(work, REPEATS if count < 1000 else 1)
+    found, cpu, wall = timed(work, REPEATS if count < MANY else 1)
     steps, value = answer(found)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {
         "cpu": cpu / per,
         "wall": wall / per,
         "steps": float(steps),
         "answer": float(value),
-        "MB": memory,
+        "MB": most_megabytes(),
     }
 
 
@@ -171,17 +286,12 @@ def study(runs: int) -> tuple[Callable[[], Any], Callable[[Any], tuple[float, fl
 
 def in_turns(what: str, count: int, sources: list[Path]) -> list[dict[str, float]]:
     """The best of several measurements with each version's source, in turns."""
-    best: list[dict[str, float]] = [{} for _ in sources]
+    best: dict[str, dict[str, float]] = {}
+    words = [sys.executable, __file__, "--one", what, str(count)]
     for _ in range(REPEATS):
-        for k, source in enumerate(sources):
-            command = [sys.executable, __file__, "--one", what, str(count)]
-            environment = {**os.environ, "PYTHONPATH": str(source)}
-            done = subprocess.run(
-                command, env=environment, capture_output=True, text=True, check=True
-            )
-            found = json.loads(done.stdout)
-            best[k] = {key: min(found[key], best[k].get(key, np.inf)) for key in found}
-    return best
+        for source in sources:
+            _kept(best, str(source), words, {"PYTHONPATH": str(source)})
+    return list(best.values())
 
 
 def say(line: str) -> None:
@@ -195,12 +305,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--configurations", type=int, nargs="+", default=[30])
     parser.add_argument("--against", type=Path)
+    parser.add_argument("--dump", nargs=2, metavar=("CONFIGURATIONS", "FILE"))
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.dump:
+        dump(int(options.dump[0]), Path(options.dump[1]))
+        return 0
     if options.one:
         sys.stdout.write(json.dumps(measured(options.one[0], int(options.one[1]))))
         return 0
     same = against_scipy(options.configurations[0])
+    program = ceres()
+    for count in options.configurations if program else ():
+        same &= against_ceres(program, count)
     sources = [Path(__file__).resolve().parents[1] / "src"]
     sources += [options.against.resolve()] if options.against else []
     work = [(what, n) for n in options.configurations for what in ("solve", "bundle")]

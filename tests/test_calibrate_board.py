@@ -149,6 +149,14 @@ def test_a_missing_board_file_and_another_camera(folder):
         load_session(folder)
 
 
+def test_the_method_of_paper_c_says_nothing_of_the_size(rendered, tmp_path):
+    """It estimates none, so none is told, though board.yaml's tolerance makes it unsure."""
+    done = run("calibrate", rendered, "-o", tmp_path / "out", "--method", "inverse-kinematic")
+    assert done.code in (0, 1)
+    target = json.loads((tmp_path / "out" / "calibration.json").read_text())["targets"][0]
+    assert "size" not in target
+
+
 def test_inverse_of_a_known_station_is_told(rendered):
     """The truth's own frames: a check on the simulator."""
     session = load_session(rendered)

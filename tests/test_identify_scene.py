@@ -97,7 +97,7 @@ class Scene:
         """All runs as one problem, and their true states."""
         assembled = assemble(self.machine, self.measurements(rng), ThreeCentres(), **options)
         normal = self.noisy(rng)
-        basis = np.zeros((len(normal), *assembled.problem.blocks.leg.shape, 1, 3, 2))
+        basis = np.zeros((len(normal), *assembled.problem.blocks.present.shape, 1, 3, 2))
         at = assembled.places.edges
         basis[:, at.row, at.place, 0] = tangent_basis(normal, self.middle)
         old = assembled.problem.data

@@ -8,12 +8,22 @@ import numpy as np
 import pytest
 
 from pkmcal.calibration.calibrate import calibrate
+from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import solve_batch
-from pkmcal.identify.noise import EDGES, FEWEST, READINGS, Components, components
+from pkmcal.identify.covariance import information
+from pkmcal.identify.gauge import default_gauge
+from pkmcal.identify.kinds import EDGES, READINGS
+from pkmcal.identify.noise import FEWEST, Components, components
+from pkmcal.identify.rows import Kinds
+from pkmcal.identify.start import start_state
+from pkmcal.mechanisms import load_mechanism
+from pose_sessions import T_CAMERA_BASE, measured, upright
 from test_identify_scene import JOINT_NOISE, exact, make_scene
 from test_pose_sessions import make
 
 RUNS = 8
+WITHIN = [-0.1, -0.1, -0.525, -0.35], [0.1, 0.1, -0.375, 0.35]
+"""Places and turns of an H4, m and rad."""
 
 
 def batch(seed, true, stated, runs=RUNS, **options):
@@ -106,3 +116,53 @@ def test_a_table_whose_noise_is_stated_too_large_is_told(tmp_path):
         said = [w for w in found.verdict.warnings if "stations.tracker.tracker.noise" in w]
         assert len(said) == told
         assert found.estimate.statistics.pose_scale == pytest.approx(1, abs=0.2)
+
+
+def pose_problem(name):
+    """A built-in machine's table of poses, at a state near the truth."""
+    rng = np.random.default_rng(5)
+    truth = load_mechanism(name)
+    case = measured(truth, upright(rng.uniform(*WITHIN, (9, 4))), rng)
+    start = start_state(truth, case.measurements, T_CAMERA_BASE[None])
+    assembled = assemble(truth, case.measurements, default_gauge(truth))
+    return assembled.problem, batch_of(truth, assembled, start)
+
+
+@pytest.mark.parametrize("name", ["edges", "h4", "h4-rods"])
+def test_traces_are_those_of_the_hat_matrix(name):
+    """Of all rows as one dense matrix; h4-rods has two rods a motor, of which half a row each is
+    the reading's and the rest of no kind."""
+    if name == "edges":
+        problem, state = batch(4, 1e-4, 1e-4, runs=1)
+    else:
+        problem, state = pose_problem(name)
+    linear = problem.linearize(state)
+    _, k, r, na = linear.by_shared.shape
+    d, c = linear.by_own.shape[-1], len(linear.shared_by)
+    jac = np.zeros((k * r + c, na + k * d))
+    jac[: k * r, :na], jac[k * r :, :na] = linear.by_shared[0].reshape(-1, na), linear.shared_by
+    for j in range(k):
+        jac[j * r : (j + 1) * r, na + j * d : na + (j + 1) * d] = linear.by_own[0, j]
+    jac /= np.maximum(np.linalg.norm(jac, axis=0), 1e-300)
+    u, s, _ = np.linalg.svd(jac, full_matrices=False)
+    q = u[: k * r, s > 1e-10 * s[0]]
+    edges, poses = (kind.rows for kind in problem.kinds)
+    m, n = problem.layout.n_readings, problem.layout.n_equations
+    pick = np.zeros((k, m, r))
+    unit = np.broadcast_to(np.eye(n)[:, None], (n, k, n))
+    pick[..., problem.closure_rows] = np.moveaxis(
+        [problem.joint_rows(row[None], state)[0] for row in unit], 0, -1
+    )
+    every = np.eye(k * r).reshape(k, r, k * r)
+    of = [every[:, edges], every[:, poses], pick @ every]
+    of = [part.reshape(-1, k * r) for part in of]
+    used = problem._in_use()[0].ravel()
+    of = [part[np.abs(part) @ used > 0] for part in of]
+    weight = Kinds(*(kind.present[None].astype(float) for kind in problem.kinds))
+    found = components(information(problem, state), weight)
+    left = [[a @ b.T - (a @ q) @ (b @ q).T for b in of] for a in of]
+    square = np.array([[np.sum(part**2) for part in row] for row in left])
+    freedom = np.array([np.trace(left[i][i]) for i in range(3)])
+    np.testing.assert_allclose(found.freedom[0], freedom, atol=1e-5)
+    np.testing.assert_allclose(found.square[0], square, atol=1e-5)
+    assert freedom[READINGS] > 1e-3  # the data do say something of each kind

@@ -7,21 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal import solver
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.papers.registration import Dense, minimise_dense
 from pkmcal.solver import (
+    Compact,
     Linear,
+    Memory,
     Stop,
     column_space,
     damped_step,
     eliminate,
+    eliminated,
     final_weights,
     inverse_root,
     minimise,
     normal_root,
     of_runs,
+    own_factors,
     put,
-    reduced_normal,
     soft_weights,
     stacked,
     take,
@@ -86,6 +90,12 @@ def test_damped_step_equals_dense_marquardt():
         )
 
 
+def reduced_normal(reduced) -> np.ndarray:
+    """Normal matrices (B, na, na) of the configurations' reduced rows."""
+    rows = reduced.rows.reshape(len(reduced.rows), -1, reduced.rows.shape[-1])
+    return rows.mT @ rows
+
+
 def test_reduced_normal_is_the_schur_complement():
     linear = random_linear(np.random.default_rng(2))
     reduced = eliminate(linear, np.zeros(3))
@@ -98,6 +108,52 @@ def test_reduced_normal_is_the_schur_complement():
         g = jac.T @ value
         g = g[:na] - full[:na, na:] @ np.linalg.solve(full[na:, na:], g[na:])
         np.testing.assert_allclose(reduced.gradient[run], g, atol=1e-11)
+
+
+def in_strips(rng, sharp, damping, runs=2, k=11, own=3, na=9):
+    """A problem whose first rows are two strips of four rows and three columns, one of them shared
+    and one of them none, before five rows of all columns that are ``sharp`` times as sharp."""
+    strips = np.array([[0, 2, 4], [3, 2, na]])
+    numbers, rest = rng.normal(size=(runs, 2, k, 4, 3)), sharp * rng.normal(size=(runs, k, 5, na))
+    by_own = rng.normal(size=(runs, k, 13, own))
+    by_own[:, :, 8:] *= sharp
+    value = rng.normal(size=(runs, k, 13))
+
+    def write(run, some, memory):
+        return numbers[run][:, some], rest[run, some]
+
+    prior = rng.normal(size=(runs, 4)), rng.normal(size=(4, na))
+    rows = Compact(value, by_own, np.ones(value.shape, dtype=bool), *prior, na, strips, write)
+    return rows, np.full(runs, damping)
+
+
+@pytest.mark.parametrize("piece", [2**17, 13 * 3 * 4])
+@pytest.mark.parametrize("sharp", [1.0, 1e6])
+@pytest.mark.parametrize("damping", [0.0, 1e-3])
+def test_products_of_strips_are_those_of_their_rows(monkeypatch, damping, sharp, piece):
+    """To the last digits, however sharp the rows after them, a few configurations at a time."""
+    monkeypatch.setattr(solver, "PIECE", piece)
+    rows, damping = in_strips(np.random.default_rng(12), sharp, damping)
+    linear = rows.linear()
+    assert np.all(linear.by_shared[:, :, :8, [1, 5, 6, 7, 8]] == 0)
+    reduced = eliminate(linear, damping)
+    q = own_factors(rows.by_own, damping)[0]
+    q = q if damping.any() else q[:, :, :13]
+    wanted = reduced_normal(reduced)
+    for run in range(2):
+        pieces = list(eliminated(rows, run, q[run], reduced.value[run], Memory()))
+        assert len(pieces) == (1 if piece == 2**17 else 3)
+        assert [part.cut.start for part in pieces[1:]] == [part.cut.stop for part in pieces[:-1]]
+        assert (pieces[0].cut.start, pieces[-1].cut.stop) == (0, 11)
+        normal, slope = np.zeros((9, 9)), np.zeros(9)
+        for part in eliminated(rows, run, q[run], reduced.value[run], Memory()):
+            flat = part.rest.reshape(-1, 9)
+            normal += part.strips_normal + flat.T @ flat
+            slope += part.gradient
+        np.testing.assert_allclose(normal, wanted[run], atol=1e-9 * np.abs(wanted[run]).max())
+        slope += rows.shared_value[run] @ rows.shared_by
+        atol = 1e-9 * np.abs(reduced.gradient[run]).max()
+        np.testing.assert_allclose(slope, reduced.gradient[run], atol=atol)
 
 
 def test_runs_of_a_batch_do_not_touch_each_other():

@@ -8,9 +8,12 @@ is ``by_shared`` (B, K, r, na) and ``by_own`` (B, K, r, d); rows that touch shar
 (drawing values, gauge) stand beside them. B counts independent runs: each has its own damping,
 acceptance and stop, and no loop goes over runs or configurations.
 
-The Schur complement is formed as a square root: with ``by_own = Q R`` the reduced rows are
-``(I - Q Q^T) by_shared``. Subtracting normal matrices instead would cancel half the digits,
-since readings a thousand times sharper than edges dominate both terms.
+The Schur complement of rows that depend on everything is formed as a square root: with
+``by_own = Q R`` the reduced rows are ``(I - Q Q^T) by_shared``. Subtracting normal matrices instead
+would cancel half the digits, since readings a thousand times sharper than edges dominate both
+terms. Rows that are many and depend on few shared unknowns are in *strips* (:class:`Compact`), of
+which only products are formed (:attr:`Eliminated.strips_normal`): a sixth of the arithmetic, and as
+many digits, as no sharp row is among them.
 
 **States and data of many runs** are arrays, or frozen dataclasses or named tuples of arrays, whose
 leading axis counts the runs; see :func:`take`, :func:`put` and :func:`of_runs`.
@@ -28,7 +31,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from enum import Enum
 from functools import reduce
-from itertools import product
 from math import prod
 from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 
@@ -62,9 +64,9 @@ ROUNDING = 1e-13
 ROWS = 2**15
 """Rows that are worked on at once: as many runs, or configurations of one, as have so many. A call
 of NumPy then costs little beside its arithmetic, and what it works on stays in the processor."""
-PIECE = 2**15
-"""Numbers of the Jacobian that are written at once, a quarter of a megabyte: it is read four times
-before it is forgotten, and the fastest cache that holds so much is half a megabyte or more."""
+PIECE = 2**17
+"""Numbers of the Jacobian that are written at once, a megabyte: what is read again before it is
+forgotten then stays in the second cache, and a call of NumPy costs little beside its arithmetic."""
 
 FULL, NONE = 4.0, 6.5
 """Final weights are 1 up to FULL and 0 from NONE standard deviations: of clean pairs of residuals
@@ -155,11 +157,16 @@ class Memory:
 
 
 class Compact(NamedTuple):
-    """As :class:`Linear`, but for the Jacobian by the shared unknowns, of which few numbers a row
-    stand in memory until it is wanted.
+    """As :class:`Linear`, but for the Jacobian by the shared unknowns, which is written a few
+    configurations at a time.
 
-    n_shared : na. write : by_shared (k, r, na) of one run and some configurations, written into
-    memory where the next is written as well.
+    Most rows depend on few of the shared unknowns, and many on the same few, as all edges of one
+    leg do: a *strip* is n rows of every configuration with w columns of their own. Strips come
+    first among a configuration's rows, one after the other; the rows after them have all columns.
+
+    n_shared : na. strips : (L, w) columns of each strip, na where it has fewer than w. write : the
+    strips (L, k, n, w) and the rows after them (k, r', na) of one run and some configurations, in
+    memory where the next are written as well.
     """
 
     value: Array
@@ -168,18 +175,32 @@ class Compact(NamedTuple):
     shared_value: Array
     shared_by: Array
     n_shared: int
-    write: Callable[[int, slice, Memory], Array]
+    strips: Integers
+    write: Callable[[int, slice, Memory], tuple[Array, Array]]
+
+    def linear(self) -> Linear:
+        """The same with the Jacobian in memory as a whole."""
+        by_shared = np.zeros((*self.value.shape, self.n_shared + 1))
+        for run in range(len(by_shared)):
+            strips, rest = self.write(run, slice(None), Memory())
+            n = strips.shape[2]
+            for k, (columns, strip) in enumerate(zip(self.strips, strips, strict=True)):
+                by_shared[run, :, n * k : n * (k + 1), columns] = np.moveaxis(strip, -1, 0)
+            by_shared[run, :, n * len(strips) :, :-1] = rest
+        return Linear(self.value, by_shared[..., :-1], *self[1:5])
 
 
 def compact(linear: Linear) -> Compact:
     """The same of a Jacobian that stands in memory."""
+    none = np.zeros((0, 0), dtype=int)
 
-    def write(run: int, configurations: slice, memory: Memory) -> Array:
+    def write(run: int, configurations: slice, memory: Memory) -> tuple[Array, Array]:
         del memory
-        return linear.by_shared[run, configurations]
+        rows = linear.by_shared[run, configurations]
+        return np.zeros((0, len(rows), 0, 0)), rows
 
     rest = linear.usable, linear.shared_value, linear.shared_by, linear.by_shared.shape[-1]
-    return Compact(linear.value, linear.by_own, *rest, write)
+    return Compact(linear.value, linear.by_own, *rest, none, write)
 
 
 @runtime_checkable
@@ -198,6 +219,11 @@ class Divisible(LeastSquares, Protocol):
 
     def compact(self, state: Any) -> Compact:
         """As :meth:`linearize`."""
+        ...
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """Configurations K and rows of each, r."""
         ...
 
 
@@ -220,6 +246,14 @@ def put(state: Runs, runs: Integers, part: Runs) -> Runs:
 def of_runs(data: Runs, runs: Integers) -> Runs:
     """The measured numbers of some runs; what all runs share (a leading axis of 1) stays."""
     return _each(lambda array: array if len(array) == 1 else array[runs], data)
+
+
+def _count(state: Any) -> int:
+    """Runs of a state."""
+    if isinstance(state, np.ndarray):
+        return len(state)
+    first = state[0] if isinstance(state, tuple) else getattr(state, fields(state)[0].name)
+    return len(cast(Array, first))
 
 
 def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
@@ -270,19 +304,25 @@ def own_factors(by_own: Array, damping: Array) -> tuple[Array, Array]:
     The damping's rows sqrt(damping) diag(column norms) are appended, so a configuration that
     its data do not fix stays solvable. q (B, K, r + d, d), r (B, K, d, d).
     """
-    norms = np.sqrt(np.sum(by_own**2, axis=-2))
+    norms = np.sqrt(_squares(by_own))
     norms = np.where(norms > 0, norms, 1.0)
     extra = np.sqrt(damping)[:, None, None, None] * norms[..., None] * np.eye(by_own.shape[-1])
     return np.linalg.qr(np.concatenate([by_own, extra], axis=-2))
 
 
+def _squares(columns: Array) -> Array:
+    """Sums of squares of columns (..., n, m), (..., m)."""
+    return np.einsum("...nm,...nm->...m", columns, columns)
+
+
 def eliminate(linear: Linear, damping: Array) -> Reduced:
     """Own unknowns eliminated with Marquardt damping (B,), zero for none."""
-    n_rows, damped = linear.by_own.shape[-2], bool(np.any(damping > 0))
+    n_rows = linear.by_own.shape[-2]
     q, r = own_factors(linear.by_own, damping)
-    along = q[..., :n_rows, :].mT @ linear.by_shared
-    rows = _left_of(linear.by_shared, q, along, damped, Memory())
+    if not np.any(damping > 0):
+        q = q[..., :n_rows, :]
     top, value = q[..., :n_rows, :], linear.value[..., None]
+    rows = _left_of(linear.by_shared, q, top.mT @ linear.by_shared, Memory())
     # the damping's rows carry no residual of their own, only -bottom top^T value
     left = value - top @ (top.mT @ value)
     gradient = (linear.by_shared.mT @ left)[..., 0].sum(axis=1)
@@ -290,16 +330,17 @@ def eliminate(linear: Linear, damping: Array) -> Reduced:
     return Reduced(rows, left[..., 0], top, r, gradient)
 
 
-def _left_of(by_shared: Array, q: Array, along: Array, damped: bool, memory: Memory) -> Array:
-    """The reduced rows ``(I - Q Q^T) by_shared`` (..., r', na), the damping's where there are any.
+def _left_of(by_shared: Array, q: Array, along: Array, memory: Memory) -> Array:
+    """The reduced rows ``by_shared - Q along`` (..., r', na), and those of the damping, which are
+    ``-Q along``, where q has them.
 
-    along : Q^T by_shared, (..., d, na).
+    along : Q^T by_shared of all rows, (..., d, na).
     """
     *batch, n_rows, na = by_shared.shape
-    out = memory.empty("reduced rows", (*batch, q.shape[-2] if damped else n_rows, na))
+    out = memory.empty("reduced rows", (*batch, q.shape[-2], na))
     data = np.matmul(q[..., :n_rows, :], along, out=out[..., :n_rows, :])
     np.subtract(by_shared, data, out=data)
-    if damped:
+    if q.shape[-2] > n_rows:
         np.negative(np.matmul(q[..., n_rows:, :], along), out=out[..., n_rows:, :])
     return out
 
@@ -335,12 +376,6 @@ def divisions(count: int, rows: int) -> list[slice]:
     return [slice(first, min(first + each, count)) for first in range(0, count, each)]
 
 
-def reduced_normal(reduced: Reduced) -> Array:
-    """Normal matrix of the shared unknowns by the configurations' rows, (B, na, na)."""
-    rows = _flat(reduced.rows)
-    return rows.mT @ rows
-
-
 class _Part(NamedTuple):
     """The normal equations of some configurations' rows, their own unknowns eliminated, and what a
     step needs of them once the rows are forgotten.
@@ -365,30 +400,102 @@ class _Part(NamedTuple):
         return -np.linalg.solve(self.r, right[..., None])[..., 0]
 
 
-def _part(rows: Compact, damping: Array, memory: Memory) -> _Part:
-    """A part's normal equations. The Jacobian is written, reduced and forgotten in pieces that stay
-    in the processor's cache.
+class Eliminated(NamedTuple):
+    """Some configurations of one run with their own unknowns eliminated, ``by_own = Q R``.
+
+    cut : which they are. along : Q^T J, (k, d, na), J the Jacobian by the shared unknowns.
+    rest : (k, r', na) reduced rows after the strips, and the damping's where there is any.
+
+    Of the strips' rows J_s what their products need, which is far less than the rows themselves:
+    normal J_s^T J_s (na, na), along_strips Q_s^T J_s (k, d, na), own Q_s^T Q_s (k, d, d).
+    gradient : (na,) of half the cost.
     """
+
+    cut: slice
+    along: Array
+    rest: Array
+    normal: Array
+    along_strips: Array
+    own: Array
+    gradient: Array
+
+    @property
+    def strips_normal(self) -> Array:
+        """Normal matrix (na, na) of the strips' reduced rows ``J_s - Q_s W`` with W = Q^T J:
+        ``J_s^T J_s - V^T W - W^T V`` with ``V = Q_s^T J_s - Q_s^T Q_s W / 2``.
+
+        Readings a thousand times sharper than edges have no part in these differences: W is in
+        units of the own unknowns' directions, of which edges see as much as of the shared ones.
+        """
+        na = len(self.normal)
+        half = self.along_strips - 0.5 * (self.own @ self.along)
+        both = half.reshape(-1, na).T @ self.along.reshape(-1, na)
+        return self.normal - both - both.T
+
+
+def eliminated(
+    rows: Compact, run: int, q: Array, left: Array, memory: Memory
+) -> Iterator[Eliminated]:
+    """Pieces of one run whose Jacobian, written, reduced and forgotten, stays in the processor's
+    cache.
+
+    q : (K, r'', d) as of :func:`own_factors`; more than the rows' where damped. left : (K, r) what
+    of the residuals the own unknowns cannot take up.
+    """
+    (count, n_rows), d, na = rows.value.shape[1:], q.shape[-1], rows.n_shared
+    n_strips, width = rows.strips.shape
+    pieces = -(-count * n_rows * (width if n_strips else na) // PIECE)
+    for cut in (slice(count * k // pieces, count * (k + 1) // pieces) for k in range(pieces)):
+        strips, rest = rows.write(run, cut, memory)
+        k, n = strips.shape[1:3]
+        own, after = q[cut, : n_strips * n], q[cut, n_strips * n : n_rows]
+        along_strips = memory.empty("along strips", (k, d, na + 1))
+        along_strips.fill(0.0)
+        normal, gradient = np.zeros((na + 1, na + 1)), np.zeros(na + 1)
+        flat = strips.reshape(n_strips, k * n, width)
+        split = own.reshape(k, n_strips, n, d).transpose(1, 0, 3, 2)
+        by_left = left[cut, : n_strips * n].reshape(k, n_strips, n).swapaxes(0, 1)
+        by_left = by_left.reshape(n_strips, k * n, 1)
+        products = flat.mT @ flat, (flat.mT @ by_left)[..., 0], split @ strips
+        for columns, square, slope, part in zip(rows.strips, *products, strict=True):
+            normal[columns[:, None], columns] += square
+            gradient[columns] += slope
+            along_strips[..., columns] += part
+        along_strips = along_strips[..., :na]
+        along = along_strips + after.mT @ rest
+        gradient[:na] += left[cut, n_strips * n :].ravel() @ rest.reshape(-1, na)
+        yield Eliminated(
+            cut,
+            along,
+            _left_of(rest, q[cut, n_strips * n :], along, memory),
+            normal[:na, :na],
+            along_strips,
+            own.mT @ own,
+            gradient[:na],
+        )
+
+
+def _part(rows: Compact, damping: Array, memory: Memory) -> _Part:
+    """A part's normal equations."""
     (n_runs, count, n_rows, d), na = rows.by_own.shape, rows.n_shared
     q, r = own_factors(rows.by_own, damping)
-    top, damped = q[..., :n_rows, :], bool(np.any(damping > 0))
+    if not np.any(damping > 0):
+        q = q[..., :n_rows, :]
+    top = q[..., :n_rows, :]
     fitted = (top.mT @ rows.value[..., None])[..., 0]
     # the damping's rows carry no residual of their own, only -bottom top^T value
     left = rows.value - (top @ fitted[..., None])[..., 0]
     along = np.empty((n_runs, count, d, na))
     matrix = np.tile(rows.shared_by.T @ rows.shared_by, (n_runs, 1, 1))
     gradient = rows.shared_value @ rows.shared_by
-    pieces = -(-count * n_rows * na // PIECE)
-    cuts = [slice(count * k // pieces, count * (k + 1) // pieces) for k in range(pieces)]
-    for run, cut in product(range(n_runs), cuts):
-        by_shared = rows.write(run, cut, memory)
-        np.matmul(top[run, cut].mT, by_shared, out=along[run, cut])
-        reduced = _left_of(by_shared, q[run, cut], along[run, cut], damped, memory)
-        reduced = reduced.reshape(-1, na)
-        matrix[run] += reduced.T @ reduced
-        gradient[run] += left[run, cut].ravel() @ by_shared.reshape(-1, na)
+    for run in range(n_runs):
+        for piece in eliminated(rows, run, q[run], left[run], memory):
+            along[run, piece.cut] = piece.along
+            rest = piece.rest.reshape(-1, na)
+            matrix[run] += piece.strips_normal + rest.T @ rest
+            gradient[run] += piece.gradient
     cost = _cost(Values(rows.value, rows.shared_value), rows.usable)
-    own = damping[:, None, None] * np.sum(rows.by_own**2, axis=-2)
+    own = damping[:, None, None] * _squares(rows.by_own)
     return _Part(matrix, gradient, cost, rows.usable, along, fitted, r, own)
 
 
@@ -449,16 +556,19 @@ def damped_step(linear: Linear, damping: Array) -> tuple[Array, Array]:
 
 def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solution:
     """Least squares from ``start``, all runs at once; each stops on its own."""
-    values = problem.residuals(start)
-    n_runs, *rows = values.value.shape
-    few = max(1, ROWS // max(1, int(np.prod(rows))))
+    if isinstance(problem, Divisible):
+        values, rows = None, problem.extent
+    else:
+        values = problem.residuals(start)
+        rows = values.value.shape[1:]
+    n_runs, few = _count(start), max(1, ROWS // max(1, prod(rows)))
     if n_runs <= few:
-        return _minimised(_Divided.of(problem, values), start, values, max_steps)
+        return _minimised(_Divided.of(problem, n_runs, *rows), start, values, max_steps)
     found: list[Solution] = []
     for first in range(0, n_runs, few):
         runs = np.arange(first, min(first + few, n_runs))
-        part, here = problem.select(runs), Values(values.value[runs], values.shared_value[runs])
-        found.append(_minimised(_Divided.of(part, here), take(start, runs), here, max_steps))
+        part = _Divided.of(problem.select(runs), len(runs), *rows)
+        found.append(_minimised(part, take(start, runs), None, max_steps))
     return Solution(
         _each(lambda *states: np.concatenate(states), *(one.state for one in found)),
         np.concatenate([one.cost for one in found]),
@@ -478,9 +588,8 @@ class _Divided(NamedTuple):
     memory: Memory
 
     @classmethod
-    def of(cls, problem: LeastSquares, values: Values) -> _Divided:
-        """The problem whose residuals are like these, divided where it can be."""
-        n_runs, count, rows = values.value.shape
+    def of(cls, problem: LeastSquares, n_runs: int, count: int, rows: int) -> _Divided:
+        """A problem of so many runs and configurations of so many rows, divided where it can be."""
         cuts = divisions(count, n_runs * rows)
         if not isinstance(problem, Divisible) or len(cuts) < 2:
             return cls(problem, [(slice(0, count), problem)], Memory())
@@ -515,11 +624,10 @@ class _Divided(NamedTuple):
             yield values._replace(shared_value=values.shared_value[:, :0]) if k else values
 
 
-def _minimised(problem: _Divided, start: Any, values: Values, max_steps: int) -> Solution:
-    """The same of few runs."""
-    n_runs = len(values.shared_value)
-    cost = _cost(values, np.isfinite(values.value))
-    steps = np.zeros(n_runs, dtype=int)
+def _minimised(problem: _Divided, start: Any, values: Values | None, max_steps: int) -> Solution:
+    """The same of few runs; values : the residuals at the start, where they are known."""
+    n_runs = _count(start)
+    cost, steps = np.full(n_runs, np.inf), np.zeros(n_runs, dtype=int)
     stop = [Stop.RUNNING] * n_runs
     search = _Search.begun(n_runs)
     state, active = start, np.arange(n_runs)

@@ -104,7 +104,8 @@ def _platforms(
     T_camera_base, T_mount = state.T_camera_base[poses.station], state.T_mount[poses.mount]
     tolerance = np.array([mount.tolerance for mount in measurements.mounts])
     size = np.zeros(len(tolerance))
-    size[tolerance > 0] = state.sizes
+    if len(state.sizes):  # the papers' methods estimate none
+        size[tolerance > 0] = state.sizes
     T_station_target = poses.T_station_target.copy()
     T_station_target[:, :3, 3] *= (1 + (tolerance * size)[poses.mount])[:, None]
     T_base_platform = inverse(T_camera_base) @ T_station_target @ inverse(T_mount)

@@ -322,7 +322,7 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
     out: list[dict[str, Any]] = []
     for m, mount in enumerate(mounts):
         size: dict[str, float] = {}
-        if mount.tolerance > 0:
+        if mount.tolerance > 0 and len(estimate.state.sizes):  # the papers' methods estimate none
             value, deviation = next(sizes)
             size = {"size": 1 + mount.tolerance * value, "sigma_size": mount.tolerance * deviation}
         body = "platform" if estimate.state.on_platform[m] else "base"

@@ -88,9 +88,10 @@ def assemble(
     """
     _check(machine, measurements)
     seen, line = seen_configurations(measurements), lines(measurements)[1]
-    edges = _places(measurements.edges.configuration, seen)
+    edges = _places(measurements.edges.configuration, seen, measurements.edges.leg)
     # boards on the base hang on no configuration, so the nearest row serves where theirs is unseen
-    poses = _places(measurements.poses.configuration, seen)
+    one = np.zeros(len(measurements.poses), dtype=int)
+    poses = _places(measurements.poses.configuration, seen, one)
     unknowns = Unknowns(
         n_free=machine.parameters.free_matrix().shape[1],
         n_stations=measurements.n_stations,
@@ -170,14 +171,19 @@ def _check(machine: Machine, measurements: Measurements) -> None:
             )
 
 
-def _places(configuration: Integers, seen: Booleans) -> Places:
-    """Measurements of one configuration after the other in a row of its own."""
+def _places(configuration: Integers, seen: Booleans, kind: Integers) -> Places:
+    """Measurements of one configuration after the other in a row of its own, where each kind (N,)
+    of them has as many places as every other, side by side.
+    """
     row = np.maximum(np.cumsum(seen) - 1, 0)[configuration]
-    order = np.argsort(row, kind="stable")
-    first = np.searchsorted(row[order], row[order])
+    kinds, number = np.unique(kind, return_inverse=True)
+    key = len(kinds) * row + number
+    order = np.argsort(key, kind="stable")
+    first = np.searchsorted(key[order], key[order])
     place = np.empty(len(row), dtype=int)
     place[order] = np.arange(len(row)) - first
-    return Places(row, place, (int(seen.sum()), int(place.max(initial=-1)) + 1))
+    each = int(place.max(initial=-1)) + 1
+    return Places(row, each * number + place, (int(seen.sum()), each * len(kinds)))
 
 
 def lines(measurements: Measurements) -> tuple[Integers, Integers]:
@@ -223,12 +229,15 @@ def _edges(
         # what one edge alone is shaded by is noise of its own: no unknown could tell it from that
         shift = np.where(line[:, None] < 0, SHADING_SIGMA * edges.shift, 0.0)
         covariance = covariance + shift[:, :, None] * shift[:, None, :]
+    legs = np.unique(edges.leg)
+    leg = np.repeat(legs, at.shape[1] // max(len(legs), 1))
+    first: Integers = np.array([machine.layout.radius[j][0] for j in leg], dtype=int)
     blocks = EdgeBlocks(
-        leg=at.filled(edges.leg),
+        leg=leg[None],
         station=at.filled(edges.station),
         camera=at.filled(camera),
         # padding needs any existing radius; its weight is zero
-        radius=at.filled(radius, int(radius[0]) if len(radius) else 0),
+        radius=np.where(at.present, at.filled(radius), first),
         side=at.filled(edges.side)[..., None],
         present=at.present,
         line=at.filled(line) if len(line) else np.zeros((0, 0), dtype=int),

@@ -25,7 +25,8 @@ from pkmcal.identify.covariance import (
 )
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
-from pkmcal.identify.noise import EDGES, FEWEST, POSES, READINGS, Components, components, counts
+from pkmcal.identify.kinds import EDGES, POSES, READINGS
+from pkmcal.identify.noise import FEWEST, Components, components, counts
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, settled_weights
 from pkmcal.identify.rows import Kinds
@@ -351,7 +352,7 @@ def _estimate(
     residuals = Kinds(*(at.taken(rows[0] / scale[0]) for at, rows, scale in measured))
     weighted = zip(assembled.places, result.weight, strict=True)
     weights = Kinds(*(at.taken(weight[0]) for at, weight in weighted))
-    value = result.info.value
+    value = result.info.by_kind.value
     closures = value[..., problem.closure_rows]
     joints = np.zeros(measurements.joints.shape)  # where no pose was fitted
     joints[assembled.seen] = problem.joint_rows(closures, found)[0]
@@ -394,17 +395,18 @@ def _with_unseen_poses(
 
 def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Statistics:
     """What the residuals (1, K, r) and their number say of the fit."""
-    problem, some = result.problem, next(result.info.pieces()).linear
+    problem, state = result.problem, result.info.state
     kinds = np.array(assembled.priors)
     rows = problem.kinds.edges.rows, problem.closure_rows, problem.kinds.poses.rows
     chi2 = [float(np.sum(value[0, :, part] ** 2)) for part in rows]
     drawn = ~np.isin(kinds, ("gauge", "mount"))
-    chi2_drawing = float(np.sum(some.shared_value[0, drawn] ** 2))
+    prior = problem.prior_values(state)[0] - problem.prior_target
+    chi2_drawing = float(np.sum(prior[drawn] ** 2))
     n_edges, n_poses = (float(number[0]) for number in counts(problem, result.weight))
     n_joints = value[0, :, rows[1]].size
     n_drawing = int(np.sum(drawn))
     unknowns = problem.unknowns.count - int(np.sum(kinds == "gauge"))
-    unknowns += value.shape[1] * some.by_own.shape[-1]
+    unknowns += value.shape[1] * problem.layout.own_motion.shape[1]
     found = components(result.info, result.weight)
     freedom = found.freedom[0].tolist()
     return Statistics(

@@ -26,6 +26,7 @@ from pkmcal.identify.gauge import (
     projector,
     transformation,
 )
+from pkmcal.identify.kinds import KindSums, kind_sums
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState, Name
 from pkmcal.mechanisms import Machine, ParameterTable
@@ -100,10 +101,10 @@ class Information:
         rows, values = zip(*parts, strict=True)
         return np.concatenate(rows, axis=1), np.concatenate(values, axis=1)
 
-    @property
-    def value(self) -> Array:
-        """Residuals (B, K, r), zero where nothing can be predicted or nothing is there."""
-        return np.concatenate([piece.linear.value for piece in self.pieces()], axis=1)
+    @cached_property
+    def by_kind(self) -> KindSums:
+        """What the rows of each kind say, summed over the configurations."""
+        return kind_sums(self.problem, self.state)
 
     @cached_property
     def covariance(self) -> Array:

@@ -18,18 +18,15 @@ degrees of freedom, fewer where the s_l of the other kinds are not well known th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.identify.covariance import UNKNOWN, Information
 from pkmcal.identify.problem import Problem
-from pkmcal.identify.rows import Kinds, joint_rows
-from pkmcal.solver import normal_root, reduced_normal
+from pkmcal.identify.rows import Kinds
+from pkmcal.solver import normal_root
 
-EDGES, POSES, READINGS = range(3)
-"""Kinds of rows in the last axes of :class:`Components`."""
 DOUBT = 0.01 / 3
 """Probability of contradicting a noise that is stated right: one in a hundred, shared by the three
 kinds of rows."""
@@ -109,53 +106,21 @@ def components(info: Information, weight: Kinds[Array]) -> Components:
     H is Q Q^T of the own unknowns and S S^T of the shared ones, orthogonal to each other; what
     nothing fixes has no part in it. With G_k = [Q S]_k^T [Q S]_k, tr(H_kl H_lk) = tr(G_k G_l).
     """
-    problem, prior = info.problem, info.problem.prior
-    normal = reduce(np.add, (reduced_normal(piece.reduced) for piece in info.pieces()))
-    half = normal_root(normal + prior.T @ prior, UNKNOWN, loose=False)
+    problem, prior, sums = info.problem, info.problem.prior, info.by_kind
+    half = normal_root(sums.every + prior.T @ prior, UNKNOWN, loose=False)
     n_readings = float(info.state.T_base_platform.shape[1] * problem.layout.n_readings)
     count = np.stack([*counts(problem, weight), np.full(len(half), n_readings)], axis=-1)
-    parts = zip(*(_squares(piece, half) for piece in info.pieces()), strict=True)
-    # of each configuration, and summed over all
-    own, cross, shared, chi2 = (list(part) for part in parts)
-    own, cross = (np.concatenate(part, axis=2) for part in (own, cross))
-    shared, chi2 = (np.sum(part, axis=0) for part in (shared, chi2))
-    flat = [part.reshape(len(half), 3, -1) for part in (own, np.sqrt(2) * cross, shared)]
-    parts = np.concatenate(flat, axis=-1)
-    trace = np.einsum("bkcii->bk", own) + np.einsum("bkii->bk", shared)
-    square = parts @ parts.mT
+    shared = half.mT[:, None] @ sums.normal @ half[:, None]
+    trace = sums.trace + np.einsum("bkii->bk", shared)
+    flat = shared.reshape(*shared.shape[:2], -1)
+    cross = np.einsum("bklij,bij->bkl", sums.cross, half @ half.mT)
+    square = sums.own + 2 * cross + flat @ flat.mT
     each = np.arange(3)
     square[:, each, each] += count - 2 * trace
     return Components(
-        chi2=chi2,
+        chi2=sums.chi2,
         freedom=count - trace,
         square=np.maximum(square, 0.0),
-    )
-
-
-def _squares(piece: Information, half: Array) -> tuple[Array, Array, Array, Array]:
-    """Of some configurations, by kind: Q_k^T Q_k (B, 3, K, d, d), Q_k^T S_k (B, 3, K, d, na), and
-    summed over them S_k^T S_k (B, 3, na, na) and c_k (B, 3).
-    """
-    problem, linear, reduced = piece.problem, piece.linear, piece.reduced
-    by_reading = problem.closure(piece.state).by_reading[..., None, :]
-
-    def readings(rows: Array) -> Array:
-        """Of rows (B, K, r, n) those of the readings, (B, K, m, n)."""
-        closures = rows[..., problem.closure_rows, :].mT
-        return joint_rows(problem.layout, by_reading, closures).mT
-
-    edges, poses = (kind.rows for kind in problem.kinds)
-    every = reduced.q, reduced.rows @ half[:, None], linear.value[..., None]
-    kinds = [
-        tuple(rows[..., edges, :] for rows in every),
-        tuple(rows[..., poses, :] for rows in every),
-        tuple(readings(rows) for rows in every),
-    ]
-    return (
-        np.stack([q.mT @ q for q, _, _ in kinds], axis=1),
-        np.stack([q.mT @ s for q, s, _ in kinds], axis=1),
-        np.stack([(s.mT @ s).sum(axis=1) for _, s, _ in kinds], axis=1),
-        np.stack([np.sum(value**2, axis=(1, 2, 3)) for _, _, value in kinds], axis=-1),
     )
 
 

@@ -57,6 +57,39 @@ class _Evaluated(NamedTuple):
     poses: PoseRows
 
 
+class _Strips(NamedTuple):
+    """The strips of L legs' edges, see :class:`pkmcal.solver.Compact`.
+
+    parameters : (L, w) columns that are written, of ``width`` that there are. place : (L, width)
+    where each of them is among a strip's, the last place for what is none of its. turn : (L, w, w')
+    from these columns to the shared unknowns', where they differ. columns : (L, w') which of the
+    shared unknowns these are.
+    """
+
+    parameters: Integers
+    place: Integers
+    turn: Array | None
+    columns: Integers
+
+    @classmethod
+    def of(cls, parameters: Integers, count: int, width: int, turn: Array | None) -> _Strips:
+        """Strips of these columns out of ``width``, of ``count`` shared unknowns; turn (width, na)
+        from all columns to the shared unknowns.
+        """
+        n_strips, w = parameters.shape
+        place = np.full((n_strips, width), w - 1)
+        np.put_along_axis(place, parameters, np.arange(w)[None], axis=1)
+        if turn is None:
+            return cls(parameters, place, None, parameters)
+        used = [np.flatnonzero(np.any(turn[own] != 0, axis=0)) for own in parameters]
+        most = max((len(own) for own in used), default=0)
+        columns, turns = np.full((n_strips, most), count), np.zeros((n_strips, w, most))
+        for k, own in enumerate(used):
+            columns[k, : len(own)] = own
+            turns[k, :, : len(own)] = turn[parameters[k]][:, own]
+        return cls(parameters, place, turns, columns)
+
+
 @dataclass(frozen=True)
 class Problem:
     """The joint estimation of B runs; a :class:`pkmcal.solver.LeastSquares`.
@@ -173,17 +206,11 @@ class Problem:
 
     def linearize(self, state: BatchState) -> Linear:
         """Residuals and exact Jacobian, zero where nothing can be predicted or nothing is there."""
-        rows = self.compact(state)
-        by_shared = np.empty((*rows.value.shape, rows.n_shared))
-        for run in range(len(by_shared)):
-            by_shared[run] = rows.write(run, slice(None), Memory())
-        return Linear(
-            rows.value, by_shared, rows.by_own, rows.usable, rows.shared_value, rows.shared_by
-        )
+        return self.compact(state).linear()
 
     def compact(self, state: BatchState) -> Compact:
-        """The same, with the derivatives by the shared unknowns of all rows that have few of them
-        in few numbers.
+        """The same with the Jacobian written a few configurations at a time; each leg's edges are
+        a strip.
         """
         return self._rows(self._evaluated(state))
 
@@ -196,37 +223,59 @@ class Problem:
     def _rows(self, found: _Evaluated) -> Compact:
         """The rows at a point, from what was needed of it for its residuals."""
         value, shared_value, c, edges, poses = found
-        usable = np.isfinite(value) & self._in_use()
+        finite = np.isfinite(value)
+        usable = finite & self._in_use()
         by_edges, own = self._of_edges(edges)
         by_closures, by_pose = self._of_closures(c)
         by_boards, by_board = self._of_boards(poses)
         by_own = np.concatenate([own, by_pose, by_board], axis=2)
-        # padding may lie anywhere, so its derivatives need not be finite though its row is zero
-        by_own[~np.isfinite(value + by_own.sum(axis=-1))] = 0.0
+        if not (finite.all() and np.isfinite(by_own.sum())):
+            by_own[~np.isfinite(value + by_own.sum(axis=-1))] = 0.0
 
-        def write(run: int, configurations: slice, memory: Memory) -> Array:
-            some = by_edges[:, :, run], by_closures[run], by_boards[run]
-            return self._written(*some, configurations, memory)
+        def write(run: int, some: slice, memory: Memory) -> tuple[Array, Array]:
+            strips = self._strips_written([part[:, :, run] for part in by_edges], some, memory)
+            rest = self._rest_written(by_closures[run, some], by_boards[run, some], memory)
+            return strips, rest
 
         value, count = np.where(usable, value, 0.0), self.unknowns.count
-        return Compact(value, by_own, usable, shared_value, self.prior, count, write)
+        strips = self._strips.columns
+        return Compact(value, by_own, usable, shared_value, self.prior, count, strips, write)
 
-    def _written(
-        self, edges: Array, closures: Array, boards: Array, some: slice, memory: Memory
-    ) -> Array:
-        """Derivatives (k, r, na) of some configurations of one run by the shared unknowns, from
-        those of the edges (n, 2g, K, G), the closures (K, E, n) and the boards (K, 6 G, na).
+    def _strips_written(self, edges: list[Array], some: slice, memory: Memory) -> Array:
+        """Derivatives (L, k, n, w) of each leg's edges in some configurations of one run by the
+        columns of its strip, from those of the edges, (m, 2g, K, G) in parts of m.
         """
-        rows, count = self.closure_rows, self.unknowns.count
-        out = memory.empty("by shared", (len(boards[some]), self.n_rows, self._width))
+        strips, k, rows = self._strips, len(self.blocks.present[some]), self._strip_rows
+        shape = len(strips.parameters), k, rows, strips.parameters.shape[1]
+        out = memory.empty("strips", shape)
         out.fill(0.0)
-        flat, before = out.reshape(-1), (some.start or 0) * self.n_rows * self._width
-        if edges.size:
-            flat[self._edge_places[:, :, some] - before] = edges[:, :, some]
-        flat[self._closure_places[some] - before] = closures[some]
+        size = rows * shape[-1]  # of a configuration in a strip
+        strip = np.repeat(np.arange(shape[0]), self.blocks.leg.shape[1] // max(shape[0], 1))
+        begin = (k * strip - (some.start or 0)) * size
+        places, numbers = self._edge_places[:, :, some] + begin, out.reshape(-1)
+        first = 0
+        for part in edges:
+            numbers[places[first : first + len(part)]] = part[:, :, some]
+            first += len(part)
+        if strips.turn is None:
+            return out
+        flat = out.reshape(shape[0], k * rows, shape[-1])
+        width = strips.turn.shape[-1]
+        turned = memory.empty("turned", (*flat.shape[:2], width))
+        return np.matmul(flat, strips.turn, out=turned).reshape(*shape[:3], width)
+
+    def _rest_written(self, closures: Array, boards: Array, memory: Memory) -> Array:
+        """Derivatives (k, r', na) of closures and boards by all shared unknowns, from those of the
+        closures (k, E, n) and the boards (k, 6 G, na).
+        """
+        count, k, equations = self.unknowns.count, len(closures), self.layout.n_equations
+        out = memory.empty("rest", (k, equations + boards.shape[1], self._width))
+        out.fill(0.0)
+        each = np.arange(equations)[:, None]
+        out[:, each, self._column[self._closure_index]] = closures
         if self._choice is None:
-            out[:, : rows.stop, self.unknowns.machine] = out[:, : rows.stop, count:-1] @ self.free
-        out[:, rows.stop :, :count] = boards[some]
+            out[:, :equations, self.unknowns.machine] = out[:, :equations, count:-1] @ self.free
+        out[:, equations:, :count] = boards
         return out[..., :count]
 
     @cached_property
@@ -234,55 +283,99 @@ class Problem:
         """Rows of a configuration, r."""
         return self.closure_rows.stop + self.pose_blocks.present.shape[1] * 6
 
+    @property
+    def extent(self) -> tuple[int, int]:
+        """Configurations K and rows of each, r."""
+        return len(self.blocks.present), self.n_rows
+
+    @property
+    def _strip_rows(self) -> int:
+        """Rows of a configuration in a strip, n."""
+        return self.closure_rows.start // max(len(self._strips.parameters), 1)
+
+    @cached_property
+    def _strips(self) -> _Strips:
+        """The edges' strips: of each leg the parameters that its edges depend on, its lines, and
+        what all edges depend on; last what is no unknown.
+        """
+        u, layout, legs = self.unknowns, self.layout, np.unique(self.blocks.leg)
+        none = self._width - 1
+        parts = [self._column[x[legs]] for x in (layout.a_index, layout.b_index)]
+        radii = np.full((len(legs), max((len(layout.radius[j]) for j in legs), default=0)), none)
+        own = np.zeros((layout.n_legs, u.n_lines + 1), dtype=bool)
+        if u.n_lines:
+            own[self.blocks.leg, self.blocks.line] = True  # -1, which is none, is the last
+        most = int(own[:, :-1].sum(axis=1).max(initial=0))
+        lines = np.full((len(legs), most), none)
+        for k, leg in enumerate(legs):
+            radii[k, : len(layout.radius[leg])] = self._column[layout.radius[leg]]
+            found = np.flatnonzero(own[leg, :-1])
+            lines[k, : len(found)] = u.shading.start + found
+        common = np.append(u.columns("stations", "optics", "breathing"), none)
+        parts += [radii, lines, np.tile(common, (len(legs), 1))]
+        return _Strips.of(np.concatenate(parts, axis=1), u.count, self._width, self._turn)
+
+    @cached_property
+    def _turn(self) -> Array | None:
+        """(width, na) from the columns that are written to those of the shared unknowns, where
+        parameters are tied or are axes.
+        """
+        if self._choice is not None:
+            return None
+        out = np.eye(self._width, self.unknowns.count)
+        out[self.unknowns.count : -1, self.unknowns.machine] = self.free
+        return out
+
     @cached_property
     def _edge_places(self) -> Integers:
-        """Where the edges' derivatives are written among all of a run, (n, 2g, K, G)."""
+        """Where the edges' derivatives are written in their own strip of all configurations,
+        (m, 2g, K, G).
+        """
         u, blocks, layout = self.unknowns, self.blocks, self.layout
-        index = (layout.a_index[blocks.leg], layout.b_index[blocks.leg], blocks.radius[..., None])
-        columns = [self._column[part] for part in index]
+        shape, leg, strips = blocks.station.shape, blocks.leg[0], self._strips
+        columns = [self._column[x[leg]] for x in (layout.a_index, layout.b_index)]
+        columns = [np.broadcast_to(x, (shape[0], *x.shape)) for x in columns]
+        columns.append(self._column[blocks.radius][..., None])
         columns.append(_columns(u.stations, blocks.station, 6))
         columns.append(_columns(u.optics, blocks.camera, u.n_optics))
         if u.n_lines:
             columns.append(_columns(u.shading, np.maximum(blocks.line, 0), 1))
         if u.n_breathing:
             columns.append(_columns(u.breathing, blocks.station, 1))
-        (k, g), n = blocks.leg.shape, 2 * blocks.side.shape[-1]
-        row = self.n_rows * np.arange(k)[:, None] + n * np.arange(g)
-        row = row + np.arange(n)[:, None, None]
-        return row * self._width + np.moveaxis(np.concatenate(columns, axis=-1), -1, 0)[:, None]
+        strip = np.searchsorted(np.unique(leg), leg)
+        column = strips.place[strip[:, None], np.concatenate(columns, axis=-1)]
+        (k, g), n = shape, 2 * blocks.side.shape[-1]
+        rows, width = self._strip_rows, strips.parameters.shape[1]
+        row = rows * np.arange(k)[:, None] + (n * np.arange(g)) % max(rows, 1)
+        return (row + np.arange(n)[:, None, None]) * width + np.moveaxis(column, -1, 0)[:, None]
 
     @cached_property
-    def _closure_places(self) -> Integers:
-        """The same of the closures' derivatives, (K, E, n); rods on one motor share their noise, so
-        each has those of all.
+    def _closure_index(self) -> Integers:
+        """Parameters (E, n) that the closures' derivatives are by; rods on one motor share their
+        noise, so each has those of all.
         """
-        rows, index = self.closure_rows, self.layout.closure_index
         if self.layout.shares_motors:
-            index = np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
-        row = self.n_rows * np.arange(len(self.blocks.leg))[:, None] + np.arange(
-            rows.start, rows.stop
-        )
-        return row[..., None] * self._width + self._column[index]
+            return np.tile(np.arange(self.drawing.size), (self.layout.n_equations, 1))
+        return self.layout.closure_index
 
-    def _of_edges(self, edges: EdgeRows) -> tuple[Array, Array]:
-        """The edges' derivatives (n, 2g, B, K, G) by what :attr:`_edge_places` says, and by the
-        configuration's own unknowns, (B, K, G 2g, d); zero where they are lost.
+    def _of_edges(self, edges: EdgeRows) -> tuple[list[Array], Array]:
+        """The edges' derivatives (m, 2g, B, K, G) by what :attr:`_edge_places` says, in parts of m,
+        and by the configuration's own unknowns, (B, K, G 2g, d); zero where they are lost.
         """
         parts = [*edges.by_machine, edges.by_station, _blocks_last(edges.by_optics)]
         if self.unknowns.n_lines:
             parts.append(_blocks_last(edges.by_line))
         if self.unknowns.n_breathing:
             parts.append(_blocks_last(edges.by_breathing))
-        own = edges.by_own(self.layout.freedoms)
-        blocks = own.shape[1:]
-        out = np.concatenate([np.broadcast_to(part, (len(part), *blocks)) for part in parts])
-        lost = ~np.isfinite(out.sum(axis=0))
+        own, lost = edges.by_own(self.layout.freedoms), edges.lost
+        # a leg through the camera; padding may lie anywhere, so that its need not be finite either
         if lost.any():
-            out[:, lost] = 0.0
-        return out, _in_rows(np.moveaxis(own, (0, 1), (-1, -2)))
+            own, *parts = (np.where(lost, 0.0, part) for part in (own, *parts))
+        parts = [np.broadcast_to(part, (len(part), *own.shape[1:])) for part in parts]
+        return parts, _in_rows(np.moveaxis(own, (0, 1), (-1, -2)))
 
     def _of_closures(self, c: Closure) -> tuple[Array, Array]:
-        """The closures' derivatives (B, K, E, n) by what :attr:`_closure_places` says, and by the
+        """The closures' derivatives (B, K, E, n) by what :attr:`_closure_index` says, and by the
         own unknowns; zero where they are lost.
         """
         by_theta = dense(c, self.drawing.size) if self.layout.shares_motors else c.by_theta

@@ -47,11 +47,12 @@ def clean_norm(share: float, count: Integers) -> Array:
     """The norm beyond which a share of those of ``count`` clean residuals lies."""
     pair = np.sqrt(-2 * np.log(share))  # the closed form of two residuals: most are edges
     out = np.full(count.shape, pair)
-    others = count != 2
-    if others.any():
+    others = [int(number) for number in np.unique(count) if number != 2]
+    if others:  # few numbers, though of very many measurements
         from scipy.special import chdtri
 
-        out[others] = np.sqrt(chdtri(np.maximum(count[others], 1), share))
+        for number in others:
+            out[count == number] = np.sqrt(chdtri(max(number, 1), share))
     return out
 
 

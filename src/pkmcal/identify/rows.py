@@ -26,6 +26,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.batches import NEXT
 from pkmcal.geometry.cylinders import EdgeNormals, edge_normal_jacobians
 from pkmcal.geometry.rigid import cross, dot, pose_difference, skew
 from pkmcal.identify.unknowns import BatchState
@@ -83,13 +84,15 @@ def _among(numbers: Numbers, configurations: slice, axis: int) -> Numbers:
 
 @dataclass(frozen=True)
 class EdgeBlocks:
-    """Where the edges are: K configurations of G blocks, padded; the same for all runs.
+    """Where the edges are: K configurations of G blocks, padded; the same for all runs. A leg has
+    as many places as every other, side by side, in all configurations: its rows have the same
+    parameters, see :class:`pkmcal.solver.Compact`.
 
     Edges that share their noise are whitened together: a *block* is g edges (g = 1 for edges
     fitted in photographs, g = 2 for the two edges that stand for a measured axis, [A] Table 1)
     of one tube at one station, with one 2g x 2g whitening matrix and one robust weight.
 
-    leg, station, camera, radius : (K, G) leg, station, camera, position of the tube's radius.
+    leg : (1, G). station, camera, radius : (K, G) station, camera, position of the tube's radius.
     side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
     its station, whose edges are shaded alike in all photographs, -1 where there is one edge alone;
     empty where nothing is shaded.
@@ -102,10 +105,6 @@ class EdgeBlocks:
     side: Integers
     present: Booleans
     line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
-
-    def place(self, n_legs: int) -> Integers:
-        """Where each block's leg stands among those of all configurations, (K, G)."""
-        return n_legs * np.arange(len(self.leg))[:, None] + self.leg
 
     def among(self, configurations: slice) -> EdgeBlocks:
         """Those of some configurations."""
@@ -141,6 +140,16 @@ class EdgeData:
     def weighed(self) -> Array:
         """The whitening with the weights, (B or 1, K, G, 2g, 2g)."""
         return np.sqrt(self.weight)[..., None, None] * self.whiten
+
+    @cached_property
+    def by_optics(self) -> Array:
+        """Rows by the unknowns of their camera, (B or 1, K, G, 2g, w)."""
+        return self.weighed @ self.optics
+
+    @cached_property
+    def by_breathing(self) -> Array:
+        """Rows by their station's focal breathing, (B or 1, K, G, 2g, 1)."""
+        return self.weighed @ self.breathing
 
     @cached_property
     def of_normals(self) -> Array:
@@ -184,10 +193,10 @@ class EdgeRows:
             rows = rows + self.by_breathing[..., 0] * breathing[:, self.blocks.station, None]
         return np.where((self.data.weight == 0)[..., None], 0.0, rows)
 
-    @cached_property
+    @property
     def by_optics(self) -> Array:
         """By their camera's unknowns, (B or 1, K, G, 2g, w)."""
-        return self.data.weighed @ self.data.optics
+        return self.data.by_optics
 
     @property
     def by_line(self) -> Array:
@@ -202,7 +211,12 @@ class EdgeRows:
     @property
     def by_breathing(self) -> Array:
         """By their station's focal breathing, (B or 1, K, G, 2g, 1)."""
-        return self.data.weighed @ self.data.breathing
+        return self.data.by_breathing
+
+    @property
+    def lost(self) -> Booleans:
+        """Where derivatives are not finite, (...)."""
+        return ~np.isfinite(np.sum(self._pulls[0] + self._pulls[1], axis=(0, 1)))
 
     @property
     def by_machine(self) -> tuple[Array, Array, Array]:
@@ -213,17 +227,28 @@ class EdgeRows:
 
     @property
     def by_station(self) -> Array:
-        """By their station's (omega, tau), (6, 2g, ...)."""
+        """By their station's (omega, tau), (6, 2g, ...): both ends turn about its origin and go
+        with it, which moves n.p by ``omega . (arm x n) + tau . n``.
+        """
         n, origin = self.normals.n, self.T_camera_base[:, 3]
-        a, b = (np.concatenate([_moments(p - origin, n), n], axis=1) for p in (self.a, self.b))
-        return self._by_a(a) + self._by_b(b)
+        arm, of_b = (
+            np.einsum("er...,j...->jer...", pull, end - origin)
+            for pull, end in zip(self._pulls, (self.a, self.b), strict=True)
+        )
+        arm += of_b
+        out = np.empty((6, arm.shape[2], *n.shape[2:]))
+        for k, (i, j) in enumerate(NEXT):
+            np.einsum("er...,e...->r...", arm[i], n[:, j], out=out[k])
+            out[k] -= np.einsum("er...,e...->r...", arm[j], n[:, i])
+        np.einsum("er...,ec...->cr...", self._pulls[0] + self._pulls[1], n, out=out[3:])
+        return out
 
     def by_own(self, freedoms: slice) -> Array:
         """By the configuration's own unknowns (d, 2g, ...): the platform's freedoms of its six, and
         what is internal.
         """
         platform = self.closure.platform
-        arm = _at(platform.arm, 1, self._place)
+        arm = _of_legs(platform.arm, 1, self.blocks)
         by = np.concatenate([_moments(arm, self._n_base), self._n_base], axis=1)[:, freedoms]
         if platform.by_internal.shape[-1]:
             by = np.concatenate([by, self._along(platform.by_internal)], axis=1)
@@ -236,12 +261,8 @@ class EdgeRows:
 
     def _along(self, by: Array) -> Array:
         """Derivatives of the limbs' ends (B, K, L, 3, n), along the blocks' normals (g, n, ...)."""
-        own = _at(by, 2, self._place)
+        own = _of_legs(by, 2, self.blocks)
         return np.einsum("ej...,jc...->ec...", self._n_base, own)
-
-    @property
-    def _place(self) -> Integers:
-        return self.blocks.place(self.closure.layout.n_legs)
 
     @cached_property
     def _pulls(self) -> tuple[Array, Array]:
@@ -265,12 +286,18 @@ class EdgeRows:
         return np.einsum("eir...,ei...->er...", self.data.of_normals, vectors)
 
 
-def _at(array: Array, components: int, place: Integers) -> Array:
-    """Vectors or matrices of a row of legs or stations (B, ..., n, c) at the blocks' places among
-    them, (K, G): components first, blocks last.
-    """
-    first = np.moveaxis(array, range(-components, 0), range(components))
-    return np.take(first.reshape(*first.shape[: components + 1], -1), place, axis=-1)
+def _of_legs(array: Array, components: int, blocks: EdgeBlocks) -> Array:
+    """Vectors or matrices of all legs (B, K, L, c) for the blocks' legs, (c, B, K, G)."""
+    return np.take(_components_first(array, components), blocks.leg[0], axis=-1)
+
+
+def _of_stations(array: Array, components: int, blocks: EdgeBlocks) -> Array:
+    """The same of all stations (B, S, c)."""
+    return np.take(_components_first(array, components), blocks.station, axis=-1)
+
+
+def _components_first(array: Array, components: int) -> Array:
+    return np.moveaxis(array, range(-components, 0), range(components))
 
 
 def _moments(arm: Array, n: Array) -> Array:
@@ -284,10 +311,10 @@ def edge_rows(
     """Rows of the edges from the machine's closure (B, K), the blocks' radii (B, K, G) and the
     stations (B, S, 4, 4).
     """
-    place, ends = blocks.place(c.layout.n_legs), np.broadcast_arrays(c.base.a, c.platform.b)
-    station = _at(T_camera_base[..., :3, :], 2, blocks.station)
+    ends = np.broadcast_arrays(c.base.a, c.platform.b)
+    station = _of_stations(T_camera_base[..., :3, :], 2, blocks)
     a, b = (
-        np.einsum("ij...,j...->i...", station[:, :3], _at(end, 1, place)) + station[:, 3]
+        np.einsum("ij...,j...->i...", station[:, :3], _of_legs(end, 1, blocks)) + station[:, 3]
         for end in ends
     )
     side = np.moveaxis(blocks.side, -1, 0)[:, None]

@@ -29,6 +29,7 @@ from pkmcal.mechanisms.document import (
     PassiveLength,
 )
 from pkmcal.mechanisms.document_checks import check_drawing
+from pkmcal.mechanisms.follower import Follower
 from pkmcal.mechanisms.joints import AXIS, axes_in_use
 from pkmcal.mechanisms.motors import (
     built_in_fixed,
@@ -206,6 +207,15 @@ class Machine:
         readings = _checked(joints, (self.n_joints,), "joints")
         begin = self._home if start is None else _checked(start, (4, 4), "start")
         return kinematics.forward(self.layout, self.values, readings, begin)
+
+    def follower(self, start: Array | None = None) -> Follower:
+        """Forward kinematics for a control loop: a function of readings (m,) that gives the pose
+        (4, 4) and begins at the last one; see :class:`~pkmcal.mechanisms.follower.Follower`.
+
+        start : (4, 4), where the machine is; the home pose when absent.
+        """
+        begin = self._home if start is None else _checked(start, (4, 4), "start")
+        return Follower(self.layout, self.values, begin)
 
     def inverse_jacobian(self, T_base_platform: Array) -> Array:
         """Readings' rates from the platform's twist, (n, m, 6), at poses (n, 4, 4).

@@ -105,8 +105,10 @@ def platform_can_be_found(machine: Machine, axes: Axes, usable: Booleans, form: 
     legs = legs_of(machine)
     seen = axes.seen & usable[axes.station][:, None]
     if form == "corrected":
-        row = np.unique(axes.configuration, return_inverse=True)[1]
-        seen = np.array([seen[row == k].any(axis=0) for k in range(row.max() + 1)])
+        configurations, row = np.unique(axes.configuration, return_inverse=True)
+        together = np.zeros((len(configurations), seen.shape[1]), dtype=bool)
+        np.logical_or.at(together, row, seen)
+        seen = together
     at_once = seen & legs.closing
     posed = fixes_pose(legs.platform, at_once, motion=legs.motion)
     if not posed.any():

@@ -135,14 +135,16 @@ def _queue(session: Session, edges: EdgeSet, white: Array, posed: Booleans, s: i
     Ranked by all residuals alike: edges that were put aside are what a reader wants to see.
     """
     first = {photo.configuration: photo for photo in reversed(session.stations[s].photographs)}
-    here = edges.station == s
+    here = np.flatnonzero(edges.station == s)
+    here = here[np.argsort(edges.configuration[here], kind="stable")]
+    ends = np.searchsorted(edges.configuration[here], np.arange(len(posed) + 1))
     level: dict[int, float] = {}
     for k in first:
         if posed[k]:
-            mine = white[here & (edges.configuration == k)]
+            mine = white[here[ends[k] : ends[k + 1]]]
             level[k] = rms(mine, np.ones(len(mine)))
     ranked = sorted((k for k in level if np.isfinite(level[k])), key=lambda k: -level[k])
-    blind = [k for k in level if k not in ranked]
+    blind = [k for k in level if not np.isfinite(level[k])]
     middle = len(ranked) // 2
     order = list(dict.fromkeys([*ranked[:1], *ranked[-1:], *ranked[middle:], *ranked, *blind]))
     names: dict[int, str] = {}

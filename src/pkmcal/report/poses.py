@@ -123,12 +123,15 @@ def _texts(values: Array, sigma: Array, factor: float) -> list[str]:
 
 def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> BarChart | None:
     """Root mean square of each configuration's poses in standard deviations."""
-    bars: list[UprightBar] = []
-    for k in np.unique(poses.configuration).tolist():
-        mine = poses.configuration == k
-        n = float(poses.rows[mine].sum())
-        level = float(np.sqrt(np.sum(estimate.pose_residuals[mine] ** 2) / n))
-        bars.append(level_bar(session.configurations[k], level, n))
+    number = np.bincount(poses.configuration, weights=poses.rows)
+    square = np.bincount(
+        poses.configuration, weights=np.sum(estimate.pose_residuals**2, axis=1)
+    ).tolist()
+    bars = [
+        level_bar(session.configurations[k], float(np.sqrt(square[k] / n)), n)
+        for k, n in enumerate(number.tolist())
+        if n
+    ]
     alt = "Bars of the poses' residuals by configuration"
     return bar_chart("Poses, by configuration", SIGMAS, bars, charts.six_labels(bars), alt)
 
@@ -138,10 +141,11 @@ def _bars(session: Session, poses: PoseSet, error: Array, unit: str, title: str)
     size = np.linalg.norm(np.nan_to_num(error), axis=-1)
     if not np.isfinite(error).any():
         return None
+    largest = np.zeros(len(session.configurations))
+    np.maximum.at(largest, poses.configuration, size)
     bars: list[UprightBar] = []
     for k in np.unique(poses.configuration).tolist():
-        value = float(size[poses.configuration == k].max())
-        name = session.configurations[k]
+        value, name = float(largest[k]), session.configurations[k]
         bars.append(
             UprightBar(name, f"configuration {name}: {brief(value)} {unit}", value, None, True)
         )

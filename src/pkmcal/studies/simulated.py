@@ -151,14 +151,17 @@ def joint_problem(
     An axis stands for two edges that are whitened together, [A] Table 1.
     """
     n = data.count
-    one = assemble(machine, measurements(data), gauge, use_drawing=use_drawing).problem
+    assembled = assemble(machine, measurements(data), gauge, use_drawing=use_drawing)
+    one, at = assembled.problem, assembled.places.edges
     blocks, numbers = one.blocks, replace(one.data, joints=data.joints[:, :n])
     if data.view.legs.size:
-        shape = blocks.leg.shape
-        radius = np.broadcast_to(machine.parameters.drawing[blocks.radius], data.axis.shape[:-1])
-        basis, whiten = as_edges(data.axis, data.noise.axis, radius)
-        blocks = replace(blocks, side=np.broadcast_to([0, 1], (*shape, 2)))
-        none = np.zeros((1, *shape, 4, 1))
+        axis = data.axis.reshape(len(data.axis), -1, 4)
+        radius = machine.parameters.drawing[blocks.radius[at.row, at.place]]
+        found = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
+        basis, whiten = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in found)
+        basis[:, at.row, at.place], whiten[:, at.row, at.place] = found
+        blocks = replace(blocks, side=np.broadcast_to([0, 1], (*at.shape, 2)))
+        none = np.zeros((1, *at.shape, 4, 1))
         numbers = replace(numbers, basis=basis, whiten=whiten, optics=none)
     poses = one.pose_data
     if data.view.T_platform_board is not None:

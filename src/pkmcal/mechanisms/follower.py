@@ -1,0 +1,252 @@
+"""The pose of a machine at one set of readings after the other, as a control loop asks for it.
+
+Forward kinematics with as few calls of NumPy as can be: at a single pose they cost more than their
+arithmetic. Newton's steps on ``|B - A|^2 - length^2 = 0``, from the last pose. The first step takes
+the factors that the last search ended with; a step that leaves too much finds new ones.
+
+Fast are machines of as many rods as freedoms whose ends stand on elementary joints
+(:class:`~pkmcal.mechanisms.carriers.contract.Chain`) and, on the platform, have no hinge: A is
+``foot + along q + across cos q + ahead sin q``, and B is ``R p + t + f``. All others, and steps
+that do not lead there, go to the search for any machine and any start
+(:func:`~pkmcal.mechanisms.kinematics.forward`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.errors import GeometryError, InputError
+from pkmcal.geometry.rigid import cross, dot, nearest_rotation, pose
+from pkmcal.mechanisms.carriers.contract import Chain
+from pkmcal.mechanisms.closure import CarrierGroup, LimbLayout, scales
+from pkmcal.mechanisms.kinematics import CONVERGED, forward
+
+MOST_STEPS = 8
+"""A pose a millimetre away takes three or four."""
+CLOSED = 0.1 * CONVERGED
+"""Closure error (m) at which a search ends, of all rods together."""
+SHRINKS = 1e-8
+"""Squared error that a step leaves, of that before it, beyond which the next finds new factors."""
+SQUARE = 512
+"""Poses after which rounding is taken out of the rotation: by then less than 1e-12."""
+
+
+@dataclass(frozen=True)
+class Rods:
+    """Rods of n freedoms' machine on elementary joints; vectors as columns, (3, n), m.
+
+    along, across, ahead : of A by the joints' values q, see the module. turns : whether any motor
+    turns, moves : whether any moves A. on_body : (4, n) p, and ones. still : f - foot.
+    column, scale : q is ``scale * readings[column]``. length, grows : the rods' are
+    ``length + grows q``.
+    """
+
+    along: Array
+    across: Array
+    ahead: Array
+    turns: bool
+    moves: bool
+    on_body: Array
+    still: Array
+    column: Integers
+    scale: Array
+    length: Array
+    grows: Array
+
+    def ends(self, readings: Array) -> tuple[Array, Array]:
+        """What B - A is without R p + t, (3, n), and the squares of the lengths, (n,)."""
+        q = readings[self.column] * self.scale
+        length = self.length + self.grows * q
+        length *= length
+        if not self.moves:
+            return self.still, length
+        off = self.still - self.along * q
+        if self.turns:
+            off -= self.across * np.cos(q)
+            off -= self.ahead * np.sin(q)
+        return off, length
+
+
+def rods_of(layout: LimbLayout, theta: Array) -> Rods | None:
+    """The rods of a machine with values theta (P,); None where it is not of the fast kind."""
+    legs = np.flatnonzero(layout.closing)
+    square = layout.n_equations == layout.motion.shape[1]
+    if not square or len(layout.angles) or layout.n_internal:
+        return None
+    base, platform = (_chains(groups, theta) for groups in (layout.base, layout.platform))
+    if base is None or platform is None:
+        return None
+    n = layout.n_legs
+    foot, along, across, ahead, on_body, floating = np.zeros((6, n, 3))
+    for j, chain in base.items():
+        foot[j] = chain.point + chain.arm
+        if chain.motion == "slide":
+            along[j] = chain.axis
+        elif chain.motion == "turn":
+            straight = dot(chain.arm, chain.axis) * chain.axis
+            foot[j], across[j] = chain.point + straight, chain.arm - straight
+            ahead[j] = cross(chain.axis, chain.arm)
+        elif chain.motion != "fixed":
+            return None
+    for j, chain in platform.items():
+        on_body[j] = chain.point
+        if chain.motion not in ("fixed", "float"):
+            return None
+        (on_body if chain.motion == "fixed" else floating)[j] += chain.arm
+    driven = layout.actuated[legs] >= 0
+    columns = (x[legs].T.copy() for x in (along, across, ahead, on_body, floating - foot))
+    along, across, ahead, on_body, still = columns
+    return Rods(
+        along,
+        across,
+        ahead,
+        bool(across.any()),
+        bool(along.any() or across.any()),
+        np.concatenate([on_body, np.ones((1, len(legs)))]),
+        still,
+        np.where(driven, layout.actuated[legs], 0),
+        np.where(driven, scales(layout, theta)[legs], 0.0),
+        theta[layout.rod[legs]],
+        layout.rod_reads[legs].astype(float),
+    )
+
+
+def _chains(groups: tuple[CarrierGroup, ...], theta: Array) -> dict[int, Chain] | None:
+    """Each leg's elementary joint; None where one has none."""
+    found: dict[int, Chain] = {}
+    for group in groups:
+        chain = group.carrier.chain(group.of(theta))
+        if chain is None:
+            return None
+        for k, leg in enumerate(group.legs.tolist()):
+            found[leg] = Chain(chain.motion, chain.point[k], chain.axis[k], chain.arm[k])
+    return found
+
+
+class Follower:
+    """Gives a machine's pose T_base_platform (4, 4) at readings (m,), called again and again.
+
+    It remembers where the machine is, and finds the pose that is near that: readings are to be
+    those of a machine that moves, a millimetre or a few between two calls, and not across a
+    singular pose. Made by :meth:`pkmcal.mechanisms.Machine.follower`.
+
+    T_base_platform : the last pose. Raises GeometryError where the readings close at no pose, and
+    stays where it was.
+    """
+
+    def __init__(self, layout: LimbLayout, theta: Array, start: Array) -> None:
+        from scipy.linalg import get_lapack_funcs
+
+        self._layout, self._theta, self._rods = layout, theta, rods_of(layout, theta)
+        functions: Any = get_lapack_funcs(("getrf", "getrs"), dtype=np.float64)
+        self._factored, self._solved = functions
+        self._ones, self._twist, self._free = np.ones(3), np.zeros(6), layout.freedoms
+        self._put(np.array(start, dtype=float))
+
+    @property
+    def T_base_platform(self) -> Array:
+        """The last pose, (4, 4)."""
+        return self._pose.copy()
+
+    def __call__(self, joints: Array) -> Array:
+        """The pose T_base_platform (4, 4) at readings (m,), m or rad, new memory each time."""
+        readings = np.asarray(joints, dtype=float)
+        if readings.shape != (self._layout.n_readings,):
+            raise InputError(
+                what="joints has the wrong shape",
+                found=str(readings.shape),
+                expected=f"({self._layout.n_readings},): one configuration at a time",
+            )
+        if self._rods is None or not self._followed(self._rods, readings):
+            self._search(readings)
+        return self._pose.copy()
+
+    def _put(self, T_base_platform: Array) -> None:
+        """Stand at a pose."""
+        self._pose = pose(nearest_rotation(T_base_platform[:3, :3]), T_base_platform[:3, 3])
+        self._factors: tuple[Array, Array] | None = None
+        self._enough, self._since = 0.0, 0
+
+    def _search(self, readings: Array) -> None:
+        """The pose by the search for any machine, and stand there."""
+        found = forward(self._layout, self._theta, readings, self._pose)
+        if not np.isfinite(readings).all() or not found.converged:
+            raise GeometryError(
+                what="the machine cannot follow: it closes at no pose near the last one",
+                found=f"closure error {float(found.error) * 1e3:.3g} mm",
+                expected="readings that the machine can reach, near those before them",
+                next_step="check the readings, or begin anew with a start near the pose",
+            )
+        self._put(found.T_base_platform)
+
+    def _followed(self, rods: Rods, readings: Array) -> bool:
+        """Newton's steps from the last pose; False, and nothing changed, where they do not close.
+
+        The pose moves by a turn about the base frame's origin and a shift, (omega, tau), by which
+        the row ``|line|^2 - length^2`` of a line B - A changes by 2 (B x line, line).
+        """
+        off, square = rods.ends(readings)
+        now, factors, twist = self._pose, self._factors, self._twist
+        before = np.inf
+        for _ in range(MOST_STEPS):
+            b = now[:3].dot(rods.on_body)
+            line = b + off
+            left = self._ones.dot(line * line)
+            left -= square
+            error = float(left.dot(left))
+            if not error < before:
+                return False
+            if factors is None or (error > SHRINKS * before and before < np.inf):
+                factors = self._factors_at(b, line)
+                self._enough = 4 * CLOSED**2 * float(square.min())
+            if error <= self._enough:
+                self._pose, self._factors = now, factors
+                self._rest()
+                return True
+            before = error
+            twist[self._free] = self._solved(*factors, left)[0]
+            now = _moved_back(now, twist)
+        return False
+
+    def _factors_at(self, b: Array, line: Array) -> tuple[Array, Array]:
+        """LU factors of half the rows' derivatives by the freedoms, (n, n)."""
+        rows = np.empty((6, line.shape[1]))
+        rows[:3] = b[FIRST] * line[SECOND]
+        rows[:3] -= b[SECOND] * line[FIRST]
+        rows[3:] = line
+        return self._factored(rows[self._free].T)[:2]
+
+    def _rest(self) -> None:
+        """Take the rounding of many steps out of the rotation."""
+        self._since += 1
+        if self._since == SQUARE:
+            self._since, self._pose = (
+                0,
+                pose(nearest_rotation(self._pose[:3, :3]), self._pose[:3, 3]),
+            )
+
+
+FIRST, SECOND = np.array([1, 2, 0]), np.array([2, 0, 1])
+"""Of two vectors' components those whose products are their cross product's, less the others."""
+
+
+def _moved_back(T_base_platform: Array, twice: Array) -> Array:
+    """A pose (4, 4) moved from the left by minus half of (omega, tau), (6,): Cayley's map, as in
+    :func:`pkmcal.geometry.batches.stepped`, in plain numbers, which are faster one by one.
+    """
+    x, y, z, a, b, c = twice.tolist()
+    x, y, z = -0.25 * x, -0.25 * y, -0.25 * z
+    s = 2 / (1 + x * x + y * y + z * z)
+    move = np.array(
+        [
+            1 - s * (y * y + z * z), s * (x * y - z), s * (x * z + y), -0.5 * a,
+            s * (x * y + z), 1 - s * (x * x + z * z), s * (y * z - x), -0.5 * b,
+            s * (x * z - y), s * (y * z + x), 1 - s * (x * x + y * y), -0.5 * c,
+            0.0, 0.0, 0.0, 1.0,
+        ]
+    )  # fmt: skip
+    return move.reshape(4, 4).dot(T_base_platform)
