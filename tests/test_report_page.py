@@ -4,7 +4,9 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from datetime import datetime
 from html.parser import HTMLParser
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,8 @@ import pytest
 
 from pkmcal.measurements import Rejection
 from pkmcal.outcome import Verdict
+from pkmcal.report.calibration import report_of
+from pkmcal.report.page import page_html
 from test_report_case import Case, make_case, report_html
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
@@ -58,6 +62,20 @@ def test_page_tells_verdict_numbers_and_model_error(page):
                      "multiplied by 1.25", "observe", "1.50 s", "three centres: legs 1, 3, 5",
                      "nothing of what the model leaves out"):  # fmt: skip
         assert expected in text, expected
+
+
+def test_page_tells_when_and_from_what_it_was_made(case):
+    noted = replace(case.session, document={"notes": "Machine 2.\nLeg 4 <b>exchanged</b>."})
+    found = report_of(noted, case.observation, case.estimate, Verdict(True, "Fine."), digest="3f2a")
+    html = page_html(found, datetime(2026, 3, 4, 15, 2))
+    text = Found(html).text
+    assert "4 March 2026, 15:02" in text
+    assert f"pkmcal {version('pkmcal')}" in text
+    assert "digest of the session 3f2a" in text
+    assert "Leg 4 <b>exchanged</b>." in text
+    assert "<h3>Notes</h3>" in html
+    assert "<h3>Notes</h3>" not in report_html(case.session, case.observation, case.estimate,
+                                               Verdict(True, "Fine."))  # fmt: skip
 
 
 def test_page_asks_for_nothing_outside(page):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,7 @@ from pkmcal.report import (
     workspace,
 )
 from pkmcal.report.residuals import KEPT
-from pkmcal.session.load import Session
+from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ NO_TURN = 1e-9
 def outcome_of(calibration: Calibration) -> Outcome:
     """Everything that `pkmcal calibrate` tells and writes."""
     c, held_out, over = calibration, holdout_of(calibration), _tool_map(calibration)
+    photographs = digests(c.session)
     told = report_of(
         c.session,
         c.observation,
@@ -59,6 +61,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
         timings=c.timings,
         holdout=held_out,
         over=over,
+        digest=session_digest(c.session, photographs),
     )
     groups = parameters.parameter_groups(c.session.machine, c.estimate)
     open_ = parameters.unidentified(groups, c.estimate, c.findings)
@@ -66,7 +69,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, open_, predicted, over),
+        texts=texts_of(c, open_, predicted, over, photographs),
         summary={
             "verdict": asdict(c.verdict),
             **(told.summary or {}),
@@ -94,7 +97,7 @@ def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -
     over = check_output(folder, force=force)
     found = outcome_of(calibration)
     kept = None if force else keep_earlier(Path(folder), found.texts)
-    write_folder(Path(folder), {REPORT: page.page_html(found), **found.texts}, over)
+    write_folder(Path(folder), {REPORT: page.page_html(found, datetime.now()), **found.texts}, over)
     return kept
 
 
@@ -108,12 +111,14 @@ def report_of(
     timings: Mapping[str, float] | None = None,
     holdout: HoldOut | None = None,
     over: ToolMap | str | None = None,
+    digest: str = "",
 ) -> Outcome:
     """The verdict, cards and parts.
 
     findings : what the data tell of the machine; without them their section is left out.
     timings : seconds by step. holdout : what the estimate predicts of configurations that it did
-    not see. over : the tool over the workspace, or why there is no map of it.
+    not see. over : the tool over the workspace, or why there is no map of it. digest : of the
+    session.
     """
     edges = observation.edges
     camera = residuals.camera_numbers(session)
@@ -141,6 +146,8 @@ def report_of(
         title=f"Calibration of {session.machine.name}",
         verdict=verdict,
         kicker=session.called,
+        origin=(f"digest of the session {digest}",) if digest else (),
+        notes=(session.document.get("notes") or "").strip(),
         figures=cards(session, observation, estimate, centres, tool),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
