@@ -118,7 +118,7 @@ def test_a_page_without_a_single_edge(case):
         Verdict(False, "Nothing seen."),
     )
     assert "Do not use" in page
-    assert "No photograph has a pose to draw in." in page
+    assert "nothing in use" in page
     assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
 
 
@@ -179,10 +179,14 @@ def test_page_runs_in_a_browser(page, tmp_path, width):
     changes = [abs(float(v.split()[2])) for v in re.findall(r'data-values="([^"]+)"', document)]
     assert len(changes) == 60
     assert changes == sorted(changes, reverse=True)
-    assert sum(a.get("class") == "shot" for tag, a in tags if tag == "svg") == 12 + 1
+    assert sum(a.get("class") == "shot" for tag, a in tags if tag == "svg") == 15 + 1
     dialog = document[document.index('<dialog id="large"') :]
     assert dialog[: dialog.index(">")].endswith('open=""')
-    assert dialog[: dialog.index("</dialog>")].count("<svg") == 1
+    shown = dialog[: dialog.index("</dialog>")]
+    assert shown.count("<svg") == 1
+    large = re.search(r'data-large="([^"]+)"', page)
+    assert large is not None
+    assert f"base64,{large[1]}" in shown
 
 
 def test_the_browser_test_sees_errors(page, tmp_path):

@@ -79,14 +79,14 @@ def whole_page(body: str, width: int, height: int, more_style: str = "") -> Shot
 def result(case: Case) -> Shot:
     """README's first picture: a photograph with fitted edges beside the geometry's change."""
     session, estimate = case.session, case.result.estimate
-    edges = case.result.observation.edges
     centres = joint_centres(
         session.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
     )
     drawn = scene.scene_of(session, estimate, centres)
-    taken = pictures.pictures(session, edges, estimate, outward(case), centres)
-    shots = {(p.station, p.configuration): p for p in taken}
-    shot = shots.get(("station2", "0011")) or next(iter(shots.values()))
+    taken = pictures.album(session, case.result.observation, estimate, outward(case), centres)
+    shots = {(p.station, p.configuration): p for p in taken.pictures}
+    shot = shots.get(("station2", "0011")) or taken.pictures[0]
+    shot = replace(shot, jpeg=shot.large)
     template = page.environment().from_string(
         '{% import "charts.html.j2" as draw %}'
         '<div class="grid"><div>{{ draw.picture(shot) }}<p>A photograph, the edges fitted in it,'

@@ -438,14 +438,17 @@ _WIDEST = 160
 
 def plain(value: Any) -> Any:
     """Arrays, tuples and NumPy numbers as JSON has them; what is not finite becomes null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, float):  # first, for there are a hundred thousand of them
+        return value if math.isfinite(value) else None
+    if isinstance(value, str | int):
+        return value
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        finite = value.dtype.kind in "biu" or (value.dtype.kind == "f" and np.isfinite(value).all())
+        return value.tolist() if finite else plain(value.tolist())
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
     return str(value) if isinstance(value, Path) else value
 
 

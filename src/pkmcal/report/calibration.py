@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.calibration import toolmap
 from pkmcal.calibration.kept import keep_earlier
 from pkmcal.calibration.results import REPORT, check_output, texts_of
@@ -40,6 +40,7 @@ from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
+    from pkmcal.boards.views import Boards
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.unidentified import Findings
     from pkmcal.judge.holdouts import HoldOut
@@ -51,7 +52,7 @@ NO_TURN = 1e-9
 def outcome_of(calibration: Calibration) -> Outcome:
     """Everything that `pkmcal calibrate` tells and writes."""
     c, held_out, over = calibration, holdout_of(calibration), _tool_map(calibration)
-    photographs = digests(c.session)
+    seen = digests(c.session)
     told = report_of(
         c.session,
         c.observation,
@@ -61,7 +62,9 @@ def outcome_of(calibration: Calibration) -> Outcome:
         timings=c.timings,
         holdout=held_out,
         over=over,
-        digest=session_digest(c.session, photographs),
+        digest=session_digest(c.session, seen),
+        boards=c.boards,
+        photographs=c.photographs,
     )
     groups = parameters.parameter_groups(c.session.machine, c.estimate)
     open_ = parameters.unidentified(groups, c.estimate, c.findings)
@@ -69,7 +72,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, open_, predicted, over, photographs),
+        texts=texts_of(c, open_, predicted, over, seen),
         summary={
             "verdict": asdict(c.verdict),
             **(told.summary or {}),
@@ -112,26 +115,28 @@ def report_of(
     holdout: HoldOut | None = None,
     over: ToolMap | str | None = None,
     digest: str = "",
+    boards: Boards | None = None,
+    photographs: Mapping[int, Sequence[Integers]] | None = None,
 ) -> Outcome:
     """The verdict, cards and parts.
 
     findings : what the data tell of the machine; without them their section is left out.
     timings : seconds by step. holdout : what the estimate predicts of configurations that it did
     not see. over : the tool over the workspace, or why there is no map of it. digest : of the
-    session.
+    session. boards : the board as it was seen, to draw its corners.
+    photographs : of stations by their number, where they are at hand.
     """
     edges = observation.edges
     camera = residuals.camera_numbers(session)
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
-    # boards and trackers alone have no edges to show; legs without any do have a question
-    photographed = len(edges) > 0 or (not len(observation.poses) and bool(session.station_names))
+    album = pictures.album(session, observation, estimate, shifts, centres, boards, photographs)
     parts = (
         scene.section(session, estimate, centres, poses.places(observation, estimate)),
         workspace.section(session, estimate, over) if over else None,
         parameters.section(session.machine, estimate),
         findings and identifiability.section(findings, estimate.machine.parameters),
-        pictures.section(session, edges, estimate, shifts, centres) if photographed else None,
+        pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate),
         holdout and validation.held_out(holdout, session),
         residuals.section(

@@ -136,6 +136,14 @@ class BarChart:
         return "M" + "L".join(points) if points else ""
 
 
+def enlargement(lengths: Array, wanted: float) -> float:
+    """1, 2 or 5 times a power of ten that brings the larger lengths (n,) near the wanted one."""
+    large = float(np.quantile(lengths, 0.9)) if lengths.size else wanted
+    ratio = max(wanted / max(large, 1e-9), 1.0)
+    power = 10.0 ** math.floor(math.log10(ratio))
+    return max(m * power for m in (1, 2, 5) if m * power <= ratio * (1 + 1e-9))
+
+
 def ticks_between(low: float, high: float, about: int = 5) -> tuple[tuple[float, str], ...]:
     """Round values from low to high with their text."""
     rough = (high - low) / about

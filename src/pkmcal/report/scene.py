@@ -19,7 +19,7 @@ from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.outcome import AXIS, LOOKS, Part, Plot
 from pkmcal.report import page
-from pkmcal.report.charts import WIDTH
+from pkmcal.report.charts import WIDTH, enlargement
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
@@ -151,13 +151,6 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
             )
             joints.append(Joint(j + 1, side.side, drawing[j], shown[j], spread[j], tip))
     return BeforeAfter(factor, spread_factor, tuple(joints))
-
-
-def enlargement(lengths: Array, wanted: float) -> float:
-    """1, 2 or 5 times a power of ten that brings the larger lengths (n,) near the wanted one."""
-    ratio = max(wanted / max(float(np.quantile(lengths, 0.9)), 1e-9), 1.0)
-    power = 10.0 ** math.floor(math.log10(ratio))
-    return max(m * power for m in (1, 2, 5) if m * power <= ratio * (1 + 1e-9))
 
 
 def views(scene: BeforeAfter) -> tuple[Projection, Projection]:

@@ -191,8 +191,8 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
         "name": name,
         "x": np.round(cut.u * 1e3, 1).tolist(),
         "y": np.round(cut.v * 1e3, 1).tolist(),
-        "z": _listed(level, 4),
-        "customdata": _listed(shown, 4),
+        "z": np.round(level, 4),
+        "customdata": _significant(shown, 4),
         "hovertemplate": f"{one} %{{x:.0f}}, {other} %{{y:.0f}}, {_title(cut)}<br>{name}:"
         " %{customdata:.3g} mm<extra></extra>",
         "hoverongaps": False,
@@ -201,12 +201,12 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
     }
 
 
-def _listed(values: Array, digits: int) -> list[list[float | None]]:
-    """Rows of numbers with so many digits, None where there is none."""
-    return [
-        [float(f"{x:.{digits}g}") if np.isfinite(x) else None for x in row]
-        for row in values.tolist()
-    ]
+def _significant(values: Array, digits: int) -> Array:
+    """Numbers with so many digits, as short as they can be written."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = digits - 1 - np.floor(np.log10(np.abs(values)))
+    one = 10.0 ** np.clip(np.nan_to_num(places), 0, 15)
+    return np.round(values * one) / one
 
 
 def _crosses(
@@ -375,7 +375,7 @@ def _space(session: Session, estimate: Estimate, found: ToolMap) -> Plot | None:
             "Calibrated, σ",
             _drawn(poses, home, which) * 1e-3,
             look,
-            customdata=_listed(np.column_stack(columns), 3),
+            customdata=_significant(np.column_stack(columns), 3),
             hovertemplate=hover,
         ),
         markers(

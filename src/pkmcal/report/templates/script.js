@@ -30,6 +30,8 @@
     button.addEventListener("click", () => {
       const picture = button.querySelector("svg").cloneNode(true);
       const { width, height } = picture.viewBox.baseVal;
+      const { large } = button.dataset;
+      if (large) picture.querySelector("image").setAttribute("href", `data:image/jpeg;base64,${large}`);
       frame.style.setProperty("--ratio", width / height);
       frame.classList.remove("near");
       frame.replaceChildren(picture);
