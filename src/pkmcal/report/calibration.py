@@ -27,6 +27,7 @@ from pkmcal.report import (
     identifiability,
     page,
     parameters,
+    photographed,
     pictures,
     poses,
     provenance,
@@ -131,8 +132,10 @@ def report_of(
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(session, observation, estimate, shifts, centres, boards, photographs)
+    space = photographed.plot(session, estimate, album, poses.places(observation, estimate))
     parts = (
-        scene.section(session, estimate, centres, poses.places(observation, estimate)),
+        scene.section(session, estimate, centres),
+        provenance.stations(session, estimate, camera, space),
         workspace.section(session, estimate, over) if over else None,
         parameters.section(session.machine, estimate),
         findings and identifiability.section(findings, estimate.machine.parameters),
@@ -143,7 +146,6 @@ def report_of(
             session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
         ),
         provenance.left_out(session, observation.rejected, estimate, findings),
-        provenance.stations(session, estimate, camera) if session.station_names else None,
         provenance.how(session, estimate, timings or {}),
     )
     return Outcome(

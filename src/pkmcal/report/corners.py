@@ -1,4 +1,4 @@
-"""Corners of a board in photographs: found, and as the calibrated machine expects them."""
+"""BoardCorners of a board in photographs: found, and as the calibrated machine expects them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pkmcal.session.load import Session
 
 
 @dataclass(frozen=True)
-class Corners:
+class BoardCorners:
     """N corners. station, configuration : (N,). photograph : (N,) its number in the station.
     name : (N,) number on the board. pixel : (N, 2) where found. off : (N, 2) px, found less
     expected. used : (N,) False where the photograph's pose is not used.
@@ -33,17 +33,19 @@ class Corners:
     def __len__(self) -> int:
         return len(self.station)
 
-    def select(self, keep: Booleans) -> Corners:
+    def select(self, keep: Booleans) -> BoardCorners:
         """Those of a mask."""
-        return Corners(*(getattr(self, f.name)[keep] for f in fields(self)))
+        return BoardCorners(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
-def board_corners(session: Session, boards: Boards, estimate: Estimate) -> Corners:
+def board_corners(session: Session, boards: Boards, estimate: Estimate) -> BoardCorners:
     """The corners in photographs whose platform's pose was estimated and whose board can be
     expected in the picture.
     """
     none = np.zeros(0, dtype=int)
-    parts = [Corners(none, none, none, none, np.zeros((0, 2)), np.zeros((0, 2)), none.astype(bool))]
+    parts = [
+        BoardCorners(none, none, none, none, np.zeros((0, 2)), np.zeros((0, 2)), none.astype(bool))
+    ]
     state = estimate.state
     size = 1 + boards.tolerance * float(state.sizes[0]) if len(state.sizes) else 1.0
     for s, station in boards.stations.items():
@@ -61,8 +63,8 @@ def board_corners(session: Session, boards: Boards, estimate: Estimate) -> Corne
             n = len(off)
             whole = (np.full(n, s), np.full(n, k), np.full(n, p), np.asarray(found.ids))
             used = np.full(n, usable.get(p, False))
-            here = Corners(*whole, found.pixels, off, used)
+            here = BoardCorners(*whole, found.pixels, off, used)
             parts.append(here.select(np.asarray(np.isfinite(off).all(axis=-1))))
-    return Corners(
-        *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Corners))
+    return BoardCorners(
+        *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(BoardCorners))
     )

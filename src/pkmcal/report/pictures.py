@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.outcome import Part
 from pkmcal.report import page
 from pkmcal.report.charts import enlargement
-from pkmcal.report.corners import Corners, board_corners
+from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.drawn import CURVE, Drawn, Spot, measured_curves, straightened
 from pkmcal.report.jpegs import small_and_large
 from pkmcal.report.residuals import KEPT, SIDES
@@ -91,6 +92,14 @@ class Album:
         order = np.argsort(-np.nan_to_num(size, nan=-np.inf), kind="stable")
         places = zip(station[order].tolist(), configuration[order].tolist(), strict=True)
         return next((f"#{self.anchors[place]}" for place in places if place in self.anchors), "")
+
+    def of_configuration(self, k: int) -> str:
+        """The link to the first shown photograph of a configuration; empty for none."""
+        return self._by_configuration.get(k, "")
+
+    @cached_property
+    def _by_configuration(self) -> dict[int, str]:
+        return {k: f"#{anchor}" for (_, k), anchor in reversed([*self.anchors.items()])}
 
 
 def section(session: Session, shown: Album) -> Part:
@@ -245,7 +254,7 @@ class _Found:
             anchor=_anchor(s, k),
         )
 
-    def _corner(self, corners: Corners, n: int) -> Corner:
+    def _corner(self, corners: BoardCorners, n: int) -> Corner:
         (x, y), (dx, dy) = corners.pixel[n].tolist(), (-corners.off[n]).tolist()
         tip = (
             f"Corner {corners.name[n]}: {number(-dx, 2, signed=True)},"
@@ -355,7 +364,7 @@ def _aside(n: int) -> str:
     return f", {n} of them put aside" if n else ""
 
 
-def _size(corners: Corners) -> str:
+def _size(corners: BoardCorners) -> str:
     """How far corners are off, in words."""
     rms = float(np.sqrt(np.mean(np.sum(corners.off**2, axis=1))))
     return f"{brief(rms)} px off"

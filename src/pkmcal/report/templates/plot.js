@@ -29,6 +29,11 @@
     for (const plot of plots) {
       const frames = read("frames", plot);
       if (frames) await Plotly.addFrames(plot, frames);
+      // a point that stands for a photograph leads to it
+      plot.on("plotly_click", ({ points }) => {
+        const lead = points[0].customdata;
+        if (typeof lead === "string" && lead.startsWith("#")) location.hash = lead;
+      });
       plot.dataset.drawn = "yes";
     }
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
