@@ -78,6 +78,19 @@ def test_page_tells_when_and_from_what_it_was_made(case):
                                                Verdict(True, "Fine."))  # fmt: skip
 
 
+def test_charts_lead_to_photographs_that_are_there(page, case):
+    found = Found(page)
+    links = [str(a["href"]) for tag, a in found.tags if tag == "a" and "download" not in a]
+    names = {f"#{a['id']}" for _, a in found.tags if "id" in a}
+    leading = [link for link in links if link.startswith("#photograph-")]
+    # a bar a configuration, a box a leg, station, joint and kind of edge, and cells
+    assert len(leading) > 5 + 6 + 3 + 6 + 20
+    assert set(leading) <= names
+    bar = re.search(r'<a href="#photograph-\d-(\d)" aria-label="configuration c(\d):', page)
+    assert bar is not None
+    assert int(bar[1]) == int(bar[2]) + 1
+
+
 def test_page_asks_for_nothing_outside(page):
     assert not re.search(r"https?:|//[a-z]+\.|@import|url\(", page)
     for tag, attributes in Found(page).tags:
@@ -99,7 +112,7 @@ def test_hostile_names_stay_text(tmp_path):
     found = Found(page)
     assert "<script>alert" not in page
     assert not [a for tag, a in found.tags if "onerror" in a or tag == "img"]
-    assert sum(tag == "script" for tag, _ in found.tags) == 3
+    assert sum(tag == "script" for tag, _ in found.tags) == 6
     assert found.text.count("<script>alert('x')") > 10
 
 

@@ -34,6 +34,7 @@ from pkmcal.report import page, pictures, scene
 from pkmcal.report import residuals as shown
 from pkmcal.report.calibration import outcome_of as outcome_of_calibration
 from pkmcal.report.calibration import save
+from pkmcal.report.links import Links
 from pkmcal.report.plan import outcome_of
 from pkmcal.session.load import Session
 from pkmcal.simulation import EdgeNoise, load_truth, simulate_edges, simulate_session
@@ -161,7 +162,7 @@ def residuals(case: Case) -> Shot:
     edges, estimate = case.result.observation.edges, case.result.estimate
     found = {
         "histogram": shown.histogram(estimate.edge_residuals),
-        "by_leg": shown.by_leg(case.session, edges, estimate),
+        "by_leg": shown.by_leg(case.session, edges, estimate, Links()),
     }
     template = page.environment().from_string(
         '{% import "charts.html.j2" as draw %}<div class="two">'

@@ -458,11 +458,10 @@ def json_text(value: Any) -> str:
 
 
 def _text(value: Any, indent: str) -> str:
-    line = _line(value)
     if not isinstance(value, dict | list) or _is_row(value):
-        return line
+        return _line(value)
     nested = any(isinstance(item, dict | list) for item in _items(value))
-    if len(line) <= _WIDEST and not nested:
+    if not nested and len(line := _line(value)) <= _WIDEST:
         return line
     inner = indent + " "
     parts = [_text(item, inner) for item in _items(value)]

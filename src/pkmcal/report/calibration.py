@@ -24,6 +24,8 @@ from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Verdict
 from pkmcal.report import (
+    correlations,
+    field,
     identifiability,
     page,
     parameters,
@@ -132,19 +134,22 @@ def report_of(
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
     album = pictures.album(session, observation, estimate, shifts, centres, boards, photographs)
-    space = photographed.plot(session, estimate, album, poses.places(observation, estimate))
+    links = album.links
+    space = photographed.plot(session, estimate, links, poses.places(observation, estimate))
     parts = (
         scene.section(session, estimate, centres),
         provenance.stations(session, estimate, camera, space),
-        workspace.section(session, estimate, over) if over else None,
+        workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         findings and identifiability.section(findings, estimate.machine.parameters),
+        correlations.section(estimate),
         pictures.section(session, album) if session.stations else None,
-        poses.section(session, observation, estimate),
+        poses.section(session, observation, estimate, links),
         holdout and validation.held_out(holdout, session),
         residuals.section(
-            session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
+            session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),
+        field.section(session, observation, estimate, album.corners, links),
         provenance.left_out(session, observation.rejected, estimate, findings),
         provenance.how(session, estimate, timings or {}),
     )

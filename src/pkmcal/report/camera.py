@@ -15,6 +15,7 @@ from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.report import charts, page
 from pkmcal.report.charts import enlargement
+from pkmcal.report.field import CellShift, ImageField
 from pkmcal.report.jpegs import THREADS, jpeg
 from pkmcal.report.pictures import Corner
 from pkmcal.wording import brief, count, decimals, number
@@ -253,10 +254,12 @@ def _field(c: CameraCalibration) -> Markup:
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     factor = enlargement(np.linalg.norm(means, axis=-1), ARROW * width)
-    arrows = np.concatenate([roots, means * factor], axis=1).tolist()
-    return page.render(
-        "field.html.j2", width=width, height=height, cells=cells, arrows=arrows, factor=factor
-    )
+    shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
+    drawn = ImageField(
+        "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),
+        tuple(CellShift(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
+    )  # fmt: skip
+    return page.render("field.html.j2", field=drawn, cells=cells, factor=factor)
 
 
 def _views_chart(c: CameraCalibration) -> charts.BarChart | None:

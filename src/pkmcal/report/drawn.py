@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -44,7 +45,7 @@ class Drawn:
     quiet: bool
     tip: str
 
-    @property
+    @cached_property
     def path(self) -> str:
         """SVG path data."""
         return "M" + "L".join(f"{x:.1f},{y:.1f}" for x, y in self.points)

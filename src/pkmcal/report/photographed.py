@@ -17,8 +17,8 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
 from pkmcal.outcome import Plot
+from pkmcal.report.links import Links
 from pkmcal.report.page import N_COLOURS
-from pkmcal.report.pictures import Album
 from pkmcal.report.scene import line, markers, ring, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import count
@@ -63,18 +63,22 @@ def limbs_of(machine: Machine, joints: Array, T_base_platform: Array) -> PosedLi
 
 
 def plot(
-    session: Session, estimate: Estimate, shown: Album, places: tuple[Array, Integers]
-) -> Plot:
-    """The figure. places : of measured targets (N, 3), base frame, and their configurations."""
+    session: Session, estimate: Estimate, links: Links, places: tuple[Array, Integers]
+) -> Plot | None:
+    """The figure; None where no pose was estimated. places : of measured targets (N, 3), base
+    frame, and their configurations.
+    """
     used = np.flatnonzero(estimate.configurations)
+    if not len(used):
+        return None
     some = used[np.unique(np.linspace(0, len(used) - 1, min(len(used), MOST)).astype(int))]
     machine, state = estimate.machine, estimate.state
     limbs = limbs_of(machine, session.joints[some], state.T_base_platform[some])
     names = [session.configurations[k] for k in some]
     cameras = np.array([inverse(T)[:3, 3] for T in state.T_camera_base[: len(session.stations)]])
     frames = _frames(machine, limbs, names)
-    still = _still(session, estimate, limbs, shown, places)
-    data = [*_moving(machine, frames[0]["data"] if frames else []), *still]
+    still = _still(session, estimate, limbs, links, places)
+    data = [*_moving(machine, frames[0]["data"]), *still]
     layout = _layout(limbs, cameras.reshape(-1, 3), data, names)
     fewer = f" of {len(used)}, evenly chosen" if len(some) < len(used) else ""
     return Plot(
@@ -177,7 +181,7 @@ def _still(
     session: Session,
     estimate: Estimate,
     limbs: PosedLimbs,
-    shown: Album,
+    links: Links,
     places: tuple[Array, Integers],
 ) -> list[dict[str, Any]]:
     """The base, the cameras, the poses, and what trackers or boards measured."""
@@ -212,10 +216,10 @@ def _still(
     used = np.flatnonzero(estimate.configurations)
     look = {"size": 3, "color": "--calibrated"}
     out.append(_poses("measured poses", estimate.state.T_base_platform[used, :3, 3], used, look,
-                      session, shown))  # fmt: skip
+                      session, links))  # fmt: skip
     if len(places[0]):
         look = {"size": 2.5, "color": "--drawing", "symbol": "diamond"}
-        out.append(_poses("measured targets", *places, look, session, shown))
+        out.append(_poses("measured targets", *places, look, session, links))
     return out
 
 
@@ -225,7 +229,7 @@ def _poses(
     configuration: Integers,
     look: dict[str, Any],
     session: Session,
-    shown: Album,
+    links: Links,
 ) -> dict[str, Any]:
     """Points (N, 3), each of which leads to its configuration's photograph."""
     return markers(
@@ -234,7 +238,7 @@ def _poses(
         look,
         hoverinfo="text",
         hovertext=[f"configuration {session.configurations[k]}" for k in configuration],
-        customdata=[shown.of_configuration(int(k)) for k in configuration],
+        customdata=[links.to_configuration(int(k)) for k in configuration],
     )
 
 

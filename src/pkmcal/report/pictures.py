@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from pkmcal.report.charts import enlargement
 from pkmcal.report.corners import BoardCorners, board_corners
 from pkmcal.report.drawn import CURVE, Drawn, Spot, measured_curves, straightened
 from pkmcal.report.jpegs import small_and_large
+from pkmcal.report.links import Links, Place
 from pkmcal.report.residuals import KEPT, SIDES
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import Photograph
@@ -35,9 +35,6 @@ ROOM = 8_000_000
 """Characters of all their JPEGs."""
 ARROW = 0.03
 """Length of a large corner's residual as drawn, in picture widths."""
-
-Place = tuple[int, int]
-"""A photograph by the numbers of its station and configuration."""
 
 
 @dataclass(frozen=True)
@@ -79,27 +76,14 @@ class Picture:
 @dataclass(frozen=True)
 class Album:
     """The photographs on the page. total : how many there are. factor : enlarges the corners'
-    residuals. anchors : the pictures' names on the page by their photographs.
+    residuals. corners : of the board, in all photographs.
     """
 
-    pictures: tuple[Picture, ...] = ()
-    total: int = 0
-    factor: float = 1.0
-    anchors: Mapping[Place, str] = field(default_factory=dict[Place, str])
-
-    def worst(self, station: Integers, configuration: Integers, size: Array) -> str:
-        """The link to the shown photograph of the largest of some things (n,); empty for none."""
-        order = np.argsort(-np.nan_to_num(size, nan=-np.inf), kind="stable")
-        places = zip(station[order].tolist(), configuration[order].tolist(), strict=True)
-        return next((f"#{self.anchors[place]}" for place in places if place in self.anchors), "")
-
-    def of_configuration(self, k: int) -> str:
-        """The link to the first shown photograph of a configuration; empty for none."""
-        return self._by_configuration.get(k, "")
-
-    @cached_property
-    def _by_configuration(self) -> dict[int, str]:
-        return {k: f"#{anchor}" for (_, k), anchor in reversed([*self.anchors.items()])}
+    pictures: tuple[Picture, ...]
+    total: int
+    factor: float
+    links: Links
+    corners: BoardCorners
 
 
 def section(session: Session, shown: Album) -> Part:
@@ -144,15 +128,18 @@ def album(
     ]
     shots = list(small_and_large(files, ROOM))
     chosen = ordered[: len(shots)]
+    links = Links.of((s, photo.configuration) for s, photo in chosen)
     found = _Found(session, observation, estimate, shifts, centres, boards or Boards(), chosen)
     return Album(
         tuple(
-            found.picture(s, photo, shot, level.get((s, photo.configuration), np.nan))
+            found.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
             for (s, photo), shot in zip(chosen, shots, strict=True)
+            for place in [(s, photo.configuration)]
         ),
         len(every),
         found.factor,
-        {(s, photo.configuration): _anchor(s, photo.configuration) for s, photo in chosen},
+        links,
+        found.corners,
     )
 
 
@@ -161,10 +148,6 @@ def _images(session: Session, s: int) -> Pictures:
     station = session.stations[s]
     paths = [photo.path for photo in station.photographs]
     return Pictures(paths, station.camera.image_size, [path.name for path in paths])
-
-
-def _anchor(s: int, k: int) -> str:
-    return f"photograph-{s + 1}-{k + 1}"
 
 
 def levels(observation: Observation, estimate: Estimate) -> dict[Place, float]:
@@ -224,7 +207,9 @@ class _Found:
                 self._missed(estimate, rejected[s], s, configurations)
                 self._spots(estimate, centres, s, configurations)
 
-    def picture(self, s: int, photo: Photograph, shot: tuple[str, str], level: float) -> Picture:
+    def picture(
+        self, s: int, photo: Photograph, shot: tuple[str, str], anchor: str, level: float
+    ) -> Picture:
         """One photograph with what was found in it."""
         k, station = photo.configuration, self.session.stations[s]
         p, c = station.photographs.index(photo), self.corners
@@ -251,7 +236,7 @@ class _Found:
             spots=tuple(self.spots[s, k]),
             corners=tuple(self._corner(mine, n) for n in range(len(mine))),
             caption="; ".join(text for text in told if text),
-            anchor=_anchor(s, k),
+            anchor=anchor,
         )
 
     def _corner(self, corners: BoardCorners, n: int) -> Corner:

@@ -34,12 +34,13 @@ MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
 
-def stations(session: Session, estimate: Estimate, camera: Integers, space: Plot) -> Part:
+def stations(session: Session, estimate: Estimate, camera: Integers, space: Plot | None) -> Part:
     """The machine as it was photographed, and where the cameras stood, one row a station; camera
     (S,) is the number of its camera file.
     """
+    plots = (space,) if space else ()
     if not session.station_names:
-        return Part("stations", "The machine in its poses", plots=(space,), menu="Poses")
+        return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
     for s, station in enumerate(session.stations):
@@ -64,7 +65,7 @@ def stations(session: Session, estimate: Estimate, camera: Integers, space: Plot
         "Where the cameras stood", columns, tuple(rows), brief=False, words=(len(columns) - 1,)
     )
     title = "The machine and its cameras"
-    return Part("stations", title, plots=(space,), tables=(table,), menu="Cameras")
+    return Part("stations", title, plots=plots, tables=(table,), menu="Cameras")
 
 
 def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
