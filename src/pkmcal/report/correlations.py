@@ -42,7 +42,8 @@ def section(estimate: Estimate) -> Part | None:
         f"A square of {len(shown)} by {len(shown)} cells, coloured by the correlation of two"
         " parameters each.",
         _figure(rho, names),
-        height=620,
+        height=600,
+        width=600,
     )
     return Part("correlations", "What is known together", (f"{said} {HOW}",), plots=(plot,),
                 menu="Correlations")  # fmt: skip

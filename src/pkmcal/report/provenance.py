@@ -124,7 +124,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
                 f"χ² of the {name}",
                 f"{number(chi2, 0)} over {number(n, 0)} numbers"
                 # degrees of freedom that the numbers leave, where they were counted
-                + (f", {number(freedom, 0)} degrees of freedom" if freedom >= 0.5 else ""),
+                + (f", {count(round(freedom), 'degree')} of freedom" if freedom >= 0.5 else ""),
             )
             for name, chi2, n, freedom in (
                 ("edges", s.chi2_edges, s.n_edges, s.dof_edges),

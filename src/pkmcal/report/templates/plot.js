@@ -14,10 +14,15 @@
     return Object.fromEntries(Object.entries(node).map(([name, value]) => [name, themed(value)]));
   };
   const options = { displayModeBar: false, responsive: true };
-  const draw = () => Promise.all(plots.map((plot, i) => {
+  const draw = (size = {}) => Promise.all(plots.map((plot, i) => {
     const figure = themed(figures[i]);
-    return Plotly.react(plot, figure.data, figure.layout, { ...options, ...figure.config });
+    return Plotly.react(plot, figure.data, { ...figure.layout, ...size }, { ...options, ...figure.config });
   }));
+  // On paper: in light colours, and as wide as a panel on A4 between its margins.
+  const paper = (printing) => {
+    document.documentElement.classList.toggle("paper", printing);
+    return draw(printing ? { width: 672 } : {});
+  };
   const load = async () => {
     const packed = Uint8Array.from(atob(document.getElementById("plotly").textContent), (c) => c.charCodeAt(0));
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
@@ -36,7 +41,9 @@
       });
       plot.dataset.drawn = "yes";
     }
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => draw());
+    addEventListener("beforeprint", () => paper(true));
+    addEventListener("afterprint", () => paper(false));
   };
   const failed = () => {
     for (const plot of plots) {
