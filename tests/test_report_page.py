@@ -202,6 +202,38 @@ def test_page_runs_in_a_browser(page, tmp_path, width):
     assert f"base64,{large[1]}" in shown
 
 
+def test_points_lead_to_photographs_and_paper_is_light(page, tmp_path):
+    """A bar's link and a plot's point go to their photograph; on paper, plots are as wide as it."""
+    act = """<script>addEventListener("load", () => {
+      const tell = document.documentElement.dataset;
+      const plot = document.getElementById("plot-photographed");
+      const width = () => plot.querySelector(".main-svg").getAttribute("width");
+      const wait = setInterval(() => {
+        if (plot.dataset.drawn !== "yes") return;
+        clearInterval(wait);
+        document.querySelector("#residuals a").dispatchEvent(new MouseEvent("click"));
+        tell.bar = location.hash;
+        plot.emit("plotly_click", { points: [{ customdata: "#photograph-1-2" }] });
+        tell.point = location.hash;
+        tell.screen = width();
+        dispatchEvent(new Event("beforeprint"));
+        tell.paper = width();
+        tell.light = getComputedStyle(document.documentElement).getPropertyValue("--ink");
+        dispatchEvent(new Event("afterprint"));
+        setInterval(() => { tell.again = width(); }, 100);
+      }, 50);
+    });</script></body>"""
+    document, console = browse(page.replace("</body>", act), tmp_path, 1280)
+    root = Found(document).tags[0][1]
+    assert root["data-errors"] == ""
+    assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
+    assert str(root["data-bar"]).startswith("#photograph-")
+    assert root["data-point"] == "#photograph-1-2"
+    assert root["data-paper"] == "672"
+    assert root["data-screen"] == root["data-again"] != "672"
+    assert root["data-light"] == "#1a1e24"
+
+
 def test_the_browser_test_sees_errors(page, tmp_path):
     broken = page.replace('"use strict";', 'fetch("https://example.org/x"); missing();', 1)
     document, console = browse(broken, tmp_path, 800)

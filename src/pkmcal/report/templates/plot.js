@@ -19,9 +19,10 @@
     return Plotly.react(plot, figure.data, { ...figure.layout, ...size }, { ...options, ...figure.config });
   }));
   // On paper: in light colours, and as wide as a panel on A4 between its margins.
-  const paper = (printing) => {
+  const paper = async (printing) => {
     document.documentElement.classList.toggle("paper", printing);
-    return draw(printing ? { width: 672 } : {});
+    await draw(printing ? { width: 672 } : { autosize: true });
+    if (!printing) for (const plot of plots) Plotly.Plots.resize(plot);
   };
   const load = async () => {
     const packed = Uint8Array.from(atob(document.getElementById("plotly").textContent), (c) => c.charCodeAt(0));
