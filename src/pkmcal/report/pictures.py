@@ -189,7 +189,7 @@ class _Found:
         self.spots: dict[Place, list[Spot]] = defaultdict(list)
         self.reasons: dict[Place, list[str]] = defaultdict(list)
         self.corners = board_corners(session, boards, estimate)
-        width = max(station.camera.image_size[0] for station in session.stations)
+        width = max((s.camera.image_size[0] for s in session.stations), default=0)
         self.factor = enlargement(np.linalg.norm(self.corners.off, axis=1), ARROW * width)
         rejected: dict[int, list[Rejection]] = defaultdict(list)
         for one in observation.rejected:
