@@ -1,5 +1,6 @@
 """Files in and out: YAML with line numbers, schemas, CSV tables, outputs whole or not at all."""
 
+from pkmcal.files.cache import remember, remembered
 from pkmcal.files.documents import (
     Document,
     Keys,
@@ -77,6 +78,8 @@ __all__ = [
     "read_json",
     "read_text",
     "read_yaml",
+    "remember",
+    "remembered",
     "remove_folder",
     "settle",
     "shown",

@@ -438,17 +438,17 @@ _WIDEST = 160
 
 def plain(value: Any) -> Any:
     """Arrays, tuples and NumPy numbers as JSON has them; what is not finite becomes null."""
-    if isinstance(value, float):  # first, for there are a hundred thousand of them
-        return value if math.isfinite(value) else None
-    if isinstance(value, str | int):
+    if value is None or isinstance(value, str | int):  # most values; of Python's own types
         return value
-    if isinstance(value, np.ndarray | np.generic):
-        finite = value.dtype.kind in "biu" or (value.dtype.kind == "f" and np.isfinite(value).all())
-        return value.tolist() if finite else plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        known = value.dtype.kind != "f" or bool(np.isfinite(value).all())
+        return value.tolist() if known and value.dtype.kind in "fiub" else plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
 
@@ -460,9 +460,10 @@ def json_text(value: Any) -> str:
 def _text(value: Any, indent: str) -> str:
     if not isinstance(value, dict | list) or _is_row(value):
         return _line(value)
-    nested = any(isinstance(item, dict | list) for item in _items(value))
-    if not nested and len(line := _line(value)) <= _WIDEST:
-        return line
+    if not any(isinstance(item, dict | list) for item in _items(value)):
+        line = _line(value)
+        if len(line) <= _WIDEST:
+            return line
     inner = indent + " "
     parts = [_text(item, inner) for item in _items(value)]
     if isinstance(value, dict):

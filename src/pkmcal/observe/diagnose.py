@@ -15,7 +15,6 @@ from itertools import combinations, islice
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
@@ -258,7 +257,7 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
     keeps = np.eye(len(names)) * station.found.grain * (DECIDED / 2 + choices)
     for _ in range(ASSIGNED):  # the wrong names have moved the pose, and it the names
         fits = evidence_by_name(replace(view, configuration=names[columns]), T_camera_base, names)
-        before, columns = columns, linear_sum_assignment(-(fits + keeps))[1]
+        before, columns = columns, _best_names(fits + keeps)
         if np.array_equal(before, columns):
             break
         T_camera_base = settled(replace(view, configuration=names[columns]), T_camera_base)
@@ -267,6 +266,16 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
         right = replace(view, configuration=names[columns])
         error = _misnamed(station, moved, names[columns[moved]])
         yield Hypothesis(right, error, len(moved) * choices)
+
+
+def _best_names(score: Array) -> Integers:
+    """The name (n,) of each photograph, each given once, with the largest sum of scores (n, n)."""
+    first = score.argmax(axis=1)
+    if len(np.unique(first)) == len(first):  # as a rule, and SciPy's takes a while to import
+        return first
+    from scipy.optimize import linear_sum_assignment
+
+    return linear_sum_assignment(-score)[1]
 
 
 def _two_legs(a: int, b: int) -> InputError:

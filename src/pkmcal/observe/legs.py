@@ -170,12 +170,12 @@ def gradient_strength(
     wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]])
     pixel = points.pixel[..., None, :] + wide[:, None] * points.outward[..., None, :]
     import cv2
-    from scipy.ndimage import maximum_filter1d
 
     smooth = (cv2.GaussianBlur(im.astype(np.float32), (0, 0), SMOOTH) for im in images)
     level = np.sqrt(255.0 * sample(smooth, pixel, cubic=False))
     slope = np.abs(level[..., 2:] - level[..., :-2]) / 2
-    peak = maximum_filter1d(slope, 2 * PEAK + 1, axis=-1)
+    about = np.ones((1, 2 * PEAK + 1), np.uint8)
+    peak = cv2.dilate(slope.reshape(-1, slope.shape[-1]), about).reshape(slope.shape)
     sharp = slope / np.maximum(peak, 1e-6)
     return (1 + sharp) / 2 * slope**2 / (slope**2 + GRADIENT_HALF**2), offsets
 
@@ -443,9 +443,12 @@ def _segment_profiles(
     count = weight.sum(axis=-1)
     full = count >= FEWEST_SHARE * weight.shape[-1]
     kept, weight = grey[full], weight[full][..., None]
-    mean = np.sum(kept * weight, axis=-2) / count[full][:, None]
+    number = count[full][:, None]
+    mean = np.sum(kept * weight, axis=-2) / number
+    square = np.sum(kept**2 * weight, axis=-2) / number - mean**2
+    error = np.sqrt(np.maximum(square, profiles.GREY_NOISE**2) / number)
     saturated = np.any((kept >= profiles.SATURATED) & weight, axis=-2)
-    cut = profiles.cut_of(saturated, half_width[full])
+    cut = profiles.cut_of(mean, error, saturated, half_width[full])
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
 
 

@@ -31,6 +31,10 @@ LIMB = 0.45
 metal begin further in. On slim legs this is less than INSIDE."""
 LEAST_INSIDE = 1.25
 """Pixels inside that are used in any case: less would not hold the limb's own brightness."""
+CLEAR_OUTSIDE = 1.0
+"""Pixels outward of the predicted edge from which samples are taken for the background's level."""
+TURNED = 3.0
+"""Standard deviations by which the brightness inside has to come back to be a highlight's."""
 STEP = 0.5
 SHIFTS = np.arange(-1.5, 1.55, 0.1)
 """Trial positions of the edge about the predicted one, px."""
@@ -147,17 +151,41 @@ class Profiles:
         return np.maximum(np.ptp(self.grey, axis=-1), 1e-3)
 
 
-def cut_of(saturated: Booleans, half_width: Array) -> Integers:
-    """Samples (N,) to leave out at the inner end of profiles.
+def cut_of(grey: Array, error: Array, saturated: Booleans, half_width: Array) -> Integers:
+    """Samples (N,) to leave out at the inner end of averaged profiles ``grey`` (N, samples), of
+    standard error ``error`` (N, samples).
 
-    Up to the outermost saturated one of ``saturated`` (N, samples), and what lies deeper than the
-    limb of a leg of ``half_width`` (N,) px.
+    Up to the outermost saturated one of ``saturated`` (N, samples), what lies deeper than the limb
+    of a leg of ``half_width`` (N,) px, and what lies deeper than the limb's own brightness goes on:
+    a highlight is none of the model's, and with its far side in the profile its near border is the
+    likelier edge.
     """
-    count = saturated.shape[-1]
-    last = count - np.argmax(saturated[..., ::-1], axis=-1)
+    n_samples = grey.shape[-1]
+    last = n_samples - np.argmax(saturated[..., ::-1], axis=-1)
     depth = np.maximum(LIMB * half_width, LEAST_INSIDE)
     beyond = np.sum(profile_offsets() < -depth[:, None] - 1e-9, axis=-1)
-    return np.maximum(np.where(saturated.any(axis=-1), last, 0), beyond)
+    cut = np.maximum(np.where(saturated.any(axis=-1), last, 0), beyond)
+    return np.maximum(cut, _turned_at(grey, error))
+
+
+def _turned_at(grey: Array, error: Array) -> Integers:
+    """The sample (N,) at which a profile's departure from its background is largest before, further
+    in, it is less by more than noise and the model's error explain; 0 where it never is.
+    """
+    offsets = profile_offsets()
+    outside = offsets >= CLEAR_OUTSIDE
+    background, plain = (np.median(x[:, outside], axis=1, keepdims=True) for x in (grey, error))
+    inside = np.flatnonzero(offsets <= -STEP)[::-1]  # from the limb inwards
+    away = np.abs(grey[:, inside] - background)
+    most = np.maximum.accumulate(away, axis=1)
+    # of a difference of two samples, as the background has it: a highlight scatters along the leg
+    noise = np.hypot(np.sqrt(2) * plain, MODEL_ERROR * most)
+    less = most - away > TURNED * noise
+    # the largest before it was less: the last place that was its own largest
+    before = np.arange(len(inside)) < np.argmax(less, axis=1)[:, None]
+    largest = len(inside) - 1 - np.argmax(((away == most) & before)[:, ::-1], axis=1)
+    least = np.searchsorted(offsets, -LEAST_INSIDE - 1e-9)
+    return np.where(less.any(axis=1), np.minimum(inside[largest], least), 0)
 
 
 def residual_curves(profiles: Profiles, blur: float) -> Array:

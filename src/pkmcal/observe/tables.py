@@ -91,12 +91,11 @@ class DistanceTables:
         place = np.where(inside[..., None], place, 0.0)
         corner = np.floor(place).astype(np.intp)
         fx, fy = (place[..., i] - corner[..., i] for i in (0, 1))
-        x, y = corner[..., 0], corner[..., 1]
-        at, photograph = self.tables, self.row[photograph]
-        upper = (1 - fx) * at[photograph, direction, y, x]
-        upper = upper + fx * at[photograph, direction, y, x + 1]
-        lower = (1 - fx) * at[photograph, direction, y + 1, x]
-        lower = lower + fx * at[photograph, direction, y + 1, x + 1]
+        table = self.row[photograph] * self.tables.shape[1] + direction
+        at = (table * height + corner[..., 1]) * width + corner[..., 0]
+        entries = self.tables.reshape(-1)
+        upper = (1 - fx) * entries.take(at) + fx * entries.take(at + 1)
+        lower = (1 - fx) * entries.take(at + width) + fx * entries.take(at + width + 1)
         return (1 - fy) * upper + fy * lower, inside
 
     def by_chance(self, direction: Integers, found: Array) -> Array:
@@ -117,7 +116,7 @@ class DistanceTables:
             PictureEdges(e.pixel * (-1, 1) + (width - 1, 0), e.normal * (-1, 1)) for e in self.edges
         )
         return DistanceTables(
-            self.tables[:, ::-1, :, ::-1],
+            np.ascontiguousarray(self.tables[:, ::-1, :, ::-1]),
             self.row,
             self.scale,
             tuple(edges),

@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from pkmcal.files import plain
+from pkmcal.files import plain, remember, remembered
 from pkmcal.wording import count
 
 if TYPE_CHECKING:
@@ -54,11 +54,23 @@ def render(template: str, **views: Any) -> Markup:
 
 @cache
 def environment() -> jinja2.Environment:
-    """Templates of this package."""
+    """Templates of this package, each compiled once a machine."""
     import jinja2
+
+    class Compiled(jinja2.BytecodeCache):
+        """Templates' code between runs; Jinja checks that it is the template's."""
+
+        def load_bytecode(self, bucket: jinja2.bccache.Bucket) -> None:
+            code = remembered(f"template-{bucket.key}")
+            if code is not None:
+                bucket.bytecode_from_string(code)
+
+        def dump_bytecode(self, bucket: jinja2.bccache.Bucket) -> None:
+            remember(f"template-{bucket.key}", bucket.bytecode_to_string())
 
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pkmcal.report"),
+        bytecode_cache=Compiled(),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -81,10 +93,14 @@ def plotly_script() -> str:
     """Plotly's script, compressed (gzip, base64): a fifth of the page's size without it."""
     import base64
     import gzip
-    from importlib import resources
+    from importlib import metadata, resources
 
-    source = resources.files("plotly") / "package_data" / "plotly.min.js"
-    packed = gzip.compress(source.read_bytes(), 6, mtime=0)
+    name = f"plotly-{metadata.version('plotly')}"
+    packed = remembered(name)
+    if packed is None:
+        source = resources.files("plotly") / "package_data" / "plotly.min.js"
+        packed = gzip.compress(source.read_bytes(), 6, mtime=0)
+        remember(name, packed)
     return base64.b64encode(packed).decode("ascii")
 
 
