@@ -28,7 +28,7 @@ def figure(case: Case):
         centres,
     )
     none = np.zeros((0, 3)), np.zeros(0, dtype=int)
-    return album, photographed.plot(case.session, case.estimate, album, none)
+    return album, photographed.plot(case.session, case.estimate, album.links, none)
 
 
 def points(trace) -> np.ndarray:
