@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from conftest import run
 from pkmcal.calibration.calibrate import calibrate
 from pkmcal.calibration.recognise import boards_of, read_photographs
 from pkmcal.errors import InputError
-from pkmcal.geometry.rigid import inverse, pose_difference
+from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.papers.hand_eye import solve_pairs
+from pkmcal.report.corners import board_corners
 from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
 
@@ -70,6 +72,22 @@ def test_boards_are_where_they_are(rendered):
     z2 = np.sum(np.einsum("nij,nj->ni", poses.whiten, error) ** 2, axis=1)
     assert len(poses) > 7
     assert np.all(z2 < 30)  # six squares each; one in twenty thousand
+
+
+def test_corners_are_expected_where_the_calibrated_machine_has_them(rendered):
+    found = calibrate(rendered)
+    corners = board_corners(found.session, found.boards, found.estimate)
+    assert len(corners) > 50
+    # what the corners' own noise leaves, a few hundredths of a pixel
+    assert np.sqrt(np.mean(corners.off[corners.used] ** 2)) < 0.15
+    state, turn = found.estimate.state, 1e-3
+    T_turned_camera = perturb(np.eye(4), np.array([0.0, turn, 0, 0, 0, 0]))
+    turned = replace(state, T_camera_base=T_turned_camera @ state.T_camera_base)
+    moved = replace(found.estimate, state=turned)
+    change = board_corners(found.session, found.boards, moved).off - corners.off
+    focal = found.session.stations[0].camera.parameters[0]
+    # expected farther right by the focal length times the turn, and more towards the border
+    np.testing.assert_allclose(change[:, 0], -focal * turn, rtol=0.3)
 
 
 def test_legs_and_board_together_need_no_pose_by_hand(rendered, folder):

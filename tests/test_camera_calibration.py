@@ -305,7 +305,7 @@ def test_the_page(calibrated, tmp_path):
     cv2.imwrite(str(path), np.full((768, 1024), 120, dtype=np.uint8))
     html = page_html(outcome_of(found, [path]))
     assert html.count('class="shot"') == 10
-    assert html.count("data:image/jpeg;base64,") == 1
+    assert html.count('href="data:image/jpeg;base64,') == 1
     assert html.count('class="seen"') == 480
     assert "http://" not in html
     assert "https://" not in html

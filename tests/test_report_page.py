@@ -4,7 +4,9 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from datetime import datetime
 from html.parser import HTMLParser
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,8 @@ import pytest
 
 from pkmcal.measurements import Rejection
 from pkmcal.outcome import Verdict
+from pkmcal.report.calibration import report_of
+from pkmcal.report.page import page_html
 from test_report_case import Case, make_case, report_html
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
@@ -60,6 +64,33 @@ def test_page_tells_verdict_numbers_and_model_error(page):
         assert expected in text, expected
 
 
+def test_page_tells_when_and_from_what_it_was_made(case):
+    noted = replace(case.session, document={"notes": "Machine 2.\nLeg 4 <b>exchanged</b>."})
+    found = report_of(noted, case.observation, case.estimate, Verdict(True, "Fine."), digest="3f2a")
+    html = page_html(found, datetime(2026, 3, 4, 15, 2))
+    text = Found(html).text
+    assert "4 March 2026, 15:02" in text
+    assert f"pkmcal {version('pkmcal')}" in text
+    assert "digest of the session 3f2a" in text
+    assert "Leg 4 <b>exchanged</b>." in text
+    assert "<h3>Notes</h3>" in html
+    assert "<h3>Notes</h3>" not in report_html(case.session, case.observation, case.estimate,
+                                               Verdict(True, "Fine."))  # fmt: skip
+
+
+def test_charts_lead_to_photographs_that_are_there(page, case):
+    found = Found(page)
+    links = [str(a["href"]) for tag, a in found.tags if tag == "a" and "download" not in a]
+    names = {f"#{a['id']}" for _, a in found.tags if "id" in a}
+    leading = [link for link in links if link.startswith("#photograph-")]
+    # a bar a configuration, a box a leg, station, joint and kind of edge, and cells
+    assert len(leading) > 5 + 6 + 3 + 6 + 20
+    assert set(leading) <= names
+    bar = re.search(r'<a href="#photograph-\d-(\d)" aria-label="configuration c(\d):', page)
+    assert bar is not None
+    assert int(bar[1]) == int(bar[2]) + 1
+
+
 def test_page_asks_for_nothing_outside(page):
     assert not re.search(r"https?:|//[a-z]+\.|@import|url\(", page)
     for tag, attributes in Found(page).tags:
@@ -81,7 +112,7 @@ def test_hostile_names_stay_text(tmp_path):
     found = Found(page)
     assert "<script>alert" not in page
     assert not [a for tag, a in found.tags if "onerror" in a or tag == "img"]
-    assert sum(tag == "script" for tag, _ in found.tags) == 3
+    assert sum(tag == "script" for tag, _ in found.tags) == 6
     assert found.text.count("<script>alert('x')") > 10
 
 
@@ -100,7 +131,7 @@ def test_a_page_without_a_single_edge(case):
         Verdict(False, "Nothing seen."),
     )
     assert "Do not use" in page
-    assert "No photograph has a pose to draw in." in page
+    assert "nothing in use" in page
     assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
 
 
@@ -161,10 +192,46 @@ def test_page_runs_in_a_browser(page, tmp_path, width):
     changes = [abs(float(v.split()[2])) for v in re.findall(r'data-values="([^"]+)"', document)]
     assert len(changes) == 60
     assert changes == sorted(changes, reverse=True)
-    assert sum(a.get("class") == "shot" for tag, a in tags if tag == "svg") == 12 + 1
+    assert sum(a.get("class") == "shot" for tag, a in tags if tag == "svg") == 15 + 1
     dialog = document[document.index('<dialog id="large"') :]
     assert dialog[: dialog.index(">")].endswith('open=""')
-    assert dialog[: dialog.index("</dialog>")].count("<svg") == 1
+    shown = dialog[: dialog.index("</dialog>")]
+    assert shown.count("<svg") == 1
+    large = re.search(r'data-large="([^"]+)"', page)
+    assert large is not None
+    assert f"base64,{large[1]}" in shown
+
+
+def test_points_lead_to_photographs_and_paper_is_light(page, tmp_path):
+    """A bar's link and a plot's point go to their photograph; on paper, plots are as wide as it."""
+    act = """<script>addEventListener("load", () => {
+      const tell = document.documentElement.dataset;
+      const plot = document.getElementById("plot-photographed");
+      const width = () => plot.querySelector(".main-svg").getAttribute("width");
+      const wait = setInterval(() => {
+        if (plot.dataset.drawn !== "yes") return;
+        clearInterval(wait);
+        document.querySelector("#residuals a").dispatchEvent(new MouseEvent("click"));
+        tell.bar = location.hash;
+        plot.emit("plotly_click", { points: [{ customdata: "#photograph-1-2" }] });
+        tell.point = location.hash;
+        tell.screen = width();
+        dispatchEvent(new Event("beforeprint"));
+        tell.paper = width();
+        tell.light = getComputedStyle(document.documentElement).getPropertyValue("--ink");
+        dispatchEvent(new Event("afterprint"));
+        setInterval(() => { tell.again = width(); }, 100);
+      }, 50);
+    });</script></body>"""
+    document, console = browse(page.replace("</body>", act), tmp_path, 1280)
+    root = Found(document).tags[0][1]
+    assert root["data-errors"] == ""
+    assert not re.search(r"ERROR:CONSOLE|Uncaught|Refused", console), console
+    assert str(root["data-bar"]).startswith("#photograph-")
+    assert root["data-point"] == "#photograph-1-2"
+    assert root["data-paper"] == "672"
+    assert root["data-screen"] == root["data-again"] != "672"
+    assert root["data-light"] == "#1a1e24"
 
 
 def test_the_browser_test_sees_errors(page, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
-from pkmcal.session.load import load_session
+from pkmcal.session.load import digests, load_session, session_digest
 from pkmcal.session.readings import check_readings
 from pkmcal.wording import MINUS
 
@@ -139,6 +139,24 @@ def test_a_session(folder):
 def test_the_file_itself_may_be_named(folder):
     assert load_session(folder / "session.yaml").folder == folder
     assert load_session(str(folder)).folder == folder
+
+
+def test_the_digest_is_of_what_a_result_depends_on(folder):
+    def digest():
+        session = load_session(folder)
+        return session_digest(session, digests(session))
+
+    first = digest()
+    with (folder / "session.yaml").open("a") as file:
+        file.write("# a comment\nnotes: |\n  Machine 2.\n  Leg 4 exchanged.\n")
+    assert load_session(folder).document["notes"] == "Machine 2.\nLeg 4 exchanged.\n"
+    assert digest() == first
+    change(folder, "joints.csv", "0.46,", "0.459,")
+    second = digest()
+    change(folder, "cameras/front.yaml", "9.0, 9.0", "9.0, 9.1")
+    third = digest()
+    assert cv2.imwrite(str(folder / "images/front/0001.png"), np.full((6, 8), 129, np.uint8))
+    assert len({first, second, third, digest()}) == 4
 
 
 def test_the_resolved_document_is_plain_and_complete(folder):

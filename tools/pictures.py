@@ -34,6 +34,7 @@ from pkmcal.report import page, pictures, scene
 from pkmcal.report import residuals as shown
 from pkmcal.report.calibration import outcome_of as outcome_of_calibration
 from pkmcal.report.calibration import save
+from pkmcal.report.links import Links
 from pkmcal.report.plan import outcome_of
 from pkmcal.session.load import Session
 from pkmcal.simulation import EdgeNoise, load_truth, simulate_edges, simulate_session
@@ -79,14 +80,14 @@ def whole_page(body: str, width: int, height: int, more_style: str = "") -> Shot
 def result(case: Case) -> Shot:
     """README's first picture: a photograph with fitted edges beside the geometry's change."""
     session, estimate = case.session, case.result.estimate
-    edges = case.result.observation.edges
     centres = joint_centres(
         session.machine, estimate.machine, free_of_gauge(estimate.machine, estimate.covariance)
     )
     drawn = scene.scene_of(session, estimate, centres)
-    taken = pictures.pictures(session, edges, estimate, outward(case), centres)
-    shots = {(p.station, p.configuration): p for p in taken}
-    shot = shots.get(("station2", "0011")) or next(iter(shots.values()))
+    taken = pictures.album(session, case.result.observation, estimate, outward(case), centres)
+    shots = {(p.station, p.configuration): p for p in taken.pictures}
+    shot = shots.get(("station2", "0011")) or taken.pictures[0]
+    shot = replace(shot, jpeg=shot.large)
     template = page.environment().from_string(
         '{% import "charts.html.j2" as draw %}'
         '<div class="grid"><div>{{ draw.picture(shot) }}<p>A photograph, the edges fitted in it,'
@@ -161,7 +162,7 @@ def residuals(case: Case) -> Shot:
     edges, estimate = case.result.observation.edges, case.result.estimate
     found = {
         "histogram": shown.histogram(estimate.edge_residuals),
-        "by_leg": shown.by_leg(case.session, edges, estimate),
+        "by_leg": shown.by_leg(case.session, edges, estimate, Links()),
     }
     template = page.environment().from_string(
         '{% import "charts.html.j2" as draw %}<div class="two">'

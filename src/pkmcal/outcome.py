@@ -205,8 +205,9 @@ class Outcome:
     """What a command found, for people and for programs.
 
     command : its name. title : of the page. kicker : above the title, such as a session's name.
-    subject : what was looked at, in a sentence. verdict : may the result be used. stamp : the
-    verdict in a word or three. level : how bad it is if the result may not be used.
+    subject : what was looked at, in a sentence. origin : what tells the data from others, such as
+    a session's digest; on the page. notes : the user's own words. verdict : may the result be used.
+    stamp : the verdict in a word or three. level : how bad it is if the result may not be used.
     figures : cards at the page's top; a terminal shows them where no part has a brief table.
     parts : sections of the page. findings : what to look at besides the verdict's warnings.
     closing : a terminal's last words before the files. document : everything as plain data, m
@@ -219,6 +220,8 @@ class Outcome:
     verdict: Verdict
     kicker: str = ""
     subject: str = ""
+    origin: tuple[str, ...] = ()
+    notes: str = ""
     stamp: str = ""
     level: Level = Level.WRONG
     figures: tuple[Figure, ...] = ()

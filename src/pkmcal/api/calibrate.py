@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Literal
 
@@ -91,7 +91,9 @@ def calibrate(
         holdout=holdout,
         progress=progress,
     )
-    return CalibrationResult(**{one.name: getattr(found, one.name) for one in fields(found)})
+    # a result that is held should not hold its photographs, too
+    kept = replace(found, photographs={})
+    return CalibrationResult(**{one.name: getattr(kept, one.name) for one in fields(kept)})
 
 
 def load_result(source: Path | str) -> SavedCalibration:

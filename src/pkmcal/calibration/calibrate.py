@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.byhand import misplaced, place_by_hand, without_misplaced
@@ -69,6 +70,8 @@ class Calibration(ShownCalibration):
     the machine and what they leave open. timings : seconds by step. holdout : configurations that
     the estimate did not see, where that was asked for; :func:`pkmcal.judge.holdouts.holdout_of`
     tells what it predicts of them. departures : what the data show that the model does not have.
+    photographs : of stations whose legs were observed, by their number; those that fitted into
+    memory are decoded.
     """
 
     session: Session
@@ -84,6 +87,9 @@ class Calibration(ShownCalibration):
     findings: Findings | None = None
     holdout: LeftOut | None = None
     departures: tuple[Departed, ...] = ()
+    photographs: Mapping[int, Sequence[Integers]] = field(
+        default_factory=dict[int, Sequence[Integers]]
+    )
 
     @property
     def machine(self) -> Machine:
@@ -329,6 +335,7 @@ def _judge(
         findings=findings,
         holdout=found.out,
         departures=departed,
+        photographs={one.station: one.images for one in seen.photographs},
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -43,7 +43,7 @@ from pkmcal.mechanisms import (
     with_exact_scales,
 )
 from pkmcal.outcome import Verdict
-from pkmcal.session.load import digests
+from pkmcal.session.load import digests, session_digest
 from pkmcal.wording import listed
 
 if TYPE_CHECKING:
@@ -120,16 +120,17 @@ def texts_of(
     not_identified: Sequence[str] = (),
     holdout: dict[str, Any] | None = None,
     over: ToolMap | str | None = None,
+    photographs: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, str]:
     """What a calibration leaves on disk besides its page: texts by their files' names.
 
-    not_identified, holdout, over : as for :func:`document_of`.
+    not_identified, holdout, over, photographs : as for :func:`document_of`.
     """
     from pkmcal.cameras.files import camera_text
 
     texts = {
         MECHANISM: calibrated_mechanism_text(calibration),
-        EVERYTHING: json_text(document_of(calibration, not_identified, holdout, over)),
+        EVERYTHING: json_text(document_of(calibration, not_identified, holdout, over, photographs)),
     }
     cameras = calibration.cameras
     for file in cameras.files if cameras.refined else ():
@@ -167,15 +168,18 @@ def document_of(
     not_identified: Sequence[str] = (),
     holdout: dict[str, Any] | None = None,
     over: ToolMap | str | None = None,
+    photographs: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Any]:
     """The content of calibration.json, plain data without NaN and dates.
 
     not_identified : sentences about what the data could not decide, as the report tells them.
     holdout : residuals on configurations that were held out, beside those in use. over : the tool
-    over the workspace, or why there is no map of it.
+    over the workspace, or why there is no map of it. photographs : their digests, read unless
+    given.
     """
     session, estimate = calibration.session, calibration.estimate
     bed = calibration.findings and calibration.findings.bed
+    seen = digests(session) if photographs is None else photographs
     document = {
         FORMAT_KEY: FORMAT,
         "conventions": CONVENTIONS,
@@ -192,7 +196,7 @@ def document_of(
         "station_covariance": _station_covariance(calibration),
         "targets": _targets(calibration),
         "cameras": _cameras(calibration),
-        "configurations": _configurations(calibration),
+        "configurations": _configurations(calibration, seen),
         "statistics": asdict(estimate.statistics),
         "tool": {"why_not": over} if isinstance(over, str) else over and over.document(),
         "bed": bed and asdict(bed),
@@ -200,7 +204,11 @@ def document_of(
         "residuals": _residuals(calibration),
         "rejected": _rejected(calibration),
         "mechanism": estimate.machine.to_document(),
-        "session": {"folder": session.folder.resolve().name, **session.document},
+        "session": {
+            "folder": session.folder.resolve().name,
+            "digest": session_digest(session, seen),
+            **session.document,
+        },
         "departures": [one.document() for one in calibration.departures],
         "warnings": session.warnings,
         "versions": versions(),
@@ -389,10 +397,13 @@ def _refined(calibration: Calibration, file: str) -> dict[str, Any]:
     }
 
 
-def _configurations(calibration: Calibration) -> list[dict[str, Any]]:
-    """Poses of all configurations; those not used have theirs from the readings alone."""
+def _configurations(
+    calibration: Calibration, seen: Mapping[str, Sequence[str]]
+) -> list[dict[str, Any]]:
+    """Poses of all configurations; those not used have theirs from the readings alone. seen : the
+    photographs' digests.
+    """
     session, estimate = calibration.session, calibration.estimate
-    seen = digests(session)
     return [
         {
             "name": name,

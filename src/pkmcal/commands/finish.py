@@ -8,6 +8,7 @@ outcome holds no text of that name itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,11 +92,12 @@ def contents(outcome: Outcome, files: Mapping[str, str]) -> dict[str, str | byte
     from pkmcal.files import json_text
     from pkmcal.report.page import page_html
 
-    texts = dict(outcome.texts)
+    texts, made = dict(outcome.texts), datetime.now()
     for name in files:
         if name in texts:
             continue
-        texts[name] = page_html(outcome) if name.endswith(".html") else json_text(outcome.document)
+        page = name.endswith(".html")
+        texts[name] = page_html(outcome, made) if page else json_text(outcome.document)
     return texts
 
 

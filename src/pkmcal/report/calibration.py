@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Integers
 from pkmcal.calibration import toolmap
 from pkmcal.calibration.kept import keep_earlier
 from pkmcal.calibration.results import REPORT, check_output, texts_of
@@ -24,9 +25,12 @@ from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Verdict
 from pkmcal.report import (
+    correlations,
+    field,
     identifiability,
     page,
     parameters,
+    photographed,
     pictures,
     poses,
     provenance,
@@ -36,10 +40,11 @@ from pkmcal.report import (
     workspace,
 )
 from pkmcal.report.residuals import KEPT
-from pkmcal.session.load import Session
+from pkmcal.session.load import Session, digests, session_digest
 from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
+    from pkmcal.boards.views import Boards
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.unidentified import Findings
     from pkmcal.judge.holdouts import HoldOut
@@ -51,6 +56,7 @@ NO_TURN = 1e-9
 def outcome_of(calibration: Calibration) -> Outcome:
     """Everything that `pkmcal calibrate` tells and writes."""
     c, held_out, over = calibration, holdout_of(calibration), _tool_map(calibration)
+    seen = digests(c.session)
     told = report_of(
         c.session,
         c.observation,
@@ -60,6 +66,9 @@ def outcome_of(calibration: Calibration) -> Outcome:
         timings=c.timings,
         holdout=held_out,
         over=over,
+        digest=session_digest(c.session, seen),
+        boards=c.boards,
+        photographs=c.photographs,
     )
     groups = parameters.parameter_groups(c.session.machine, c.estimate)
     open_ = parameters.unidentified(groups, c.estimate, c.findings)
@@ -67,7 +76,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
-        texts=texts_of(c, open_, predicted, over),
+        texts=texts_of(c, open_, predicted, over, seen),
         summary={
             "verdict": asdict(c.verdict),
             **(told.summary or {}),
@@ -95,7 +104,7 @@ def save(calibration: Calibration, folder: Path | str, *, force: bool = False) -
     over = check_output(folder, force=force)
     found = outcome_of(calibration)
     kept = None if force else keep_earlier(Path(folder), found.texts)
-    write_folder(Path(folder), {REPORT: page.page_html(found), **found.texts}, over)
+    write_folder(Path(folder), {REPORT: page.page_html(found, datetime.now()), **found.texts}, over)
     return kept
 
 
@@ -109,32 +118,40 @@ def report_of(
     timings: Mapping[str, float] | None = None,
     holdout: HoldOut | None = None,
     over: ToolMap | str | None = None,
+    digest: str = "",
+    boards: Boards | None = None,
+    photographs: Mapping[int, Sequence[Integers]] | None = None,
 ) -> Outcome:
     """The verdict, cards and parts.
 
     findings : what the data tell of the machine; without them their section is left out.
     timings : seconds by step. holdout : what the estimate predicts of configurations that it did
-    not see. over : the tool over the workspace, or why there is no map of it.
+    not see. over : the tool over the workspace, or why there is no map of it. digest : of the
+    session. boards : the board as it was seen, to draw its corners.
+    photographs : of stations by their number, where they are at hand.
     """
     edges = observation.edges
     camera = residuals.camera_numbers(session)
     shifts = residuals.outward_shift(edges, estimate, session.joints, camera)
     centres, tool = centres_and_tool(session.machine, estimate, session.joints)
-    # boards and trackers alone have no edges to show; legs without any do have a question
-    photographed = len(edges) > 0 or (not len(observation.poses) and bool(session.station_names))
+    album = pictures.album(session, observation, estimate, shifts, centres, boards, photographs)
+    links = album.links
+    space = photographed.plot(session, estimate, links, poses.places(observation, estimate))
     parts = (
-        scene.section(session, estimate, centres, poses.places(observation, estimate)),
-        workspace.section(session, estimate, over) if over else None,
+        scene.section(session, estimate, centres),
+        provenance.stations(session, estimate, camera, space),
+        workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         findings and identifiability.section(findings, estimate.machine.parameters),
-        pictures.section(session, edges, estimate, shifts, centres) if photographed else None,
-        poses.section(session, observation, estimate),
+        correlations.section(estimate),
+        pictures.section(session, album) if session.stations else None,
+        poses.section(session, observation, estimate, links),
         holdout and validation.held_out(holdout, session),
         residuals.section(
-            session, edges, estimate, shifts, poses.axes(observation.poses, estimate)
+            session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),
+        field.section(session, observation, estimate, album.corners, links),
         provenance.left_out(session, observation.rejected, estimate, findings),
-        provenance.stations(session, estimate, camera) if session.station_names else None,
         provenance.how(session, estimate, timings or {}),
     )
     return Outcome(
@@ -142,6 +159,8 @@ def report_of(
         title=f"Calibration of {session.machine.name}",
         verdict=verdict,
         kicker=session.called,
+        origin=(f"digest of the session {digest}",) if digest else (),
+        notes=(session.document.get("notes") or "").strip(),
         figures=cards(session, observation, estimate, centres, tool, findings and findings.bed),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),

@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from pkmcal.arrays import Array
 from pkmcal.boards.camera import CELLS, CameraCalibration, coverage, tilts
 from pkmcal.cameras.files import camera_text, foreign_text
 from pkmcal.outcome import Figure, Outcome, Part, Row, Table, Verdict
 from pkmcal.report import charts, page
-from pkmcal.report.pictures import THREADS, jpeg
+from pkmcal.report.charts import enlargement
+from pkmcal.report.field import CellShift, ImageField
+from pkmcal.report.jpegs import THREADS, jpeg
+from pkmcal.report.pictures import Corner
 from pkmcal.wording import brief, count, decimals, number
 
 ARROW = 0.05
 """Length of a large residual's arrow as a share of the picture's width."""
-FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000)
 ANGLE_STEP = 5.0
 """degrees of the angle from the axis that one bar of the histogram holds."""
 FIELD_CELLS = (16, 12)
@@ -47,13 +48,13 @@ SIGMA = (
 
 @dataclass(frozen=True)
 class Shot:
-    """One photograph; corners are (x, y, dx, dy, in use, tip), residuals already enlarged."""
+    """One photograph with the corners found in it."""
 
     name: str
     width: int
     height: int
     jpeg: str
-    corners: tuple[tuple[float, float, float, float, bool, str], ...]
+    corners: tuple[Corner, ...]
     caption: str
 
 
@@ -68,7 +69,8 @@ def outcome_of(
     and forms.
     """
     c = calibration
-    factor = _factor(c.residuals[c.kept], c.camera.image_size[0])
+    wanted = ARROW * c.camera.image_size[0]
+    factor = enlargement(np.linalg.norm(c.residuals[c.kept], axis=-1), wanted)
     together = "; ".join(f"{a} with {b} (ρ = {rho:+.3f})" for a, b, rho in c.correlations)
     hardly = f"Hardly told apart, and so to be used together only: {together}."
     # with its covariance, so that `calibrate --refine-camera` knows how far to move it
@@ -203,14 +205,7 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
     )
 
 
-def _factor(residuals: Array, width: int) -> int:
-    """Enlargement by which a large residual's arrow becomes visible and no longer than that."""
-    large = float(np.quantile(np.linalg.norm(residuals, axis=-1), 0.95)) if len(residuals) else 1.0
-    wanted = ARROW * width / max(large, 1e-9)
-    return max((f for f in FACTORS if f <= wanted), default=1)
-
-
-def _shots(c: CameraCalibration, paths: list[Path], factor: int) -> tuple[Shot, ...]:
+def _shots(c: CameraCalibration, paths: list[Path], factor: float) -> tuple[Shot, ...]:
     by_name = {path.name: path for path in paths}
     size = c.camera.image_size
     with ThreadPoolExecutor(THREADS) as pool:
@@ -218,9 +213,9 @@ def _shots(c: CameraCalibration, paths: list[Path], factor: int) -> tuple[Shot, 
         return tuple(_shot(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
 
 
-def _shot(c: CameraCalibration, v: int, jpeg: str, factor: int) -> Shot:
+def _shot(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Shot:
     seen = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
-    corners: list[tuple[float, float, float, float, bool, str]] = []
+    corners: list[Corner] = []
     for i in seen.tolist():
         (x, y), off = c.pixels[v, i].tolist(), c.residuals[v, i]
         places = decimals(max(c.rms, 1e-6)) + 1
@@ -229,8 +224,8 @@ def _shot(c: CameraCalibration, v: int, jpeg: str, factor: int) -> Shot:
             f" {number(off[1], places, signed=True)} px; weight {c.weight[v, i]:.2f}"
         )
         dx, dy = (off * factor).tolist()
-        corners.append((x, y, dx, dy, bool(c.kept[v, i]), tip))
-    aside = int(np.sum([not corner[4] for corner in corners]))
+        corners.append(Corner(x, y, dx, dy, not c.kept[v, i], tip))
+    aside = sum(corner.quiet for corner in corners)
     caption = f"{count(len(seen), 'corner')}" + (f", {aside} put aside" if aside else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
     width, height = c.camera.image_size
@@ -258,11 +253,13 @@ def _field(c: CameraCalibration) -> Markup:
     full = np.flatnonzero(counts >= 3)
     roots = np.array([pixels[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
     means = np.array([off[flat == k].mean(axis=0) for k in full]).reshape(-1, 2)
-    factor = _factor(means, width)
-    arrows = np.concatenate([roots, means * factor], axis=1).tolist()
-    return page.render(
-        "field.html.j2", width=width, height=height, cells=cells, arrows=arrows, factor=factor
-    )
+    factor = enlargement(np.linalg.norm(means, axis=-1), ARROW * width)
+    shifts = zip(roots.tolist(), (means * factor).tolist(), strict=True)
+    drawn = ImageField(
+        "", width, height, (float(c.camera.parameters[2]), float(c.camera.parameters[3])),
+        tuple(CellShift(x, y, dx, dy) for (x, y), (dx, dy) in shifts),
+    )  # fmt: skip
+    return page.render("field.html.j2", field=drawn, cells=cells, factor=factor)
 
 
 def _views_chart(c: CameraCalibration) -> charts.BarChart | None:

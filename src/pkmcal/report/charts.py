@@ -34,13 +34,15 @@ NORMAL_90 = 1.6449
 class Spread:
     """One row: the middle half as a bar, nine tenths as a line, the median as a mark.
 
-    leg : number from 1 for its colour, None for none. quantiles : 5, 25, 50, 75, 95 %.
+    leg : number from 1 for its colour, None for none. quantiles : 5, 25, 50, 75, 95 %. lead : a
+    link to what it is of.
     """
 
     label: str
     tip: str
     leg: int | None
     quantiles: tuple[float, float, float, float, float]
+    lead: str = ""
 
     @property
     def name(self) -> str:
@@ -86,13 +88,16 @@ class RowChart:
 
 @dataclass(frozen=True)
 class UprightBar:
-    """One upright bar; ``expected`` is the range to compare it with, where there is one."""
+    """One upright bar; ``expected`` is the range to compare it with, where there is one. lead : a
+    link to what it is of.
+    """
 
     label: str
     tip: str
     value: float
     expected: tuple[float, float] | None = None
     quiet: bool = False
+    lead: str = ""
 
 
 @dataclass(frozen=True)
@@ -136,6 +141,14 @@ class BarChart:
         return "M" + "L".join(points) if points else ""
 
 
+def enlargement(lengths: Array, wanted: float) -> float:
+    """1, 2 or 5 times a power of ten that brings the larger lengths (n,) near the wanted one."""
+    large = float(np.quantile(lengths, 0.9)) if lengths.size else wanted
+    ratio = max(wanted / max(large, 1e-9), 1.0)
+    power = 10.0 ** math.floor(math.log10(ratio))
+    return max(m * power for m in (1, 2, 5) if m * power <= ratio * (1 + 1e-9))
+
+
 def ticks_between(low: float, high: float, about: int = 5) -> tuple[tuple[float, str], ...]:
     """Round values from low to high with their text."""
     rough = (high - low) / about
@@ -147,7 +160,9 @@ def ticks_between(low: float, high: float, about: int = 5) -> tuple[tuple[float,
     return tuple((k * step, number(k * step, places)) for k in range(first, last + 1))
 
 
-def box(label: str, values: Array, unit: str, places: int, leg: int | None = None) -> Spread | None:
+def box(
+    label: str, values: Array, unit: str, places: int, leg: int | None = None, lead: str = ""
+) -> Spread | None:
     """A box of the finite ones of the values, None without any; its tooltip says what it shows."""
     values = values[np.isfinite(values)]
     if not values.size:
@@ -160,7 +175,7 @@ def box(label: str, values: Array, unit: str, places: int, leg: int | None = Non
         f"{count(values.size, 'value')}"
     )
     q05, q25, q50, q75, q95 = (float(v) for v in q)
-    return Spread(label, tip, leg, (q05, q25, q50, q75, q95))
+    return Spread(label, tip, leg, (q05, q25, q50, q75, q95), lead)
 
 
 def row_chart(

@@ -19,8 +19,9 @@ from pkmcal.files import staged_folder
 from pkmcal.outcome import Part
 from pkmcal.report import page
 from pkmcal.report.drawn import Drawn, Spot, laid_over
+from pkmcal.report.jpegs import jpeg
 from pkmcal.report.page import N_COLOURS
-from pkmcal.report.pictures import Picture, jpeg
+from pkmcal.report.pictures import Picture
 
 SHIFT = 4
 """Binary digits of a pixel to which cv2 draws."""
@@ -59,7 +60,6 @@ def with_pictures(look: Look) -> Part:
                         jpeg=shot,
                         edges=edges,
                         spots=spots,
-                        rms=float("nan"),
                         kind="predicted",
                     )
                 )

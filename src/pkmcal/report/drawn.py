@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -13,11 +14,20 @@ from pkmcal.geometry.rigid import apply, dot
 from pkmcal.measurements import EdgeSet
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
+from pkmcal.observe.predict import (
+    LegsInCamera,
+    TubeList,
+    edge_points,
+    legs_in_camera,
+    plane_normals,
+    tubes_of,
+    unobstructed,
+)
 from pkmcal.wording import number
 
 CURVE = 13
 """Points of an edge's curve: a mirror bends an edge by less than a pixel between them."""
+FRACTIONS = np.linspace(0, 1, CURVE)
 STRAIGHT = 0.1
 """Curves that stay within this many pixels of their chord are written as two points."""
 FINE = 65
@@ -35,7 +45,7 @@ class Drawn:
     quiet: bool
     tip: str
 
-    @property
+    @cached_property
     def path(self) -> str:
         """SVG path data."""
         return "M" + "L".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
@@ -90,24 +100,37 @@ def laid_over(
 def measured_curves(
     machine: Machine,
     camera: Camera,
-    T_camera_base: Array,
-    T_base_platform: Array,
-    joints: Array,
+    legs: LegsInCamera,
+    photograph: Integers,
     edges: EdgeSet,
+    fraction: Array = FRACTIONS,
 ) -> Array:
-    """Curves (n, CURVE, 2) px of measured edges in one photograph.
+    """Curves (n, m, 2) px of measured edges in photographs of one station, at fractions (m,) of
+    their span.
 
-    The predicted contour's rays, each turned into the measured plane: r - (r . n) n.
+    legs : (K, L, 3) in each photograph. photograph : (n,) the edges' among them. The predicted
+    contour's rays, each turned into the measured plane: r - (r . n) n.
     """
-    legs = legs_in_camera(machine, T_camera_base, T_base_platform, joints)
-    fraction = np.linspace(0, 1, CURVE)
     along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * fraction
     radius = machine.values[radius_positions(machine, edges)]
-    axis = legs.a[edges.leg][:, None] + along[..., None] * legs.u[edges.leg][:, None]
+    at = photograph, edges.leg
+    axis = legs.a[at][:, None] + along[..., None] * legs.u[at][:, None]
     normal = edges.normal[:, None]
     rays = axis + radius[:, None, None] * normal
     rays = rays - dot(rays, normal)[..., None] * normal
     return camera.project(rays)
+
+
+def own_edges(
+    machine: Machine, legs: LegsInCamera, photograph: Integers, edges: EdgeSet
+) -> EdgeSet:
+    """The edges as the machine itself would show them, as for :func:`measured_curves`."""
+    radius = radius_positions(machine, edges)
+    start, stop = edges.span.T
+    each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
+    at = photograph, edges.leg
+    own, _ = plane_normals(legs.a[at], legs.u[at], machine.values[radius], each)
+    return replace(edges, normal=own)
 
 
 def radius_positions(machine: Machine, edges: EdgeSet) -> Integers:

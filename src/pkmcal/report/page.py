@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from functools import cache
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from pkmcal.files import plain, remember, remembered
 from pkmcal.wording import count
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     import jinja2
     from markupsafe import Markup
 
@@ -19,8 +22,11 @@ N_COLOURS = 8
 """Leg colours in the style sheet; machines with more legs use them again."""
 
 
-def page_html(outcome: Outcome) -> str:
-    """The page: verdict, what to look at, cards, then the parts, each with its navigation."""
+def page_html(outcome: Outcome, made: datetime | None = None) -> str:
+    """The page: verdict, what to look at, cards, then the parts, each with its navigation.
+
+    made : when, for its head.
+    """
     plots = [plot for part in outcome.parts for plot in part.plots]
     warnings = [finding.text for finding in outcome.findings if finding.level != "note"]
     template = environment().get_template("page.html.j2")
@@ -28,6 +34,11 @@ def page_html(outcome: Outcome) -> str:
         o=outcome,
         verdict=outcome.verdict,
         warnings=(*outcome.verdict.warnings, *warnings),
+        origin=(
+            *((f"{made.day} {made:%B %Y, %H:%M}",) if made else ()),
+            f"pkmcal {version('pkmcal')}",
+            *outcome.origin,
+        ),
         remarks=[finding.text for finding in outcome.findings if finding.level == "note"],
         plots=plots,
         plotly=plotly_script() if plots else "",

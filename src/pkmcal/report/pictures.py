@@ -2,240 +2,365 @@
 
 from __future__ import annotations
 
-import base64
-from concurrent.futures import ThreadPoolExecutor
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.errors import InputError
+from pkmcal.arrays import Array, Integers
+from pkmcal.boards.views import Boards
 from pkmcal.geometry.rigid import apply, inverse
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.measurements import EdgeSet
+from pkmcal.measurements import Observation, Rejection
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.observe.images import decode
+from pkmcal.observe.images import Pictures
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
 from pkmcal.outcome import Part
 from pkmcal.report import page
-from pkmcal.report.drawn import Drawn, Spot, measured_curves, straightened
-from pkmcal.report.residuals import KEPT, SIDES, rms
+from pkmcal.report.charts import enlargement
+from pkmcal.report.corners import BoardCorners, board_corners
+from pkmcal.report.drawn import CURVE, Drawn, Spot, measured_curves, straightened
+from pkmcal.report.jpegs import small_and_large
+from pkmcal.report.links import Links, Place
+from pkmcal.report.residuals import KEPT, SIDES
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import Photograph
-from pkmcal.wording import count, number
+from pkmcal.wording import brief, count, number
 
-MOST = 12
-LARGEST_WIDTH = 640
-QUALITY = 70
-THREADS = 4
+MOST = 400
+"""Photographs on a page: browsers take a second to lay out as many."""
+ROOM = 8_000_000
+"""Characters of all their JPEGs."""
+ARROW = 0.03
+"""Length of a large corner's residual as drawn, in picture widths."""
+
+
+@dataclass(frozen=True)
+class Corner:
+    """A board's corner in pixels: where found, and the way to where it is expected, enlarged."""
+
+    x: float
+    y: float
+    dx: float
+    dy: float
+    quiet: bool
+    tip: str
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One photograph. jpeg : base64, empty where the file could not be read. kind : of its edges,
-    measured or predicted.
+    """One photograph. jpeg, large : base64, empty where the file could not be read, and large where
+    there was no room. edges, spots, corners : found; missed : edges that were looked for and left
+    out. caption : what is in it. kind : of its edges, measured or predicted. anchor : its name on
+    the page.
     """
 
     station: str
     configuration: str
-    why: str
     width: int
     height: int
     jpeg: str
     edges: tuple[Drawn, ...]
     spots: tuple[Spot, ...]
-    rms: float
+    why: str = ""
+    caption: str = ""
     kind: str = "measured"
-
-    @property
-    def caption(self) -> str:
-        """Residuals and number of edges, in words."""
-        if not self.edges:
-            return "no edge in use"
-        aside = sum(edge.quiet for edge in self.edges)
-        text = count(len(self.edges), "edge") + (f", {aside} of them put aside" if aside else "")
-        return f"{text}; residuals {number(self.rms, 2)} σ"
+    anchor: str = ""
+    large: str = ""
+    missed: tuple[Drawn, ...] = ()
+    corners: tuple[Corner, ...] = ()
 
 
-def section(
-    session: Session,
-    edges: EdgeSet,
-    estimate: Estimate,
-    shifts: Array,
-    centres: tuple[Centres, ...],
-) -> Part:
-    """The section; as :func:`pictures`."""
+@dataclass(frozen=True)
+class Album:
+    """The photographs on the page. total : how many there are. factor : enlarges the corners'
+    residuals. corners : of the board, in all photographs.
+    """
+
+    pictures: tuple[Picture, ...]
+    total: int
+    factor: float
+    links: Links
+    corners: BoardCorners
+
+
+def section(session: Session, shown: Album) -> Part:
+    """The section."""
     html = page.render(
         "photographs.html.j2",
         n_legs=session.machine.n_legs,
-        pictures=pictures(session, edges, estimate, shifts, centres),
-        total=sum(len({p.configuration for p in s.photographs}) for s in session.stations),
+        album=shown,
+        legs=any(p.edges or p.missed or p.spots for p in shown.pictures),
+        boards=any(p.corners for p in shown.pictures),
+        missed=any(p.missed for p in shown.pictures),
+        large=sum(bool(p.large) for p in shown.pictures),
     )
     return Part("photographs", "Photographs", html=html)
 
 
-def pictures(
+def album(
     session: Session,
-    edges: EdgeSet,
+    observation: Observation,
     estimate: Estimate,
     shifts: Array,
     centres: tuple[Centres, ...],
-) -> tuple[Picture, ...]:
-    """At most ``MOST`` photographs that stand for the rest. shifts : (N,) px, for tooltips."""
-    chosen = choose(session, edges, estimate.edge_residuals, estimate.configurations)
-    with ThreadPoolExecutor(THREADS) as pool:
-        sizes = (session.stations[s].camera.image_size for s, _, _ in chosen)
-        shots = list(pool.map(jpeg, (photo.path for _, photo, _ in chosen), sizes))
-    out: list[Picture] = []
-    for (s, photo, why), shot in zip(chosen, shots, strict=True):
-        k, station = photo.configuration, session.stations[s]
-        mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
-        width, height = station.camera.image_size
-        out.append(
-            Picture(
-                station=station.name,
-                configuration=session.configurations[k],
-                why=why,
-                width=width,
-                height=height,
-                jpeg=shot,
-                edges=_drawn(session, edges, estimate, shifts, mine, s, k),
-                spots=_spots(session, estimate, centres, s, k),
-                rms=rms(estimate.edge_residuals[mine], estimate.edge_weights[mine]),
-            )
-        )
-    return tuple(out)
-
-
-Choice = tuple[int, Photograph, str]
-
-
-def choose(
-    session: Session, edges: EdgeSet, white: Array, posed: Booleans, most: int = MOST
-) -> list[Choice]:
-    """Photographs for the page in the session's order: (station, photograph, why).
-
-    Of every station the worst, the best, then the middle ones, in turn until there are enough.
-    posed : (K,) True where the pose was estimated.
+    boards: Boards | None = None,
+    photographs: Mapping[int, Sequence[Integers]] | None = None,
+) -> Album:
+    """The photographs, those in which nothing is in use first, then by their residuals, the largest
+    first, as many as there is room for. shifts : (N,) px of the edges, for tooltips. photographs :
+    of stations by their number, where they are at hand.
     """
-    queues = [_queue(session, edges, white, posed, s) for s in range(len(session.stations))]
-    taken: list[Choice] = []
-    while len(taken) < most and any(queues):
-        for queue in queues:
-            if queue and len(taken) < most:
-                taken.append(queue.pop(0))
-    return sorted(taken, key=lambda item: (item[0], item[1].configuration))
-
-
-def _queue(session: Session, edges: EdgeSet, white: Array, posed: Booleans, s: int) -> list[Choice]:
-    """A station's photographs in the order of their worth to the reader.
-
-    Ranked by all residuals alike: edges that were put aside are what a reader wants to see.
-    """
-    first = {photo.configuration: photo for photo in reversed(session.stations[s].photographs)}
-    here = np.flatnonzero(edges.station == s)
-    here = here[np.argsort(edges.configuration[here], kind="stable")]
-    ends = np.searchsorted(edges.configuration[here], np.arange(len(posed) + 1))
-    level: dict[int, float] = {}
-    for k in first:
-        if posed[k]:
-            mine = white[here[ends[k] : ends[k + 1]]]
-            level[k] = rms(mine, np.ones(len(mine)))
-    ranked = sorted((k for k in level if np.isfinite(level[k])), key=lambda k: -level[k])
-    blind = [k for k in level if not np.isfinite(level[k])]
-    middle = len(ranked) // 2
-    order = list(dict.fromkeys([*ranked[:1], *ranked[-1:], *ranked[middle:], *ranked, *blind]))
-    names: dict[int, str] = {}
-    if len(ranked) > 1:
-        names = {ranked[-1]: "best of this station", ranked[0]: "worst of this station"}
-    return [(s, first[k], names.get(k, "")) for k in order]
-
-
-def jpeg(path: Path | None, size: tuple[int, int]) -> str:
-    """A photograph in grey, small, as base64; empty where it is not there any more."""
-    import cv2
-
-    if path is None:
-        return ""
-    try:
-        image: Any = decode(path, size, path.name)
-    except InputError:
-        return ""
-    if size[0] > LARGEST_WIDTH:
-        height = max(1, round(size[1] * LARGEST_WIDTH / size[0]))
-        image = cv2.resize(image, (LARGEST_WIDTH, height), interpolation=cv2.INTER_AREA)
-    packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-    return base64.b64encode(packed.tobytes()).decode("ascii")
-
-
-def _drawn(
-    session: Session,
-    edges: EdgeSet,
-    estimate: Estimate,
-    shifts: Array,
-    mine: Integers,
-    s: int,
-    k: int,
-) -> tuple[Drawn, ...]:
-    """The fitted edges of one photograph."""
-    curves = edge_curves(session, edges, estimate, mine, s, k)
-    out: list[Drawn] = []
-    for n, curve in zip(mine.tolist(), curves, strict=True):
-        points = straightened(curve[np.isfinite(curve).all(axis=-1)])
-        if len(points) > 1:
-            quiet = bool(estimate.edge_weights[n] < KEPT)
-            leg = int(edges.leg[n]) + 1
-            across, tilt = estimate.edge_residuals[n]
-            tip = (
-                f"Leg {leg}, tube {edges.tube[n] + 1}, {SIDES[edges.side[n]]} edge: "
-                f"{number(float(shifts[n]), 2, signed=True)} px outward; residual "
-                f"{number(float(across), 1, signed=True)} σ across, "
-                f"{number(float(tilt), 1, signed=True)} σ tilt; "
-                f"weight {number(float(estimate.edge_weights[n]), 2)}"
-            )
-            line = tuple((float(x), float(y)) for x, y in points)
-            out.append(Drawn(leg, line, quiet, tip))
-    return tuple(out)
-
-
-def edge_curves(
-    session: Session, edges: EdgeSet, estimate: Estimate, mine: Integers, s: int, k: int
-) -> Array:
-    """Curves (n, CURVE, 2) px of the edges ``mine`` in the picture of station s."""
-    state = estimate.state
-    return measured_curves(
-        estimate.machine,
-        session.stations[s].camera,
-        state.T_camera_base[s],
-        state.T_base_platform[k],
-        session.joints[k],
-        edges.select(mine),
+    level = levels(observation, estimate)
+    every = [
+        (s, photo)
+        for s, station in enumerate(session.stations)
+        for photo in {p.configuration: p for p in reversed(station.photographs)}.values()
+    ]
+    ordered = sorted(every, key=lambda item: -level.get((item[0], item[1].configuration), np.inf))
+    images = {s: _images(session, s) for s in range(len(session.stations))} | {
+        **(photographs or {})
+    }
+    files = [
+        (images[s], session.stations[s].photographs.index(photo)) for s, photo in ordered[:MOST]
+    ]
+    shots = list(small_and_large(files, ROOM))
+    chosen = ordered[: len(shots)]
+    links = Links.of((s, photo.configuration) for s, photo in chosen)
+    found = _Found(session, observation, estimate, shifts, centres, boards or Boards(), chosen)
+    return Album(
+        tuple(
+            found.picture(s, photo, shot, links.anchors[place], level.get(place, np.nan))
+            for (s, photo), shot in zip(chosen, shots, strict=True)
+            for place in [(s, photo.configuration)]
+        ),
+        len(every),
+        found.factor,
+        links,
+        found.corners,
     )
 
 
-def _spots(
-    session: Session, estimate: Estimate, centres: tuple[Centres, ...], s: int, k: int
-) -> tuple[Spot, ...]:
-    """Joint centres in the picture, by the result and by the drawing laid over it."""
-    state, camera = estimate.state, session.stations[s].camera
-    pose, joints = state.T_base_platform[k], session.joints[k]
-    base, platform = (side.T_calibrated_drawing for side in centres)
-    after = limb_ends(estimate.machine.layout, estimate.machine.values, joints, pose)
-    old_pose = inverse(base) @ pose @ platform
-    before = limb_ends(session.machine.layout, session.machine.values, joints, old_pose)
-    out: list[Spot] = []
-    labelled: set[int] = set()
-    for end, new, old in (("base", after.a, before.a), ("platform", after.b, before.b)):
-        seen = camera.project(apply(state.T_camera_base[s], new))
-        drawn = camera.project(apply(state.T_camera_base[s] @ base, old))
+def _images(session: Session, s: int) -> Pictures:
+    """A station's photographs, decoded when they are looked at."""
+    station = session.stations[s]
+    paths = [photo.path for photo in station.photographs]
+    return Pictures(paths, station.camera.image_size, [path.name for path in paths])
+
+
+def levels(observation: Observation, estimate: Estimate) -> dict[Place, float]:
+    """Root mean square of each photograph's residuals, in σ: of edges and of the board's pose.
+
+    By all of them alike: edges that were put aside are what a reader wants to see.
+    """
+    edges, poses = observation.edges, observation.poses
+    squares = np.concatenate(
+        [np.sum(estimate.edge_residuals**2, axis=1), np.sum(estimate.pose_residuals**2, axis=1)]
+    )
+    numbers = np.concatenate([np.full(len(edges), 2.0), poses.rows])
+    places = np.concatenate([np.column_stack([x.station, x.configuration]) for x in (edges, poses)])
+    each, which = np.unique(places, axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    mean = np.bincount(which, squares) / np.bincount(which, numbers)
+    return {(s, k): float(m) ** 0.5 for (s, k), m in zip(each.tolist(), mean, strict=True)}
+
+
+class _Found:
+    """What is drawn over the chosen photographs, worked out for all of a station at once.
+
+    factor : enlarges the corners' residuals.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        observation: Observation,
+        estimate: Estimate,
+        shifts: Array,
+        centres: tuple[Centres, ...],
+        boards: Boards,
+        chosen: Iterable[tuple[int, Photograph]],
+    ) -> None:
+        self.session = session
+        self.edges: dict[Place, list[Drawn]] = defaultdict(list)
+        self.missed: dict[Place, list[Drawn]] = defaultdict(list)
+        self.spots: dict[Place, list[Spot]] = defaultdict(list)
+        self.reasons: dict[Place, list[str]] = defaultdict(list)
+        self.corners = board_corners(session, boards, estimate)
+        width = max((s.camera.image_size[0] for s in session.stations), default=0)
+        self.factor = enlargement(np.linalg.norm(self.corners.off, axis=1), ARROW * width)
+        rejected: dict[int, list[Rejection]] = defaultdict(list)
+        for one in observation.rejected:
+            rejected[one.station].append(one)
+            if one.leg < 0:
+                self.reasons[one.station, one.configuration].append(one.reason)
+        rows: dict[int, list[int]] = defaultdict(list)
+        for s, photo in chosen:
+            if estimate.configurations[photo.configuration]:
+                rows[s].append(photo.configuration)
+        for s, some in rows.items():
+            if "legs" in session.stations[s].observe:
+                configurations = np.array(sorted(some))
+                self._edges(observation, estimate, shifts, s, configurations)
+                self._missed(estimate, rejected[s], s, configurations)
+                self._spots(estimate, centres, s, configurations)
+
+    def picture(
+        self, s: int, photo: Photograph, shot: tuple[str, str], anchor: str, level: float
+    ) -> Picture:
+        """One photograph with what was found in it."""
+        k, station = photo.configuration, self.session.stations[s]
+        p, c = station.photographs.index(photo), self.corners
+        mine = c.select((c.station == s) & (c.photograph == p))
+        width, height = station.camera.image_size
+        edges, missed = self.edges[s, k], self.missed[s, k]
+        told = [
+            count(len(edges), "edge") + _aside(sum(e.quiet for e in edges)) if edges else "",
+            f"{len(missed)} not used" if missed else "",
+            f"{count(len(mine), 'corner')}, {_size(mine)}" if len(mine) else "",
+            f"residuals {number(level, 2)} σ" if np.isfinite(level) else "nothing in use",
+            *self.reasons[s, k],
+            "" if shot[0] else "the file could not be read",
+        ]
+        return Picture(
+            station=station.name,
+            configuration=self.session.configurations[k],
+            width=width,
+            height=height,
+            jpeg=shot[0],
+            large=shot[1],
+            edges=tuple(edges),
+            missed=tuple(missed),
+            spots=tuple(self.spots[s, k]),
+            corners=tuple(self._corner(mine, n) for n in range(len(mine))),
+            caption="; ".join(text for text in told if text),
+            anchor=anchor,
+        )
+
+    def _corner(self, corners: BoardCorners, n: int) -> Corner:
+        (x, y), (dx, dy) = corners.pixel[n].tolist(), (-corners.off[n]).tolist()
+        tip = (
+            f"Corner {corners.name[n]}: {number(-dx, 2, signed=True)},"
+            f" {number(-dy, 2, signed=True)} px from where it is expected"
+        )
+        return Corner(x, y, dx * self.factor, dy * self.factor, not corners.used[n], tip)
+
+    def _edges(
+        self,
+        observation: Observation,
+        estimate: Estimate,
+        shifts: Array,
+        s: int,
+        configurations: Integers,
+    ) -> None:
+        """The fitted edges of a station."""
+        edges = observation.edges
+        mine = np.flatnonzero((edges.station == s) & np.isin(edges.configuration, configurations))
+        curves = edge_curves(self.session, observation, estimate, mine, s)
+        for n, curve in zip(mine.tolist(), curves, strict=True):
+            weight = float(estimate.edge_weights[n])
+            across, tilt = estimate.edge_residuals[n].tolist()
+            leg, tube, side = (int(x[n]) for x in (edges.leg, edges.tube, edges.side))
+            tip = (
+                f"Leg {leg + 1}, tube {tube + 1}, {SIDES[side]} edge: "
+                f"{number(float(shifts[n]), 2, signed=True)} px outward; residual "
+                f"{number(across, 1, signed=True)} σ across, "
+                f"{number(tilt, 1, signed=True)} σ tilt; weight {number(weight, 2)}"
+            )
+            drawn = _line(leg, curve, weight < KEPT, tip)
+            if drawn:
+                self.edges[s, int(edges.configuration[n])].append(drawn)
+
+    def _missed(
+        self, estimate: Estimate, rejected: list[Rejection], s: int, configurations: Integers
+    ) -> None:
+        """Where edges should have been that were left out, each with why."""
+        machine, state, camera = estimate.machine, estimate.state, self.session.stations[s].camera
+        row = {int(k): n for n, k in enumerate(configurations)}
+        some = [one for one in rejected if one.leg >= 0 and one.configuration in row]
+        if not some:
+            return
+        legs = legs_in_camera(
+            machine,
+            state.T_camera_base[s],
+            state.T_base_platform[configurations],
+            self.session.joints[configurations],
+        )
+        tubes = tubes_of(machine)
+        pixel = edge_points(machine, camera, legs, tubes, CURVE).pixel
+        inside = camera.in_image(pixel)
+        for one in some:
+            at = row[one.configuration]
+            meant = (tubes.leg == one.leg) & ((one.tube < 0) | (tubes.tube == one.tube))
+            meant &= (one.side < 0) | (tubes.side == one.side)
+            for e in np.flatnonzero(meant).tolist():
+                tip = (
+                    f"Leg {one.leg + 1}, tube {tubes.tube[e] + 1}, {SIDES[tubes.side[e]]} edge,"
+                    f" not used: {one.reason}"
+                )
+                drawn = _line(one.leg, pixel[at, e][inside[at, e]], True, tip)
+                if drawn:
+                    self.missed[s, one.configuration].append(drawn)
+
+    def _spots(
+        self, estimate: Estimate, centres: tuple[Centres, ...], s: int, configurations: Integers
+    ) -> None:
+        """Joint centres, by the result and by the drawing laid over it."""
+        session, state = self.session, estimate.state
+        camera, T_camera_base = session.stations[s].camera, state.T_camera_base[s]
+        pose, joints = state.T_base_platform[configurations], session.joints[configurations]
+        base, platform = (side.T_calibrated_drawing for side in centres)
+        after = limb_ends(estimate.machine.layout, estimate.machine.values, joints, pose)
+        old_pose = inverse(base) @ pose @ platform
+        before = limb_ends(session.machine.layout, session.machine.values, joints, old_pose)
+        seen = camera.project(apply(T_camera_base, np.stack([after.a, after.b])))
+        drawn = camera.project(apply(T_camera_base @ base, np.stack([before.a, before.b])))
         inside = camera.in_image(seen)
-        for j in np.flatnonzero(inside).tolist():
-            cross = _pair(drawn[j]) if np.isfinite(drawn[j]).all() else None
-            out.append(Spot(j + 1, end, _pair(seen[j]), cross, j not in labelled))
-            labelled.add(j)
-    return tuple(out)
+        for n, k in enumerate(configurations.tolist()):
+            labelled: set[int] = set()
+            for side, end in enumerate(("base", "platform")):
+                for j in np.flatnonzero(inside[side, n]).tolist():
+                    old = drawn[side, n, j]
+                    cross = _pair(old) if np.isfinite(old).all() else None
+                    new = _pair(seen[side, n, j])
+                    self.spots[s, k].append(Spot(j + 1, end, new, cross, j not in labelled))
+                    labelled.add(j)
+
+
+def edge_curves(
+    session: Session, observation: Observation, estimate: Estimate, mine: Integers, s: int
+) -> Array:
+    """Curves (n, CURVE, 2) px of the edges ``mine`` in the photographs of station s."""
+    edges, state = observation.edges.select(mine), estimate.state
+    rows, photograph = np.unique(edges.configuration, return_inverse=True)
+    legs = legs_in_camera(
+        estimate.machine,
+        state.T_camera_base[s],
+        state.T_base_platform[rows],
+        session.joints[rows],
+    )
+    camera = session.stations[s].camera
+    return measured_curves(estimate.machine, camera, legs, photograph, edges)
+
+
+def _aside(n: int) -> str:
+    return f", {n} of them put aside" if n else ""
+
+
+def _size(corners: BoardCorners) -> str:
+    """How far corners are off, in words."""
+    rms = float(np.sqrt(np.mean(np.sum(corners.off**2, axis=1))))
+    return f"{brief(rms)} px off"
+
+
+def _line(leg: int, curve: Array, quiet: bool, tip: str) -> Drawn | None:
+    """What is drawn of a curve (n, 2), where two points of it are seen."""
+    points = straightened(curve[np.isfinite(curve).all(axis=-1)])
+    if len(points) < 2:
+        return None
+    return Drawn(leg + 1, tuple(map(tuple, points.tolist())), quiet, tip)
 
 
 def _pair(point: Array) -> tuple[float, float]:

@@ -20,6 +20,7 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
+from pkmcal.report.links import Links
 from pkmcal.report.residuals import KEPT, SIGMAS, level_bar
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
@@ -34,8 +35,12 @@ JUMPS = (
 )
 
 
-def section(session: Session, observation: Observation, estimate: Estimate) -> Part | None:
-    """The section; None in a session without boards and trackers on the platform."""
+def section(
+    session: Session, observation: Observation, estimate: Estimate, links: Links
+) -> Part | None:
+    """The section; None in a session without boards and trackers on the platform. links : to the
+    photographs on the page.
+    """
     poses = observation.poses
     if not len(poses):
         return None
@@ -46,9 +51,9 @@ def section(session: Session, observation: Observation, estimate: Estimate) -> P
         "Board" if session.board else "Measured poses",
         (f"{' '.join([*_summary(poses, estimate, error), *turns])} {JUMPS}",),
         html=charts.panels(
-            _by_configuration(session, poses, estimate),
-            _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off, mm"),
-            _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned, degrees"),
+            _by_configuration(session, poses, estimate, links),
+            _bars(session, poses, error[:, 3:] * 1e3, "mm", "How far off, mm", links),
+            _bars(session, poses, np.rad2deg(error[:, :3]), "°", "How far turned, degrees", links),
         ),
         tables=(_mounts(session, estimate), _worst(session, poses, estimate, error)),
     )
@@ -121,14 +126,21 @@ def _texts(values: Array, sigma: Array, factor: float) -> list[str]:
     return out
 
 
-def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> BarChart | None:
+def _by_configuration(
+    session: Session, poses: PoseSet, estimate: Estimate, links: Links
+) -> BarChart | None:
     """Root mean square of each configuration's poses in standard deviations."""
     number = np.bincount(poses.configuration, weights=poses.rows)
     square = np.bincount(
         poses.configuration, weights=np.sum(estimate.pose_residuals**2, axis=1)
     ).tolist()
     bars = [
-        level_bar(session.configurations[k], float(np.sqrt(square[k] / n)), n)
+        level_bar(
+            session.configurations[k],
+            float(np.sqrt(square[k] / n)),
+            n,
+            lead=links.to_configuration(k),
+        )
         for k, n in enumerate(number.tolist())
         if n
     ]
@@ -136,7 +148,9 @@ def _by_configuration(session: Session, poses: PoseSet, estimate: Estimate) -> B
     return bar_chart("Poses, by configuration", SIGMAS, bars, charts.six_labels(bars), alt)
 
 
-def _bars(session: Session, poses: PoseSet, error: Array, unit: str, title: str) -> BarChart | None:
+def _bars(
+    session: Session, poses: PoseSet, error: Array, unit: str, title: str, links: Links
+) -> BarChart | None:
     """Length of each configuration's error, largest of its poses."""
     size = np.linalg.norm(np.nan_to_num(error), axis=-1)
     if not np.isfinite(error).any():
@@ -147,7 +161,14 @@ def _bars(session: Session, poses: PoseSet, error: Array, unit: str, title: str)
     for k in np.unique(poses.configuration).tolist():
         value, name = float(largest[k]), session.configurations[k]
         bars.append(
-            UprightBar(name, f"configuration {name}: {brief(value)} {unit}", value, None, True)
+            UprightBar(
+                name,
+                f"configuration {name}: {brief(value)} {unit}",
+                value,
+                None,
+                True,
+                links.to_configuration(k),
+            )
         )
     alt = f"Bars of the poses' errors in {unit}"
     return bar_chart(title, unit, bars, charts.six_labels(bars), alt)

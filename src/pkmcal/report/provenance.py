@@ -15,7 +15,7 @@ from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import Findings
 from pkmcal.measurements import Rejection
-from pkmcal.outcome import Part, Row, Table
+from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.report import page, parameters
 from pkmcal.report.residuals import SIDES
 from pkmcal.session.load import Session
@@ -34,8 +34,13 @@ MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
 
-def stations(session: Session, estimate: Estimate, camera: Integers) -> Part:
-    """Where the cameras stood, one row a station; camera (S,) is the number of its camera file."""
+def stations(session: Session, estimate: Estimate, camera: Integers, space: Plot | None) -> Part:
+    """The machine as it was photographed, and where the cameras stood, one row a station; camera
+    (S,) is the number of its camera file.
+    """
+    plots = (space,) if space else ()
+    if not session.station_names:
+        return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
     for s, station in enumerate(session.stations):
@@ -56,8 +61,11 @@ def stations(session: Session, estimate: Estimate, camera: Integers) -> Part:
     columns = ("Station", "x, mm", "y, mm", "z, mm", "σ of its turn")
     columns += ("Edge shift, px",) if edges else ()
     columns += ("Away from the pose by hand", "Camera")
-    table = Table("", columns, tuple(rows), brief=False, words=(len(columns) - 1,))
-    return Part("stations", "Where the cameras stood", tables=(table,), menu="Cameras")
+    table = Table(
+        "Where the cameras stood", columns, tuple(rows), brief=False, words=(len(columns) - 1,)
+    )
+    title = "The machine and its cameras"
+    return Part("stations", title, plots=plots, tables=(table,), menu="Cameras")
 
 
 def _place(estimate: Estimate, s: int) -> tuple[str, str, str, str]:
@@ -116,7 +124,7 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
                 f"χ² of the {name}",
                 f"{number(chi2, 0)} over {number(n, 0)} numbers"
                 # degrees of freedom that the numbers leave, where they were counted
-                + (f", {number(freedom, 0)} degrees of freedom" if freedom >= 0.5 else ""),
+                + (f", {count(round(freedom), 'degree')} of freedom" if freedom >= 0.5 else ""),
             )
             for name, chi2, n, freedom in (
                 ("edges", s.chi2_edges, s.n_edges, s.dof_edges),

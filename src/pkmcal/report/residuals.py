@@ -24,6 +24,7 @@ from pkmcal.report.charts import (
     row_chart,
 )
 from pkmcal.report.drawn import radius_positions
+from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
 
@@ -51,20 +52,22 @@ def section(
     edges: EdgeSet,
     estimate: Estimate,
     shifts: Array,
+    links: Links,
     poses: charts.RowChart | None = None,
 ) -> Part:
     """The section's charts, under sentences about what stands out in them.
 
-    shifts : (N,) px, of :func:`outward_shift`. poses : a chart of the poses' residuals.
+    shifts : (N,) px, of :func:`outward_shift`. links : to the photographs on the page. poses : a
+    chart of the poses' residuals.
     """
     shown = charts.panels(
-        by_leg(session, edges, estimate),
-        _edge_boxes("station", session.station_names, edges.station, estimate),
-        _joints(session, estimate),
+        by_leg(session, edges, estimate, links),
+        _edge_boxes("station", session.station_names, edges.station, edges, estimate, links),
+        _joints(session, estimate, links),
         poses,
         histogram(estimate.edge_residuals),
-        _configurations(session, edges, estimate),
-        _outward(edges, shifts),
+        _configurations(session, edges, estimate, links),
+        _outward(edges, shifts, links),
         remarks=remarks(session, edges, estimate, shifts),
     )
     return Part("residuals", "Residuals", (READING,), html=shown)
@@ -105,26 +108,37 @@ def rms(white: Array, weights: Array) -> float:
     return float(np.sqrt(np.sum(weights[:, None] * white**2) / total)) if total else float("nan")
 
 
-def by_leg(session: Session, edges: EdgeSet, estimate: Estimate) -> RowChart | None:
+def by_leg(session: Session, edges: EdgeSet, estimate: Estimate, links: Links) -> RowChart | None:
     """The edges' residuals by leg, in the legs' colours."""
     legs = [f"leg {j + 1}" for j in range(session.machine.n_legs)]
-    return _edge_boxes("leg", legs, edges.leg, estimate)
+    return _edge_boxes("leg", legs, edges.leg, edges, estimate, links)
 
 
 def _edge_boxes(
-    by: str, names: Sequence[str], group: Integers, estimate: Estimate
+    by: str,
+    names: Sequence[str],
+    group: Integers,
+    edges: EdgeSet,
+    estimate: Estimate,
+    links: Links,
 ) -> RowChart | None:
-    """A box for each group that has edges; both numbers of a residual count."""
+    """A box for each group that has edges; both numbers of a residual count. Each leads to the
+    photograph of its largest.
+    """
     white = estimate.edge_residuals
-    boxes = [
-        box(name, white[group == g], "σ", 2, g + 1 if by == "leg" else None)
-        for g, name in enumerate(names)
-    ]
+    boxes: list[charts.Spread | None] = []
+    for g, name in enumerate(names):
+        mine = group == g
+        size = np.linalg.norm(white[mine], axis=1)
+        lead = links.to_largest(edges.station[mine], edges.configuration[mine], size)
+        boxes.append(box(name, white[mine], "σ", 2, g + 1 if by == "leg" else None, lead))
     alt = f"Boxes of the whitened edge residuals by {by}"
     return row_chart(f"Edges, by {by}", SIGMAS, boxes, NORMAL_90, alt)
 
 
-def _configurations(session: Session, edges: EdgeSet, estimate: Estimate) -> BarChart | None:
+def _configurations(
+    session: Session, edges: EdgeSet, estimate: Estimate, links: Links
+) -> BarChart | None:
     """Root mean square of each configuration's edges, with the range that noise alone gives."""
     bars: list[UprightBar] = []
     for k, name in enumerate(session.configurations):
@@ -134,20 +148,21 @@ def _configurations(session: Session, edges: EdgeSet, estimate: Estimate) -> Bar
         if not np.isfinite(level):
             continue
         of = f" over {count(len(weights), 'edge')}"
-        bars.append(level_bar(name, level, 2 * float(weights.sum()), of))
+        lead = links.to_configuration(k)
+        bars.append(level_bar(name, level, 2 * float(weights.sum()), of, lead))
     title, unit = "Edges, by configuration", "root mean square, standard deviations"
     alt = "Bars of the residuals by configuration"
     return bar_chart(title, unit, bars, charts.six_labels(bars), alt)
 
 
-def level_bar(name: str, level: float, n: float, of: str = "") -> UprightBar:
+def level_bar(name: str, level: float, n: float, of: str = "", lead: str = "") -> UprightBar:
     """A configuration's root mean square, in σ, beside where that of n numbers of noise lies."""
     low, high = expected_rms(n)
     tip = (
         f"configuration {name}: {number(level, 2)} σ{of}, {number(low, 2)} to {number(high, 2)}"
         " expected of noise alone"
     )
-    return UprightBar(name, tip, level, (low, high), level <= high)
+    return UprightBar(name, tip, level, (low, high), level <= high, lead)
 
 
 def expected_rms(n: float) -> tuple[float, float]:
@@ -179,11 +194,14 @@ def histogram(white: Array) -> BarChart | None:
     return bar_chart("All edge residuals", SIGMAS, bars, labels, alt, curve)
 
 
-def _outward(edges: EdgeSet, shifts: Array) -> RowChart | None:
+def _outward(edges: EdgeSet, shifts: Array, links: Links) -> RowChart | None:
     """Outward shift of every leg's edges: shading and wrong radii show here."""
     boxes = [
-        box(f"leg {j + 1}, tube {t + 1}, {SIDES[s]}", shifts[mine], "px", 3, j + 1)
+        box(f"leg {j + 1}, tube {t + 1}, {SIDES[s]}", shifts[mine], "px", 3, j + 1, lead)
         for (j, t, s), mine in _edge_kinds(edges)
+        for lead in [
+            links.to_largest(edges.station[mine], edges.configuration[mine], np.abs(shifts[mine]))
+        ]
     ]
     alt = "Boxes of the outward shift in pixels by leg, tube and side"
     title = "Edges too far out (+) or in (−), by leg, tube and side"
@@ -200,13 +218,16 @@ def _edge_kinds(edges: EdgeSet) -> list[tuple[tuple[int, int, int], Booleans]]:
     ]
 
 
-def _joints(session: Session, estimate: Estimate) -> RowChart | None:
-    """Residuals of the readings by joint."""
+def _joints(session: Session, estimate: Estimate, links: Links) -> RowChart | None:
+    """Residuals of the readings by joint, each leading to the photograph of its largest."""
     motor = session.machine.layout.actuated
-    white = estimate.joint_residuals[estimate.configurations]
+    used = np.flatnonzero(estimate.configurations)
+    white = estimate.joint_residuals[used]
     moved = [np.flatnonzero(motor == column).tolist() for column in range(white.shape[1])]
+    worst = used[np.abs(white).argmax(axis=0)] if len(white) else np.zeros(len(moved), dtype=int)
     boxes = [
-        box(named(legs), white[:, column], "σ", 2, legs[0] + 1) for column, legs in enumerate(moved)
+        box(named(legs), white[:, column], "σ", 2, legs[0] + 1, links.to_configuration(int(k)))
+        for column, (legs, k) in enumerate(zip(moved, worst, strict=True))
     ]
     alt = "Boxes of the readings' residuals by joint"
     return row_chart("Joint readings, by leg", SIGMAS, boxes, NORMAL_90, alt)

@@ -12,14 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers
+from pkmcal.arrays import Array
 from pkmcal.errors import PkmcalError
 from pkmcal.geometry.rigid import apply
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.closure import joint_values, skeletons
 from pkmcal.outcome import AXIS, LOOKS, Part, Plot
 from pkmcal.report import page
-from pkmcal.report.charts import WIDTH
+from pkmcal.report.charts import WIDTH, enlargement
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, number
 
@@ -39,7 +41,8 @@ class Joint:
     """One joint centre at home, base frame, m.
 
     drawing, shown : (3,) by the drawing, and with the error enlarged. spread : (3, 3) enlarged
-    covariance. leg : from 1.
+    covariance. leg : from 1. arm : (2, k, 3) of a joint on the base, from where a motor holds its
+    arm to the joint, by the drawing and enlarged; of another the joint alone.
     """
 
     leg: int
@@ -48,6 +51,7 @@ class Joint:
     shown: Array
     spread: Array
     tip: str
+    arm: Array
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Projection:
-    """The scene from one direction. limbs : pairs of ends, drawing then shown.
+    """The scene from one direction. limbs : by the drawing, each from its arm to the platform.
 
     grid : (horizontal?, place, text). labels : (x, y, text).
     """
@@ -101,9 +105,8 @@ def section(
     session: Session,
     estimate: Estimate,
     centres: tuple[Centres, ...],
-    places: tuple[Array, Integers],
 ) -> Part:
-    """The section. places : of measured targets, as :func:`figure_of` takes them."""
+    """The section."""
     drawn = scene_of(session, estimate, centres)
     return Part(
         "geometry",
@@ -116,7 +119,7 @@ def section(
                 "Drag to turn, wheel or pinch to come nearer.",
                 "The machine in three dimensions: joint centres by the drawing and as calibrated."
                 " The two plane views show the same.",
-                figure_of(drawn, places, session.configurations),
+                figure_of(drawn),
                 height=420,
             ),
         ),
@@ -138,6 +141,7 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
     factor = enlargement(change, SHARE * size)
     spread_factor = enlargement(ELLIPSE * sigma, SHARE / 3 * size)
     joints: list[Joint] = []
+    before, after = _arms(session.machine), _arms(estimate.machine)
     for side in centres:
         T = placed[side.side]
         drawing = apply(T, side.drawing)
@@ -149,15 +153,18 @@ def scene_of(session: Session, estimate: Estimate, centres: tuple[Centres, ...])
                 f"Leg {j + 1}, {side.side}: {dx}, {dy}, {dz} mm from the drawing (x, y, z); "
                 f"σ {brief(float(side.sigma[j]) * 1e3)} mm"
             )
-            joints.append(Joint(j + 1, side.side, drawing[j], shown[j], spread[j], tip))
+            arm = np.stack([drawing[j], shown[j]])[:, None]
+            if side.side == "base":
+                old = apply(side.T_calibrated_drawing, before[j])
+                arm = np.stack([old, old + factor * (after[j] - old)])
+            joints.append(Joint(j + 1, side.side, drawing[j], shown[j], spread[j], tip, arm))
     return BeforeAfter(factor, spread_factor, tuple(joints))
 
 
-def enlargement(lengths: Array, wanted: float) -> float:
-    """1, 2 or 5 times a power of ten that brings the larger lengths (n,) near the wanted one."""
-    ratio = max(wanted / max(float(np.quantile(lengths, 0.9)), 1e-9), 1.0)
-    power = 10.0 ** math.floor(math.log10(ratio))
-    return max(m * power for m in (1, 2, 5) if m * power <= ratio * (1 + 1e-9))
+def _arms(machine: Machine) -> tuple[Array, ...]:
+    """What carries each leg's end on the base, (k, 3) m, its last point the joint itself."""
+    moved = joint_values(machine.layout, machine.values, machine.middle_readings())
+    return skeletons(machine.layout, machine.values, moved)
 
 
 def views(scene: BeforeAfter) -> tuple[Projection, Projection]:
@@ -176,7 +183,8 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
     pick = list(axes)
     drawn = np.array([joint.drawing[pick] for joint in scene.joints])
     shown = np.array([joint.shown[pick] for joint in scene.joints])
-    corners = np.concatenate([drawn, shown])
+    arms = [joint.arm[0][:, pick] for joint in scene.joints]
+    corners = np.concatenate([drawn, shown, *arms])
     low, high = corners.min(axis=0), corners.max(axis=0)
     scale = (WIDTH - 2 * MARGIN) / (high - low).max()
     width, height = WIDTH, float((high - low)[1] * scale + 2 * MARGIN)
@@ -203,7 +211,8 @@ def _view(scene: BeforeAfter, title: str, axes: tuple[int, int]) -> Projection:
         axes=(names[axes[0]], names[axes[1]]),
         marks=marks,
         limbs=tuple(
-            (a.drawing, b.drawing) for a, b in zip(marks[:half], marks[half:], strict=True)
+            (*map(place, arm), end.drawing)
+            for arm, end in zip(arms[:half], marks[half:], strict=True)
         ),
         grid=_grid(low, high, place),
         labels=_labels(marks, (width / 2, height / 2)),
@@ -255,22 +264,17 @@ def _labels(
 # ------------------------------------------------------------------ in space
 
 
-def figure_of(
-    scene: BeforeAfter, places: tuple[Array, Integers] | None = None, names: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Traces, layout and configuration for ``Plotly.newPlot``.
-
-    places : of measured targets (N, 3), base frame, and their configurations, by their names.
-    """
+def figure_of(scene: BeforeAfter) -> dict[str, Any]:
+    """Traces, layout and configuration for ``Plotly.newPlot``."""
     base, platform = scene.of_side("base"), scene.of_side("platform")
     legs = list(zip(base, platform, strict=True))
     data = [
-        line("Drawing", "--drawing", 4, [np.stack([a.drawing, b.drawing]) for a, b in legs]),
+        line("Drawing", "--drawing", 4, [np.stack([*a.arm[0], b.drawing]) for a, b in legs]),
         line(
             f"Calibrated, × {scene.factor:g}",
             "--calibrated",
             4,
-            [np.stack([a.shown, b.shown]) for a, b in legs],
+            [np.stack([*a.arm[1], b.shown]) for a, b in legs],
         ),
         *(
             line(
@@ -286,11 +290,6 @@ def figure_of(
         _ellipsoids(scene),
         _centres(base, platform),
     ]
-    if places is not None and len(places[0]):
-        points, configuration = places
-        hover = [f"configuration {names[k]}" for k in configuration]
-        look = {"size": 2.5, "color": "--quiet", "symbol": "diamond"}
-        data.append(markers("Measured poses", points, look, hovertext=hover, hoverinfo="text"))
     layout = space_layout({"x": 1.45, "y": -1.45, "z": 0.8})
     layout["scene"]["camera"]["center"] = {"x": 0, "y": 0, "z": -0.14}
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}

@@ -12,6 +12,7 @@ from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import ToolError
 from pkmcal.outcome import AXIS, LOOKS, Part, Plot, Row, Table
+from pkmcal.report.links import Links
 from pkmcal.report.scene import markers, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, number
@@ -44,12 +45,12 @@ OUTSIDE = (
 NARROW = "The workspace has an extent along one axis at most, so there are no slices."
 
 
-def section(session: Session, estimate: Estimate, found: ToolMap | str) -> Part:
+def section(session: Session, estimate: Estimate, found: ToolMap | str, links: Links) -> Part:
     """The section; of a machine without a map the sentence that says why."""
     name, title, menu = "workspace", "The tool over the workspace", "Workspace"
     if isinstance(found, str):
         return Part(name, title, (found,), menu=menu)
-    slices = _slices(session, estimate, found)
+    slices = _slices(session, estimate, found, links)
     how = HOW if slices else NARROW if _narrow(found) else OUTSIDE
     return Part(
         name,
@@ -125,7 +126,7 @@ def _pair(values: Array) -> tuple[str, str]:
 # ------------------------------------------------------------------ slices
 
 
-def _slices(session: Session, estimate: Estimate, found: ToolMap) -> Plot | None:
+def _slices(session: Session, estimate: Estimate, found: ToolMap, links: Links) -> Plot | None:
     """Every quantity in every slice, one under the other; a single slice's beside each other."""
     if not found.slices:
         return None
@@ -141,7 +142,7 @@ def _slices(session: Session, estimate: Estimate, found: ToolMap) -> Plot | None
             panel = _panel(place[1] * across + place[0])
             axes = {"xaxis": f"x{panel}", "yaxis": f"y{panel}"}
             data.append(_heat(cut, values * 1e3, name, axes))
-            data.append(_crosses(session, estimate, found, cut, axes))
+            data.append(_crosses(session, estimate, found, cut, axes, links))
             _place_axes(layout, cut, panel, place, (across, down), extent)
             if single or row == 0:
                 layout["annotations"].append(_label(name if single else _title(cut), panel, "top"))
@@ -191,8 +192,8 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
         "name": name,
         "x": np.round(cut.u * 1e3, 1).tolist(),
         "y": np.round(cut.v * 1e3, 1).tolist(),
-        "z": _listed(level, 4),
-        "customdata": _listed(shown, 4),
+        "z": np.round(level, 4),
+        "customdata": _significant(shown, 4),
         "hovertemplate": f"{one} %{{x:.0f}}, {other} %{{y:.0f}}, {_title(cut)}<br>{name}:"
         " %{customdata:.3g} mm<extra></extra>",
         "hoverongaps": False,
@@ -201,18 +202,23 @@ def _heat(cut: Slice, values: Array, name: str, axes: dict[str, str]) -> dict[st
     }
 
 
-def _listed(values: Array, digits: int) -> list[list[float | None]]:
-    """Rows of numbers with so many digits, None where there is none."""
-    return [
-        [float(f"{x:.{digits}g}") if np.isfinite(x) else None for x in row]
-        for row in values.tolist()
-    ]
+def _significant(values: Array, digits: int) -> Array:
+    """Numbers with so many digits, as short as they can be written."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = digits - 1 - np.floor(np.log10(np.abs(values)))
+    one = 10.0 ** np.clip(np.nan_to_num(places), 0, 15)
+    return np.round(values * one) / one
 
 
 def _crosses(
-    session: Session, estimate: Estimate, found: ToolMap, cut: Slice, axes: dict[str, str]
+    session: Session,
+    estimate: Estimate,
+    found: ToolMap,
+    cut: Slice,
+    axes: dict[str, str],
+    links: Links,
 ) -> dict[str, Any]:
-    """Measured poses near a slice."""
+    """Measured poses near a slice, each of which leads to its photograph."""
     used = np.flatnonzero(estimate.configurations)
     place = estimate.state.T_base_platform[used, :3, 3]
     even = found.after.T_base_platform[: found.spread, cut.normal, 3]
@@ -225,6 +231,7 @@ def _crosses(
         "y": np.round(place[:, cut.up] * 1e3, 1).tolist(),
         "text": [f"measured: {session.configurations[k]}" for k in used],
         "hoverinfo": "text",
+        "customdata": [links.to_configuration(int(k)) for k in used],
         "marker": {
             "symbol": "x-thin",
             "size": 7,
@@ -375,7 +382,7 @@ def _space(session: Session, estimate: Estimate, found: ToolMap) -> Plot | None:
             "Calibrated, σ",
             _drawn(poses, home, which) * 1e-3,
             look,
-            customdata=_listed(np.column_stack(columns), 3),
+            customdata=_significant(np.column_stack(columns), 3),
             hovertemplate=hover,
         ),
         markers(

@@ -7,7 +7,7 @@ any work is spent; each fault is an `InputError` with file, line and field.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
@@ -27,6 +27,7 @@ from pkmcal.files import (
     any_unit,
     check_regular,
     closest,
+    json_text,
     no_such,
     read_csv,
     read_yaml,
@@ -632,3 +633,21 @@ def digests(session: Session) -> dict[str, list[str]]:
             digest = blake2b(photo.path.read_bytes(), digest_size=8).hexdigest()
             out.setdefault(name, []).append(digest)
     return out
+
+
+def session_digest(session: Session, photographs: Mapping[str, Sequence[str]]) -> str:
+    """A short digest of everything that a result depends on: readings, drawing, cameras, board,
+    trackers' tables and photographs, by :func:`digests`.
+
+    Of what the files say, not of their bytes: comments and the user's notes leave it as it is.
+    """
+    said = {name: value for name, value in session.document.items() if name != "notes"}
+    cameras = {
+        s.camera_file: [s.camera.model, s.camera.image_size, s.camera.parameters]
+        for s in session.stations
+    }
+    tables = [[t.configuration, t.T, t.position, t.rotation] for t in session.trackers]
+    board = session.board.read_bytes() if session.board else b""
+    all_of_it = [said, session.machine.to_document(), session.model, cameras, tables, photographs]
+    text = json_text(all_of_it) + blake2b(board).hexdigest()
+    return blake2b(text.encode("utf-8"), digest_size=8).hexdigest()

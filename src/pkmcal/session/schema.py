@@ -136,6 +136,7 @@ class SessionDocument(Schema):
         default=None, description="straight paths by configurations, paths: {line: [c01, c02, c03]}"
     )
     workspace: WorkspaceDocument | None = None
+    notes: str | None = Field(default=None, description="your own words, as text")
 
     def observers(self, word: str) -> list[str]:
         """Names of the stations that observe legs, or the board."""

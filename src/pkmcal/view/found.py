@@ -7,7 +7,6 @@ its file.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +14,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
-from pkmcal.observe.predict import TubeList, edge_points, legs_in_camera, plane_normals, tubes_of
-from pkmcal.report.drawn import CURVE, Drawn, measured_curves, radius_positions, straightened
+from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
+from pkmcal.report.drawn import CURVE, Drawn, measured_curves, own_edges, straightened
 from pkmcal.view.overlay import moved, pane_of
 from pkmcal.view.requests import LookRequest
 from pkmcal.view.viewed import Pane, Viewed
@@ -126,21 +125,14 @@ def _off(pane: Pane, T_camera_base: Array, edges: EdgeSet) -> tuple[Array, Array
     """
     if not len(edges):
         return np.zeros((0, CURVE, 2)), np.zeros(0)
-    machine = pane.machine
-    axes = legs_in_camera(machine, T_camera_base, pane.T_base_platform, pane.joints)
-    radius = radius_positions(machine, edges)
-    start, stop = edges.span.T
-    each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
-    a, u = axes.a[edges.leg], axes.u[edges.leg]
-    own, _ = plane_normals(a, u, machine.values[radius], each)
-    predicted = replace(edges, normal=own)
+    machine, one = pane.machine, np.zeros(len(edges), dtype=int)
+    axes = legs_in_camera(machine, T_camera_base, pane.T_base_platform[None], pane.joints[None])
     measured, drawn = (
-        measured_curves(
-            machine, pane.camera, T_camera_base, pane.T_base_platform, pane.joints, part
-        )
-        for part in (edges, predicted)
+        measured_curves(machine, pane.camera, axes, one, part)
+        for part in (edges, own_edges(machine, axes, one, edges))
     )
     # outward of the leg: away from where its axis is seen
+    a, u = axes.a[0, edges.leg], axes.u[0, edges.leg]
     axis = pane.camera.project(a + (edges.span.mean(axis=1))[:, None] * u)
     middle = CURVE // 2
     tangent = drawn[:, middle + 1] - drawn[:, middle - 1]

@@ -14,10 +14,16 @@
     return Object.fromEntries(Object.entries(node).map(([name, value]) => [name, themed(value)]));
   };
   const options = { displayModeBar: false, responsive: true };
-  const draw = () => Promise.all(plots.map((plot, i) => {
+  const draw = (size = {}) => Promise.all(plots.map((plot, i) => {
     const figure = themed(figures[i]);
-    return Plotly.react(plot, figure.data, figure.layout, { ...options, ...figure.config });
+    return Plotly.react(plot, figure.data, { ...figure.layout, ...size }, { ...options, ...figure.config });
   }));
+  // On paper: in light colours, and as wide as a panel on A4 between its margins.
+  const paper = async (printing) => {
+    document.documentElement.classList.toggle("paper", printing);
+    await draw(printing ? { width: 672 } : { autosize: true });
+    if (!printing) for (const plot of plots) Plotly.Plots.resize(plot);
+  };
   const load = async () => {
     const packed = Uint8Array.from(atob(document.getElementById("plotly").textContent), (c) => c.charCodeAt(0));
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
@@ -29,9 +35,16 @@
     for (const plot of plots) {
       const frames = read("frames", plot);
       if (frames) await Plotly.addFrames(plot, frames);
+      // a point that stands for a photograph leads to it
+      plot.on("plotly_click", ({ points }) => {
+        const lead = points[0].customdata;
+        if (typeof lead === "string" && lead.startsWith("#")) location.hash = lead;
+      });
       plot.dataset.drawn = "yes";
     }
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => draw());
+    addEventListener("beforeprint", () => paper(true));
+    addEventListener("afterprint", () => paper(false));
   };
   const failed = () => {
     for (const plot of plots) {

@@ -22,6 +22,19 @@
   addEventListener("scroll", hide, { passive: true });
 })();
 
+// What can be scrolled sideways can be reached by the keyboard, as long as there is anything to scroll.
+(() => {
+  const areas = [...document.querySelectorAll(".scroll")];
+  const mark = () => {
+    for (const area of areas) {
+      if (area.scrollWidth > area.clientWidth) area.tabIndex = 0;
+      else area.removeAttribute("tabindex");
+    }
+  };
+  addEventListener("load", mark);
+  addEventListener("resize", mark);
+})();
+
 // Enlarged photographs; a click inside comes nearer still.
 (() => {
   const dialog = document.getElementById("large");
@@ -30,6 +43,8 @@
     button.addEventListener("click", () => {
       const picture = button.querySelector("svg").cloneNode(true);
       const { width, height } = picture.viewBox.baseVal;
+      const { large } = button.dataset;
+      if (large) picture.querySelector("image").setAttribute("href", `data:image/jpeg;base64,${large}`);
       frame.style.setProperty("--ratio", width / height);
       frame.classList.remove("near");
       frame.replaceChildren(picture);

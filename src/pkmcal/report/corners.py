@@ -1,0 +1,70 @@
+"""BoardCorners of a board in photographs: found, and as the calibrated machine expects them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.boards.views import MOUNT, Boards
+from pkmcal.geometry.rigid import apply
+from pkmcal.identify.estimate import Estimate
+from pkmcal.session.load import Session
+
+
+@dataclass(frozen=True)
+class BoardCorners:
+    """N corners. station, configuration : (N,). photograph : (N,) its number in the station.
+    name : (N,) number on the board. pixel : (N, 2) where found. off : (N, 2) px, found less
+    expected. used : (N,) False where the photograph's pose is not used.
+    """
+
+    station: Integers
+    configuration: Integers
+    photograph: Integers
+    name: Integers
+    pixel: Array
+    off: Array
+    used: Booleans
+
+    __repr__ = short_repr
+
+    def __len__(self) -> int:
+        return len(self.station)
+
+    def select(self, keep: Booleans) -> BoardCorners:
+        """Those of a mask."""
+        return BoardCorners(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+
+def board_corners(session: Session, boards: Boards, estimate: Estimate) -> BoardCorners:
+    """The corners in photographs whose platform's pose was estimated and whose board can be
+    expected in the picture.
+    """
+    none = np.zeros(0, dtype=int)
+    parts = [
+        BoardCorners(none, none, none, none, np.zeros((0, 2)), np.zeros((0, 2)), none.astype(bool))
+    ]
+    state = estimate.state
+    size = 1 + boards.tolerance * float(state.sizes[0]) if len(state.sizes) else 1.0
+    for s, station in boards.stations.items():
+        seen, moves = station.seen, boards.body == "platform"
+        usable = dict(zip(seen.shown.tolist(), seen.usable.tolist(), strict=True))
+        for p, (k, found) in enumerate(
+            zip(seen.configuration.tolist(), seen.detections, strict=True)
+        ):
+            if not found.found or not estimate.configurations[k]:
+                continue
+            body = state.T_base_platform[k] if moves else np.eye(4)
+            T_camera_board = state.T_camera_base[s] @ body @ state.T_mount[MOUNT]
+            points = apply(T_camera_board, size * seen.board.points[found.ids])
+            off = found.pixels - session.stations[s].camera.project(points)
+            n = len(off)
+            whole = (np.full(n, s), np.full(n, k), np.full(n, p), np.asarray(found.ids))
+            used = np.full(n, usable.get(p, False))
+            here = BoardCorners(*whole, found.pixels, off, used)
+            parts.append(here.select(np.asarray(np.isfinite(off).all(axis=-1))))
+    return BoardCorners(
+        *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(BoardCorners))
+    )

@@ -1,0 +1,272 @@
+"""Residuals against their place in the picture: what a wrong lens leaves there has an order.
+
+An edge tells nothing along itself, so a cell's mean shift is the one (least squares) that its edges
+and corners, each across its own direction, agree on best.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.geometry.rigid import dot
+from pkmcal.identify.estimate import Estimate
+from pkmcal.measurements import EdgeSet, Observation
+from pkmcal.observe.predict import legs_in_camera
+from pkmcal.outcome import Part
+from pkmcal.report import page
+from pkmcal.report.charts import enlargement
+from pkmcal.report.corners import BoardCorners
+from pkmcal.report.drawn import measured_curves, own_edges
+from pkmcal.report.links import Links
+from pkmcal.report.residuals import KEPT, camera_numbers
+from pkmcal.session.load import Session
+from pkmcal.wording import brief, number
+
+ALONG = np.linspace(0.05, 0.95, 10)
+"""Places on an edge, in parts of its span: an edge crosses several cells."""
+COLUMNS = 14
+"""Cells across the picture."""
+FEWEST = 5
+"""Edges and corners' coordinates from which a cell is shown."""
+PARALLEL = np.sin(np.deg2rad(15.0)) ** 2
+"""Part of a cell's weight that must lie across a direction for it to be shown: of edges within 15
+degrees of one another, what is left along them is their noise, enlarged four times."""
+CHANCE = 0.01
+"""Share of cells that stand out by chance alone, where edges err independently."""
+ARROW = 0.06
+"""Length of a large mean shift as drawn, in picture widths."""
+HOW = (
+    "Arrows: from where the calibrated machine expects edges and corners to where they are, the"
+    " mean of each cell of the picture. Without order where the camera's file is right; arrows that"
+    " grow with the distance from the middle, or go round it, are a lens that the file does not"
+    " describe. Strong: more than chance makes in one cell of a hundred. A click leads to the"
+    " photograph that differs most there."
+)
+
+
+@dataclass(frozen=True)
+class CellShift:
+    """A cell's mean residual: from (x, y), px, by (dx, dy), enlarged. loud : beyond chance."""
+
+    x: float
+    y: float
+    dx: float
+    dy: float
+    loud: bool = True
+    tip: str = ""
+    lead: str = ""
+
+
+@dataclass(frozen=True)
+class ImageField:
+    """The mean residuals over one camera's picture. middle : its centre, px."""
+
+    title: str
+    width: int
+    height: int
+    middle: tuple[float, float]
+    cells: tuple[CellShift, ...]
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Residuals in pictures: (n,) px along unit directions (n, 2) at pixels (n, 2), with what they
+    are of: station, configuration, and a number for each edge or corner, (n,).
+    """
+
+    station: Integers
+    configuration: Integers
+    thing: Integers
+    pixel: Array
+    direction: Array
+    value: Array
+
+    def select(self, keep: Booleans) -> Offsets:
+        """Those of a mask."""
+        return Offsets(*(getattr(self, f.name)[keep] for f in dataclasses.fields(self)))
+
+
+def section(
+    session: Session,
+    observation: Observation,
+    estimate: Estimate,
+    corners: BoardCorners,
+    links: Links,
+) -> Part | None:
+    """The section; None without anything seen."""
+    found = fields(session, offsets(session, observation.edges, estimate, corners), links)
+    if not found:
+        return None
+    shown, factor, longest = found
+    text = f"{HOW} Drawn {factor:g} times as long as they are; the longest is {brief(longest)} px."
+    html = page.render("fields.html.j2", fields=shown)
+    return Part("field", "Residuals over the picture", (text,), html=html, menu="Over the picture")
+
+
+def offsets(session: Session, edges: EdgeSet, estimate: Estimate, corners: BoardCorners) -> Offsets:
+    """Of the edges in use, at several places of each, the camera's constant shift taken out, and of
+    the corners in use, in x and y.
+    """
+    parts = [
+        _of_edges(session, edges, estimate, s)
+        for s in np.unique(edges.station[estimate.edge_weights >= KEPT]).tolist()
+    ]
+    used, n = np.flatnonzero(corners.used), len(edges)
+    parts += [
+        Offsets(
+            corners.station[used],
+            corners.configuration[used],
+            n + used,
+            corners.pixel[used],
+            np.broadcast_to(np.eye(2)[axis], (len(used), 2)),
+            corners.off[used, axis],
+        )
+        for axis in (0, 1)
+    ]
+    found = Offsets(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(Offsets))
+    )
+    known = np.isfinite(found.value) & np.isfinite(found.pixel).all(axis=-1)
+    return found.select(np.asarray(known))
+
+
+def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> Offsets:
+    """Of one station's edges."""
+    state, machine, camera = estimate.state, estimate.machine, session.stations[s].camera
+    mine = np.flatnonzero((edges.station == s) & (estimate.edge_weights >= KEPT))
+    some = edges.select(mine)
+    rows, photograph = np.unique(some.configuration, return_inverse=True)
+    legs = legs_in_camera(
+        machine, state.T_camera_base[s], state.T_base_platform[rows], session.joints[rows]
+    )
+    own = own_edges(machine, legs, photograph, some)
+    outward = state.edge_shift[camera_numbers(session)[s]]
+    normal = own.normal + outward * (some.basis @ some.shift[..., None])[..., 0]
+    normal /= np.sqrt(dot(normal, normal))[..., None]
+    shifted = replace(own, normal=normal)
+    measured, expected = (
+        measured_curves(machine, camera, legs, photograph, part, ALONG) for part in (some, shifted)
+    )
+    tangent = np.gradient(expected, axis=1)
+    across = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    value = np.sum(across * (measured - expected), axis=-1)
+    n = len(ALONG)
+    return Offsets(
+        np.full(len(mine) * n, s),
+        np.repeat(some.configuration, n),
+        np.repeat(mine, n),
+        expected.reshape(-1, 2),
+        across.reshape(-1, 2),
+        value.ravel(),
+    )
+
+
+def fields(
+    session: Session, found: Offsets, links: Links
+) -> tuple[tuple[ImageField, ...], float, float] | None:
+    """A field for each station, hand-held photographs of one camera together; the factor by which
+    all arrows are enlarged, and the longest of them, px. None without any cell.
+    """
+    entries = [station.entry or station.name for station in session.stations]
+    shown: list[tuple[str, int, list[_Cell]]] = []
+    for entry in dict.fromkeys(entries):
+        of_entry = [s for s, name in enumerate(entries) if name == entry]
+        mine = np.isin(found.station, of_entry)
+        cells = _cells(
+            found.select(mine),
+            session.stations[of_entry[0]].camera.image_size,
+            links,
+        )
+        if cells:
+            shown.append((entry, of_entry[0], cells))
+    if not shown:
+        return None
+    lengths = np.array([np.hypot(*cell.shift) for _, _, cells in shown for cell in cells])
+    width = max(session.stations[s].camera.image_size[0] for _, s, _ in shown)
+    factor = enlargement(lengths, ARROW * width)
+    return (
+        tuple(_field(session, entry, s, cells, factor) for entry, s, cells in shown),
+        factor,
+        float(lengths.max()),
+    )
+
+
+def _field(
+    session: Session, entry: str, s: int, cells: Sequence[_Cell], factor: float
+) -> ImageField:
+    camera = session.stations[s].camera
+    values = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
+    return ImageField(
+        entry,
+        *camera.image_size,
+        (values["center.x"], values["center.y"]),
+        tuple(
+            CellShift(x, y, dx * factor, dy * factor, cell.loud, cell.tip, cell.lead)
+            for cell in cells
+            for (x, y), (dx, dy) in [(cell.place.tolist(), cell.shift.tolist())]
+        ),
+    )
+
+
+class _Cell(NamedTuple):
+    place: Array
+    shift: Array
+    loud: bool
+    tip: str
+    lead: str
+
+
+def _cells(found: Offsets, size: tuple[int, int], links: Links) -> list[_Cell]:
+    """The mean shifts of the cells of one picture that hold enough."""
+    from scipy.special import fdtrc
+
+    side = size[0] / COLUMNS
+    inside = np.all((found.pixel > -0.5) & (found.pixel < np.array(size) - 0.5), axis=1)
+    some = found.select(np.asarray(inside))
+    at = np.floor((some.pixel + 0.5) / side).astype(int)
+    # an edge counts once in a cell: its places there are one measurement; a corner twice
+    steep = np.abs(some.direction).argmax(axis=1)
+    keys = np.column_stack([at[:, 1] * COLUMNS + at[:, 0], some.thing, steep])
+    each, first, one = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    one, direction = one.reshape(-1), some.direction[first]
+    same = np.sign(dot(some.direction, direction[one]))
+    value = np.bincount(one, same * some.value) / np.bincount(one)
+    cells, number_of = np.unique(each[:, 0], return_inverse=True)
+    n = np.bincount(number_of)
+
+    def total(values: Array) -> Array:
+        out = np.zeros((len(cells), *values.shape[1:]))
+        np.add.at(out, number_of, values)
+        return out
+
+    information = total(direction[:, :, None] * direction[:, None])
+    strength, axes = np.linalg.eigh(information)
+    known = strength > PARALLEL * strength.sum(axis=1, keepdims=True)
+    along = np.einsum("cij,ci->cj", axes, total(direction * value[:, None]))
+    shift = np.einsum("cij,cj->ci", axes, np.where(known, along / np.maximum(strength, 1e-12), 0.0))
+    explained = np.einsum("ci,cij,cj->c", shift, information, shift)
+    rank = known.sum(axis=1)
+    freedom = np.maximum(n - rank, 1)
+    left = np.maximum(total(value**2) - explained, 1e-300)
+    loud = fdtrc(rank, freedom, explained / rank / (left / freedom)) < CHANCE
+    places = (np.stack([cells % COLUMNS, cells // COLUMNS], axis=-1) + 0.5) * side - 0.5
+    out: list[_Cell] = []
+    for c in np.flatnonzero(n >= FEWEST).tolist():
+        here = first[number_of == c]
+        right, down = shift[c].tolist()
+        tip = (
+            f"{number(right, 3, signed=True)} px to the right,"
+            f" {number(-down, 3, signed=True)} px upwards, of"
+            f" {len(np.unique(some.thing[here]))} edges and corners"
+        )
+        size_of = np.abs(value[number_of == c])
+        lead = links.to_largest(some.station[here], some.configuration[here], size_of)
+        out.append(_Cell(places[c], shift[c], bool(loud[c]), tip, lead))
+    return out

@@ -1,0 +1,64 @@
+"""Photographs as small JPEG files in a page: base64, in grey, within a number of bytes."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from pkmcal.arrays import Integers
+from pkmcal.errors import InputError
+from pkmcal.observe.images import Pictures
+
+LARGE, SMALL = 640, 256
+"""Widths, px: to look at one, and to look over all."""
+QUALITY = 70
+THREADS = 2
+AT_ONCE = 32
+"""Photographs that are decoded before it is asked whether there is room for more."""
+
+
+def jpeg(path: Path | None, size: tuple[int, int]) -> str:
+    """A photograph, ``LARGE`` or as wide as it is; empty where it is not there any more."""
+    return _packed(Pictures([path], size, [path.name]), 0, (LARGE,))[0] if path else ""
+
+
+def small_and_large(
+    photographs: Sequence[tuple[Sequence[Integers], int]], room: int
+) -> Iterator[tuple[str, str]]:
+    """Each photograph small, and large as long as there is room for ``room`` characters of both;
+    empty where its file cannot be read. Ends where there is no room for small ones either.
+
+    photographs : each as a station's, and its number among them.
+    """
+    left, waiting = room, len(photographs)
+    with ThreadPoolExecutor(THREADS) as pool:
+        for first in range(0, len(photographs), AT_ONCE):
+            some = photographs[first : first + AT_ONCE]
+            for small, large in pool.map(lambda one: _packed(one[0], one[1], (SMALL, LARGE)), some):
+                if len(small) > left:
+                    return
+                # that of this one and those that follow come before a large one
+                fits = len(small) * waiting + len(large) <= left
+                left, waiting = left - len(small) - (len(large) if fits else 0), waiting - 1
+                yield small, large if fits else ""
+
+
+def _packed(images: Sequence[Integers], number: int, widths: Sequence[int]) -> list[str]:
+    """A photograph in several widths, none more than its own."""
+    import cv2
+
+    try:
+        image: Any = images[number]
+    except InputError:
+        return [""] * len(widths)
+    out: dict[int, str] = {}
+    for width in sorted(widths, reverse=True):
+        if image.shape[1] > width:
+            height = max(1, round(image.shape[0] * width / image.shape[1]))
+            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+        out[width] = base64.b64encode(packed.tobytes()).decode("ascii")
+    return [out[width] for width in widths]

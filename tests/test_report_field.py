@@ -1,0 +1,97 @@
+"""Residuals over the picture: what edges and corners tell of a shift, each across its direction."""
+
+import numpy as np
+import pytest
+
+from pkmcal.report import correlations, field
+from pkmcal.report.corners import BoardCorners
+from pkmcal.report.field import Offsets
+from pkmcal.report.links import Links
+from test_report_case import OUTWARD, Case, make_case
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory) -> Case:
+    return make_case(tmp_path_factory.mktemp("session"))
+
+
+def drawn_field(case: Case, shift_at, noise, n=6000):
+    """The first station's cells from n edges that tell ``shift_at`` pixels across themselves; the
+    factor by which they are drawn.
+    """
+    rng = np.random.default_rng(5)
+    pixel = rng.uniform(0, 1, (n, 2)) * [319, 239]
+    angle = rng.uniform(0, np.pi, n)
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    value = np.sum(direction * shift_at(pixel), axis=-1) + noise * rng.normal(size=n)
+    zero = np.zeros(n, dtype=int)
+    found = field.fields(
+        case.session, Offsets(zero, zero, np.arange(n), pixel, direction, value), Links()
+    )
+    assert found is not None
+    (one,), factor, _ = found
+    return one, factor
+
+
+def test_cells_have_the_shift_that_their_edges_agree_on(case):
+    def lens(pixel):
+        away = pixel - [160.2, 119.1]
+        return 2e-7 * np.sum(away**2, axis=-1, keepdims=True) * away
+
+    one, factor = drawn_field(case, lens, noise=0.01)
+    assert one.middle == (160.2, 119.1)
+    place = np.array([(c.x, c.y) for c in one.cells])
+    shift = np.array([(c.dx, c.dy) for c in one.cells]) / factor
+    # half a cell of 320 / 14 px: the lens moves the corner by 1.6 px
+    np.testing.assert_allclose(shift, lens(place), atol=0.12)
+    far = np.linalg.norm(place - one.middle, axis=1) > 60
+    assert all(cell.loud for cell, away in zip(one.cells, far, strict=True) if away)
+
+
+def test_noise_alone_stands_out_in_one_cell_of_a_hundred(case):
+    one, _ = drawn_field(case, np.zeros_like, noise=0.2, n=20000)
+    loud = sum(cell.loud for cell in one.cells)
+    assert len(one.cells) > 130
+    assert loud <= 6  # 1.5 expected; more than six by chance once in a thousand
+
+
+def test_of_parallel_edges_only_what_is_across_them_is_shown(case):
+    rng = np.random.default_rng(2)
+    n = 4000
+    pixel = rng.uniform(0, 1, (n, 2)) * [319, 239]
+    direction = np.tile([1.0, 0.0], (n, 1))
+    zero = np.zeros(n, dtype=int)
+    value = 0.3 + 0.01 * rng.normal(size=n)
+    offsets = Offsets(zero, zero, np.arange(n), pixel, direction, value)
+    found = field.fields(case.session, offsets, Links())
+    assert found is not None
+    (one,), factor, longest = found
+    shift = np.array([(c.dx, c.dy) for c in one.cells]) / factor
+    np.testing.assert_allclose(shift, np.tile([0.3, 0.0], (len(shift), 1)), atol=0.02)
+    assert longest == pytest.approx(0.3, abs=0.02)
+
+
+def test_edges_are_off_by_what_they_were_shifted(case):
+    none, no_pixel = np.zeros(0, dtype=int), np.zeros((0, 2))
+    corners = BoardCorners(none, none, none, none, no_pixel, no_pixel, none.astype(bool))
+    found = field.offsets(case.session, case.observation.edges, case.estimate, corners)
+    kept = int(np.sum(case.estimate.edge_weights >= 0.5))
+    assert len(found.value) == kept * len(field.ALONG)
+    # the camera's own constant shift is taken out; the two sides of a leg lie off in opposite ways
+    side = case.observation.edges.side[found.thing]
+    np.testing.assert_allclose(found.value, np.where(side == 0, OUTWARD, -OUTWARD), atol=2e-3)
+
+
+def test_correlations_are_those_of_the_covariance(case):
+    part = correlations.section(case.estimate)
+    assert part is not None
+    (heat,) = part.plots[0].figure["data"]
+    rho = np.asarray(heat["z"])
+    covariance = case.estimate.covariance
+    free = np.flatnonzero(np.diag(covariance) > 0)
+    sigma = np.sqrt(np.diag(covariance)[free])
+    np.testing.assert_allclose(
+        rho, covariance[np.ix_(free, free)] / np.outer(sigma, sigma), atol=0.005
+    )
+    table = case.estimate.machine.parameters
+    assert heat["x"] == heat["y"] == [table.in_words(table.names[k]) for k in free]

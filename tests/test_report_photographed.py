@@ -1,0 +1,111 @@
+"""The machine in space as it was photographed: tubes, arms, cameras, and the slider's poses."""
+
+import numpy as np
+import pytest
+
+from pkmcal.cameras.pinhole import Pinhole
+from pkmcal.cameras.unified import Unified
+from pkmcal.geometry.rigid import apply, inverse, perturb
+from pkmcal.identify.centres import joint_centres
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.report import photographed, pictures, scene
+from test_report_case import RADIUS, Case, make_case
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory) -> Case:
+    return make_case(tmp_path_factory.mktemp("session"))
+
+
+def figure(case: Case):
+    centres = joint_centres(case.session.machine, case.estimate.machine, case.estimate.covariance)
+    shifts = np.zeros(len(case.observation.edges))
+    album = pictures.album(
+        case.session,
+        case.observation,
+        case.estimate,
+        shifts,
+        centres,
+    )
+    none = np.zeros((0, 3)), np.zeros(0, dtype=int)
+    return album, photographed.plot(case.session, case.estimate, album.links, none)
+
+
+def points(trace) -> np.ndarray:
+    return np.stack([np.asarray(trace[axis], dtype=float) for axis in "xyz"], axis=-1) * 1e-3
+
+
+def test_tubes_lie_about_their_legs_in_every_pose(case):
+    _, plot = figure(case)
+    machine, poses = case.estimate.machine, case.estimate.state.T_base_platform
+    limbs = photographed.limbs_of(machine, case.session.joints, poses)
+    assert [frame["name"] for frame in plot.frames] == list(case.session.configurations)
+    for k, frame in enumerate(plot.frames):
+        for leg, trace in enumerate(frame["data"][:6]):
+            a, b = limbs.a[k, leg], limbs.b[k, leg]
+            u = (b - a) / np.linalg.norm(b - a)
+            rings = points(trace).reshape(2, 2, photographed.AROUND, 3)
+            along = (rings - a) @ u
+            away = np.linalg.norm(rings - a - along[..., None] * u, axis=-1)
+            for tube, drawn in enumerate(machine.document.legs[leg].tubes):
+                np.testing.assert_allclose(away[tube], RADIUS[tube], atol=2e-4)  # tenths of a mm
+                ends = np.minimum([drawn.start, drawn.stop], np.linalg.norm(b - a))
+                np.testing.assert_allclose(along[tube], np.tile(ends[:, None], 10), atol=2e-4)
+
+
+def test_a_crank_is_drawn_with_its_arm():
+    machine = load_mechanism("h4")
+    pose = machine.home()
+    joints = machine.inverse(pose[None])
+    limbs = photographed.limbs_of(machine, joints, pose[None])
+    turned = photographed.limbs_of(machine, joints + 0.1, pose[None])
+    for leg, arm in enumerate(limbs.arms):
+        np.testing.assert_allclose(arm[0, -1], limbs.a[0, leg])
+        # the motor's axis stays, and the arm about it turns with the reading
+        held, end = arm[0]
+        other, away = turned.arms[leg][0]
+        np.testing.assert_allclose(other, held, atol=1e-12)
+        length = machine.document.legs[leg].base.arm
+        assert np.linalg.norm(end - held) == pytest.approx(length)
+        assert np.linalg.norm(away - end) == pytest.approx(2 * length * np.sin(0.05))
+    drawn = scene._arms(machine)
+    assert [len(arm) for arm in drawn] == [2] * 4
+    assert [len(arm) for arm in scene._arms(load_mechanism("gough-stewart"))] == [1] * 6
+
+
+def test_a_frustum_is_what_the_camera_sees():
+    camera = Pinhole((320, 240), np.array([280.0, 281.0, 160.2, 119.1, -0.3, 0.05, 1e-3, 0, 0]))
+    T_base_camera = perturb(np.eye(4), np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0]))
+    border, *rays = photographed.frustum(camera, T_base_camera, 0.5)
+    inside = apply(inverse(T_base_camera), border)
+    np.testing.assert_allclose(inside[:, 2], 0.5)
+    pixel = camera.project(inside)
+    on = np.isclose(pixel, -0.5, atol=1e-3) | np.isclose(pixel, [319.5, 239.5], atol=1e-3)
+    assert on.any(axis=1).all()
+    assert len(rays) == 4
+    for ray in rays:
+        np.testing.assert_allclose(ray[0], T_base_camera[:3, 3])
+
+
+def test_a_mirrors_field_has_no_plane():
+    camera = Unified((640, 480), np.array([200.0, 200.0, 319.5, 239.5, 1.0, 0, 0, 0, 0]))
+    border, *_ = photographed.frustum(camera, np.eye(4), 0.5)
+    np.testing.assert_allclose(np.linalg.norm(border, axis=1), 0.5)
+
+
+def test_points_lead_to_photographs_that_are_on_the_page(case):
+    album, plot = figure(case)
+    poses = next(t for t in plot.figure["data"] if t["name"] == "measured poses")
+    assert len(poses["customdata"]) == len(case.session.configurations)
+    there = {f"#{picture.anchor}" for picture in album.pictures}
+    for link, k in zip(poses["customdata"], range(5), strict=True):
+        assert link in there
+        assert link.endswith(f"-{k + 1}")
+
+
+def test_many_poses_are_thinned_and_that_is_said(case, monkeypatch):
+    monkeypatch.setattr(photographed, "MOST", 3)
+    plot = figure(case)[1]
+    assert [frame["name"] for frame in plot.frames] == ["c0", "c2", "c4"]
+    assert "3 poses of 5, evenly chosen" in plot.caption
+    assert [s["label"] for s in plot.figure["layout"]["sliders"][0]["steps"]] == ["c0", "c2", "c4"]
