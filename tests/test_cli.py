@@ -504,7 +504,7 @@ def test_simulate_refuses(tmp_path, option, value, said):
         (["calibrate", "s", "--seed", "-1"], "'--seed': it should be greater than or equal to 0"),
         (["calibrate", "s", "--method", "best"], "'bundle', 'four-step', 'linear'"),
         (["calibrate", "s", "--method", "bundel"], "'inverse-kinematic', did you mean bundle. See"),
-        (["reproduce", "d"], "'d' is not one of 'a', 'c'. See pkmcal reproduce --help."),
+        (["reproduce", "d"], "'d' is not one of 'a', 'b', 'c'. See pkmcal reproduce --help."),
     ],
 )
 def test_usage_errors(words, said):

@@ -16,6 +16,7 @@ from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.report.calibration import save
+from pkmcal.report.links import Links
 from pkmcal.report.workspace import section
 from pkmcal.simulation.truth import true_machine
 
@@ -183,7 +184,7 @@ def page_of(name, **region):
     state = SimpleNamespace(T_base_platform=made.after.T_base_platform[:4])
     estimate = SimpleNamespace(configurations=np.ones(4, dtype=bool), state=state)
     session = SimpleNamespace(machine=drawing, configurations=tuple("abcd"))
-    return section(session, estimate, made), made
+    return section(session, estimate, made, Links.of([])), made
 
 
 def test_the_page_shows_every_cell_with_its_number():
@@ -243,6 +244,6 @@ def test_a_plane_a_line_and_a_point_are_regions_too(name, region, slices, said):
 
 
 def test_a_machine_without_a_map_says_why():
-    part = section(None, None, "There is no map of the workspace: out of reach.")
+    part = section(None, None, "There is no map of the workspace: out of reach.", Links.of([]))
     assert part.text == ("There is no map of the workspace: out of reach.",)
     assert part.plots == ()
