@@ -424,3 +424,12 @@ def test_what_calibrate_tells_programs(kit):
     document = json.loads((kit / "calibration" / "calibration.json").read_text())
     assert document["bed"].keys() == {"radius", "sigma", "by_drawing", "sideways", "size", "z"}
     assert document["station_covariance"]["stations"] == []
+
+
+def test_of_a_value_above_and_in_saved_lines_klipper_takes_the_one_above():
+    """As its own reader does; who pastes above and leaves SAVE_CONFIG's lines has the new value."""
+    text = printers.workshop()
+    changed = text.replace("[stepper_a]\n", "[stepper_a]\nposition_endstop: 299.5\n", 1)
+    before, after = (klipper.printer(t, "printer.cfg") for t in (text, changed))
+    assert before.homed[0] - after.homed[0] == pytest.approx(0.5)
+    np.testing.assert_array_equal(before.homed[1:], after.homed[1:])

@@ -19,7 +19,6 @@ from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented
 from pkmcal.export.delta import (
     DEGREE,
-    MM,
     Delta,
     Fit,
     Freedoms,
@@ -30,7 +29,6 @@ from pkmcal.export.delta import (
     fitted,
     follows,
     mm,
-    reach,
     redo,
     tool_difference,
 )
@@ -91,7 +89,6 @@ def _linear(delta: Delta, fit: Fit) -> dict[str, dict[str, str]]:
         "printer": {
             "kinematics": "delta",
             "delta_radius": mm(fit.radius),
-            "print_radius": mm(MM * reach(delta)),
         }
     }
     for k, name in enumerate(STEPPERS):

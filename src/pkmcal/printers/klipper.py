@@ -1,9 +1,9 @@
 """Klipper's printer.cfg: the delta's values, and the bed as DELTA_CALIBRATE felt it.
 
 Meaning: Klipper's configuration reference, klippy/kinematics/delta.py and
-klippy/extras/delta_calibrate.py. SAVE_CONFIG writes into lines that begin with ``#*#``, which count
-more than those above. ``heightN_pos`` are steps of the three motors since their end switches,
-``heightN`` the height of the nozzle above the bed there.
+klippy/extras/delta_calibrate.py. SAVE_CONFIG writes into lines that begin with ``#*#``; of what
+stands above as well, that above counts (klippy/configfile.py). ``heightN_pos`` are steps of the
+three motors since their end switches, ``heightN`` the height of the nozzle above the bed there.
 """
 
 from __future__ import annotations
@@ -90,13 +90,13 @@ def printer(text: str, label: str) -> Printer:
 
 
 def sections(text: str, label: str) -> Sections:
-    """What a configuration says: what SAVE_CONFIG wrote stands last, and replaces what is above."""
+    """What a configuration says; where SAVE_CONFIG wrote what stands above as well, that above."""
     lines = [(n, line.rstrip()) for n, line in enumerate(text.splitlines(), 1)]
     own = [(n, line) for n, line in lines if not line.startswith(SAVED)]
     saved = [(n, line.removeprefix(SAVED).strip()) for n, line in lines if line.startswith(SAVED)]
     out: Sections = {}
     section = ""
-    for n, line in (*own, *saved):
+    for n, line in (*saved, *own):
         plain = re.split(r"(?:^|\s)[#;]", line)[0].rstrip()
         if head := _SECTION.fullmatch(plain.strip()):
             section = head[1]
