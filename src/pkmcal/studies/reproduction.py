@@ -241,14 +241,20 @@ def compared(
 
 
 def prototype_check(figures: list[Compared], within: str) -> Check:
-    """Whether all figures that are held against the prototype's agree; within : in words."""
+    """Whether all figures that are held against the prototype's agree, and how many of the others
+    do not, which depend on what the paper leaves open; within : in words.
+    """
     held = [f for f in figures if f.held]
     bad = [
         f"{', '.join(f.key)}, {f.quantity}: {f.found.value:.3g} against {f.expected:g}"
         for f in held
         if not f.tolerable
     ]
-    text = "; ".join(bad) or f"{len(held)} of {len(held)}"
+    others = [f for f in figures if not f.held]
+    text = "; ".join(bad) or f"{len(held)} of {len(held)} that are held"
+    if others:
+        differ = sum(not f.tolerable for f in others)
+        text += f"; of {len(others)} that depend on what is left open {differ} differ"
     return Check("figures of the independent prototype", text, within, not bad)
 
 
