@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from export_sources import built, source_of
+from conftest import run
+from export_sources import built, calibration, source_of
 from pkmcal.calibration.source import load_source
 from pkmcal.errors import InputError
 from pkmcal.export.c import END, FOLDER, CSource
@@ -178,6 +179,35 @@ def test_the_self_test_finds_another_machine(tmp_path, capfd):
     done = subprocess.run([program], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "FAIL" in done.stdout
+
+
+@needs_compiler
+def test_an_old_self_test_is_not_taken_for_the_new_ones(tmp_path, monkeypatch):
+    """The printed command, typed after each of two exports into one folder."""
+    monkeypatch.chdir(tmp_path)
+    first, second = (
+        calibration(tmp_path / place, built("gough-stewart", seed=seed))
+        for seed, place in ((1, "monday"), (2, "friday"))
+    )
+    told = {}
+    for folder, words in ((first, ()), (second, ("--json",))):
+        made = run("export", folder, "--to", "c", "-o", "for my robot", *words)
+        assert made.code == 0, made.err
+        # the first one's program is gone before the new one is compiled
+        assert not (tmp_path / "for my robot" / "pkmcal_selftest").exists()
+        lines = made.out.splitlines()
+        command = made.json["trial"] if words else next(x for x in lines if "(cd " in x)
+        for _ in range(2):
+            done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+        told[folder] = done.stdout.splitlines()[-1]
+        assert told[folder].endswith(f"of gough-stewart ({load_source(folder).identity})")
+    # both have one name, and one session's
+    assert told[first] != told[second]
+    stranger = tmp_path / "for my robot" / "a.out"
+    stranger.write_text("mine")
+    assert run("export", first, "--to", "c", "-o", "for my robot").code == 2
+    assert stranger.read_text() == "mine"
 
 
 @needs_compiler

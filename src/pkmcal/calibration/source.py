@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -38,7 +39,8 @@ class Source:
     headline : the calibration's verdict in a sentence. usable : False for a refused one; reasons
     : why. origin : where it was read. calibrated : False for a drawing. frames : the gauge.
     sigma_camera : (6,) by station, of T_base_camera, rad and m, base axes. bed : z (m, base frame)
-    of the platform's origin on a bed that was felt, None where none was.
+    of the platform's origin on a bed that was felt, None where none was. session : the
+    calibration's session and its digest, in words; empty for a drawing.
     """
 
     machine: Machine
@@ -54,6 +56,15 @@ class Source:
     frames: str = "as in the mechanism file"
     sigma_camera: Mapping[str, Array] = field(default_factory=lambda: MappingProxyType({}))
     bed: float | None = None
+    session: str = ""
+
+    @property
+    def identity(self) -> str:
+        """Where the values are from, and their short digest: many calibrations have one name."""
+        values = np.asarray(self.machine.values + 0.0, dtype="<f8")
+        digest = blake2b(values.tobytes(), digest_size=4).hexdigest()
+        parts = (self.origin, self.session, f"values {digest}", "" if self.usable else "refused")
+        return ", ".join(part for part in parts if part)
 
     def sigma_of(self, name: str) -> float | None:
         """A parameter's standard deviation, m or rad; None where it is not known."""
@@ -66,7 +77,7 @@ class Source:
         state = "" if self.usable else "REFUSED, NOT TO BE USED: "
         lines = (
             f"Machine {self.machine.name}, exported by pkmcal {version('pkmcal')}"
-            f" from {self.origin}.",
+            f" from {self.identity}.",
             state + " ".join((self.headline, *self.reasons)),
             f"Frames: {self.frames}.",
             *conventions,
@@ -127,6 +138,10 @@ def loaded(origin: Path | str) -> SavedCalibration | Machine:
 
 def _of_calibration(saved: SavedCalibration, session: Path | None) -> Source:
     folder = saved.path.parent
+    told = saved.document.get("session") or {}
+    session_words = " ".join(
+        ("session", *(str(told[key]) for key in ("folder", "digest") if key in told))
+    )
     files = {station.name: station.camera for station in saved.stations}
     cameras = {
         name: load_camera(found)
@@ -149,6 +164,7 @@ def _of_calibration(saved: SavedCalibration, session: Path | None) -> Source:
         calibrated=True,
         frames=saved.gauge,
         bed=(saved.document.get("bed") or {}).get("z"),
+        session=session_words if told else "",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -86,7 +87,14 @@ def summary(made: Export, source: Source, folder: Path) -> dict[str, Any]:
         ],
         "notes": [{"level": note.level.value, "text": note.text} for note in made.notes],
         "files": {name: str(folder / name) for name in made.files},
+        "trial": _trial(made, folder),
     }
+
+
+def _trial(made: Export, folder: Path) -> str | None:
+    """A command that tries the files out, from here and as often as one likes."""
+    trial = made.exporter.trial
+    return f"(cd {shlex.quote(str(folder))} && {trial})" if trial else None
 
 
 def tell(out: Console, made: Export, source: Source, folder: Path) -> None:
@@ -104,3 +112,7 @@ def tell(out: Console, made: Export, source: Source, folder: Path) -> None:
     console.print_points(out, points)
     out.print()
     console.print_files(out, [(str(folder / name), made.exporter.title) for name in made.files])
+    if trial := _trial(made, folder):
+        out.print()
+        # in one line however narrow the terminal is: it is there to be copied
+        out.print(f"  {trial}", soft_wrap=True, markup=False, highlight=False)

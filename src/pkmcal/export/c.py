@@ -26,6 +26,7 @@ from pkmcal.outcome import Finding, Level
 
 FOLDER = Path(__file__).parent / "c_source"
 HEADER, SOURCE, SELFTEST = "pkmcal_kinematics.h", "pkmcal_kinematics.c", "pkmcal_selftest.c"
+PROGRAM = "pkmcal_selftest"
 BEGIN = "/* ---- the machine ---- */\n"
 END = "/* ---- what follows is the same for every machine ---- */\n"
 NEXT_LINE = "\n    "
@@ -50,6 +51,8 @@ class CSource(Exporter):
 
     name: ClassVar = "c"
     title: ClassVar = "C99 header and source: inverse and forward kinematics"
+    trial: ClassVar = f"cc -std=c99 -O2 pkmcal_*.c -lm -o {PROGRAM} && ./{PROGRAM}"
+    leaves: ClassVar = (PROGRAM, f"{PROGRAM}.exe")
 
     def files(self, source: Source) -> dict[str, str]:
         """Header, source and self-test."""
@@ -64,12 +67,12 @@ class CSource(Exporter):
         test = (
             "Self-test: reference pairs of readings and poses, computed by pkmcal. Compile and"
             " run:",
-            f"cc -std=c99 -O2 {SELFTEST} {SOURCE} -lm && ./a.out",
+            self.trial,
         )
         return {
             HEADER: _filled(HEADER, about, _sizes(source.machine, rods)),
             SOURCE: _filled(SOURCE, (*about, *sigmas), _tables(source.machine, rods)),
-            SELFTEST: _filled(SELFTEST, (*source.header(), *test), _pairs(source.machine)),
+            SELFTEST: _filled(SELFTEST, (*source.header(), *test), _pairs(source)),
         }
 
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
@@ -107,8 +110,8 @@ class CSource(Exporter):
         out = [
             Finding(
                 Level.NOTE,
-                f"Test on the controller: cc -std=c99 -O2 {SELFTEST}"
-                f" {SOURCE} -lm && ./a.out prints PASS.",
+                "Compile the self-test on the controller, after every export: it prints PASS and"
+                f" what it tested: {source.identity}.",
             )
         ]
         passive = np.flatnonzero(~source.machine.layout.closing) + 1
@@ -245,12 +248,16 @@ def _axes(machine: Machine, rods: Limbs) -> str:
     return f"/* one row at least */\nstatic const axis_data AXIS[AXES + 1] = {{\n{rows}}};\n"
 
 
-def _pairs(machine: Machine) -> str:
+def _pairs(source: Source) -> str:
     """Reference poses and readings, with starts nearby."""
+    machine = source.machine
     poses, joints = samples(machine, PAIRS)
     starts = perturb(poses, 0.02 * machine.layout.motion.sum(axis=1))
-    # a machine's name may hold anything; in a string it must not end it
-    name = "".join(c for c in machine.name if c.isalnum() or c in " -_.")
+    # names may hold anything; in a string they must not end it
+    name, identity = (
+        "".join(c for c in text if c.isalnum() or c in " -_.,")
+        for text in (machine.name, source.identity)
+    )
     lists = "\n".join(
         f"static const pkmcal_pose {what}[PAIRS] = {{\n    "
         + ",\n    ".join(_pose(T) for T in of)
@@ -258,7 +265,7 @@ def _pairs(machine: Machine) -> str:
         for what, of in (("POSES", poses), ("STARTS", starts))
     )
     return (
-        f'#define MACHINE "{name}"\n#define PAIRS {len(poses)}\n'
+        f'#define MACHINE "{name}"\n#define TESTED "{identity}"\n#define PAIRS {len(poses)}\n'
         "#define LIMIT 1e-10 /* m and rad; a few digits above the rounding of a double */\n\n"
         + c_array("READINGS", "[PAIRS][PKMCAL_JOINTS]", joints)
         + "\n"

@@ -48,11 +48,15 @@ class Difference:
 class Exporter(ABC):
     """One format. Exporters have no state; all is in the source.
 
-    name : the word after ``--to``. title : what it is, for people.
+    name : the word after ``--to``. title : what it is, for people. trial : a command, for the
+    files' folder, that tries them out. leaves : what it leaves there, which a later export removes:
+    an old result must not be taken for the new one's.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
+    trial: ClassVar[str] = ""
+    leaves: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def files(self, source: Source) -> dict[str, str]:
@@ -133,9 +137,10 @@ def export(source: Source, name: str, *, force: bool = False) -> Export:
 
 
 def write(made: Export, folder: Path) -> None:
-    """Write the files, whole or not at all."""
-    check_own_folder(folder, made.files, "this export", "an earlier export")
-    write_folder(folder, made.files)
+    """Write the files, whole or not at all; what a trial of earlier ones left goes."""
+    leaves = made.exporter.leaves
+    check_own_folder(folder, {*made.files, *leaves}, "this export", "an earlier export")
+    write_folder(folder, made.files, over=leaves)
 
 
 def exact(value: float) -> str:

@@ -1,13 +1,14 @@
 /*
- * Machine gough-stewart, exported by pkmcal 0.1.0 from the built-in machine gough-stewart.
+ * Machine gough-stewart, exported by pkmcal 0.1.0 from the built-in machine gough-stewart, values
+ * 83784bb4.
  * Drawing only, not calibrated.
  * Frames: as in the mechanism file.
  * Units: m and rad.
  * pose: R and t map platform coordinates to base coordinates, p_base = R p_platform + t.
  * twist: omega_x, omega_y, omega_z (rad/s), tau_x, tau_y, tau_z (m/s): R changes by omega x R, t
  * by tau, both along the base frame's axes.
- * length of a rod = scale * reading + offset; a slide's way and a crank's turn are scale * reading.
- * Readings in the order of the machine's columns.
+ * length of a rod = scale * reading + offset; a slide's way and a crank's turn are scale *
+ * reading. Readings in the order of the machine's columns.
  * C99, math.h alone; no memory is allotted, nothing but the arguments is written, so that all
  * functions can run at once in several threads. Do not compile with -ffast-math.
  *
@@ -189,10 +190,10 @@ static const axis_data AXIS[AXES + 1] = {
     {.rod = 0},
 };
 
-static const pkmcal_pose HOME = {{{0.99999999999357247, -9.5379877496990761e-17, -3.5854207794893581e-06},
-    {9.5379797522831603e-17, 1.0, -2.2305547142772206e-17},
-    {3.5854207794893581e-06, 2.2305205165920852e-17, 0.99999999999357247}},
-    {6.8825564613636151e-05, -3.0639008595821244e-17, 0.35941207075412851}};
+static const pkmcal_pose HOME = {{{0.99999999999357247, -9.5387380270257459e-17, -3.5854207794893586e-06},
+    {9.5387300296976377e-17, 1.0, -2.2305302258447904e-17},
+    {3.5854207794893586e-06, 2.2304960254695947e-17, 0.99999999999357247}},
+    {6.8825564613636151e-05, -3.0638190610927038e-17, 0.35941207075412851}};
 
 /* m or rad, by the mechanism file */
 static const double RANGE[PKMCAL_JOINTS][2] = {

@@ -1,9 +1,10 @@
 /*
- * Machine gough-stewart, exported by pkmcal 0.1.0 from the built-in machine gough-stewart.
+ * Machine gough-stewart, exported by pkmcal 0.1.0 from the built-in machine gough-stewart, values
+ * 83784bb4.
  * Drawing only, not calibrated.
  * Frames: as in the mechanism file.
  * Self-test: reference pairs of readings and poses, computed by pkmcal. Compile and run:
- * cc -std=c99 -O2 pkmcal_selftest.c pkmcal_kinematics.c -lm && ./a.out
+ * cc -std=c99 -O2 pkmcal_*.c -lm -o pkmcal_selftest && ./pkmcal_selftest
  */
 #include "pkmcal_kinematics.h"
 
@@ -13,6 +14,7 @@
 /* ---- the machine ---- */
 
 #define MACHINE "gough-stewart"
+#define TESTED "the built-in machine gough-stewart, values 83784bb4"
 #define PAIRS 12
 #define LIMIT 1e-10 /* m and rad; a few digits above the rounding of a double */
 
@@ -111,6 +113,6 @@ int main(void)
         printf("FAIL: %d calls did not return what they should\n", failed);
         return 1;
     }
-    printf("PASS: %d reference poses of %s\n", PAIRS, MACHINE);
+    printf("PASS: %d reference poses of %s (%s)\n", PAIRS, MACHINE, TESTED);
     return 0;
 }
