@@ -11,6 +11,7 @@ import pytest
 
 import printers
 from conftest import run
+from pkmcal.boards.board import load_board
 from pkmcal.calibration.calibrate import calibrate
 from pkmcal.calibration.results import load
 from pkmcal.calibration.source import Source, load_source
@@ -18,11 +19,17 @@ from pkmcal.errors import InputError
 from pkmcal.export import reprap
 from pkmcal.export.contract import export
 from pkmcal.export.klipper import Klipper
+from pkmcal.files import read_csv
 from pkmcal.geometry.rigid import pose
+from pkmcal.mechanisms import load_mechanism
 from pkmcal.printers import klipper
 from pkmcal.printers.probed import read_touches
 from pkmcal.printers.read import read_printer
 from pkmcal.printers.session import write_printer_session
+from pkmcal.session.load import load_session
+from pkmcal.session.starter import untouched_files
+from pkmcal.simulation.drives import to_simulate
+from pkmcal.simulation.placement import draw_configurations
 
 SAYS = printers.Settings()
 BUILT = printers.Settings(radius=105.6, angle=(210.3, 329.8, 90.0), rod=(270.3, 269.8, 270.1))
@@ -195,7 +202,7 @@ def said(folder, text, name="console.txt"):
 @pytest.fixture
 def cfg(tmp_path):
     """A printer.cfg without heights, whose probe is aside of the nozzle."""
-    text = printers.printer_cfg(SAYS) + "[probe]\nx_offset: 12\ny_offset: -5.5\nz_offset: 1.25\n"
+    text = "[probe]\nx_offset: 12\ny_offset: -5.5\nz_offset: 1.25\n" + printers.printer_cfg(SAYS)
     return said(tmp_path, text, "printer.cfg")
 
 
@@ -218,6 +225,65 @@ def test_points_of_klippers_console(cfg):
     np.testing.assert_allclose(one.heights, 1.25)
     np.testing.assert_allclose(other.carriages, want, atol=1e-3)
     np.testing.assert_allclose(other.heights, 0.0)
+
+
+END_A = "#*# position_endstop = 300.0\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        (END_A, "position_endstop = 299.1\n", "found 'position_endstop = 299.1',"),
+        (END_A, "#*#position_endstop = 299.1\n", "found '#*#position_endstop = 299.1',"),
+        ("#*#\n#*# [stepper_b]", "\n#*# [stepper_b]", "remove it if it is empty"),
+        ("#*# <--", "# <--", "Put the header back"),
+    ],
+)
+def test_saved_lines_that_klipper_would_drop_are_told(tmp_path, old, new, told):
+    text = printers.printer_cfg(SAYS)
+    spoilt = text.replace(old, new, 1)
+    assert spoilt != text
+    with pytest.raises(InputError, match="Klipper drops all that SAVE_CONFIG wrote") as error:
+        read_printer(said(tmp_path, spoilt, "printer.cfg"))
+    assert told in str(error.value)
+    # of a header that is gone the line after it is told
+    above = spoilt[: spoilt.index(new)].count("\n") + new.startswith("# <")
+    assert f"line {above + 1}:" in str(error.value)
+
+
+def test_a_board_on_a_printer(cfg):
+    """The session is a delta's: its motors, millimetres and steps, and a board that has room."""
+    folder = cfg.parent / "kit"
+    done = run("new", folder, "--printer", cfg, "--board", "--places", "2")
+    assert done.code == 0, done.err
+    texts = {p.name: p.read_text() for p in folder.rglob("*") if p.is_file()}
+    words = " ".join(texts.values())
+    assert not re.search(r"\bleg(s|1)\b", words.replace("legs[*]", "").replace("legs:", ""))
+    session = load_session(folder, measured=False)
+    assert session.joint_noise == pytest.approx(1e-3 * printers.STEP / np.sqrt(12), rel=0.15)
+    assert texts["joints.csv"].startswith(
+        "configuration,stepper_a [mm],stepper_b [mm],stepper_c [mm]"
+    )
+    there = session.machine.forward(read_csv(folder / "joints.csv").values)[:, :3, 3]
+    np.testing.assert_allclose(there[0], session.machine.home()[:3, 3], atol=1e-6)
+    # from a place half way out, its corners stay where the tool itself may go
+    corners = load_board(session.board).points
+    across = np.linalg.norm(np.ptp(corners, axis=0))
+    assert 0.5 * 0.09 < across < 0.09
+    untouched = " ".join(untouched_files(folder))
+    assert "joints.csv is still the example" in untouched
+    assert "board.yaml is still the example" in untouched
+
+
+def test_the_drawing_of_a_printer_is_simulated(cfg):
+    """Its rods meet in one point, all that a firmware knows of the platform."""
+    run("new", cfg.parent / "kit", "--printer", cfg, "--board")
+    drawing = load_mechanism(cfg.parent / "kit" / "mechanism.yaml")
+    poses, joints = draw_configurations(
+        to_simulate(drawing, "x"), 30, 0.3, np.random.default_rng(0)
+    )
+    assert len(poses) >= 30
+    np.testing.assert_allclose(drawing.forward(joints), poses, atol=1e-9)
 
 
 REPRAP = """\

@@ -98,17 +98,24 @@ def _of_printer(
             expected="neither --machine nor --legs, and --probed or --board",
         )
     names = write_printer_session(folder, printer, probed, "board" if board else None, places)
-    return _told(folder, names, as_json, done=not board)
+    return _told(folder, names, as_json, done=not board, of_printer=True)
 
 
-def _told(folder: Path, names: Sequence[str], as_json: bool, done: bool = False) -> int:
-    """What was written; done : nothing is missing in it."""
+def _told(
+    folder: Path,
+    names: Sequence[str],
+    as_json: bool,
+    done: bool = False,
+    of_printer: bool = False,
+) -> int:
+    """What was written; done : nothing is missing in it. of_printer : drawn by its firmware."""
     if as_json:
         console.print_json({"folder": str(folder), "files": names})
         return 0
     out = console.out()
     out.print("A session:\n" if done else "A session to fill in:\n", style="bold")
-    what = {**WHAT, **(FELT if done else {})}
+    drawn = {"mechanism.yaml": FELT["mechanism.yaml"]} if of_printer else {}
+    what = {**WHAT, **(FELT if done else drawn)}
     known = [name for name in what if name in names]
     others = sorted(set(names) - set(known))
     rows = [(name, what[name]) for name in known] + [(name, PHOTOGRAPHS) for name in others]

@@ -32,13 +32,18 @@ from pkmcal.export.delta import (
     redo,
     tool_difference,
 )
-from pkmcal.outcome import Finding
+from pkmcal.outcome import Finding, Level
 
 FILE = "pkmcal_printer.cfg"
 PROGRAM = "Klipper"
 LINEAR = Freedoms((210.0, 330.0, 90.0))
 ROTARY = Freedoms((30.0, 150.0, 270.0), heights=False)
 STEPPERS = "abc"
+MARK = (
+    "Below SAVE_CONFIG's header keep the mark '#*# ' before each line: where one is without it,"
+    " Klipper drops all that was saved."
+)
+"""klippy/configfile.py, _find_autosave_data."""
 
 
 def _fit(source: Source) -> tuple[Delta, Fit]:
@@ -59,6 +64,7 @@ class Klipper(Exporter):
         word = "Multiply its rotation_distance" if fit.kind == "linear" else "Divide its gear_ratio"
         lines = about(source, delta, fit, STEPPERS, PROGRAM, f"{word} by that.")
         lines.append("Put these values into the sections of the printer's own configuration.")
+        lines.append(MARK)
         sections = _linear(delta, fit) if fit.kind == "linear" else _rotary(delta, fit)
         body = "".join(
             f"\n[{name}]\n" + "".join(f"{key}: {value}\n" for key, value in values.items())
@@ -80,7 +86,7 @@ class Klipper(Exporter):
     def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
         del files
-        return (follows(_fit(source)[1], PROGRAM), *redo(source))
+        return (follows(_fit(source)[1], PROGRAM), Finding(Level.NOTE, MARK), *redo(source))
 
 
 def _linear(delta: Delta, fit: Fit) -> dict[str, dict[str, str]]:

@@ -2,8 +2,10 @@
 
 Meaning: Klipper's configuration reference, klippy/kinematics/delta.py and
 klippy/extras/delta_calibrate.py. SAVE_CONFIG writes into lines that begin with ``#*#``; of what
-stands above as well, that above counts (klippy/configfile.py). ``heightN_pos`` are steps of the
-three motors since their end switches, ``heightN`` the height of the nozzle above the bed there.
+stands above as well, that above counts; where one line below SAVE_CONFIG's header is without that
+mark, or one with it stands above the header, nothing that was saved counts (klippy/configfile.py,
+_find_autosave_data). ``heightN_pos`` are steps of the three motors since their end switches,
+``heightN`` the height of the nozzle above the bed there.
 """
 
 from __future__ import annotations
@@ -21,10 +23,11 @@ from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.export.klipper import STEPPERS, homed, linear_motors
 from pkmcal.files import shown
-from pkmcal.printers.printer import LARGEST, Printer, Touches
+from pkmcal.printers.printer import LARGEST, STEP, Printer, Touches
 
 NOMINAL = (210.0, 330.0, 90.0)
 SAVED = "#*#"
+_HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>")
 FULL_STEPS = 200.0
 """Steps a turn of a motor whose section says nothing else, as in Klipper."""
 MOST_STEPS = 1e9
@@ -43,6 +46,7 @@ def is_one(text: str) -> bool:
 
 def printer(text: str, label: str) -> Printer:
     """The printer of a printer.cfg, checked field by field."""
+    _check_saved(text, label)
     found = sections(text, label)
     kinematics = found["printer"].get("kinematics", ("", f"{label}, [printer]"))
     if kinematics[0] != "delta":
@@ -86,7 +90,38 @@ def printer(text: str, label: str) -> Printer:
         carriages=partial(linear_motors, config),
         offset=_probe(found, label),
         touches=_touches(found, label, ends),
+        step=max(_step(found, label, f"stepper_{s}") for s in STEPPERS)
+        if _stepped(found)
+        else STEP,
     )
+
+
+def _check_saved(text: str, label: str) -> None:
+    """Raises InputError where Klipper would take nothing of what SAVE_CONFIG wrote."""
+    lines = [line.rstrip("\r") for line in text.rstrip().splitlines()]
+    header = next((n for n, line in enumerate(lines) if _HEADER.match(line)), len(lines))
+    for n, line in enumerate(lines):
+        marked = line == SAVED or line.startswith(SAVED + " ")
+        if marked == (n >= header):
+            continue
+        raise InputError(
+            "Klipper drops all that SAVE_CONFIG wrote, for this line "
+            + (
+                "is marked and not below its header" if marked else "below its header is not marked"
+            ),
+            where=f"{label}, line {n + 1}",
+            found=shown(line),
+            expected=f"'{SAVED} ' before each line below SAVE_CONFIG's header, and no other",
+            next_step="Put the header back"
+            if marked
+            else f"Put '{SAVED} ' before it, remove it if it is empty, or move it above the header;"
+            " then restart Klipper",
+        )
+
+
+def _stepped(found: Sections) -> bool:
+    """Whether the motors' steps are told."""
+    return {"rotation_distance", "microsteps"} <= found.get("stepper_a", {}).keys()
 
 
 def sections(text: str, label: str) -> Sections:

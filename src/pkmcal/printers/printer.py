@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from pkmcal.arrays import Array, short_repr
 
+STEP = 1 / 80
+"""mm of a carriage a step: 200 full steps of 16, belts of 2 mm on 20 teeth, as on most printers."""
 LARGEST = 1e6
 """mm, or degrees: what is larger is no printer's, and would overflow where it is squared."""
 
@@ -31,7 +33,8 @@ class Printer:
     program : the firmware. motors : their names. radius : of the towers' circle less the tool's.
     angle, rod : (3,). homed : (3,) carriages at their end switches. reach : radius of the bed.
     carriages : points (n, 3) mm of the tool to carriages (n, 3) mm, by the firmware's formulas.
-    offset : (x, y, z) mm of a probe from the nozzle. touches : saved in the same file.
+    offset : (x, y, z) mm of a probe from the nozzle. touches : saved in the same file. step : of a
+    carriage, mm.
     """
 
     program: str
@@ -45,5 +48,6 @@ class Printer:
     carriages: Callable[[Array], Array]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     touches: Touches | None = None
+    step: float = STEP
 
     __repr__ = short_repr

@@ -10,11 +10,18 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import csv_text
-from pkmcal.printers.printer import Printer, Touches
+from pkmcal.files import csv_text, parse_yaml, validate
+from pkmcal.mechanisms import MechanismDocument, checked_machine
+from pkmcal.printers.printer import STEP, Printer, Touches
 from pkmcal.printers.probed import FEWEST, read_touches
 from pkmcal.printers.read import read_printer
-from pkmcal.session.starter import session_texts, write_texts
+from pkmcal.session.starter import (
+    SQUARES,
+    board_text,
+    example_readings,
+    session_texts,
+    write_texts,
+)
 from pkmcal.wording import count
 
 MM = 1e3
@@ -41,6 +48,36 @@ LEG = """\
       range: [{low} mm, {high} mm]
     platform: {{joint: spherical, center: [0, 0, 0]}}
     length: {{actuated: false, constant: {rod} mm}}"""
+CARRIED = """\
+# A calibration session of a delta printer, by a camera and a board that its tool carries.
+#
+# What to do, in this order:
+#   1. mechanism.yaml      the printer by its firmware: see whether its tolerances are right
+#   2. board.yaml          pkmcal board prints it, in a size for a print radius of {reach} mm:
+#                          measure it, and fix it to the effector, flat, facing the camera
+#   3. cameras/front.yaml  the calibration of your camera
+#   4. Put the camera in place. Home. Move to 25 places over the whole bed and half of the height,
+#      also where a carriage is near its lowest or highest; wait until the tool hangs still, take a
+#      photograph and note where the carriages are. Do not touch the camera in between.
+#   5. images/front/       the photographs, each under the name of its configuration
+#   6. joints.csv          the carriages' heights in mm, one row a configuration: {where}
+#   7. pkmcal check, in this folder's place, until it finds nothing wrong; then pkmcal calibrate
+pkmcal: 1                     # the format's version; leave it
+mechanism: mechanism.yaml
+
+joints:
+  file: joints.csv
+  noise: {noise} mm             # {steps}
+
+# Your own words, which stand on the report: who, when, which machine, what was changed.
+# notes: |
+#   New belts.
+
+"""
+WHERE = {
+    "Klipper": "what Klipper's\n#                          GET_POSITION tells behind stepper:",
+    "RepRapFirmware": "what M114\n#                          tells behind Count, divided by M92",
+}
 FIRMWARE = """\
 # What the firmware can hold: towers upright, motors that go as far as it says.
 fixed: ["legs[*].platform.center", "legs[*].base.axis", "legs[*].scale"]
@@ -56,7 +93,7 @@ mechanism: mechanism.yaml
 
 joints:
   file: joints.csv            # the carriages when the bed was felt
-  noise: 0.004 mm             # a step of 1/80 mm, of which a carriage is anywhere
+  noise: {noise} mm             # {steps}
 
 stations:
   probe:
@@ -87,9 +124,37 @@ def write_printer_session(
         touches = found.touches if probed is None else read_touches(probed, found)
         texts = heights_texts(found, _enough(found, touches))
     else:
-        texts = session_texts("linear-delta", "board", places)
-        texts["mechanism.yaml"] = drawing_text(found) + HELD
+        texts = carried_texts(found, places)
     return write_texts(folder, texts)
+
+
+def carried_texts(printer: Printer, places: int = 1) -> dict[str, str]:
+    """The files of a session with a board on the tool, to fill in."""
+    texts = session_texts("linear-delta", "board", places)
+    drawing = drawing_text(printer) + HELD
+    document = parse_yaml(drawing, Path("mechanism.yaml"))
+    machine = checked_machine(validate(document, MechanismDocument), document)
+    heads = [f"{motor} [mm]" for motor in printer.motors]
+    # corners stay within the print radius where the tool goes half as far: room is beside no tower
+    square = int(printer.reach / np.hypot(7, 5))
+    head = CARRIED.format(
+        where=WHERE[printer.program], reach=_mm(printer.reach), **_resolution(printer)
+    )
+    session = texts["session.yaml"]
+    texts["session.yaml"] = head + session[session.index("# One entry") :]
+    texts["mechanism.yaml"] = drawing
+    texts["joints.csv"] = example_readings(machine, heads)
+    texts["board.yaml"] = board_text(min(max(square, SQUARES[0]), SQUARES[-1]))
+    return texts
+
+
+def _resolution(printer: Printer) -> dict[str, str]:
+    """How well a carriage is known, in words: no finer than motors hold their steps."""
+    step = max(printer.step, STEP)
+    return {
+        "noise": f"{step / np.sqrt(12):.1g}",
+        "steps": f"a step of {step:.3g} mm, of which a carriage is anywhere",
+    }
 
 
 def _enough(printer: Printer, touches: Touches | None) -> Touches:
@@ -128,7 +193,9 @@ def heights_texts(printer: Printer, touches: Touches) -> dict[str, str]:
     to = "klipper" if printer.program == "Klipper" else "reprap"
     heads = [f"{motor} [mm]" for motor in printer.motors]
     return {
-        "session.yaml": SESSION.format(n=len(names), origin=touches.origin, to=to),
+        "session.yaml": SESSION.format(
+            n=len(names), origin=touches.origin, to=to, **_resolution(printer)
+        ),
         "mechanism.yaml": drawing_text(printer, touches) + FIRMWARE,
         "joints.csv": csv_text(heads, names, touches.carriages.round(6)),
         "poses.csv": csv_text(["z [mm]"], names, touches.heights[:, None]),

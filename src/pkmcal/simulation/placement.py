@@ -170,7 +170,8 @@ def _around_home(machine: Machine, n: int, rng: np.random.Generator) -> Array:
 
 def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Booleans:
     """(n,) True where no two legs come nearer than their tubes are thick, nor a leg to a guide of
-    another.
+    another. Legs that meet in a joint, as in drawings that know no more of a platform than a point,
+    come near each other nowhere else.
     """
     ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
     along = np.linspace(0.06, 0.97, 24)[:, None]
@@ -180,8 +181,12 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
     apart = np.ones(T_base_platform.shape[0], dtype=bool)
     for i, j in np.ndindex(machine.n_legs, machine.n_legs):
         if j < i:
+            thick = widths[i] + widths[j]
             gap = points[:, i, :, None] - points[:, j, None, :]
-            apart &= np.sqrt(dot(gap, gap).min(axis=(-1, -2))) > widths[i] + widths[j]
+            meet = [
+                np.linalg.norm(end[:, i] - end[:, j], axis=1) < thick for end in (ends.a, ends.b)
+            ]
+            apart &= (np.sqrt(dot(gap, gap).min(axis=(-1, -2))) > thick) | meet[0] | meet[1]
         # carriages side by side on one guide have their own legs beside it
         if j != i and drives.guides[j] and drives.away[i] @ drives.away[j] <= SIDE_BY_SIDE:
             for start, stop in pairwise(drives.ways[j]):

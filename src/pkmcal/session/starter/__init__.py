@@ -6,6 +6,7 @@ board, or from several places, is made of it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, PkmcalError
 from pkmcal.files import csv_text, entries, read_text, staged_folder
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.mechanisms.document import MOTIONS
@@ -36,11 +37,13 @@ BOARD = """\
 # what each key means: docs/files.md, board.yaml.
 type: charuco
 squares: [7, 5]           # columns and rows of squares
-square: 30 mm             # the side of a square: measure over all of them, and divide
-marker: 22 mm             # the side of a marker
+square: {square:<17} # the side of a square: measure over all of them, and divide
+marker: {marker:<17} # the side of a marker
 dictionary: DICT_5X5_100
 tolerance: 0.1 %          # how well you measured: paper changes its size by as much
 """
+SQUARE, SQUARES = 30, range(8, 31)
+"""mm, of the board's squares as they are, and as they can be asked for."""
 ON_PLATFORM = """\
 
 board:
@@ -61,6 +64,13 @@ POSE = """\
 ALONE = """\
 # No stations: this machine has more readings than freedoms, and they alone tell its geometry.
 # Spread the configurations over all that it reaches.
+"""
+UNITS = {"[deg]": np.rad2deg(1.0), "[mm]": 1e3}
+"""Units of example readings by the mark in a column's head."""
+LEGS = " - The machine stands still."
+BOARD_SEEN = """\
+ - The machine stands still. The board sharp, whole in the picture, neither white nor black, and
+   not always seen from the same side.
 """
 DRIVES = """\
   # Standard deviation of a reading: about a third of the encoder's repeatability.
@@ -119,13 +129,15 @@ def session_texts(
         if seen is None and not visible:
             seen = "readings" if drawn.redundancy > 0 else "board"
         texts["mechanism.yaml"] = read_text(catalogue().get(machine, Path(machine)))
-        texts["joints.csv"] = _readings(drawn)
+        texts["joints.csv"] = example_readings(drawn)
         turns = set(drawn.joint_units) == {"rad"}
     seen = seen or "legs"
     texts["session.yaml"] = _session(texts["session.yaml"], machine is None, turns, seen, places)
     if seen in ("board", "both"):
-        texts["board.yaml"] = BOARD
+        texts["board.yaml"] = board_text()
     where_to = texts.pop("images/front/README.txt")
+    if seen == "board":
+        where_to = where_to[: where_to.index(LEGS)] + BOARD_SEEN
     if seen == "readings":
         del texts["cameras/front.yaml"]
         return texts
@@ -134,12 +146,19 @@ def session_texts(
     return texts
 
 
+def board_text(square: int = SQUARE) -> str:
+    """board.yaml of the example, with squares of so many millimetres."""
+    return BOARD.format(square=f"{square} mm", marker=f"{round(0.73 * square)} mm")
+
+
 def _places(count: int) -> list[str]:
     return [*PLACES, *(f"place{k + 1}" for k in range(len(PLACES), count))][:count]
 
 
-def _readings(machine: Machine) -> str:
-    """Two rows: the home pose's, and one's beside it."""
+def example_readings(machine: Machine, heads: Sequence[str] | None = None) -> str:
+    """Two rows of joints.csv: the home pose's, and one's beside it. heads : of the columns, such as
+    ``stepper_a [mm]``, in mm or degrees where they say so; the joints' names unless told.
+    """
     poses = np.repeat(machine.home()[None], 2, axis=0)
     lengths = machine.parameters.drawing[np.array(machine.parameters.units) == "m"]
     # along the last of its motions that is no turn, by a part of its size
@@ -148,12 +167,11 @@ def _readings(machine: Machine) -> str:
     poses[1, :3, 3] += slide * np.abs(lengths).max() / 30
     rows = machine.inverse(poses)
     rows = np.where(np.isfinite(rows), rows, rows[:1])
-    turns = np.array([unit == "rad" for unit in machine.joint_units])
-    rows[:, turns] = np.rad2deg(rows[:, turns])
-    heads = [
-        f"{name} [deg]" if turn else name
-        for name, turn in zip(machine.joint_names, turns, strict=True)
+    heads = heads or [
+        f"{name} [deg]" if unit == "rad" else name
+        for name, unit in zip(machine.joint_names, machine.joint_units, strict=True)
     ]
+    rows *= [next((k for mark, k in UNITS.items() if head.endswith(mark)), 1.0) for head in heads]
     return csv_text(heads, ["0001", "0002"], rows.round(4))
 
 
@@ -193,19 +211,31 @@ def _untouched(path: Path, name: str) -> bool:
     # readings of a machine in motion are many: only examples have two rows
     if not lines or (name == "joints.csv" and len(lines) != 3):
         return False
-    return any(lines == text.splitlines() for text in _examples(name))
+    examples = _examples(name)
+    if name == "joints.csv":
+        examples = (*examples, *_of_the_drawing(path.parent, lines[0].split(",")[1:]))
+    return any(lines == text.splitlines() for text in examples)
+
+
+def _of_the_drawing(folder: Path, heads: Sequence[str]) -> tuple[str, ...]:
+    """The example readings of a folder's own drawing, where it can be read."""
+    try:
+        machine = load_mechanism(folder / "mechanism.yaml")
+        return (example_readings(machine, heads),) if len(heads) == machine.n_joints else ()
+    except PkmcalError:  # told elsewhere, with its line
+        return ()
 
 
 @cache
 def _examples(name: str) -> tuple[str, ...]:
     """Every text that a file of a new session can begin as."""
     if name == "board.yaml":
-        return (BOARD,)
+        return tuple(board_text(square) for square in SQUARES)
     template = (TEMPLATE / name).read_text("utf-8")
     if name == "mechanism.yaml":
         return template, *(read_text(path) for path in catalogue().values())
     if name == "joints.csv":
-        return template, *(_readings(load_mechanism(machine)) for machine in catalogue())
+        return template, *(example_readings(load_mechanism(machine)) for machine in catalogue())
     if name == "session.yaml":
         return tuple(
             _session(template, *given)
