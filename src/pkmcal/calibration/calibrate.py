@@ -42,11 +42,18 @@ from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, take_turns
 from pkmcal.errors import InputError
 from pkmcal.files import closest, shown
+from pkmcal.identify.bed import bed_of
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.centres import free_of_gauge
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import ToolError, checked_poses, tool_error
-from pkmcal.identify.unidentified import Findings, explain, joined_by_boards, seen_legs
+from pkmcal.identify.unidentified import (
+    Findings,
+    explain,
+    joined_by_boards,
+    only_heights,
+    seen_legs,
+)
 from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
@@ -351,7 +358,8 @@ def _findings(measurements: Measurements, estimate: Estimate) -> Findings:
         seen = np.ones_like(seen)
     told = what_data_tell(measurements, estimate)
     counted = conditions(estimate.machine, seen) if len(measurements.edges) else ()
-    return explain(told, estimate, joined_by_boards(seen, measurements), counted)
+    bed = bed_of(measurements, estimate) if only_heights(estimate) else None
+    return explain(told, estimate, joined_by_boards(seen, measurements), counted, bed)
 
 
 class _Clock:

@@ -1,4 +1,10 @@
-"""What heights of a flat bed tell of a machine: how flat it will be, and how little of x and y."""
+"""What heights of a flat bed tell of a machine: how flat it will be, and how little of x and y.
+
+What the mechanism file holds because a firmware cannot hold it otherwise, towers that lean and
+motors that go further than told, bends the bed all the same. So deviations are those of a wider
+model, in which all that has a tolerance is free: its best values say how far the machine as
+estimated is off, as far as the heights show that, and its covariance what they leave open.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.identify.bundle import as_ended
+from pkmcal.identify.covariance import reduced_rows
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.tool import pose_by_parameters
+from pkmcal.measurements import Measurements
+from pkmcal.mechanisms import Machine, machine_from_document
 
 POINTS = 60
 """Places all over the bed: where nobody probed counts as well."""
+EXACT = 1e-9
+"""Share of what a parameter does below which it is rounding."""
 GOLDEN = np.pi * (3 - np.sqrt(5))
 """Turn from one place to the next on a spiral that covers a disc evenly."""
 
@@ -21,10 +33,11 @@ class Bed:
     """How well the platform is known over the disc about the places that were probed.
 
     radius : of the disc, m. sigma : standard deviation (m, root mean square over the disc) of the
-    platform's height above the bed, the bed's own height and tilt aside; by_drawing : the same by
-    the drawing's tolerances. sideways : of its place along the bed, frames aside. size : of how
-    much larger or smaller all is along the bed, a share. z : of the platform's origin, m, base
-    frame, in the middle of the disc where the first table's height is 0.
+    platform's height above the bed, the bed's own height and tilt aside, tolerances of held values
+    included; by_drawing : the same by the drawing's tolerances alone. sideways : of its place along
+    the bed, frames aside. size : of how much larger or smaller all is along the bed, a share. z :
+    of the platform's origin, m, base frame, in the middle of the disc where the first table's
+    height is 0.
     """
 
     radius: float
@@ -35,9 +48,9 @@ class Bed:
     z: float
 
 
-def bed_of(estimate: Estimate) -> Bed:
+def bed_of(measurements: Measurements, estimate: Estimate) -> Bed:
     """The bed of an estimate from heights alone."""
-    machine, table = estimate.machine, estimate.machine.parameters
+    machine = estimate.machine
     poses = _over_the_disc(estimate.state.T_base_platform[estimate.configurations])
     joints = machine.inverse(poses)
     reached = np.isfinite(joints).all(axis=1)
@@ -55,13 +68,14 @@ def bed_of(estimate: Estimate) -> Bed:
     stretch = xy.ravel() @ along / np.sum(xy**2)
     middle, state = poses[0], estimate.state
     there = state.T_camera_base[0] @ middle @ state.T_mount[0]
-    drawing = table.free_matrix() * table.tolerances_free()
+    drawing = _drawing_root(machine, by)
+    off, root = _wider(measurements, estimate, drawing)
     return Bed(
         radius=float(np.linalg.norm(xy, axis=1).max()),
-        sigma=_deviation(height, estimate.covariance, len(xy)),
-        by_drawing=_deviation(height, drawing @ drawing.T, len(xy)),
-        sideways=_deviation(along, estimate.covariance, len(xy)),
-        size=_deviation(stretch[None], estimate.covariance, 1),
+        sigma=_deviation(height, off, root, len(xy)),
+        by_drawing=_deviation(height, np.zeros(len(off)), drawing, len(xy)),
+        sideways=_deviation(along, off, root, len(xy)),
+        size=_deviation(stretch[None], off, root, 1),
         z=float(middle[2, 3] - there[2, 3]),
     )
 
@@ -88,6 +102,43 @@ def _less(rows: Array, known: Array) -> Array:
     return rows - known @ np.linalg.lstsq(known, rows, rcond=None)[0]
 
 
-def _deviation(rows: Array, covariance: Array, places: int) -> float:
-    """Standard deviation of rows (n, P), root mean square over so many places."""
-    return float(np.sqrt(max(np.sum((rows @ covariance) * rows), 0.0) / places))
+def _drawing_root(machine: Machine, by: Array) -> Array:
+    """R (P, m): the drawing's covariance R R^T of the free parameters, and of those held ones that
+    do something no free one does. by : (n, 3, P) how the parameters move the platform.
+
+    What a free one stands for, as a tower's place for that of the rod's lower end, would count
+    twice.
+    """
+    table = machine.parameters
+    everything = machine_from_document(machine.document.model_copy(update={"fixed": ()})).parameters
+    free, wide = (t.free_matrix() * t.tolerances_free() for t in (table, everything))
+    by = by.reshape(-1, by.shape[-1])
+    u, s, _ = np.linalg.svd(by @ free, full_matrices=False)
+    u = u[:, s > EXACT * s[0]]
+    moved = by @ wide
+    own = np.linalg.norm(moved - u @ (u.T @ moved), axis=0)
+    return np.column_stack([free, wide[:, own > EXACT * np.linalg.norm(moved, axis=0)]])
+
+
+def _wider(measurements: Measurements, estimate: Estimate, drawing: Array) -> tuple[Array, Array]:
+    """Of the parameters in the model in which all vary that the drawing R (P, m) lets vary: how far
+    the best values are from the estimate's (P,), and a root (P, m) of their covariance.
+    """
+    assembled, state = as_ended(measurements, estimate)
+    rows, left = reduced_rows(*assembled.problem.opened(state), ("machine",))
+    table = estimate.machine.parameters
+    at = np.zeros(drawing.shape[1])  # the estimate, in the drawing's deviations
+    free = table.to_free(estimate.machine.values) / table.tolerances_free()
+    at[: free.size] = free
+    both = np.concatenate([rows @ drawing, np.eye(len(at))])
+    _, s, vt = np.linalg.svd(both, full_matrices=False)
+    half = vt.T / s
+    best = -half @ (half.T @ (both.T @ np.concatenate([left, at])))
+    return drawing @ best, drawing @ half
+
+
+def _deviation(rows: Array, off: Array, root: Array, places: int) -> float:
+    """Standard deviation of rows (n, P), root mean square over so many places, of parameters that
+    are ``off`` (P,) with the covariance of a root (P, m).
+    """
+    return float(np.sqrt((np.sum((rows @ off) ** 2) + np.sum((rows @ root) ** 2)) / places))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
-from pkmcal.identify.bed import Bed, bed_of
+from pkmcal.identify.bed import Bed
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.motions import Motion, Situation, all_radii, candidates
@@ -90,8 +90,10 @@ def explain(
     estimate: Estimate,
     seen: Booleans,
     conditions: tuple[Condition, ...] = (),
+    bed: Bed | None = None,
 ) -> Findings:
-    """The findings of an estimate; seen : (S, L) legs that each station sees.
+    """The findings of an estimate; seen : (S, L) legs that each station sees. bed : where nothing
+    but heights was measured.
 
     Stations that a board on the base joins are one here, see :func:`joined_by_boards`.
     """
@@ -119,7 +121,7 @@ def explain(
         conditions,
         conventional,
         others,
-        bed_of(estimate) if only_heights(estimate) else None,
+        bed,
     )
 
 
