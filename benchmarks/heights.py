@@ -10,8 +10,10 @@ moves over places that nobody probed.
 
 Printers are off what their firmware says, one standard deviation: delta radius and end switches 0.5
 mm, towers 0.2 degrees, rods 0.3 mm together and 0.1 mm each. Those "of a kit" have towers that lean
-by 0.1 degrees and motors that go 0.03 % wrong besides, which no firmware holds. In the last table
-one touch is 0.3 mm too high, as of a crumb on the bed.
+by 0.1 degrees and motors that go 0.03 % wrong besides, which no firmware holds; the drawing states
+these two tolerances as the printers have them. In the last table one touch is 0.3 mm too high, as
+of a crumb on the bed. Deviations stated of a bed are compared with errors over the disc that was
+probed, which is what they are stated for; all else is told of the whole bed.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from pkmcal.arrays import Array
 from pkmcal.calibration.calibrate import calibrate
 from pkmcal.calibration.source import Source
 from pkmcal.export.contract import export
-from pkmcal.identify.bed import Bed
+from pkmcal.identify.bed import Bed, bed_of
 from pkmcal.mechanisms import Machine
 from pkmcal.printers.klipper import sections
 from pkmcal.printers.session import write_printer_session
@@ -145,7 +147,7 @@ def by_us(
             text = re.sub("axis: .* deg, scale: .* %", tolerance, text)
         (folder / "kit" / "mechanism.yaml").write_text(text)
         found = calibrate(folder / "kit")
-    bed = found.findings.bed
+    bed = bed_of(found.measurements, found.estimate)
     source = Source(found.machine, bed=bed.z)
     (text,) = export(source, "klipper").files.values()
     values = sections(text, "printer.cfg")

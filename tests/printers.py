@@ -114,8 +114,18 @@ def printer_cfg(settings, readings=None, height=0.0):
 BUILT = Settings(radius=105.4, angle=(210.2, 329.9, 90.1), rod=(270.2, 269.9, 270.1))
 
 
-def workshop():
-    """printer.cfg of one printer that is off what its firmware says, after DELTA_CALIBRATE."""
+def workshop(n=7):
+    """Carriages of one printer that is off what its firmware says, at n places of its bed."""
     true = machine(BUILT, endstops=(0.5, -0.3, 0.2))
-    readings = felt(true, bed(7), 0.015, np.random.default_rng(4))
-    return printer_cfg(Settings(), readings)
+    return felt(true, bed(n), 0.015, np.random.default_rng(4))
+
+
+def calibrated_cfg():
+    """Its printer.cfg after DELTA_CALIBRATE."""
+    return printer_cfg(Settings(), workshop())
+
+
+def console(n):
+    """What its console says while it probes n places."""
+    there = 1e3 * machine(Settings()).forward(1e-3 * workshop(n))[:, :3, 3]
+    return "".join(f"// probe at {x:.3f},{y:.3f} is z={z:.6f}\n" for x, y, z in there)

@@ -197,6 +197,10 @@ def test_a_demonstration_is_exported(demo, tmp_path):
     assert len(list((tmp_path / "ros").iterdir())) == 4
     hal = (tmp_path / "linuxcnc" / "pkmcal_kinematics.hal").read_text()
     assert f"base.3.x {1e3 * value['legs[4].base.center.x']:.17g}\n" in hal
+    # what the frames hold is zero, in every file
+    texts = [hal, (demo.calibration / "mechanism.yaml").read_text()]
+    assert "platform.0.z 0\n" in hal
+    assert not re.findall(r"\S*\de-(?:1[3-9]|[2-9]\d)", "\n".join(texts))
     source = (tmp_path / "c" / "pkmcal_kinematics.c").read_text()
     assert f"{value['legs[4].base.center.x']:.17g}" in source
 

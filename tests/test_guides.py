@@ -35,7 +35,8 @@ def form(text: str, folder: object = None) -> str:
 @pytest.fixture
 def workplace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "printer.cfg").write_text(printers.workshop())
+    (tmp_path / "printer.cfg").write_text(printers.calibrated_cfg())
+    (tmp_path / "probed.txt").write_text(printers.console(15))
     return tmp_path.resolve()
 
 

@@ -27,7 +27,7 @@ def by_board(request, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def by_heights(tmp_path_factory):
-    kit = probe_kit(tmp_path_factory.mktemp("kit") / "session")
+    kit = probe_kit(tmp_path_factory.mktemp("kit") / "session", n=15)
     return kit, kit.calibrated()
 
 
@@ -79,8 +79,13 @@ def test_heights_flatten_the_bed_and_are_accepted_for_that(by_heights):
     assert f"{bed.size:.2%}" in told
 
 
-def test_heights_do_not_tell_rods_from_radius_and_it_is_said(by_heights):
-    _, found = by_heights
+def test_heights_do_not_tell_rods_from_radius_and_it_is_said(tmp_path):
+    """As few as the bed's four bends, which leave nothing over: refused, and explained."""
+    found = probe_kit(tmp_path / "session", n=7).calibrated()
+    assert not found.verdict.usable
+    assert found.findings.bed.unnoticed is None or (
+        found.findings.bed.unnoticed > 0.5 * found.findings.bed.by_drawing
+    )
     told = found.findings.told
     assert told.rank == 4
     assert told.rank + len(told.unidentified) == told.n_parameters - told.n_frames

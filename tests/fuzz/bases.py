@@ -61,7 +61,7 @@ def delta_printers(folder: Path) -> None:
     """What firmwares say of a printer and of its bed."""
     folder.mkdir()
     places = printers.bed(8)
-    (folder / "printer.cfg").write_text("[probe]\nz_offset: 1.2\n" + printers.workshop())
+    (folder / "printer.cfg").write_text("[probe]\nz_offset: 1.2\n" + printers.calibrated_cfg())
     (folder / "config.g").write_text(
         "G90 ; absolute\nM665 L270:270.1:269.9 R105 H300 B90 X0.1 Y0 Z-0.1\nM666 X0.2 Y0 Z-0.2\n"
     )

@@ -46,6 +46,9 @@ class Gauge(Protocol):
         ...
 
 
+ROUNDED = 1e-12
+"""Share of the machine's size, and of a direction's one, below which a value is the rounding of a
+change of frames: some thousand times a double's."""
 FLAT = 1e-3
 """Three points nearer to one line than this part of their distances fix no turn about it."""
 
@@ -346,8 +349,15 @@ def alignment(machine: Machine, state: State, gauge: Gauge) -> tuple[Array, Arra
 
 
 def apply(machine: Machine, state: State, gauge: Gauge) -> State:
-    """The same machine, stations and poses told in the gauge's frames; no residual changes."""
-    return changed_frames(machine.layout, state, *alignment(machine, state, gauge))
+    """The same machine, stations and poses told in the gauge's frames; no residual changes.
+
+    What the frames make zero is zero, not the rounding of their change.
+    """
+    moved = changed_frames(machine.layout, state, *alignment(machine, state, gauge))
+    lengths = np.array([unit == "m" for unit in machine.parameters.units])
+    size = np.where(lengths, np.abs(moved.theta[..., lengths]).max(initial=0.0), 1.0)
+    rounding = np.abs(moved.theta) < ROUNDED * size
+    return replace(moved, theta=np.where(rounding, 0.0, moved.theta))
 
 
 def changed_frames(layout: LimbLayout, state: State, e: Array, f: Array) -> State:

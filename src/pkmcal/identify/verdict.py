@@ -44,6 +44,9 @@ the whole larger by an eighth."""
 BED_LEFT = 0.5
 """Part of what the drawing's tolerances let the bed bend that heights may leave: below a half the
 result is flatter than the drawing almost for sure; above, new values are not worth their risk."""
+ENOUGH_TOUCHES = 15
+"""Of a bed, where a wrong one moves it by little more than its deviation before it is noticed
+(benchmarks/heights.py)."""
 EXACT_SHARE = 1e-9
 """Part of a variance below which it is rounding."""
 POOR = 1.3
@@ -89,7 +92,7 @@ def judge(
     left = [f"{s.text} {s.advice}" for s in large]
     if findings and bed:
         left = _bed_unknown(bed)
-        hints = (*_not_by_heights(estimate, bed, findings), *hints)
+        hints = (*_not_by_heights(bed, findings), *hints)
     elif findings is None and (undecided := _undecided(estimate)):
         left = [
             f"The data hardly say more than the drawing about {listed(undecided, 4)}: more"
@@ -145,16 +148,30 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
 
 def _bed_unknown(bed: Bed) -> list[str]:
     """Why heights are of no use, if they are not."""
-    if bed.sigma <= BED_LEFT * bed.by_drawing:
-        return []
+    largest = BED_LEFT * bed.by_drawing
+    out: list[str] = []
+    if bed.unnoticed is None or bed.unnoticed > largest:
+        bends = (
+            "as far as it likes" if bed.unnoticed is None else f"by {bed.unnoticed * 1e3:.2g} mm"
+        )
+        more = max(ENOUGH_TOUCHES - bed.touches, ENOUGH_TOUCHES // 2)
+        out.append(
+            f"So few heights, {bed.touches}, do not show a wrong one: a crumb under the probe could"
+            f" bend the bed {bends} unnoticed, and the drawing's tolerances alone bend it by"
+            f" {bed.by_drawing * 1e3:.2g} mm. Probe {more} more places, spread to the edge of the"
+            " bed."
+        )
+    if bed.sigma <= largest:
+        return out
     return [
+        *out,
         f"The heights leave the tool's height above the bed known to {bed.sigma * 1e3:.2g} mm, and"
         f" the drawing's tolerances alone to {bed.by_drawing * 1e3:.2g} mm: that is no gain. Probe"
-        " more points, spread to the edge of the bed, or with a probe that repeats better."
+        " more points, spread to the edge of the bed, or with a probe that repeats better.",
     ]
 
 
-def _not_by_heights(estimate: Estimate, bed: Bed, findings: Findings) -> list[str]:
+def _not_by_heights(bed: Bed, findings: Findings) -> list[str]:
     """What heights leave to the drawing, in figures, and the largest cause in words."""
     told = [
         f"Heights do not tell x and y: these are known to {bed.sideways * 1e3:.2g} mm, and sizes to"
@@ -166,11 +183,6 @@ def _not_by_heights(estimate: Estimate, bed: Bed, findings: Findings) -> list[st
         first = max(matter, key=lambda s: s.moves_platform)
         more = f" ({len(matter) - 1} more in the report)" if len(matter) > 1 else ""
         told.append(f"{first.text}{more}")
-    if estimate.statistics.dof <= 0:
-        told.append(
-            "So few heights leave nothing over that could show a wrong one, or a bed that is not"
-            " flat: probe fifteen or more."
-        )
     return told
 
 
