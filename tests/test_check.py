@@ -194,6 +194,40 @@ def test_crowded_and_few_configurations(demo):
     assert found[1].text.startswith("There are only 2 configurations")
 
 
+def test_a_pose_under_several_names_is_told(demo):
+    """0001 and 0002 at one station, or each at a station of its own, with the readings of 0000."""
+    session = load_session(demo.session)
+    joints = session.joints.copy()
+    assert joint_findings(session, ()) == []
+    noise = session.joint_noise * np.random.default_rng(0).normal(size=(2, joints.shape[1]))
+    joints[1:3] = joints[0] + noise
+    photos = [p for p in session.stations[0].photographs if p.configuration > 2]
+
+    def told(*seen):
+        """What is said where stations see these of the first three configurations."""
+        stations = tuple(
+            replace(s, photographs=(*(replace(photos[0], configuration=k) for k in rows), *photos))
+            for s, rows in zip(session.stations, seen, strict=True)
+        )
+        (finding,) = joint_findings(replace(session, joints=joints, stations=stations), ())
+        assert finding.level is Level.NOTE
+        assert finding.text.startswith(
+            "12 configurations are of 10 poses: the readings of 0000, 0001 and 0002 are equal"
+            " within their noise. --holdout"
+        )
+        return finding.text.partition("one pose: ")[2]
+
+    assert told((0, 1, 2), (), ()) == (
+        "at station1 name its photographs images/station1/0000_1.png and"
+        " images/station1/0000_2.png, with images: images/station1/{configuration}_{repeat}.png,"
+        " and keep one of its rows in joints.csv."
+    )
+    assert told((0,), (1,), (2,)) == (
+        "its photographs bear one name at all stations, such as 0000, and it has one row in"
+        " joints.csv."
+    )
+
+
 def test_nearly_singular_configurations_are_named(demo, monkeypatch):
     session = load_session(demo.session)
     singularity = session.machine.forward_result(session.joints).singularity

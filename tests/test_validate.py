@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration.aside import chosen, clusters, places, regions, select, spread
+from pkmcal.calibration.aside import by_region, chosen, clusters, places, regions, select, spread
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle
@@ -23,6 +23,7 @@ from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.report.validation import held_out
 from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
@@ -283,15 +284,15 @@ def test_regions_are_whole_named_and_the_same_again():
 
 def test_held_out_regions_know_nothing_of_their_readings(hexapod):
     drawing, _, estimate, data = hexapod
-    region = chosen(drawing, estimate, 5)
-    held_out = hold_out(drawing, data, estimate, region)
-    assert list(held_out.left_out.rows) == list(region.rows)
-    assert not held_out.estimate.configurations[region.rows].any()
+    region = chosen(drawing, estimate, data, 5)
+    found = hold_out(drawing, data, estimate, region)
+    assert list(found.left_out.rows) == list(region.rows)
+    assert not found.estimate.configurations[region.rows].any()
     spoiled = data.joints.copy()
     spoiled[region.rows] += 1e-3
     other = hold_out(drawing, replace(data, joints=spoiled), estimate, region)
-    assert np.allclose(other.estimate.machine.values, held_out.estimate.machine.values, atol=1e-9)
-    shift = other.left_out.calibrated.residuals - held_out.left_out.calibrated.residuals
+    assert np.allclose(other.estimate.machine.values, found.estimate.machine.values, atol=1e-9)
+    shift = other.left_out.calibrated.residuals - found.left_out.calibrated.residuals
     assert np.abs(shift - 1e-3).max() < 1e-4
 
 
@@ -306,7 +307,7 @@ def test_regions_judged_together(hexapod):
 
 def test_poor_extrapolation_is_told(hexapod):
     drawing, _, estimate, data = hexapod
-    item = hold_out(drawing, data, estimate, chosen(drawing, estimate, 4))
+    item = hold_out(drawing, data, estimate, chosen(drawing, estimate, data, 4))
     far = replace(item, left_out=replace(item.left_out, after=5 * item.left_out.after))
     (warning,) = validation_verdict(None, (far,), drawing).warnings
     assert warning.startswith("Extrapolation is poor where the platform is spread")
@@ -314,16 +315,62 @@ def test_poor_extrapolation_is_told(hexapod):
 
 @pytest.mark.parametrize("n", [0, 13, 24])
 def test_how_many_to_hold_out(hexapod, n):
-    drawing, _, estimate, _ = hexapod
-    with pytest.raises(InputError, match=r"configurations held out is not possible.*1 to 12"):
-        chosen(drawing, estimate, n)
+    drawing, _, estimate, data = hexapod
+    with pytest.raises(InputError, match=r"configurations held out is not possible.*1 to 12, for"):
+        chosen(drawing, estimate, data, n)
 
 
 def test_too_few_configurations_to_hold_out(hexapod):
-    drawing, _, estimate, _ = hexapod
+    drawing, _, estimate, data = hexapod
     few = SimpleNamespace(configurations=np.arange(24) < 3, state=estimate.state)
     with pytest.raises(InputError, match="too few configurations to hold any out"):
-        chosen(drawing, few, 1)
+        chosen(drawing, few, data, 1)
+
+
+def photographed_again(estimate, data):
+    """The first 22 poses of an estimate, which differ, each three times."""
+    rng = np.random.default_rng(1)
+    joints = np.tile(data.joints[:22], (3, 1))
+    joints += data.joint_noise * rng.normal(size=joints.shape)
+    poses = np.tile(estimate.state.T_base_platform[:22], (3, 1, 1))
+    poses[:, :3, 3] += 3e-6 * rng.normal(size=(len(poses), 3))
+    whole = SimpleNamespace(
+        configurations=np.ones(len(poses), dtype=bool),
+        state=SimpleNamespace(T_base_platform=poses),
+    )
+    return whole, replace(data, joints=joints)
+
+
+def test_a_pose_under_several_names_is_held_out_whole(hexapod):
+    drawing, _, estimate, data = hexapod
+    whole, again = photographed_again(estimate, data)
+    out = chosen(drawing, whole, again, 5).rows
+    assert list(np.unique(out % 22, return_counts=True)[1]) == [3] * 5
+    found = by_region(drawing, whole, again, 4)
+    assert sum(len(region.rows) for region in found) == 66
+    for region in found:
+        assert set(np.unique(region.rows % 22, return_counts=True)[1]) == {3}
+    with pytest.raises(InputError, match=r"found 12, expected 1 to 11, for 22 poses seen"):
+        chosen(drawing, whole, again, 12)
+
+
+def test_the_report_tells_of_how_many_poses_hold_outs_are(hexapod):
+    drawing, _, estimate, data = hexapod
+    item = hold_out(drawing, data, estimate, chosen(drawing, estimate, data, 4))
+    joints = data.joints.copy()
+
+    def said():
+        session = SimpleNamespace(
+            machine=drawing,
+            joints=joints,
+            joint_noise=data.joint_noise,
+            document={"joints": {"columns": drawing.joint_names}},
+        )
+        return " ".join(held_out(item, session).said)
+
+    assert said().startswith("On 4 configurations held out")
+    joints[item.region.rows[1]] = joints[item.region.rows[0]] + data.joint_noise
+    assert said().startswith("On 4 configurations of 3 poses held out")
 
 
 # the commands
