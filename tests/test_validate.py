@@ -167,19 +167,35 @@ def test_better_than_the_drawing(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, true)
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
-    verdict = validation_verdict(judged, (), estimate.machine)
+    verdict = validation_verdict(judged, (), estimate.machine, data)
     assert verdict.usable
     assert "times better than the drawing: 0." in verdict.headline
     assert judged.ratio.low > 3
     assert finite_rms(judged.after) < np.sqrt(2) * judged.floor
     assert "the photographs' own noise" in verdict.advice[0]
+    assert verdict.advice[0].endswith(
+        "Each of these configurations is seen from one of the 3 stations only: photographs of the"
+        " same ones from several would tell."
+    )
+
+    def told(seen_from):
+        """What is advised where station ``seen_from(row)`` sees a configuration, for each edge."""
+        edges = replace(data.edges, station=seen_from(data.edges))
+        seen = replace(data, edges=edges)
+        (text,) = validation_verdict(judged, (), estimate.machine, seen).advice
+        return text.partition("better still. ")[2]
+
+    assert told(lambda e: 0 * e.station).startswith("Several stations that see the same")
+    assert told(lambda e: e.leg % 3).startswith("All are seen from several of the 3 stations")
+    some = told(lambda e: np.where(e.configuration < 10, e.leg % 3, e.station))
+    assert some.startswith("14 of 24 of these configurations are seen from one of the 3 stations")
 
 
 def test_a_leg_that_changed_is_named(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, changed(true, "legs[3].length.offset", 1e-3))
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
-    verdict = validation_verdict(judged, (), estimate.machine)
+    verdict = validation_verdict(judged, (), estimate.machine, data)
     assert not verdict.usable
     assert judged.ratio.better  # it is still better than the drawing
     assert "joint 3 reads" in verdict.reasons[0]
@@ -191,7 +207,7 @@ def test_a_calibration_that_made_it_worse(hexapod):
     _, _, stations, data = legs_case(60, true)
     worse = changed(estimate.machine, "legs[3].length.offset", 0.02)
     judged = judged_on(drawing, estimate, worse, data, stations)
-    verdict = validation_verdict(judged, (), worse)
+    verdict = validation_verdict(judged, (), worse, data)
     assert not verdict.usable
     assert verdict.headline.startswith("The drawing predicts the readings")
     assert "made the machine worse" in verdict.reasons[0]
@@ -202,7 +218,7 @@ def test_the_drawing_itself_is_not_better_than_the_drawing(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, true)
     judged = judged_on(drawing, estimate, drawing, data, stations)
-    verdict = validation_verdict(judged, (), drawing)
+    verdict = validation_verdict(judged, (), drawing, data)
     assert not verdict.usable
     assert not judged.ratio.better
 
@@ -213,7 +229,7 @@ def test_a_board_on_an_h4(h4):
     start = start_state(estimate.machine, new.measurements, T_CAMERA_BASE[None])
     found = predict(estimate.machine, new.measurements, start)
     judged = compare(drawing, estimate.covariance, new.measurements, found, None, np.arange(12))
-    verdict = validation_verdict(judged, (), estimate.machine)
+    verdict = validation_verdict(judged, (), estimate.machine, new.measurements)
     assert verdict.usable, verdict
     assert "° against" in verdict.headline
     assert new.measurements.joint_noise == JOINT_NOISE
@@ -300,7 +316,7 @@ def test_regions_judged_together(hexapod):
     drawing, _, estimate, data = hexapod
     found = by_regions(drawing, data, estimate, 3)
     assert sum(len(item.left_out.rows) for item in found) == estimate.configurations.sum()
-    verdict = validation_verdict(None, found, drawing)
+    verdict = validation_verdict(None, found, drawing, data)
     assert verdict.usable, verdict
     assert "of regions that it did not see" in verdict.headline
 
@@ -309,7 +325,7 @@ def test_poor_extrapolation_is_told(hexapod):
     drawing, _, estimate, data = hexapod
     item = hold_out(drawing, data, estimate, chosen(drawing, estimate, data, 4))
     far = replace(item, left_out=replace(item.left_out, after=5 * item.left_out.after))
-    (warning,) = validation_verdict(None, (far,), drawing).warnings
+    (warning,) = validation_verdict(None, (far,), drawing, data).warnings
     assert warning.startswith("Extrapolation is poor where the platform is spread")
 
 
