@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from pkmcal.calibration.numbering import equal_numberings, numbering_told
 from pkmcal.check import check
 from pkmcal.check.check import (
     JointCheck,
@@ -19,6 +20,8 @@ from pkmcal.check.check import (
     check_session,
     joint_findings,
 )
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.session.load import load_session
 
 GOOD = StationCheck("front", 15, True, 0.2, 0.04, 0.08, 5.5, 0.05, 0.01, 0.8)
@@ -226,6 +229,37 @@ def test_a_pose_under_several_names_is_told(demo):
         "its photographs bear one name at all stations, such as 0000, and it has one row in"
         " joints.csv."
     )
+
+
+def test_which_leg_is_the_first_is_asked_where_no_pose_tells(demo):
+    session = load_session(demo.session)
+    assert numbering_told(session) == ()
+    stations = tuple(replace(s, T_camera_base=None) for s in session.stations)
+    (text,) = numbering_told(replace(session, stations=stations))
+    assert text.startswith(
+        "The drawing is alike from three sides: with the legs counted from the column leg3 or leg5"
+        " of joints.csv on, photographs"
+    )
+    assert numbering_told(replace(session, stations=(session.stations[0], *stations[1:]))) == ()
+    board = tuple(replace(s, observe=("board",)) for s in stations)
+    assert numbering_told(replace(session, stations=board)) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "firsts"),
+    [("gough-stewart", [2, 4]), ("3-rps", [1, 2]), ("delta", [1, 2]), ("hexaglide", [])],
+)
+def test_numberings_that_nothing_tells_apart(name, firsts):
+    """Their machines differ by one turn of everything, tubes and unlike joints do not."""
+    machine = load_mechanism(name)
+    joints = machine.inverse(poses_in(machine.limits(), Region(), 8))
+    assert [order[0] for order in equal_numberings(machine, joints)] == firsts
+    for part in ("base.center.x", "tubes[1].radius"):
+        k = next((k for k, n in enumerate(machine.parameters.names) if n == f"legs[2].{part}"), -1)
+        if k >= 0:
+            values = machine.values.copy()
+            values[k] += 5 * np.sqrt(machine.n_legs) * machine.parameters.tolerance[k]
+            assert equal_numberings(machine.with_values(values), joints) == ()
 
 
 def test_nearly_singular_configurations_are_named(demo, monkeypatch):

@@ -28,6 +28,7 @@ from pkmcal.calibration.doubts import (
     sizes_told,
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
+from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
     Progress,
@@ -319,6 +320,7 @@ def _judge(
         hints=(
             *sizes_told(session, found.turns.measurements, found.estimate),
             *scales_told(session, found.estimate, tuple(x.of for x in departed)),
+            *numbering_told(session),
         ),
     )
     clock.lap("identify")

@@ -23,6 +23,7 @@ from pkmcal.calibration.byhand import found_alone, why_lost
 from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.doubts import check_poses, richer_models, turning
 from pkmcal.calibration.gather import measurements_of, refinement_of
+from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.recognise import (
     board_images,
     check_observable,
@@ -232,6 +233,7 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
     seen = _observed(session, photographs, motion.poses, rng)
     stations, joints = seen.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
+    findings += [note(text) for text in numbering_told(session)]
     told("What such photographs will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no place to come back to
     expected = forecast(seen.look) if seen.look and not by_hand else None
