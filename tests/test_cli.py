@@ -26,6 +26,7 @@ from pkmcal.cameras import load_camera
 from pkmcal.commands.cli import main
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
+from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.session.load import load_session
 from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
@@ -245,6 +246,20 @@ def test_new_files_load(tmp_path):
     assert machine.forward_result(readings.values).converged.all()
     for name in ("session.yaml", "mechanism.yaml", "cameras/front.yaml"):
         assert (folder / name).read_text().startswith("# ")
+
+
+@pytest.mark.parametrize("options", [(), ("--machine", "3-rps", "--places", 2)])
+def test_a_new_session_says_nothing_of_where_its_camera_stands(tmp_path, options):
+    """It cannot know; a pose by hand is a comment's mark away."""
+    folder = tmp_path / "mine"
+    assert run("new", folder, *options).code == 0
+    stations = load_session(folder, measured=False).stations
+    assert {station.T_camera_base is None for station in stations} == {True}
+    text = (folder / "session.yaml").read_text()
+    assert text.count("    # pose: {") == 1
+    (folder / "session.yaml").write_text(text.replace("    # pose: {", "    pose: {"))
+    front = load_session(folder, measured=False).stations[0]
+    assert np.allclose(inverse(front.T_camera_base)[:3, 3], [0, -0.85, 0.2])
 
 
 @pytest.mark.parametrize("name", sorted(catalogue()))
