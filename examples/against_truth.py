@@ -27,7 +27,7 @@ def main() -> int:
     try:
         result = pkmcal.load_result(words.calibration)
         drawing = pkmcal.load_session(words.session).machine
-        truth = load_truth(words.session, drawing)
+        truth = load_truth(words.session)
     except pkmcal.errors.PkmcalError as error:
         print(error, file=sys.stderr)
         return 2

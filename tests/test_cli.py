@@ -30,6 +30,7 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.session.load import load_session
 from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
+from test_report_page import Found
 
 COMMANDS = (
     *("demo", "new", "check", "view", "board", "camera", "plan", "calibrate", "validate"),
@@ -330,6 +331,15 @@ def test_check_of_a_good_session(session):
     assert all(row.startswith("✓") for row in rows)
     assert max(map(len, done.out.splitlines())) <= 80 + len(str(session))
     assert "Wander" not in done.out  # of a board, where there is none
+
+
+def test_check_here_is_called_by_the_folders_name(session, monkeypatch, tmp_path):
+    monkeypatch.chdir(session)
+    (session / "joints.csv").unlink()  # refused at once
+    assert run("check", ".", "-o", tmp_path / "c").code == 2
+    title = Found((tmp_path / "c" / "check.html").read_text()).text
+    assert f"Check of {session.name}" in title
+    assert "Check of ." not in title
 
 
 def test_check_as_json(session, checked, monkeypatch):

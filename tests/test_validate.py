@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,6 +31,7 @@ from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth, true_machine
 from pose_sessions import JOINT_NOISE, T_CAMERA_BASE, measured, papers_case, papers_poses
 from test_identify_scene import exact
+from test_report_page import Found
 
 STATIONS = 3
 
@@ -408,6 +410,12 @@ def test_calibrate_with_some_held_out(kept):
     unused = [c["name"] for c in document["configurations"] if not c["used"]]
     assert unused == out["left_out"]["configurations"]
     assert document["holdout"] == out
+    report = Found((kept.folder / "c" / "report.html").read_text()).text
+    for station in document["session"]["stations"].values():
+        names = [Path(photograph).stem for photograph in station["photographs"]]
+        used = len(names) - len({*names} & {*unused})
+        told = f"{used} of {len(names)}" if used < len(names) else f"{used}"
+        assert f"{station['camera']}, pinhole, {told} photographs" in report
     assert (
         "held out, the calibrated machine predicts"
         in (kept.folder / "c" / "report.html").read_text()

@@ -714,6 +714,9 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         "It cannot be calibrated yet.",
     )
     code = _exit_code(findings)
+    name = found.folder
+    if Path(name).name in ("", ".."):  # "." and the like name nothing to a reader
+        name = Path(name).resolve().name or name
     parts: tuple[Part, ...] = ()
     if found.machine:
         said = KINEMATICS.format(found) if math.isfinite(found.singularity) else ""
@@ -731,8 +734,8 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
     photographs = sum(station.photographs for station in found.stations)
     return Outcome(
         command="check",
-        title=f"Check of {found.folder}",
-        subject=f"{found.folder}: {found.machine}, {found.n_legs} legs,"
+        title=f"Check of {name}",
+        subject=f"{name}: {found.machine}, {found.n_legs} legs,"
         f" {found.configurations} configurations, {photographs} photographs"
         if found.machine
         else "",
