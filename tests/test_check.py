@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import run
+from pkmcal.calibration.numbering import equal_numberings, numbering_told
 from pkmcal.check import check
 from pkmcal.check.check import (
     JointCheck,
@@ -19,6 +20,8 @@ from pkmcal.check.check import (
     check_session,
     joint_findings,
 )
+from pkmcal.mechanisms import load_mechanism
+from pkmcal.mechanisms.region import Region, poses_in
 from pkmcal.session.load import load_session
 
 GOOD = StationCheck("front", 15, True, 0.2, 0.04, 0.08, 5.5, 0.05, 0.01, 0.8)
@@ -192,6 +195,71 @@ def test_crowded_and_few_configurations(demo):
     assert [finding.level for finding in found] == [Level.NOTE] * 2
     assert found[0].text.startswith("leg1 used little of the range (down to 7%)")
     assert found[1].text.startswith("There are only 2 configurations")
+
+
+def test_a_pose_under_several_names_is_told(demo):
+    """0001 and 0002 at one station, or each at a station of its own, with the readings of 0000."""
+    session = load_session(demo.session)
+    joints = session.joints.copy()
+    assert joint_findings(session, ()) == []
+    noise = session.joint_noise * np.random.default_rng(0).normal(size=(2, joints.shape[1]))
+    joints[1:3] = joints[0] + noise
+    photos = [p for p in session.stations[0].photographs if p.configuration > 2]
+
+    def told(*seen):
+        """What is said where stations see these of the first three configurations."""
+        stations = tuple(
+            replace(s, photographs=(*(replace(photos[0], configuration=k) for k in rows), *photos))
+            for s, rows in zip(session.stations, seen, strict=True)
+        )
+        (finding,) = joint_findings(replace(session, joints=joints, stations=stations), ())
+        assert finding.level is Level.NOTE
+        assert finding.text.startswith(
+            "12 configurations are of 10 poses: the readings of 0000, 0001 and 0002 are equal"
+            " within their noise. --holdout"
+        )
+        return finding.text.partition("one pose: ")[2]
+
+    assert told((0, 1, 2), (), ()) == (
+        "at station1 name its photographs images/station1/0000_1.png and"
+        " images/station1/0000_2.png, with images: images/station1/{configuration}_{repeat}.png,"
+        " and keep one of its rows in joints.csv."
+    )
+    assert told((0,), (1,), (2,)) == (
+        "its photographs bear one name at all stations, such as 0000, and it has one row in"
+        " joints.csv."
+    )
+
+
+def test_which_leg_is_the_first_is_asked_where_no_pose_tells(demo):
+    session = load_session(demo.session)
+    assert numbering_told(session) == ()
+    stations = tuple(replace(s, T_camera_base=None) for s in session.stations)
+    (text,) = numbering_told(replace(session, stations=stations))
+    assert text.startswith(
+        "The drawing is alike from three sides: with the legs counted from the column leg3 or leg5"
+        " of joints.csv on, photographs"
+    )
+    assert numbering_told(replace(session, stations=(session.stations[0], *stations[1:]))) == ()
+    board = tuple(replace(s, observe=("board",)) for s in stations)
+    assert numbering_told(replace(session, stations=board)) == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "firsts"),
+    [("gough-stewart", [2, 4]), ("3-rps", [1, 2]), ("delta", [1, 2]), ("hexaglide", [])],
+)
+def test_numberings_that_nothing_tells_apart(name, firsts):
+    """Their machines differ by one turn of everything, tubes and unlike joints do not."""
+    machine = load_mechanism(name)
+    joints = machine.inverse(poses_in(machine.limits(), Region(), 8))
+    assert [order[0] for order in equal_numberings(machine, joints)] == firsts
+    for part in ("base.center.x", "tubes[1].radius"):
+        k = next((k for k, n in enumerate(machine.parameters.names) if n == f"legs[2].{part}"), -1)
+        if k >= 0:
+            values = machine.values.copy()
+            values[k] += 5 * np.sqrt(machine.n_legs) * machine.parameters.tolerance[k]
+            assert equal_numberings(machine.with_values(values), joints) == ()
 
 
 def test_nearly_singular_configurations_are_named(demo, monkeypatch):

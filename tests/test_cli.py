@@ -26,9 +26,11 @@ from pkmcal.cameras import load_camera
 from pkmcal.commands.cli import main
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
+from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.session.load import load_session
 from pkmcal.session.starter import TO_FILL, session_texts, untouched_files
+from test_report_page import Found
 
 COMMANDS = (
     *("demo", "new", "check", "view", "board", "camera", "plan", "calibrate", "validate"),
@@ -247,6 +249,20 @@ def test_new_files_load(tmp_path):
         assert (folder / name).read_text().startswith("# ")
 
 
+@pytest.mark.parametrize("options", [(), ("--machine", "3-rps", "--places", 2)])
+def test_a_new_session_says_nothing_of_where_its_camera_stands(tmp_path, options):
+    """It cannot know; a pose by hand is a comment's mark away."""
+    folder = tmp_path / "mine"
+    assert run("new", folder, *options).code == 0
+    stations = load_session(folder, measured=False).stations
+    assert {station.T_camera_base is None for station in stations} == {True}
+    text = (folder / "session.yaml").read_text()
+    assert text.count("    # pose: {") == 1
+    (folder / "session.yaml").write_text(text.replace("    # pose: {", "    pose: {"))
+    front = load_session(folder, measured=False).stations[0]
+    assert np.allclose(inverse(front.T_camera_base)[:3, 3], [0, -0.85, 0.2])
+
+
 @pytest.mark.parametrize("name", sorted(catalogue()))
 def test_a_new_session_of_any_machine_lacks_its_photographs_alone(name, tmp_path):
     done = run("new", tmp_path / "mine", "--machine", name, "--json")
@@ -315,6 +331,15 @@ def test_check_of_a_good_session(session):
     assert all(row.startswith("✓") for row in rows)
     assert max(map(len, done.out.splitlines())) <= 80 + len(str(session))
     assert "Wander" not in done.out  # of a board, where there is none
+
+
+def test_check_here_is_called_by_the_folders_name(session, monkeypatch, tmp_path):
+    monkeypatch.chdir(session)
+    (session / "joints.csv").unlink()  # refused at once
+    assert run("check", ".", "-o", tmp_path / "c").code == 2
+    title = Found((tmp_path / "c" / "check.html").read_text()).text
+    assert f"Check of {session.name}" in title
+    assert "Check of ." not in title
 
 
 def test_check_as_json(session, checked, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -264,6 +265,28 @@ def test_what_cannot_be_compared(words, said, tmp_path, monkeypatch):
     assert done.code == 2
     assert said in done.err
     assert not (tmp_path / "diff").exists()
+
+
+def test_an_earlier_difference_is_kept_beside_the_calibration(demo, tmp_path, monkeypatch):
+    """Not written over, and not into wherever one happens to be."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    shutil.copytree(demo.calibration, tmp_path / "machine" / "calibration")
+    b = "../machine/calibration"
+    first = run("diff", "gough-stewart", b, "--json").json
+    folder = tmp_path / "machine" / "diff"
+    assert first["files"]["diff.json"] == str(folder / "diff.json")
+    before = (folder / "diff.json").read_text()
+    assert "kept" not in run("diff", "gough-stewart", b, "--json").json
+    second = run("diff", b, b, "--json").json
+    kept = Path(second["kept"])
+    assert kept.parent == folder.parent
+    assert kept.name.startswith("diff-20")
+    assert (kept / "diff.json").read_text() == before != (folder / "diff.json").read_text()
+    assert (kept / "diff.html").is_file()
+    assert "kept" not in run("diff", "gough-stewart", b, "--force", "--json").json
+    assert sorted(p.name for p in folder.parent.iterdir()) == ["calibration", "diff", kept.name]
+    assert list((tmp_path / "here").iterdir()) == []
 
 
 def test_a_folder_with_other_things_is_left_alone(demo, tmp_path):

@@ -47,6 +47,20 @@ def test_what_is_not_in_the_session_is_named(demo):
     assert "Traceback" not in done.stderr
 
 
+def test_a_calibration_is_held_beside_its_truth(demo):
+    done = run_example("against_truth.py", demo.session, demo.calibration)
+    assert done.returncode == 0, done.stderr
+    rows = {line.split()[0]: line.split() for line in done.stdout.splitlines()}
+    told = json.loads(demo.run.out)["comparison"]  # the demonstration's own figures
+    for name in ("drawing", "calibrated"):
+        assert float(rows[name][1]) == pytest.approx(1e3 * told[name]["centre"], abs=6e-4)
+        assert float(rows[name][3]) == pytest.approx(1e3 * told[name]["position"], abs=6e-4)
+    assert float(rows["calibrated"][3]) < 0.2 * float(rows["drawing"][3])
+    done = run_example("against_truth.py", demo.calibration, demo.calibration)
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+
+
 def test_numbered_pictures_stand_in_for_a_camera(demo):
     source = demo.session / "images" / "station1" / "%04d.png"
     words = (demo.calibration, "station1", "--goal", "0000", "--source", source)

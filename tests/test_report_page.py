@@ -220,7 +220,11 @@ def test_points_lead_to_photographs_and_paper_is_light(page, tmp_path):
         tell.paper = width();
         tell.light = getComputedStyle(document.documentElement).getPropertyValue("--ink");
         dispatchEvent(new Event("afterprint"));
-        setInterval(() => { tell.again = width(); }, 100);
+        setInterval(() => {
+          tell.again = width();
+          tell.printed = [...document.querySelectorAll(".in-space img.printed")]
+            .map((image) => image.naturalWidth).join();
+        }, 100);
       }, 50);
     });</script></body>"""
     document, console = browse(page.replace("</body>", act), tmp_path, 1280)
@@ -232,6 +236,8 @@ def test_points_lead_to_photographs_and_paper_is_light(page, tmp_path):
     assert root["data-paper"] == "672"
     assert root["data-screen"] == root["data-again"] != "672"
     assert root["data-light"] == "#1a1e24"
+    # what is drawn in space has a picture for paper, twice as fine as a screen
+    assert root["data-printed"] == ",".join(["1344"] * page.count('class="panel in-space"'))
 
 
 def test_the_browser_test_sees_errors(page, tmp_path):

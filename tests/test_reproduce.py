@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from conftest import run
 from pkmcal.commands.reproduce import Paper
+from pkmcal.files import read_yaml
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.report.page import page_html
-from pkmcal.studies import engine
+from pkmcal.studies import engine, reproduction
 from pkmcal.studies import paper_a_expected as expected
 from pkmcal.studies.paper_a import BOUND, JOINT, METHODS, PRINTED, HexapodByAxes
 from pkmcal.studies.paper_a_photographs import MeasuredNoise
@@ -77,6 +79,32 @@ def test_in_words(tmp_path, monkeypatch, found):
                  f"{RUNS} of {RUNS}, expected all", "paper-a.html open it"):  # fmt: skip
         assert said.lower() in text.lower(), said
     assert "…" not in done.out
+
+
+@pytest.mark.parametrize("letter", PAPERS)
+def test_a_headline_says_what_is_reproduced_and_what_is_not(letter):
+    words = read_yaml(Path(reproduction.__file__).with_name(f"paper_{letter}.yaml")).data
+    assert words["headline"].startswith("Reproduced: ")
+    assert " Not reproduced: " in words["headline"]
+    for name, text in words["remarks"].items():
+        assert text.startswith("Not reproduced: ") == (name in words["not_reproduced"])
+
+
+def test_what_is_not_reproduced_is_no_green_sign(found, page, tmp_path, monkeypatch):
+    assert found.verdict.usable
+    assert "0.018, printed in rad where degrees must be meant" in found.verdict.headline
+    assert '<section class="verdict partial"' in page
+    assert "</span> Reproduced in part</p>" in page
+    not_reproduced = found.document["not_reproduced"]
+    assert [text.partition(". ")[0] for text in not_reproduced] == [
+        "Not reproduced: 0.08 mm by the paper's four steps as printed",
+        "Not reproduced: 1 mm before calibration",
+    ]
+    monkeypatch.setattr("pkmcal.studies.reproduction.reproduce", lambda _paper, _options: found)
+    done = run("reproduce", "-o", tmp_path)
+    assert "\n! Reproduced: the end-effector" in done.out
+    assert "\n! Not reproduced: 0.08 mm" in done.out
+    assert done.code == 0  # all that is expected of it holds
 
 
 def test_another_seed_draws_anew():

@@ -12,6 +12,9 @@ from pkmcal.calibration.toolmap import map_of
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference
 from pkmcal.identify.centres import free_of_gauge, laid_over
+from pkmcal.identify.compared import compare
+from pkmcal.identify.estimate import State
+from pkmcal.identify.gauge import ThreeCentres, apply
 from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
@@ -247,3 +250,39 @@ def test_a_machine_without_a_map_says_why():
     part = section(None, None, "There is no map of the workspace: out of reach.", Links.of([]))
     assert part.text == ("There is no map of the workspace: out of reach.",)
     assert part.plots == ()
+
+
+# ------------------------------------------------------------------ beside a known machine
+
+
+def test_frames_are_no_error(small):
+    """Those by three joints in place of the truth's: other numbers, the same machine."""
+    state = State(small.machine.values, np.eye(4)[None], small.poses, np.zeros(1))
+    told = apply(small.machine, state, ThreeCentres((0, 2, 4)))
+    other = small.machine.with_values(told.theta)
+    joints = small.machine.inverse(small.poses)
+    plain = np.linalg.norm((other.forward(joints) - small.poses)[:, :3, 3], axis=1)
+    assert plain.min() > 1e-4
+    error = compare(other, small.machine, joints)
+    assert error.centre.max() < 1e-12
+    assert error.position.max() < 1e-9
+    assert error.orientation.max() < 1e-9
+
+
+def test_errors_beside_a_known_machine_are_those_of_its_poses(small):
+    joints = small.machine.inverse(small.poses)
+    error = compare(small.drawing, small.machine, joints)
+    there = error.T_base @ small.drawing.forward(joints) @ inverse(error.T_platform)
+    off = pose_difference(there, small.poses)
+    np.testing.assert_allclose(error.position, np.linalg.norm(off[:, 3:], axis=1), atol=1e-12)
+    np.testing.assert_allclose(error.orientation, np.linalg.norm(off[:, :3], axis=1), atol=1e-12)
+    k = small.drawing.parameters.of_kind("offset")
+    np.testing.assert_allclose(error.offset, (small.drawing.values - small.machine.values)[k])
+    # by the poses too, where no legs tell where the joints are: never further apart
+    by_poses = compare(small.drawing, small.machine, joints, legs_seen=False)
+    assert np.sum(by_poses.position**2) < np.sum(error.position**2)
+
+
+def test_machines_of_other_drawings_are_not_compared(small):
+    with pytest.raises(InputError, match="these are two different machines; found delta, 3 legs"):
+        compare(load_mechanism("delta"), small.machine, np.zeros((1, 3)))

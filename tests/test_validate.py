@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration.aside import chosen, clusters, places, regions, select, spread
+from pkmcal.calibration.aside import by_region, chosen, clusters, places, regions, select, spread
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle
@@ -23,12 +24,14 @@ from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.report.validation import held_out
 from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
 from pkmcal.simulation.truth import draw_truth, true_machine
 from pose_sessions import JOINT_NOISE, T_CAMERA_BASE, measured, papers_case, papers_poses
 from test_identify_scene import exact
+from test_report_page import Found
 
 STATIONS = 3
 
@@ -166,19 +169,35 @@ def test_better_than_the_drawing(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, true)
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
-    verdict = validation_verdict(judged, (), estimate.machine)
+    verdict = validation_verdict(judged, (), estimate.machine, data)
     assert verdict.usable
     assert "times better than the drawing: 0." in verdict.headline
     assert judged.ratio.low > 3
     assert finite_rms(judged.after) < np.sqrt(2) * judged.floor
     assert "the photographs' own noise" in verdict.advice[0]
+    assert verdict.advice[0].endswith(
+        "Each of these configurations is seen from one of the 3 stations only: photographs of the"
+        " same ones from several would tell."
+    )
+
+    def told(seen_from):
+        """What is advised where station ``seen_from(row)`` sees a configuration, for each edge."""
+        edges = replace(data.edges, station=seen_from(data.edges))
+        seen = replace(data, edges=edges)
+        (text,) = validation_verdict(judged, (), estimate.machine, seen).advice
+        return text.partition("better still. ")[2]
+
+    assert told(lambda e: 0 * e.station).startswith("Several stations that see the same")
+    assert told(lambda e: e.leg % 3).startswith("All are seen from several of the 3 stations")
+    some = told(lambda e: np.where(e.configuration < 10, e.leg % 3, e.station))
+    assert some.startswith("14 of 24 of these configurations are seen from one of the 3 stations")
 
 
 def test_a_leg_that_changed_is_named(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, changed(true, "legs[3].length.offset", 1e-3))
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
-    verdict = validation_verdict(judged, (), estimate.machine)
+    verdict = validation_verdict(judged, (), estimate.machine, data)
     assert not verdict.usable
     assert judged.ratio.better  # it is still better than the drawing
     assert "joint 3 reads" in verdict.reasons[0]
@@ -190,7 +209,7 @@ def test_a_calibration_that_made_it_worse(hexapod):
     _, _, stations, data = legs_case(60, true)
     worse = changed(estimate.machine, "legs[3].length.offset", 0.02)
     judged = judged_on(drawing, estimate, worse, data, stations)
-    verdict = validation_verdict(judged, (), worse)
+    verdict = validation_verdict(judged, (), worse, data)
     assert not verdict.usable
     assert verdict.headline.startswith("The drawing predicts the readings")
     assert "made the machine worse" in verdict.reasons[0]
@@ -201,7 +220,7 @@ def test_the_drawing_itself_is_not_better_than_the_drawing(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, true)
     judged = judged_on(drawing, estimate, drawing, data, stations)
-    verdict = validation_verdict(judged, (), drawing)
+    verdict = validation_verdict(judged, (), drawing, data)
     assert not verdict.usable
     assert not judged.ratio.better
 
@@ -212,7 +231,7 @@ def test_a_board_on_an_h4(h4):
     start = start_state(estimate.machine, new.measurements, T_CAMERA_BASE[None])
     found = predict(estimate.machine, new.measurements, start)
     judged = compare(drawing, estimate.covariance, new.measurements, found, None, np.arange(12))
-    verdict = validation_verdict(judged, (), estimate.machine)
+    verdict = validation_verdict(judged, (), estimate.machine, new.measurements)
     assert verdict.usable, verdict
     assert "° against" in verdict.headline
     assert new.measurements.joint_noise == JOINT_NOISE
@@ -283,15 +302,15 @@ def test_regions_are_whole_named_and_the_same_again():
 
 def test_held_out_regions_know_nothing_of_their_readings(hexapod):
     drawing, _, estimate, data = hexapod
-    region = chosen(drawing, estimate, 5)
-    held_out = hold_out(drawing, data, estimate, region)
-    assert list(held_out.left_out.rows) == list(region.rows)
-    assert not held_out.estimate.configurations[region.rows].any()
+    region = chosen(drawing, estimate, data, 5)
+    found = hold_out(drawing, data, estimate, region)
+    assert list(found.left_out.rows) == list(region.rows)
+    assert not found.estimate.configurations[region.rows].any()
     spoiled = data.joints.copy()
     spoiled[region.rows] += 1e-3
     other = hold_out(drawing, replace(data, joints=spoiled), estimate, region)
-    assert np.allclose(other.estimate.machine.values, held_out.estimate.machine.values, atol=1e-9)
-    shift = other.left_out.calibrated.residuals - held_out.left_out.calibrated.residuals
+    assert np.allclose(other.estimate.machine.values, found.estimate.machine.values, atol=1e-9)
+    shift = other.left_out.calibrated.residuals - found.left_out.calibrated.residuals
     assert np.abs(shift - 1e-3).max() < 1e-4
 
 
@@ -299,31 +318,77 @@ def test_regions_judged_together(hexapod):
     drawing, _, estimate, data = hexapod
     found = by_regions(drawing, data, estimate, 3)
     assert sum(len(item.left_out.rows) for item in found) == estimate.configurations.sum()
-    verdict = validation_verdict(None, found, drawing)
+    verdict = validation_verdict(None, found, drawing, data)
     assert verdict.usable, verdict
     assert "of regions that it did not see" in verdict.headline
 
 
 def test_poor_extrapolation_is_told(hexapod):
     drawing, _, estimate, data = hexapod
-    item = hold_out(drawing, data, estimate, chosen(drawing, estimate, 4))
+    item = hold_out(drawing, data, estimate, chosen(drawing, estimate, data, 4))
     far = replace(item, left_out=replace(item.left_out, after=5 * item.left_out.after))
-    (warning,) = validation_verdict(None, (far,), drawing).warnings
+    (warning,) = validation_verdict(None, (far,), drawing, data).warnings
     assert warning.startswith("Extrapolation is poor where the platform is spread")
 
 
 @pytest.mark.parametrize("n", [0, 13, 24])
 def test_how_many_to_hold_out(hexapod, n):
-    drawing, _, estimate, _ = hexapod
-    with pytest.raises(InputError, match=r"configurations held out is not possible.*1 to 12"):
-        chosen(drawing, estimate, n)
+    drawing, _, estimate, data = hexapod
+    with pytest.raises(InputError, match=r"configurations held out is not possible.*1 to 12, for"):
+        chosen(drawing, estimate, data, n)
 
 
 def test_too_few_configurations_to_hold_out(hexapod):
-    drawing, _, estimate, _ = hexapod
+    drawing, _, estimate, data = hexapod
     few = SimpleNamespace(configurations=np.arange(24) < 3, state=estimate.state)
     with pytest.raises(InputError, match="too few configurations to hold any out"):
-        chosen(drawing, few, 1)
+        chosen(drawing, few, data, 1)
+
+
+def photographed_again(estimate, data):
+    """The first 22 poses of an estimate, which differ, each three times."""
+    rng = np.random.default_rng(1)
+    joints = np.tile(data.joints[:22], (3, 1))
+    joints += data.joint_noise * rng.normal(size=joints.shape)
+    poses = np.tile(estimate.state.T_base_platform[:22], (3, 1, 1))
+    poses[:, :3, 3] += 3e-6 * rng.normal(size=(len(poses), 3))
+    whole = SimpleNamespace(
+        configurations=np.ones(len(poses), dtype=bool),
+        state=SimpleNamespace(T_base_platform=poses),
+    )
+    return whole, replace(data, joints=joints)
+
+
+def test_a_pose_under_several_names_is_held_out_whole(hexapod):
+    drawing, _, estimate, data = hexapod
+    whole, again = photographed_again(estimate, data)
+    out = chosen(drawing, whole, again, 5).rows
+    assert list(np.unique(out % 22, return_counts=True)[1]) == [3] * 5
+    found = by_region(drawing, whole, again, 4)
+    assert sum(len(region.rows) for region in found) == 66
+    for region in found:
+        assert set(np.unique(region.rows % 22, return_counts=True)[1]) == {3}
+    with pytest.raises(InputError, match=r"found 12, expected 1 to 11, for 22 poses seen"):
+        chosen(drawing, whole, again, 12)
+
+
+def test_the_report_tells_of_how_many_poses_hold_outs_are(hexapod):
+    drawing, _, estimate, data = hexapod
+    item = hold_out(drawing, data, estimate, chosen(drawing, estimate, data, 4))
+    joints = data.joints.copy()
+
+    def said():
+        session = SimpleNamespace(
+            machine=drawing,
+            joints=joints,
+            joint_noise=data.joint_noise,
+            document={"joints": {"columns": drawing.joint_names}},
+        )
+        return " ".join(held_out(item, session).said)
+
+    assert said().startswith("On 4 configurations held out")
+    joints[item.region.rows[1]] = joints[item.region.rows[0]] + data.joint_noise
+    assert said().startswith("On 4 configurations of 3 poses held out")
 
 
 # the commands
@@ -345,6 +410,12 @@ def test_calibrate_with_some_held_out(kept):
     unused = [c["name"] for c in document["configurations"] if not c["used"]]
     assert unused == out["left_out"]["configurations"]
     assert document["holdout"] == out
+    report = Found((kept.folder / "c" / "report.html").read_text()).text
+    for station in document["session"]["stations"].values():
+        names = [Path(photograph).stem for photograph in station["photographs"]]
+        used = len(names) - len({*names} & {*unused})
+        told = f"{used} of {len(names)}" if used < len(names) else f"{used}"
+        assert f"{station['camera']}, pinhole, {told} photographs" in report
     assert (
         "held out, the calibrated machine predicts"
         in (kept.folder / "c" / "report.html").read_text()

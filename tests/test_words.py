@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from string import Formatter
 
 import numpy as np
 import pytest
+import yaml
+from scipy.optimize import least_squares
 
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.assembly import assemble, batch_of
@@ -14,7 +17,7 @@ from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.gauge import default_gauge, freedoms, generators
 from pkmcal.identify.motions import Motion, Situation, candidates, groups, hanging_together
 from pkmcal.identify.sentences import MOST
-from pkmcal.identify.tool import platform_by_parameters, pose_by_parameters
+from pkmcal.identify.tool import _around, platform_by_parameters, pose_by_parameters
 from pkmcal.identify.unidentified import describe, joined_by_boards, seen_legs, vectors
 from pkmcal.mechanisms import kinematics, load_mechanism
 from pkmcal.mechanisms.carriers.contract import NamedMotion, base_carriers, platform_carriers
@@ -356,9 +359,58 @@ def test_what_is_said_about_fixed_can_be_written_there(name):
     _, _, sentences = told_of(make(name, n=1, n_stations=2))
     table = load_mechanism(name).parameters
     for sentence in sentences:
-        entries = re.findall(r'"(legs[^"]+)"', sentence.advice)
-        assert entries
-        assert len(table.with_roles(tuple(entries)).fixed) >= len(entries)
+        (line,) = re.findall(r"(fixed: \[.*\]) in the mechanism file", sentence.advice)
+        held = table.with_roles(tuple(yaml.safe_load(line)["fixed"])).fixed
+        assert {*sentence.parameters} <= {*held}
+
+
+def test_all_legs_are_fixed_in_one_entry_beside_what_is_fixed_already():
+    machine = load_mechanism("gough-stewart")
+    document = machine.document.model_copy(update={"fixed": ("legs[1].base.center.z",)})
+    seen = np.ones((1, 6), bool)
+
+    def advice(change, document):
+        around = Situation(replace(machine, document=document), seen, hexapod()[1])
+        (sentence,) = describe(around, unit(machine, change)[None])
+        return re.search(r"; or (.*) the mechanism file if", sentence.advice)[1]
+
+    scales = {f"legs[{j}].scale": 1e-4 * j for j in range(6, 0, -1)}
+    assert advice(scales, machine.document) == 'fixed: ["legs[*].scale"] in'
+    assert advice(scales, document) == '"legs[*].scale" beside what stands under fixed: in'
+    del scales["legs[1].scale"]
+    every = ", ".join(f'"legs[{j}].scale"' for j in range(2, 7))
+    assert advice(scales, machine.document) == f"fixed: [{every}] in"
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "3-rps"])
+def test_how_far_the_platform_moves_agrees_with_the_forward_solution(name):
+    """Of both machines, at the same readings, the one's frames laid over the other's."""
+    machine = load_mechanism(name)
+    few = moved(machine, np.random.default_rng(5), 30)
+    few = kinematics.on_manifold(machine.layout, machine.values, few).T_base_platform
+    readings, poses = _around(machine, few)
+    other = machine.with_values(
+        machine.values + np.random.default_rng(6).normal(size=len(machine.parameters)) * 2e-5
+    )
+    change = other.values - machine.values
+    there = other.forward(readings)
+    joints = machine.platform_centers()
+    a, b = (T[:, None, :3, :3] @ joints[..., None] for T in (poses, there))
+    a, b = (p[..., 0] + T[:, None, :3, 3] for p, T in ((a, poses), (b, there)))
+
+    def left(frames):
+        """Displacements of the joints once B's base and platform frame are laid over A's."""
+        base, platform = perturb(np.eye(4)[None], frames[:6][None]), frames[6:]
+        own = perturb(np.eye(4)[None], platform[None])
+        T = base @ there @ own
+        return (T[:, None, :3, :3] @ joints[..., None])[..., 0] + T[:, None, :3, 3] - a
+
+    fitted = least_squares(lambda x: left(x).ravel() * 1e3, np.zeros(12), x_scale=1e-5).x
+    found = float(np.sqrt(np.mean(np.sum(left(fitted) ** 2, axis=-1))))
+    told = float(np.linalg.norm(platform_by_parameters(machine, few) @ change))
+    plain = float(np.sqrt(np.mean(np.sum((b - a) ** 2, axis=-1))))
+    assert found < 0.9 * plain  # the frames do count
+    assert told == pytest.approx(found, rel=1e-3)  # of second order, 1e-4 of a radian's
 
 
 # ------------------------------------------------------------------ parts

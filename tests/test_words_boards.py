@@ -70,7 +70,7 @@ def test_the_turn_about_z_is_found_and_one_number_holds_it():
     _, findings, _ = told_of("h4")
     (turn,) = of(findings, "The turn of the base frame about z is free")
     assert (turn.dimensions, turn.matters) == (1, False)
-    assert 'fixed: ["legs[1].base.axis.x"]' in turn.advice
+    assert '"legs[1].base.axis.x" beside what stands under fixed: in' in turn.advice
 
 
 def test_what_the_advice_holds_leaves_nothing_open():

@@ -208,6 +208,7 @@ class Outcome:
     subject : what was looked at, in a sentence. origin : what tells the data from others, such as
     a session's digest; on the page. notes : the user's own words. verdict : may the result be used.
     stamp : the verdict in a word or three. level : how bad it is if the result may not be used.
+    partial : it may be used, but not all of it holds.
     figures : cards at the page's top; a terminal shows them where no part has a brief table.
     parts : sections of the page. findings : what to look at besides the verdict's warnings.
     closing : a terminal's last words before the files. document : everything as plain data, m
@@ -224,6 +225,7 @@ class Outcome:
     notes: str = ""
     stamp: str = ""
     level: Level = Level.WRONG
+    partial: bool = False
     figures: tuple[Figure, ...] = ()
     parts: tuple[Part, ...] = ()
     findings: tuple[Finding, ...] = ()
@@ -235,7 +237,9 @@ class Outcome:
     @property
     def mark(self) -> Mark:
         """The sign of the verdict."""
-        return "good" if self.verdict.usable else self.level
+        if self.verdict.usable:
+            return Level.DOUBTFUL if self.partial else "good"
+        return self.level
 
     @property
     def exit_code(self) -> int:

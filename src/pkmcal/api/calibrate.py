@@ -65,7 +65,8 @@ def calibrate(
     refine_camera :
         Estimate the cameras' intrinsics as well, from their calibration's covariance on.
     holdout :
-        Configurations, spread over the workspace, to leave out and to judge the result by.
+        Poses, spread over the workspace, to leave out and to judge the result by; configurations
+        with the same readings are of one pose.
     progress :
         Called with the step in words and the share that is done, 0 to 1.
 

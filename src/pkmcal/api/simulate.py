@@ -49,7 +49,8 @@ def simulate(
     Returns
     -------
     Session
-        As :func:`pkmcal.load_session` loads it. ``pkmcal.simulation.load_truth`` reads its truth.
+        As :func:`pkmcal.load_session` loads it. ``pkmcal.simulation.load_truth(folder)`` reads its
+        truth; ``pkmcal.compare`` holds a machine beside that.
 
     Raises
     ------

@@ -18,6 +18,8 @@ from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
+from pkmcal.session.readings import same_pose
+from pkmcal.wording import count
 
 LEAST = 3
 """Configurations without which a calibration of the rest means nothing."""
@@ -120,23 +122,43 @@ def _distances(points: Array, centres: Array) -> Array:
     return np.sum((points[:, None] - centres) ** 2, axis=-1)
 
 
-def chosen(drawing: Machine, whole: Estimate, n: int) -> Neighbours:
-    """Some configurations, n, to hold out, spread over the workspace."""
-    rows = np.flatnonzero(whole.configurations)
-    _check(n, rows.size - n, rows.size, "configurations held out")
-    points = places(drawing, whole.state.T_base_platform[rows])
-    return Neighbours(rows[spread(points, n)], "spread over the workspace")
+def chosen(drawing: Machine, whole: Estimate, measurements: Measurements, n: int) -> Neighbours:
+    """Configurations of n poses, to hold out, spread over the workspace.
+
+    One that is in use tells of the others of its pose what they read: all of a pose are held out.
+    """
+    rows, pose = _poses(whole, measurements)
+    first, at = np.unique(pose, return_index=True)
+    _check(n, first.size - n, first.size, "configurations held out")
+    points = places(drawing, whole.state.T_base_platform[rows[at]])
+    out = np.isin(pose, first[spread(points, n)])
+    return Neighbours(rows[out], "spread over the workspace")
 
 
-def by_region(drawing: Machine, whole: Estimate, n: int) -> tuple[Neighbours, ...]:
-    """The configurations that were seen, in n regions of the workspace."""
+def by_region(
+    drawing: Machine, whole: Estimate, measurements: Measurements, n: int
+) -> tuple[Neighbours, ...]:
+    """The configurations that were seen, in n regions of the workspace, those of a pose in one."""
+    rows, pose = _poses(whole, measurements)
+    first, at = np.unique(pose, return_index=True)
+    _check(n, first.size - first.size // n, first.size, "regions")
+    points = places(drawing, whole.state.T_base_platform[rows[at]])
+    return tuple(
+        replace(region, rows=rows[np.isin(pose, region.rows)])
+        for region in regions(points, first, n)
+    )
+
+
+def _poses(whole: Estimate, measurements: Measurements) -> tuple[Integers, Integers]:
+    """The configurations that were seen (n,), and the row of each one's pose (n,)."""
     rows = np.flatnonzero(whole.configurations)
-    _check(n, rows.size - rows.size // n, rows.size, "regions")
-    points = places(drawing, whole.state.T_base_platform[rows])
-    return regions(points, rows, n)
+    if not rows.size:
+        return rows, rows
+    return rows, same_pose(measurements.joints[rows], measurements.joint_noise)
 
 
 def _check(n: int, left: int, total: int, what: str) -> None:
+    """Raise InputError where n poses or regions, of a total, leave too few poses to calibrate."""
     if n >= 1 and left >= max(LEAST, total // 2) and not (what == "regions" and n < 2):
         return
     least = 2 if what == "regions" else 1
@@ -144,14 +166,15 @@ def _check(n: int, left: int, total: int, what: str) -> None:
     if most < least:
         raise InputError(
             "there are too few configurations to hold any out",
-            found=f"{total} seen",
-            expected=f"{2 * LEAST} at least",
+            found=f"{count(total, 'pose')} seen",
+            expected=f"{2 * LEAST} at least; configurations whose readings are equal within their"
+            " noise are of one pose",
             next_step="Photograph more configurations",
         )
     raise InputError(
         f"this number of {what} is not possible",
         found=str(n),
-        expected=f"{least} to {most}, for {total} configurations that were seen",
+        expected=f"{least} to {most}, for {count(total, 'pose')} seen",
     )
 
 

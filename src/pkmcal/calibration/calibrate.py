@@ -28,6 +28,7 @@ from pkmcal.calibration.doubts import (
     sizes_told,
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
+from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
     Progress,
@@ -156,7 +157,7 @@ def calibrate(
     seed : of the random search for the stations' poses.
     refine_camera : estimate the cameras' intrinsics with the machine, from their calibration's
         covariance on.
-    holdout : configurations, spread over the workspace, to leave out, to judge the result by them.
+    holdout : poses, spread over the workspace, to leave out, to judge the result by them.
     progress : called with the step in words and the share done.
     Raises InputError where the session is at fault, ResultError where nothing can be said.
     """
@@ -278,7 +279,8 @@ def _identify(
         turns = turns._replace(estimate=stated)
     out = None
     if holdout:
-        out = LeftOut(chosen(session.machine, turns.estimate, holdout), turns.measurements)
+        region = chosen(session.machine, turns.estimate, turns.measurements, holdout)
+        out = LeftOut(region, turns.measurements)
         turns = set_aside(session.machine, turns, out.region)
     estimate = turns.estimate
     if method != "bundle":
@@ -325,6 +327,7 @@ def _judge(
         hints=(
             *sizes_told(session, found.turns.measurements, found.estimate),
             *scales_told(session, found.estimate, tuple(x.of for x in departed)),
+            *numbering_told(session),
         ),
     )
     clock.lap("identify")

@@ -17,19 +17,25 @@ from pkmcal.calibration.results import EVERYTHING, REPORT
 from pkmcal.files import entries, staged_folder
 
 
-def keep_earlier(folder: Path, texts: Mapping[str, str | bytes]) -> Path | None:
+def keep_earlier(
+    folder: Path,
+    texts: Mapping[str, str | bytes],
+    document: str = EVERYTHING,
+    page: str = REPORT,
+) -> Path | None:
     """Copy the result that ``folder`` holds into a folder beside it; returns that.
 
-    texts : the new result's by their files' names. None where there is no earlier one, or the new
+    texts : the new result's by their files' names. document : the file by which a result is known;
+    page : the one that is made from it. None where there is no earlier one, or the new
     one is the same but for how long it took: nothing needs keeping twice. The copy's name is the
     folder's with the earlier result's date, as calibration-2026-11-23T1502; a second one of the
     same minute ends in -2.
     """
     folder = folder.resolve()
     names = entries(folder)
-    if EVERYTHING not in names or _same(folder, names, texts):
+    if document not in names or _same(folder, names, texts, page):
         return None
-    written = datetime.fromtimestamp((folder / EVERYTHING).stat().st_mtime)
+    written = datetime.fromtimestamp((folder / document).stat().st_mtime)
     stem = f"{folder.name}-{written:%Y-%m-%dT%H%M}"
     number, place = 1, folder.with_name(stem)
     while entries(place) or place.is_file():
@@ -43,14 +49,14 @@ def keep_earlier(folder: Path, texts: Mapping[str, str | bytes]) -> Path | None:
     return place
 
 
-def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes]) -> bool:
+def _same(folder: Path, names: list[str], texts: Mapping[str, str | bytes], page: str) -> bool:
     """Whether the new result tells what the one in the folder does; pages are made from these."""
-    if {*names} - {REPORT} != {*texts} - {REPORT}:
+    if {*names} - {page} != {*texts} - {page}:
         return False
     return all(
         _told(name, (folder / name).read_bytes()) == _told(name, texts[name])
         for name in names
-        if name != REPORT
+        if name != page
     )
 
 

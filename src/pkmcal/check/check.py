@@ -23,6 +23,7 @@ from pkmcal.calibration.byhand import found_alone, why_lost
 from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.doubts import check_poses, richer_models, turning
 from pkmcal.calibration.gather import measurements_of, refinement_of
+from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.recognise import (
     board_images,
     check_observable,
@@ -64,6 +65,7 @@ from pkmcal.outcome import (
 )
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.session.photographs import label_of
+from pkmcal.session.readings import same_pose
 from pkmcal.session.starter import untouched_files
 from pkmcal.wording import listed
 
@@ -231,6 +233,7 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
     seen = _observed(session, photographs, motion.poses, rng)
     stations, joints = seen.stations, joint_checks(session)
     findings += [*broken, *motion.findings, *seen.findings, *joint_findings(session, joints)]
+    findings += [note(text) for text in numbering_told(session)]
     told("What such photographs will give", 0.8)
     by_hand = any(station.handheld for station in session.stations)  # no place to come back to
     expected = forecast(seen.look) if seen.look and not by_hand else None
@@ -619,7 +622,51 @@ def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Fin
                 " mistakes hard to notice. 15 or more are usual.",
             )
         )
-    return findings
+    return findings + _poses_of_many_names(session)
+
+
+def _poses_of_many_names(session: Session) -> list[Finding]:
+    """That configurations are of one pose, by their readings, and how to say so."""
+    owner = same_pose(session.joints, session.joint_noise)
+    first, names = np.unique(owner, return_counts=True)
+    if len(first) == len(owner):
+        return []
+    alike = [
+        session.configurations[k] for k in np.flatnonzero(owner == first[np.argmax(names > 1)])
+    ]
+    others = ", and so on" if np.sum(names > 1) > 1 else ""
+    told = [
+        f"{len(owner)} configurations are of {len(first)} poses: the readings of"
+        f" {listed(alike)} are equal within their noise{others}. --holdout and --regions leave"
+        " those of a pose out together."
+    ]
+    again = {
+        station.entry or station.name
+        for station in session.stations
+        if len({owner[photo.configuration] for photo in station.photographs})
+        < len({photo.configuration for photo in station.photographs})
+    }
+    if session.stations:  # a tracker's table has one row a configuration
+        told.append(
+            "Where the machine moved away between them and came back, all is well. Where it stood"
+            " still, tell that it is one pose:"
+        )
+    if again:
+        entry = min(again)
+        pattern = session.document["stations"][entry]["images"]
+        if "{repeat}" not in pattern:
+            pattern = pattern.replace("{configuration}", "{configuration}_{repeat}")
+        files = [pattern.format(configuration=alike[0], repeat=k) for k in (1, 2)]
+        told.append(
+            f"at {listed(sorted(again))} name its photographs {' and '.join(files)}, with"
+            f" images: {pattern}, and keep one of its rows in joints.csv."
+        )
+    elif session.stations:
+        told.append(
+            f"its photographs bear one name at all stations, such as {alike[0]}, and it has one row"
+            " in joints.csv."
+        )
+    return [note(" ".join(told))]
 
 
 def pose_findings(session: Session, boards: Boards) -> list[Finding]:
@@ -667,6 +714,9 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
         "It cannot be calibrated yet.",
     )
     code = _exit_code(findings)
+    name = found.folder
+    if Path(name).name in ("", ".."):  # "." and the like name nothing to a reader
+        name = Path(name).resolve().name or name
     parts: tuple[Part, ...] = ()
     if found.machine:
         said = KINEMATICS.format(found) if math.isfinite(found.singularity) else ""
@@ -684,8 +734,8 @@ def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome
     photographs = sum(station.photographs for station in found.stations)
     return Outcome(
         command="check",
-        title=f"Check of {found.folder}",
-        subject=f"{found.folder}: {found.machine}, {found.n_legs} legs,"
+        title=f"Check of {name}",
+        subject=f"{name}: {found.machine}, {found.n_legs} legs,"
         f" {found.configurations} configurations, {photographs} photographs"
         if found.machine
         else "",

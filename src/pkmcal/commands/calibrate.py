@@ -54,7 +54,7 @@ def calibrate(
     ] = False,
     holdout: Annotated[
         int,
-        typer.Option(metavar="N", min=0, help="Leave N configurations out, and predict them."),
+        typer.Option(metavar="N", min=0, help="Leave N poses out, and predict them."),
     ] = 0,
     force: Annotated[
         bool,

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pkmcal.arrays import Array, rms
-from pkmcal.identify.centres import joint_centres
+from pkmcal.identify.compared import compare as machine_errors
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.identify.tool import tool_error
 from pkmcal.mechanisms import Machine
 from pkmcal.simulation import Truth, load_truth
 
@@ -63,17 +62,12 @@ def compare(calibration: Calibration, session_folder: Path) -> AgainstTruth:
 
 
 def _errors(machine: Machine, truth: Truth) -> Errors:
-    table = machine.parameters
-    nothing = np.zeros((len(table), len(table)))
-    centres = joint_centres(machine, truth.machine, nothing)
-    tool = tool_error(machine, truth.machine, nothing, truth.T_base_platform, truth.joints)
-    change = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in centres])
-    offsets = (machine.values - truth.machine.values)[table.of_kind("offset")]
+    found = machine_errors(machine, truth.machine, truth.joints)
     return Errors(
-        centre=float(change.mean()),
-        offset=rms(offsets) if offsets.size else 0.0,
-        position=float(np.nanmean(tool.off_position)),
-        orientation=float(np.nanmean(tool.off_orientation)),
+        centre=float(found.centre.mean()),
+        offset=rms(found.offset) if found.offset.size else 0.0,
+        position=float(np.nanmean(found.position)),
+        orientation=float(np.nanmean(found.orientation)),
     )
 
 

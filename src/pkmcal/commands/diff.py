@@ -10,7 +10,8 @@ import typer
 from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS, PAGE, finish
 
-FILES = {"diff.html": PAGE, "diff.json": NUMBERS}
+REPORT, DOCUMENT = "diff.html", "diff.json"
+FILES = {REPORT: PAGE, DOCUMENT: NUMBERS}
 
 
 def diff(
@@ -22,19 +23,38 @@ def diff(
     ],
     b: Annotated[str, typer.Argument(metavar="B", help="Another of the same machine.")],
     out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="DIR", help="Where the page goes.")
-    ] = Path("diff"),
+        Path | None,
+        typer.Option(
+            "-o", "--out", metavar="DIR", help="diff beside the calibration B unless given."
+        ),
+    ] = None,
+    force: Annotated[
+        bool,
+        typer.Option("--force", help="Replace an earlier one; otherwise it is kept, dated."),
+    ] = False,
     as_json: console.Json = False,
 ) -> int:
     """Two calibrations or drawings, and what differs at the tool."""
     from threadpoolctl import threadpool_limits
 
-    from pkmcal.files import check_own_folder
+    from pkmcal.calibration.kept import keep_earlier
+    from pkmcal.files import check_own_folder, json_text
     from pkmcal.judge.difference import difference
     from pkmcal.report.difference import outcome_of
 
-    check_own_folder(out, FILES, "a difference")
+    if out is not None:
+        check_own_folder(out, FILES, "a difference")
     with console.progress(as_json) as told, threadpool_limits(1, "blas"):
         told("Comparing", 0.1)
         found = difference(a, b)
-    return finish(outcome_of(found), out, FILES, as_json=as_json)
+    saved = found.b.saved or found.a.saved
+    folder = out or Path("diff")
+    if out is None:
+        if saved is not None:
+            beside, here = saved.path.resolve().parent.parent / "diff", Path.cwd()
+            folder = beside.relative_to(here) if beside.is_relative_to(here) else beside
+        check_own_folder(folder, FILES, "a difference")
+    outcome = outcome_of(found)
+    texts = {DOCUMENT: json_text(outcome.document)}
+    kept = None if force else keep_earlier(folder, texts, DOCUMENT, REPORT)
+    return finish(outcome, folder, FILES, kept=kept, as_json=as_json)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.motions import AXES, Motion, Situation, changes
+from pkmcal.mechanisms.parameters import EVERY
 from pkmcal.wording import in_full, joined, listed, named, split_name, ways
 
 MOVES = 0.01
@@ -17,7 +19,6 @@ of what the drawing leaves open disappears beside any calibration's own deviatio
 MOST = 8
 """Sentences that people read."""
 MOST_NAMES = 5
-MOST_FIXED = 3
 SHARE = 0.15
 """Part of the greatest change, in tolerances, from which on a parameter is named."""
 TURNED = 0.02
@@ -111,7 +112,9 @@ def sentence(around: Situation, found: Found, unit: Array, moved: float, weak: b
     how_far = "This does not move the platform."
     if matters:
         how_far = (
-            f"Within the drawing's tolerances this moves the platform by {moved * 1e3:.2g} mm."
+            f"Within the drawing's tolerances this moves the platform by {moved * 1e3:.2g} mm"
+            " (rms of its joints over these and nearby poses; what moves all poses alike, as other"
+            " frames do, is not counted)."
         )
     return Sentence(
         f"{text[0].upper()}{text[1:]}. {how_far}",
@@ -167,7 +170,7 @@ def advice_on(
     around: Situation, found: Found, names: tuple[str, ...], matters: bool, weak: bool
 ) -> str:
     """What to do about a motion that changes these parameters."""
-    held = _fixing(_enough(around, found.motion, names))
+    held = _fixing(around, _enough(around, found.motion, names))
     if not matters:
         return f"Nothing needs to be done; {held} silences this."
     legs = found.legs
@@ -230,17 +233,31 @@ def _enough(around: Situation, motion: Motion, names: tuple[str, ...]) -> tuple[
     return tuple(axes[:1]) or tuple(n for n in names if ".platform." in n) or names
 
 
-def _fixing(names: tuple[str, ...]) -> str:
-    """The line of the mechanism file that takes parameters out.
+def _fixing(around: Situation, names: tuple[str, ...]) -> str:
+    """The line of the mechanism file that takes parameters out, or what it takes besides.
 
-    An axis is held as a whole, and a centre is said as a whole where all of it is meant.
+    An axis is held as a whole; a centre is said as a whole where all of it is meant, and all legs
+    in one where all that have the number are meant.
     """
+    table = around.machine.parameters
     entries: dict[str, None] = {}
-    for name in names:
+    for name in sorted(names, key=table.index):
         whole, _, component = name.rpartition(".")
         every = component in AXES and all(f"{whole}.{c}" in names for c in AXES)
         axis = ".axis." in name and len(names) > 1
         entries[whole if every or axis else name] = None
-    more = ", …" if len(entries) > MOST_FIXED else ""
-    said = ", ".join(f'"{name}"' for name in [*entries][:MOST_FIXED])
-    return f"fixed: [{said}{more}] in the mechanism file"
+    said: dict[str, None] = {}
+    for entry in entries:
+        rest = entry.partition("]")[2]
+        legs = dict.fromkeys(n.partition("]")[0] for n in table.names)
+        having = [
+            f"{leg}]{rest}"
+            for leg in legs
+            if any(n == f"{leg}]{rest}" or n.startswith(f"{leg}]{rest}.") for n in table.names)
+        ]
+        alike = len(having) > 1 and all(other in entries for other in having)
+        said[f"{EVERY}{rest}" if alike else entry] = None
+    line = ", ".join(json.dumps(entry) for entry in said)
+    if around.machine.document.fixed:
+        return f"{line} beside what stands under fixed: in the mechanism file"
+    return f"fixed: [{line}] in the mechanism file"

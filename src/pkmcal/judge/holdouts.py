@@ -80,5 +80,5 @@ def by_regions(
     drawing: Machine, measurements: Measurements, whole: Estimate, n: int
 ) -> tuple[HoldOut, ...]:
     """Each of n regions of the workspace left out once."""
-    found = by_region(drawing, whole, n)
+    found = by_region(drawing, whole, measurements, n)
     return tuple(hold_out(drawing, measurements, whole, region) for region in found)

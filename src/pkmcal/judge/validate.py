@@ -117,7 +117,7 @@ def validate(
         return Validation(
             calibration=saved,
             session=session,
-            verdict=validation_verdict(judged, held_out, saved.machine),
+            verdict=validation_verdict(judged, held_out, saved.machine, data),
             judged=judged,
             known=known,
             regions=held_out,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.judge.changes import (
     POWER,
     Change,
@@ -21,6 +21,7 @@ from pkmcal.judge.changes import (
 )
 from pkmcal.judge.comparison import BesideDrawing, Ratio, finite_rms, ratio
 from pkmcal.judge.holdouts import HoldOut
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.wording import SCALES, amount, brief, count, decimals, listed, named, number, with_unit
@@ -52,9 +53,15 @@ def better(gain: Ratio) -> str:
 
 
 def validation_verdict(
-    judged: BesideDrawing | None, holdouts: Sequence[HoldOut], machine: Machine
+    judged: BesideDrawing | None,
+    holdouts: Sequence[HoldOut],
+    machine: Machine,
+    measurements: Measurements,
 ) -> Verdict:
-    """The verdict on new data, or, without any, on the regions held out, pooled."""
+    """The verdict on new data, or, without any, on the regions held out, pooled.
+
+    measurements : of all configurations.
+    """
     units = machine.joint_units
     unit = units[0] if len(set(units)) == 1 else None
     groups = [judged] if judged else [h.left_out for h in holdouts]
@@ -66,9 +73,8 @@ def validation_verdict(
     reasons = [*_not_better(gain), *_broken(groups, units)]
     headline = _validation_headline(gain, before, after, unit, bool(judged))
     warnings = _regions(holdouts, unit)
-    return Verdict(
-        not reasons, headline, tuple(reasons), tuple(warnings), tuple(_noise(after, floor, unit))
-    )
+    noise = _noise(after, floor, unit, measurements, np.concatenate([g.rows for g in groups]))
+    return Verdict(not reasons, headline, tuple(reasons), tuple(warnings), noise)
 
 
 def _validation_headline(
@@ -151,13 +157,36 @@ def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> str:
     )
 
 
-def _noise(after: Array, floor: float, unit: str | None) -> list[str]:
+def _noise(
+    after: Array, floor: float, unit: str | None, measurements: Measurements, rows: Integers
+) -> tuple[str, ...]:
+    """That what is left of configurations ``rows`` is noise, and what would lessen it."""
     if unit is None or finite_rms(after) > MOSTLY_NOISE * floor:
-        return []
-    return [
+        return ()
+    seen = np.zeros((len(measurements.joints), measurements.n_stations), dtype=bool)
+    edges, poses = measurements.edges, measurements.poses
+    poses = poses.select(measurements.on_platform[poses.mount])
+    for one in (edges, poses):
+        seen[one.configuration, one.station] = True
+    stations = int(seen[rows].any(axis=0).sum())
+    once = int(np.sum(seen[rows].sum(axis=1) == 1))
+    if stations == 1:
+        do = "Several stations that see the same configurations would tell"
+    elif once:
+        those = "Each" if once == len(rows) else f"{once} of {len(rows)}"
+        do = (
+            f"{those} of these configurations {'is' if those == 'Each' else 'are'} seen from one of"
+            f" the {stations} stations only: photographs of the same ones from several would tell"
+        )
+    else:
+        do = (
+            f"All are seen from several of the {stations} stations already: photographs from nearer"
+            " or with more pixels would tell"
+        )
+    return (
         f"What is left is mostly the photographs' own noise, {amount(floor, unit)}: the machine may"
-        " be better still. Several stations that see the same configurations would tell."
-    ]
+        f" be better still. {do}.",
+    )
 
 
 def _regions(holdouts: Sequence[HoldOut], unit: str | None) -> list[str]:

@@ -139,7 +139,7 @@ def report_of(
     space = photographed.plot(session, estimate, links, poses.places(observation, estimate))
     parts = (
         scene.section(session, estimate, centres),
-        provenance.stations(session, estimate, camera, space),
+        provenance.stations(session, observation, estimate, camera, space),
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         findings and identifiability.section(findings, estimate.machine.parameters),
@@ -309,16 +309,7 @@ def _data(session: Session, observation: Observation, estimate: Estimate) -> Fig
             ((f"{n - quiet} of {n}", " and ".join(kinds)),),
             f"measured without a camera; {quiet} of them given less than half their weight",
         )
-    seen = {
-        pair
-        for found in (observation.edges, observation.poses)
-        for pair in zip(found.station.tolist(), found.configuration.tolist(), strict=True)
-    }
-    used = sum(
-        (s, photo.configuration) in seen
-        for s, station in enumerate(session.stations)
-        for photo in station.photographs
-    )
+    used = sum(provenance.used_photographs(session, observation))
     parts = [
         f"{count(len(weights), thing)} measured, {int(np.sum(weights < KEPT))} of them given less "
         "than half their weight"

@@ -14,7 +14,7 @@ from pkmcal.calibration.results import base_camera_covariance, versions
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.unidentified import Findings
-from pkmcal.measurements import Rejection
+from pkmcal.measurements import Observation, Rejection
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.report import page, parameters
 from pkmcal.report.residuals import SIDES
@@ -34,7 +34,28 @@ MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
 
-def stations(session: Session, estimate: Estimate, camera: Integers, space: Plot | None) -> Part:
+def used_photographs(session: Session, observation: Observation) -> tuple[int, ...]:
+    """How many of each station's photographs show something that is in use; those that were held
+    out do not.
+    """
+    seen = {
+        pair
+        for found in (observation.edges, observation.poses)
+        for pair in zip(found.station.tolist(), found.configuration.tolist(), strict=True)
+    }
+    return tuple(
+        sum((s, photo.configuration) in seen for photo in station.photographs)
+        for s, station in enumerate(session.stations)
+    )
+
+
+def stations(
+    session: Session,
+    observation: Observation,
+    estimate: Estimate,
+    camera: Integers,
+    space: Plot | None,
+) -> Part:
     """The machine as it was photographed, and where the cameras stood, one row a station; camera
     (S,) is the number of its camera file.
     """
@@ -43,7 +64,12 @@ def stations(session: Session, estimate: Estimate, camera: Integers, space: Plot
         return Part("stations", "The machine in its poses", plots=plots, menu="Poses")
     edges = len(estimate.edge_weights) > 0
     rows: list[Row] = []
+    used = used_photographs(session, observation)
     for s, station in enumerate(session.stations):
+        taken = len(station.photographs)
+        photographs = count(taken, "photograph")
+        if used[s] < taken:
+            photographs = f"{used[s]} of {photographs} in use"
         shift = float(estimate.state.edge_shift[camera[s]])
         sigma = float(estimate.edge_shift_sigma[camera[s]])
         places = decimals(sigma)
@@ -51,8 +77,7 @@ def stations(session: Session, estimate: Estimate, camera: Integers, space: Plot
             *_place(estimate, s),
             *([f"{number(shift, places, signed=True)} ± {number(sigma, places)}"] if edges else []),
             _moved(station.T_camera_base, estimate.state.T_camera_base[s]),
-            f"{station.camera_file}, {station.camera.model},"
-            f" {count(len(station.photographs), 'photograph')}",
+            f"{station.camera_file}, {station.camera.model}, {photographs}",
         )
         rows.append(Row(station.name, cells))
     for s, table in enumerate(session.trackers, start=len(session.stations)):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from pkmcal.judge.comparison import BesideDrawing, WeighedErrors, finite_rms
 from pkmcal.judge.holdouts import HoldOut
 from pkmcal.judge.paths import LinePath, Straightness
@@ -10,6 +12,7 @@ from pkmcal.judge.words import against, better, factor
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
 from pkmcal.report import charts
 from pkmcal.session.load import Session
+from pkmcal.session.readings import same_pose
 from pkmcal.wording import SCALES, amount, brief, count, decimals, number
 
 HOW = (
@@ -188,8 +191,12 @@ def held_out(item: HoldOut, session: Session) -> Part:
         amounts = f": {against(out.after, out.before, unit)}"
         inside = f" In the configurations in use, {amount(finite_rms(used.after), unit)}."
     kept = "" if out.promise.kept else " That is more than the deviations promise."
+    held = count(len(out.rows), "configuration")
+    poses = len(np.unique(same_pose(session.joints[out.rows], session.joint_noise)))
+    if poses < len(out.rows):
+        held += f" of {count(poses, 'pose')}"
     sentence = (
-        f"On {count(len(out.rows), 'configuration')} held out, the calibrated machine predicts the"
+        f"On {held} held out, the calibrated machine predicts the"
         f" readings {better(out.ratio)} times better than the drawing{amounts}.{inside}{kept}"
     )
     in_use, new = used.figures(used.calibrated), out.figures(out.calibrated)

@@ -9,7 +9,7 @@ from math import pi
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.files import CsvTable
 from pkmcal.measurements import Departure, Effect
@@ -283,6 +283,23 @@ def _check_movement(table: CsvTable, noise: float) -> list[str]:
     ]
 
 
+def same_pose(joints: Array, noise: float) -> Integers:
+    """(K,) of each of the readings (K, m) the first row whose readings differ from its own by no
+    more than noise explains: rows of one pose share it.
+    """
+    owner = np.full(len(joints), -1)
+    # by the reading that spreads most, so that each row is held against few others
+    spread = joints[:, np.argmax(np.ptp(joints, axis=0))]
+    order = np.argsort(spread, kind="stable")
+    far = np.searchsorted(spread[order], spread + noise * np.array([[-1.0], [1.0]]) * (_ALIKE + 1))
+    for row in range(len(owner)):
+        if owner[row] < 0:
+            near = order[far[0, row] : far[1, row]]
+            alike = (np.abs(joints[near] - joints[row]) <= _ALIKE * noise).all(axis=1)
+            owner[near[alike & (owner[near] < 0)]] = row
+    return owner
+
+
 def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[str]]:
     """The table with rows of one pose made one, at their mean, and a sentence about them.
 
@@ -291,18 +308,8 @@ def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[str]]
     promise too much. Rows are of one pose where no reading differs by more than noise explains.
     Over so small a step the closures are straight, so a mean of rows is what the mean pose reads.
     """
-    owner = np.full(len(table.names), -1)
-    # by the reading that spreads most, so that each row is held against few others
-    spread = table.values[:, np.argmax(np.ptp(table.values, axis=0))]
-    order = np.argsort(spread, kind="stable")
-    far = np.searchsorted(spread[order], spread + noise * np.array([[-1.0], [1.0]]) * (_ALIKE + 1))
-    for row in range(len(owner)):
-        if owner[row] < 0:
-            near = order[far[0, row] : far[1, row]]
-            alike = (np.abs(table.values[near] - table.values[row]) <= _ALIKE * noise).all(axis=1)
-            owner[near[alike & (owner[near] < 0)]] = row
-    first, group = np.unique(owner, return_inverse=True)
-    if len(first) == len(owner):
+    first, group = np.unique(same_pose(table.values, noise), return_inverse=True)
+    if len(first) == len(group):
         return table, []
     total = np.zeros((len(first), table.values.shape[1]))
     np.add.at(total, group, table.values)
@@ -313,7 +320,7 @@ def without_repeats(table: CsvTable, noise: float) -> tuple[CsvTable, list[str]]
         lines=tuple(table.lines[row] for row in first),
     )
     return merged, [
-        f"{table.label}: its {len(owner)} rows are of {len(first)} poses, whose readings differ by"
+        f"{table.label}: its {len(group)} rows are of {len(first)} poses, whose readings differ by"
         f" more than {_ALIKE:g} times joints.noise; each pose counts once, by the mean of its rows,"
         " for what the model leaves out is the same in all of them."
     ]

@@ -21,6 +21,7 @@ from pkmcal.errors import GeometryError, InputError
 from pkmcal.files import read_text
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import Machine
+from pkmcal.session.load import load_session
 from pkmcal.session.schema import Body
 from pkmcal.simulation.board import place_board
 from pkmcal.simulation.placement import (
@@ -325,8 +326,9 @@ def truth_document(truth: Truth) -> dict[str, Any]:
     }
 
 
-def load_truth(folder: Path | str, drawing: Machine) -> Truth:
-    """Read ``truth.json`` of a simulated session, for scoring; drawing : the session's machine.
+def load_truth(folder: Path | str, drawing: Machine | None = None) -> Truth:
+    """Read ``truth.json`` of a simulated session, for scoring; drawing : the session's machine,
+    read from there unless given.
 
     Readings and rough poses are the session's; here the exact readings stand for the former.
     """
@@ -334,6 +336,7 @@ def load_truth(folder: Path | str, drawing: Machine) -> Truth:
     data = json.loads(read_text(path))
     if data.get("pkmcal_truth") != 1:
         raise InputError("not the truth of a simulated session", where=str(path))
+    drawing = drawing or load_session(folder).machine
     known = data["parameters"]
     # a truth from before readings had scales has readings that are what they say
     values = [

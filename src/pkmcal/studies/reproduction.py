@@ -129,14 +129,16 @@ class Words:
         passed = all(check.passed for check in checks)
         failed = tuple(check.sentence for check in checks if not check.passed)
         headline, cited = self.say(self.document["headline"]), self.document["cited"]
-        told = [self.say(self.document["remarks"][name]) for name in remarks]
+        said = {name: self.say(self.document["remarks"][name]) for name in remarks}
+        open_ = [said[name] for name in self.document["not_reproduced"] if name in said]
         return Outcome(
             command="reproduce",
             title=self.document["title"],
             kicker=f"reproduction of paper {self.letter.upper()}",
             subject=cited,
             verdict=Verdict(passed, headline, reasons=failed),
-            stamp="Reproduced" if passed else "Not reproduced",
+            stamp=("Reproduced in part" if open_ else "Reproduced") if passed else "Not reproduced",
+            partial=bool(open_),
             figures=tuple(
                 Figure(
                     card["question"],
@@ -146,14 +148,18 @@ class Words:
                 for card in self.document["cards"]
             ),
             parts=(*parts, Part("checks", "Expectations", checks=tuple(checks))),
-            findings=tuple(Finding(Level.NOTE, text) for text in told),
+            findings=tuple(
+                Finding(Level.DOUBTFUL if text in open_ else Level.NOTE, text)
+                for text in said.values()
+            ),
             document={
                 "paper": self.letter,
                 "title": cited,
                 "passed": passed,
                 "headline": headline,
                 "checks": [vars(check) for check in checks],
-                "remarks": told,
+                "remarks": list(said.values()),
+                "not_reproduced": open_,
                 **numbers,
             },
         )

@@ -24,6 +24,22 @@
     await draw(printing ? { width: 672 } : { autosize: true });
     if (!printing) for (const plot of plots) Plotly.Plots.resize(plot);
   };
+  // What WebGL draws does not reach paper: there a picture of it stands, in light colours, as wide as
+  // the sheet. It is made once and beforehand, since printing waits for nobody.
+  const pictured = async (plot, figure) => {
+    const root = document.documentElement, screen = !root.classList.contains("paper");
+    if (screen) root.classList.add("paper");
+    const { data, layout } = themed(figure);
+    if (screen) root.classList.remove("paper");
+    const size = { width: 672, height: 440 };  // lower than wide: cameras stand to the sides
+    const margin = { ...layout.margin, b: 8 };  // without the slider
+    const still = { ...layout, ...size, margin, autosize: false, sliders: [], updatemenus: [] };
+    const image = new Image();
+    image.src = await Plotly.toImage({ data, layout: still }, { format: "png", scale: 2, ...size });
+    image.alt = plot.getAttribute("aria-label");
+    image.className = "printed";
+    plot.closest("figure").append(image);
+  };
   const load = async () => {
     const packed = Uint8Array.from(atob(document.getElementById("plotly").textContent), (c) => c.charCodeAt(0));
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
@@ -45,6 +61,9 @@
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => draw());
     addEventListener("beforeprint", () => paper(true));
     addEventListener("afterprint", () => paper(false));
+    for (const [i, plot] of plots.entries()) {
+      if (figures[i].layout.scene) await pictured(plot, figures[i]).catch(() => {});
+    }
   };
   const failed = () => {
     for (const plot of plots) {

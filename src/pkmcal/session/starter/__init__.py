@@ -25,7 +25,7 @@ TEMPLATE = Path(__file__).parent / "session"
 TO_FILL = {
     "mechanism.yaml": "write the drawing of your machine into it",
     "cameras/front.yaml": "write the calibration of your camera into it",
-    "session.yaml": "write down where the camera stands and how good the readings are",
+    "session.yaml": "write down how good the readings are, and each place that the camera stood in",
     "joints.csv": "write one row of readings for each configuration into it",
     "board.yaml": "write down which board it is, and measure its squares",
 }
@@ -55,11 +55,6 @@ MOVED = """\
     camera: cameras/front.yaml  # the same camera, moved there later
     images: images/{name}/{{configuration}}.png
     observe: {observe}
-"""
-POSE = """\
-    # The rough pose of the camera in the base frame makes the search for it quicker: measured by
-    # hand, right to about 10 cm and 10 degrees. Lengths may have a unit, such as -850 mm.
-    # pose: {position: [0.0, -1.0, 0.2], look_at: [0.0, 0.0, 0.2], up: [0, 0, 1]}
 """
 ALONE = """\
 # No stations: this machine has more readings than freedoms, and they alone tell its geometry.
@@ -185,8 +180,7 @@ def _session(text: str, hexapod: bool, turns: bool, seen: Seen, places: int) -> 
     start, end = text.index("    observe: legs"), text.index("#  left:")
     first = f"    observe: {OBSERVE[seen]}\n"
     if seen == "legs":
-        pose = text[start:end].partition("\n")[2]
-        first += pose if hexapod else POSE  # how large another machine is nobody knows here
+        first += text[start:end].partition("\n")[2]
     moved = [MOVED.format(name=n, observe=OBSERVE[seen]) for n in _places(places)[1:]]
     rest = text[end:] if places == 1 and seen == "legs" and hexapod else ""
     board = "" if seen == "legs" else ON_PLATFORM
