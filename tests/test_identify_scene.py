@@ -102,7 +102,7 @@ class Scene:
         basis[:, at.row, at.place, 0] = tangent_basis(normal, self.middle)
         old = assembled.problem.data
         joints = self.joints + JOINT_NOISE * rng.normal(size=self.joints.shape)
-        data = EdgeData(basis, old.whiten, old.optics, joints, old.weight)
+        data = EdgeData(basis, old.white, old.optics, joints, old.weight)
         problem = replace(assembled.problem, data=data)
         z = (self.theta - self.machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
         stations = np.broadcast_to(self.T_camera_base, (len(z), *self.T_camera_base.shape))

@@ -17,7 +17,7 @@ degrees of freedom, fewer where the s_l of the other kinds are not well known th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,6 +56,12 @@ class Components:
         across = self.square**2 / np.where(others, own[:, None, :], 1.0)
         spread = own + np.where(others, across, 0.0).sum(axis=-1)
         return np.where(own > 0, self.freedom**2 / np.where(own > 0, spread, 1.0), 0.0)
+
+    def granted(self, kind: int) -> Components:
+        """The same with one kind's noise taken to be as it counts."""
+        chi2 = self.chi2.copy()
+        chi2[:, kind] = self.freedom[:, kind]
+        return replace(self, chi2=chi2)
 
     def factor(self, kind: int) -> Array:
         """By what to multiply a kind's noise next, (B,): to where c_k is as expected, or, where no
