@@ -159,9 +159,9 @@ def test_cameras_are_refined(demo, calibrated):
     session = load_session(demo.session)
     camera = session.stations[0].camera
     sigma = np.zeros(len(camera.parameters))
-    sigma[:4] = [1.5, 1.5, 2.0, 2.0]
+    sigma[:4] = [3.0, 3.0, 4.0, 4.0]
     off = np.zeros(len(camera.parameters))
-    off[:4] = [3.0, 2.5, -3.0, 4.0]
+    off[:4] = [6.0, 5.0, -6.0, 8.0]
     wrong = replace(camera, parameters=camera.parameters + off, covariance=np.diag(sigma**2))
     stations = tuple(replace(s, camera=wrong) for s in session.stations)
     held = pkmcal.calibrate(replace(session, stations=stations))

@@ -355,7 +355,9 @@ def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
 
 
 def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
-    """Where each edge is its station's only one, no unknown stands for its shading."""
+    """Where each edge is its station's only one, no unknown stands for its shading: what a line's
+    edges have in common is as much noise of its own as what they have not.
+    """
     calibration, _ = breathed
     machine = calibration.session.machine
     assembled = assemble(machine, calibration.measurements, default_gauge(machine))
@@ -368,7 +370,7 @@ def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
     first = int(np.flatnonzero(calibration.measurements.edges.configuration == 0)[0])
     shift = SHADING_SIGMA * calibration.measurements.edges.shift[first]
     grown = noise[0] @ noise[0].T - noise[1] @ noise[1].T
-    np.testing.assert_allclose(grown, np.outer(shift, shift), rtol=1e-6, atol=1e-18)
+    np.testing.assert_allclose(grown, 2 * np.outer(shift, shift), rtol=1e-6, atol=1e-18)
 
 
 # recognition

@@ -60,6 +60,9 @@ from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 ESTIMATE: Key = ("joint",)
 BATCH = 10
 """Runs that are solved at once, and that share a plan of photographs."""
+NEAR = 1e-9
+"""Of a variance, what two edges with the same normal are shaded by each for itself; a covariance of
+equal rows has no root."""
 ROUGH = np.repeat([np.deg2rad(1.0), 0.01], 3)
 """rad and m, standard deviations by which stations start off: so far is what a search for the drawn
 machine in photographs leaves, as the drawing's own errors do."""
@@ -420,7 +423,7 @@ def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> 
     for number in range(int(line.max(initial=-1)) + 1):
         own = np.flatnonzero(line == number)
         angle = np.arccos(np.clip(normal[own] @ normal[own].T, -1, 1))
-        out[:, own] = out[:, own] @ np.linalg.cholesky(np.exp(-angle / ALIKE)).T
+        out[:, own] = out[:, own] @ np.linalg.cholesky(np.exp(-angle / ALIKE) + NEAR * np.eye(len(own))).T
     return out
 
 
