@@ -15,6 +15,9 @@ SHADING_SIGMA = 0.03
 """Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
 where light is even; hard light and polished metal show ten times as much, so data may enlarge it.
 Path-traced photographs of matt machines show 0.02, our own renderer's 0.05."""
+OWN_SHADING = 0.015
+"""Standard deviation (px) of what shading adds to one edge beside what all of its line have in
+common, where light is even; highlights and what metal mirrors add ten times as much."""
 ALIKE = np.radians(7.0)
 """Angle between the normals of two edges of one side of a tube at one station over which their
 shading ceases to be the same, by exp(-angle / ALIKE): what a surface mirrors, and where its
@@ -132,7 +135,7 @@ class EdgeSet:
         if len(self.by_focal) != len(self.station):
             object.__setattr__(self, "by_focal", np.zeros((len(self.station), 2)))
         if len(self.shading) != len(self.station):
-            object.__setattr__(self, "shading", np.full(len(self.station), SHADING_SIGMA))
+            object.__setattr__(self, "shading", np.full(len(self.station), OWN_SHADING))
 
     @classmethod
     def empty(cls) -> EdgeSet:

@@ -41,10 +41,13 @@ from pkmcal.solver import (
 )
 
 LEAST_SCALE = 1.0
-"""The stated noise is never believed to be too large. What moves several edges alike (shading,
-lens) is partly taken up by the parameters, so residuals come out smaller than errors are: scaling
-down by them would promise too much."""
+"""The stated noise of poses, and of edges that nothing shades, is never believed to be too large.
+What moves several alike (a lens) is partly taken up by the parameters, so residuals come out
+smaller than errors are: scaling down by them would promise too much."""
 ROUNDS = 30
+PACE = 1.6
+"""A round of weights, deviations and solution brings the deviations of shading and of the edges a
+part of the way only; from the third on they go by so much further."""
 FREE_ROUNDS = 6
 """Rounds in which the tails of the edges' noise are chosen; they are steps, and two that are alike
 would take turns for ever."""
@@ -165,8 +168,6 @@ def _settle(
         edges, trust = fit.edges, fit.trust
         if scale_noise:
             found = components(fit.info, weight)
-            if estimates_edges:  # their noise is what it is found to be
-                found = found.granted(EDGES)
             scale, factor = _scale(fit, found), np.where(by_data, found.factor(READINGS), 1.0)
         if scale.poses.min() > hopeless:
             return fit._replace(scale=scale)
@@ -175,13 +176,19 @@ def _settle(
             scale = scale._replace(edges=np.ones_like(scale.edges))
             late = number >= FREE_ROUNDS
             edges = edge_noise(fit.info, weight.edges, fit.edges, same_tails=late)
+        if estimates_shading:
+            shading = _shading_of(fit, least)
+        if number > 1:  # these go on as they began, slowly
+            edges = edges.beyond(fit.edges, PACE)
+            shading = np.maximum(
+                problem.data.shading * (shading / problem.data.shading) ** PACE, least
+            )
+        if estimates_edges:
             problem = edges.applied(problem)
             rows = problem.unweighted(state).edges
             trust = edges.trust(problem, np.sum(rows**2, axis=-1))
         if robust:
             weight = settled_weights(problem, state, scale)
-        if estimates_shading:
-            shading = _shading_of(fit, least)
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
         found_readings = np.abs(factor - 1).max() < SCALE_CHANGE
         found_edges = edges.close_to(fit.edges, SHADING_CHANGE)
@@ -444,8 +451,6 @@ def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Stat
     unknowns = problem.unknowns.count - int(np.sum(kinds == "gauge"))
     unknowns += value.shape[1] * problem.layout.own_motion.shape[1]
     found = components(result.info, result.weight)
-    if problem.blocks.crowd.size:
-        found = found.granted(EDGES)
     freedom = found.freedom[0].tolist()
     return Statistics(
         chi2=sum(chi2) + chi2_drawing,

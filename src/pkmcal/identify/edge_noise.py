@@ -25,7 +25,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.covariance import UNKNOWN, Information
 from pkmcal.identify.problem import Problem
-from pkmcal.measurements import SHADING_SIGMA
+from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
 from pkmcal.solver import divisions, normal_root
 
 PAIR = 2
@@ -59,7 +59,7 @@ class EdgeScatter:
     def stated(cls, n_runs: int, problem: Problem) -> EdgeScatter:
         """What edges are given with."""
         full = (n_runs, max(map(len, problem.layout.radius), default=0))
-        return cls(np.ones(full), np.full(full, SHADING_SIGMA), np.full(full, TAILS[-1]))
+        return cls(np.ones(full), np.full(full, OWN_SHADING), np.full(full, TAILS[-1]))
 
     def trust(self, problem: Problem, square: Array) -> Array:
         """By how much more or less each edge counts than on average, (B, K, G), where the squares
@@ -83,7 +83,7 @@ class EdgeScatter:
             return np.ones(len(self.scale))
         size = np.sum(problem.data.by_shift**2, axis=-1)
         scale, shading = (part[:, problem.blocks.tube] for part in (self.scale, self.shading))
-        along = (scale**2 + shading**2 * size) / (1 + SHADING_SIGMA**2 * size)
+        along = (scale**2 + shading**2 * size) / (1 + OWN_SHADING**2 * size)
         square = np.sum(weight * (along + scale**2) / 2, axis=(1, 2))
         count = np.sum(weight, axis=(1, 2))
         return np.sqrt(np.where(count > 0, square / np.maximum(count, TINY), 1.0))
@@ -93,6 +93,12 @@ class EdgeScatter:
         pairs = ((self.scale, other.scale), (self.shading, other.shading))
         change = [np.abs(new / old - 1).max(initial=0.0) for new, old in pairs]
         return max(change) < share and bool(np.all(self.tails == other.tails))
+
+    def beyond(self, before: EdgeScatter, pace: float) -> EdgeScatter:
+        """Deviations as many times as far from another's, with these tails."""
+        scale = before.scale * (self.scale / before.scale) ** pace
+        shading = before.shading * (self.shading / before.shading) ** pace
+        return replace(self, scale=scale, shading=np.maximum(shading, OWN_SHADING))
 
     def applied(self, problem: Problem) -> Problem:
         """The problem with edges of this noise."""
@@ -201,7 +207,7 @@ def _student(
         det = aa * bb - ab**2
         det = np.where(det > TINY * aa * bb, det, np.inf)
         new_a, new_b = a + (bb * by_a - ab * by_b) / det, b + (aa * by_b - ab * by_a) / det
-        least = SHADING_SIGMA**2 / norm
+        least = OWN_SHADING**2 / norm
         # a shading at its least is known: the scale goes on alone
         new_a = np.where(new_b > least, new_a, a + (by_a + (b - least) * ab) / aa)
         new_a = np.clip(new_a, a / LARGEST, a * LARGEST)

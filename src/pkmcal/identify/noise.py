@@ -17,7 +17,7 @@ degrees of freedom, fewer where the s_l of the other kinds are not well known th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -57,12 +57,6 @@ class Components:
         spread = own + np.where(others, across, 0.0).sum(axis=-1)
         return np.where(own > 0, self.freedom**2 / np.where(own > 0, spread, 1.0), 0.0)
 
-    def granted(self, kind: int) -> Components:
-        """The same with one kind's noise taken to be as it counts."""
-        chi2 = self.chi2.copy()
-        chi2[:, kind] = self.freedom[:, kind]
-        return replace(self, chi2=chi2)
-
     def factor(self, kind: int) -> Array:
         """By what to multiply a kind's noise next, (B,): to where c_k is as expected, or, where no
         noise would be too much, by how much less it is. Where the data allow the present noise and
@@ -77,7 +71,8 @@ class Components:
 
     def interval(self, kind: int) -> tuple[Array, Array]:
         """Factors on a kind's noise, smallest and largest (B,) each, that the data allow; 0 and
-        infinity where they say nothing.
+        infinity where they say nothing. Where less is left than the other kinds' noise alone would
+        leave, it is that which counts too much, and nothing is said of this one.
         """
         from scipy.special import chdtri
 
@@ -87,7 +82,8 @@ class Components:
         for share in (DOUBT / 2, 1 - DOUBT / 2):
             mean = self.chi2[:, kind] * dof / chdtri(np.where(known, dof, FEWEST), share)
             ends.append(np.sqrt(np.maximum(self._variance(kind, mean), 0.0)))
-        return np.where(known, ends[0], 0.0), np.where(known, ends[1], np.inf)
+        said = known & (ends[1] > 0)
+        return np.where(said, ends[0], 0.0), np.where(said, ends[1], np.inf)
 
     def contradicts(self, kind: int) -> Booleans:
         """Whether the data do not allow a kind's noise as it is, (B,)."""

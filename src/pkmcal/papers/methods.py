@@ -20,7 +20,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import data_share, told_in_gauge
 from pkmcal.identify.estimate import Estimate, State, Statistics, told_unknowns
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.measurements import SHADING_SIGMA, Measurements
+from pkmcal.measurements import OWN_SHADING, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.four_step import four_step
 from pkmcal.papers.four_step_base import with_boards
@@ -163,7 +163,7 @@ def _estimate(
         pose_weights=np.ones(len(poses)),
         edge_weights=weight,
         edge_scale=np.full(n_tubes, scale),
-        edge_shading=np.full(n_tubes, scale * SHADING_SIGMA),
+        edge_shading=np.full(n_tubes, scale * OWN_SHADING),
         edge_tails=np.full(n_tubes, np.inf),
         edge_trust=np.ones(len(weight)),
         joint_residuals=joints / measurements.joint_noise,

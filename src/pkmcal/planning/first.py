@@ -18,7 +18,7 @@ from pkmcal.errors import ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import SHADING_SIGMA, EdgeSet, Measurements, concatenate
+from pkmcal.measurements import OWN_SHADING, EdgeSet, Measurements, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.predict import tubes_of
@@ -52,7 +52,7 @@ class EdgePool(NamedTuple):
     told: Array
     weight: Array
     length: Array
-    shading: float = SHADING_SIGMA
+    shading: float = OWN_SHADING
 
     def chances(self, length: Array) -> Array:
         """(m, n) chance of each, for edges of m lengths in px.

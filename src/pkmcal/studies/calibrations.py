@@ -46,7 +46,7 @@ from pkmcal.identify.start import mean_pose
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import TOO_NOISY
-from pkmcal.measurements import ALIKE
+from pkmcal.measurements import ALIKE, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
@@ -394,9 +394,8 @@ def _measured_edges(
     line = blocks.line[at.row, at.place]
     lines = rng.standard_normal((runs, int(line.max(initial=0)) + 1))
     alone = rng.standard_normal((runs, n))
-    shaded = design.shading * (
-        np.where(line < 0, alone, lines[:, line]) + _own(line, normal[0], rng, runs)
-    )
+    own = OWN_SHADING / SHADING_SIGMA * _own(line, normal[0], rng, runs)
+    shaded = design.shading * (np.where(line < 0, alone, lines[:, line]) + own)
     turn = by_shift * (error[0] + outward + shaded)[..., None] + by_tilt * error[1][..., None]
     normal = normal + (basis @ turn[..., None])[..., 0]
     normal = normal / np.sqrt(dot(normal, normal))[..., None]
@@ -423,7 +422,9 @@ def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> 
     for number in range(int(line.max(initial=-1)) + 1):
         own = np.flatnonzero(line == number)
         angle = np.arccos(np.clip(normal[own] @ normal[own].T, -1, 1))
-        out[:, own] = out[:, own] @ np.linalg.cholesky(np.exp(-angle / ALIKE) + NEAR * np.eye(len(own))).T
+        out[:, own] = (
+            out[:, own] @ np.linalg.cholesky(np.exp(-angle / ALIKE) + NEAR * np.eye(len(own))).T
+        )
     return out
 
 
