@@ -32,7 +32,7 @@ from pkmcal.files import (
 )
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.centres import free_of_gauge
-from pkmcal.identify.estimate import Statistics
+from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import (
