@@ -122,7 +122,7 @@ def test_noise_scale_is_found():
     scene = make_scene(rng, runs=40, configurations=8, n_stations=2)
     assembled, truth = scene.batch(rng)
     data = assembled.problem.data
-    problem = replace(assembled.problem, data=replace(data, whiten=3 * data.whiten))
+    problem = replace(assembled.problem, data=replace(data, white=3 * data.white))
     for robust in (False, True):
         result = solve_batch(problem, truth, robust=robust)
         n_edges = data.weight.sum() * 2

@@ -20,7 +20,7 @@ from pkmcal.files import Exif, read_exif, with_exif
 from pkmcal.geometry.rigid import apply, perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.gauge import default_gauge
-from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA
+from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import legs
 from pkmcal.observe.alone import Alone, find_alone, turned_about
@@ -355,7 +355,9 @@ def test_edges_tell_focal_lengths_as_the_derivative_says(breathed):
 
 
 def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
-    """Where each edge is its station's only one, no unknown stands for its shading."""
+    """Where each edge is its station's only one, no unknown stands for its shading: what a line's
+    edges have in common is as much noise of its own as what they have not.
+    """
     calibration, _ = breathed
     machine = calibration.session.machine
     assembled = assemble(machine, calibration.measurements, default_gauge(machine))
@@ -366,7 +368,7 @@ def test_a_photographs_edges_are_no_lines_of_their_own(breathed):
         for m in (calibration.measurements, plain)
     ]
     first = int(np.flatnonzero(calibration.measurements.edges.configuration == 0)[0])
-    shift = SHADING_SIGMA * calibration.measurements.edges.shift[first]
+    shift = np.hypot(SHADING_SIGMA, OWN_SHADING) * calibration.measurements.edges.shift[first]
     grown = noise[0] @ noise[0].T - noise[1] @ noise[1].T
     np.testing.assert_allclose(grown, np.outer(shift, shift), rtol=1e-6, atol=1e-18)
 

@@ -15,7 +15,6 @@ from pkmcal.geometry.rigid import apply, dot, look_at, perturb
 from pkmcal.identify.assembly import Assembled, assemble
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres
-from pkmcal.identify.rows import EdgeData
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import (
@@ -102,7 +101,7 @@ class Scene:
         basis[:, at.row, at.place, 0] = tangent_basis(normal, self.middle)
         old = assembled.problem.data
         joints = self.joints + JOINT_NOISE * rng.normal(size=self.joints.shape)
-        data = EdgeData(basis, old.whiten, old.optics, joints, old.weight)
+        data = replace(old, basis=basis, joints=joints)
         problem = replace(assembled.problem, data=data)
         z = (self.theta - self.machine.parameters.drawing) @ np.linalg.pinv(problem.free).T
         stations = np.broadcast_to(self.T_camera_base, (len(z), *self.T_camera_base.shape))

@@ -192,7 +192,14 @@ def test_what_a_calibration_knows_counts_as_its_data_would():
     work = poses_in(machine.limits(), Region(), 20)
     first, second = np.arange(8), np.arange(8, 16)
     # stations and machine, and lines' shading left out of it as calibrations do
-    bare = replace(rig, shading=1e-7)
+    bare = replace(
+        rig,
+        shading=1e-7,
+        instruments=tuple(
+            replace(one, pools=tuple(pool._replace(shading=0.0) for pool in one.pools))
+            for one in rig.instruments
+        ),
+    )
     everything = information_of(bare, Candidates.of_all(groups, joints, poses), work)
     one = np.concatenate([first, 16 + first])
     two = np.concatenate([second, 16 + second])

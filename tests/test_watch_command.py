@@ -59,7 +59,7 @@ def later(demo, tmp_path_factory):
     drawing = load_mechanism(demo.session / "mechanism.yaml")
     true = load_truth(demo.session, drawing).machine
     camera = load_camera(next((demo.session / "cameras").iterdir()))
-    same = photographed(folder / "same", drawing, true, camera, 33)
+    same = photographed(folder / "same", drawing, true, camera, 34)
     off = shutil.copytree(same, folder / "off")
     table = read_csv(same / "joints.csv")
     readings = table.values - 2.5e-3 * (np.arange(6) == 2)

@@ -15,6 +15,14 @@ SHADING_SIGMA = 0.03
 """Standard deviation (px) of what shading adds to all edges of one side of a tube at one station,
 where light is even; hard light and polished metal show ten times as much, so data may enlarge it.
 Path-traced photographs of matt machines show 0.02, our own renderer's 0.05."""
+OWN_SHADING = 0.015
+"""Standard deviation (px) of what shading adds to one edge beside what all of its line have in
+common, where light is even; highlights and what metal mirrors add ten times as much."""
+ALIKE = np.radians(7.0)
+"""Angle between the normals of two edges of one side of a tube at one station over which their
+shading ceases to be the same, by exp(-angle / ALIKE): what a surface mirrors, and where its
+highlight lies, turns with it. Edges of path-traced tubes, of metal and painted, agree by half at 5
+degrees once what all have in common is taken off."""
 BREATHING_SIGMA = 1.5e-3
 """Standard deviation of a hand-held photograph's focal length, relative to the camera's. A lens of
 focal length f that is focused at a distance u forms its picture at f u / (u - f): a telephone's (5
@@ -99,6 +107,9 @@ class EdgeSet:
         the edge's pixels held; n = 0 where nobody asked.
     by_focal : (N, 2) the same by the relative excess of the focal lengths, where these breathe from
         photograph to photograph; else zero.
+    shading : (N,) px, standard deviation of what shading adds to each edge beside what it adds to
+        all of its line; edges of a line share it as far as their normals agree, see
+        :func:`~pkmcal.identify.assembly.crowd`. It counts where measurements are ``shaded``.
     """
 
     station: Integers
@@ -113,15 +124,18 @@ class EdgeSet:
     span: Array
     by_intrinsics: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
     by_focal: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    shading: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Edges without derivatives by intrinsics get empty ones, so that all select alike."""
+        """What is not given is empty, zero or the usual, so that all edges select alike."""
         if len(self.by_intrinsics) != len(self.station):
             object.__setattr__(self, "by_intrinsics", np.zeros((len(self.station), 2, 0)))
         if len(self.by_focal) != len(self.station):
             object.__setattr__(self, "by_focal", np.zeros((len(self.station), 2)))
+        if len(self.shading) != len(self.station):
+            object.__setattr__(self, "shading", np.full(len(self.station), OWN_SHADING))
 
     @classmethod
     def empty(cls) -> EdgeSet:

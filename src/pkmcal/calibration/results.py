@@ -32,7 +32,7 @@ from pkmcal.files import (
 )
 from pkmcal.geometry.rigid import inverse, skew
 from pkmcal.identify.centres import free_of_gauge
-from pkmcal.identify.estimate import Statistics
+from pkmcal.identify.estimate import Estimate, Statistics
 from pkmcal.identify.tool import ToolError, checked_poses, tool_error
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import (
@@ -198,6 +198,7 @@ def document_of(
         "cameras": _cameras(calibration),
         "configurations": _configurations(calibration, seen),
         "statistics": asdict(estimate.statistics),
+        "edge_noise": _edge_noise(estimate),
         "tool": {"why_not": over} if isinstance(over, str) else over and over.document(),
         "bed": bed and asdict(bed),
         "holdout": holdout,
@@ -215,6 +216,17 @@ def document_of(
         "timings": {name: round(value, 3) for name, value in calibration.timings.items()},
     }
     return plain(document)
+
+
+def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
+    """One entry for each tube of a leg, from 1: what its edges scatter by."""
+    if not estimate.edge_weights.size:
+        return []
+    rows = zip(estimate.edge_scale, estimate.edge_shading, estimate.edge_tails, strict=True)
+    return [
+        {"tube": k, "scale": scale, "shading": shading, "tails": tails}
+        for k, (scale, shading, tails) in enumerate(rows, start=1)
+    ]
 
 
 def versions() -> dict[str, str]:

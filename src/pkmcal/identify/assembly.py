@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TypeVar, cast
 
 import numpy as np
@@ -14,7 +15,7 @@ from pkmcal.identify.gauge import Gauge, exact_moves, frame_rows, freedoms
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import EdgeBlocks, EdgeData, Kinds, PoseBlocks, PoseData
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.measurements import BREATHING_SIGMA, SHADING_SIGMA, Measurements
+from pkmcal.measurements import ALIKE, BREATHING_SIGMA, SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
 
 SHIFT_SIGMA = 0.3
@@ -80,11 +81,13 @@ def assemble(
     use_drawing: bool = True,
     radius_prior: bool = True,
     shading: float | Array = SHADING_SIGMA,
+    share: float = 1.0,
 ) -> Assembled:
     """The joint problem of one session (B = 1), every edge a block of its own.
 
     shading : px, standard deviation of the lines' shading, of all or of each (n,), where an
-    estimate has told it.
+    estimate has told it. share : of the configurations how many are to count together in the end,
+    where these are candidates, for the edges that share their shading.
     """
     _check(machine, measurements)
     seen, line = seen_configurations(measurements), lines(measurements)[1]
@@ -115,7 +118,7 @@ def assemble(
         camera = np.array([kind == "camera" for kind in kinds])
         target[camera] = np.pad(-measurements.intrinsics_at, ((0, 0), (1, 0))).ravel()
     target[[kind == "breathing" for kind in kinds]] = -measurements.breathing_at
-    blocks, data = _edges(machine, measurements, edges, line, seen)
+    blocks, data = _edges(machine, measurements, edges, line, seen, share)
     data = replace(data, shading=np.atleast_2d(shading).astype(float))
     pose_blocks, pose_data = _poses(measurements, poses)
     problem = Problem(
@@ -202,6 +205,29 @@ def lines(measurements: Measurements) -> tuple[Integers, Integers]:
     return keys, number
 
 
+def crowd(measurements: Measurements) -> Array:
+    """How many edges of its line share an edge's own shading, itself among them, (N,): the sum of
+    exp(-angle / ALIKE) over the angles between the normals.
+
+    Of n edges with the same normal each counts as one n-th, whatever their number. Normals are
+    gathered in cells an eighth of ALIKE wide first, so that thousands cost little.
+    """
+    edges, number = measurements.edges, lines(measurements)[1]
+    out = np.ones(len(edges))
+    cell = np.round(8 * edges.normal / ALIKE).astype(int)
+    keys, at = np.unique(np.column_stack([number, cell]), axis=0, return_inverse=True)
+    at = at.reshape(-1)
+    count = np.bincount(at)
+    middle = np.stack([np.bincount(at, n) for n in edges.normal.T], axis=-1) / count[:, None]
+    middle = middle / np.linalg.norm(middle, axis=-1, keepdims=True)
+    first = np.searchsorted(keys[:, 0], np.arange(number.max(initial=-1) + 2))
+    many = np.ones(len(count))
+    for start, end in pairwise(first.tolist()):
+        angle = np.arccos(np.clip(middle[start:end] @ middle[start:end].T, -1, 1))
+        many[start:end] = np.exp(-angle / ALIKE) @ count[start:end]
+    return np.where(number >= 0, many[at], out)
+
+
 def _alone(measurements: Measurements) -> Booleans:
     """(N,) edges of stations that saw one configuration alone, as photographs by hand do."""
     pair = np.unique(
@@ -212,7 +238,12 @@ def _alone(measurements: Measurements) -> Booleans:
 
 
 def _edges(
-    machine: Machine, measurements: Measurements, at: Places, line: Integers, seen: Booleans
+    machine: Machine,
+    measurements: Measurements,
+    at: Places,
+    line: Integers,
+    seen: Booleans,
+    share: float,
 ) -> tuple[EdgeBlocks, EdgeData]:
     """The edges at their places, and the readings of the seen configurations."""
     edges, factor = measurements.edges, measurements.intrinsics_factor
@@ -224,11 +255,12 @@ def _edges(
     if factor.shape[-1] and len(edges):
         # the measured normals move with the intrinsics; residuals are predicted less measured
         optics[..., 1:] = -edges.by_intrinsics @ factor[camera]
-    covariance = edges.covariance
+    own, crowded = np.zeros((2, len(edges)))
     if len(line):
         # what one edge alone is shaded by is noise of its own: no unknown could tell it from that
-        shift = np.where(line[:, None] < 0, SHADING_SIGMA * edges.shift, 0.0)
-        covariance = covariance + shift[:, :, None] * shift[:, None, :]
+        alone = np.where(line < 0, SHADING_SIGMA, 0.0)
+        crowded = 1 + share * (crowd(measurements) - 1)
+        own = np.hypot(edges.shading * np.sqrt(crowded), alone)
     legs = np.unique(edges.leg)
     leg = np.repeat(legs, at.shape[1] // max(len(legs), 1))
     first: Integers = np.array([machine.layout.radius[j][0] for j in leg], dtype=int)
@@ -241,14 +273,17 @@ def _edges(
         side=at.filled(edges.side)[..., None],
         present=at.present,
         line=at.filled(line) if len(line) else np.zeros((0, 0), dtype=int),
+        tube=at.filled(edges.tube) if len(line) else np.zeros((0, 0), dtype=int),
+        crowd=at.filled(crowded) if len(line) else np.zeros((0, 0)),
     )
     data = EdgeData(
         basis=at.filled(edges.basis)[None, :, :, None],
-        whiten=at.filled(np.linalg.inv(np.linalg.cholesky(covariance)))[None],
+        white=at.filled(np.linalg.inv(np.linalg.cholesky(edges.covariance)))[None],
         optics=at.filled(optics)[None],
         joints=measurements.joints[None, seen],
         weight=at.present[None].astype(float),
         breathing=at.filled(-BREATHING_SIGMA * edges.by_focal[..., None])[None],
+        own=at.filled(own)[None],
     )
     return blocks, data
 

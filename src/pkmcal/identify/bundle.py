@@ -23,6 +23,7 @@ from pkmcal.identify.covariance import (
     information,
     machine_covariance,
 )
+from pkmcal.identify.edge_noise import EdgeScatter, edge_noise
 from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.kinds import EDGES, POSES, READINGS
@@ -40,14 +41,21 @@ from pkmcal.solver import (
 )
 
 LEAST_SCALE = 1.0
-"""The stated noise is never believed to be too large. What moves several edges alike (shading,
-lens) is partly taken up by the parameters, so residuals come out smaller than errors are: scaling
-down by them would promise too much."""
+"""The stated noise of poses, and of edges that nothing shades, is never believed to be too large.
+What moves several alike (a lens) is partly taken up by the parameters, so residuals come out
+smaller than errors are: scaling down by them would promise too much."""
 ROUNDS = 30
+PACE = 1.6
+"""A round of weights, deviations and solution brings the deviations of shading and of the edges a
+part of the way only; from the third on they go by so much further."""
+FREE_ROUNDS = 6
+"""Rounds in which the tails of the edges' noise are chosen; they are steps, and two that are alike
+would take turns for ever."""
 SCALE_CHANGE = 1e-3
 """Relative change of a noise scale below which it counts as found."""
 SHADING_CHANGE = 0.02
-"""Relative change of the shading's deviation below which it counts as found."""
+"""Relative change of the shading's deviation below which it counts as found; and of the edges'
+noise."""
 FREEDOM = 4.0
 """Degrees of freedom of Student's distribution of the lines' shading: four lets a line go that is
 some five deviations off, and costs clean ones little."""
@@ -62,7 +70,8 @@ class BatchResult:
     problem : with the weights in use, noise scale included. solution : states, cost, stops.
     weight : (B, K, G) robust weights 0..1 of each kind of measurement. scale : (B,) factor on its
     stated noise; reading_scale : (B,) on the readings'. steps : (B,). info : rows and
-    covariance at the solution.
+    covariance at the solution. edges : their noise, where it was looked for; trust : (B, K, G) what
+    each counts besides.
     """
 
     problem: Problem
@@ -72,6 +81,8 @@ class BatchResult:
     reading_scale: Array
     steps: Integers
     info: Information
+    edges: EdgeScatter
+    trust: Array
 
 
 def solve_batch(
@@ -105,7 +116,8 @@ def solve_batch(
         found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
         state, weight, steps = found.state, found.weight, steps + found.steps
         scale = found.scale if scale_noise else ones
-    fit = _solved(problem, state, weight, scale, steps)
+    begin = EdgeScatter.stated(n_runs, problem)
+    fit = _solved(problem, state, weight, scale, steps, begin, np.ones_like(every.edges))
     if robust or scale_noise:
         settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
         fit = settle(fit, hopeless=hopeless, by_data=np.zeros(n_runs, dtype=bool))
@@ -115,18 +127,23 @@ def solve_batch(
                 fit = settle(fit, hopeless=hopeless, by_data=by_data)
     used, steps = fit.info.problem, fit.solution.steps
     readings = np.broadcast_to(used.joint_noise / problem.joint_noise, n_runs)
-    return BatchResult(used, fit.solution, fit.weight, fit.scale, readings, steps, fit.info)
+    return BatchResult(
+        used, fit.solution, fit.weight, fit.scale, readings, steps, fit.info, fit.edges, fit.trust
+    )
 
 
 class _Fit(NamedTuple):
     """A solution with fixed weights (B, K, G) and noise scales (B,), the steps of all solutions
-    before it counted, and what its problem says there.
+    before it counted, and what its problem says there. edges : their noise; trust : (B, K, G) by
+    how much more or less each counts for it.
     """
 
     solution: Solution
     weight: Kinds[Array]
     scale: Kinds[Array]
     info: Information
+    edges: EdgeScatter
+    trust: Array
 
 
 def _settle(
@@ -144,22 +161,39 @@ def _settle(
     the lines' shading.
     """
     estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
-    for _ in range(ROUNDS):
+    estimates_edges = scale_noise and robust and fit.info.problem.blocks.crowd.size > 0
+    for number in range(ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, factor = fit.scale, np.ones(len(by_data))
+        edges, trust = fit.edges, fit.trust
         if scale_noise:
             found = components(fit.info, weight)
             scale, factor = _scale(fit, found), np.where(by_data, found.factor(READINGS), 1.0)
         if scale.poses.min() > hopeless:
             return fit._replace(scale=scale)
         shading = problem.data.shading
-        if robust:
-            weight = settled_weights(problem, state, scale)
+        if estimates_edges:
+            scale = scale._replace(edges=np.ones_like(scale.edges))
+            late = number >= FREE_ROUNDS
+            edges = edge_noise(fit.info, weight.edges, fit.edges, same_tails=late)
         if estimates_shading:
             shading = _shading_of(fit, least)
+        if number > 1:  # these go on as they began, slowly
+            edges = edges.beyond(fit.edges, PACE)
+            shading = np.maximum(
+                problem.data.shading * (shading / problem.data.shading) ** PACE, least
+            )
+        if estimates_edges:
+            problem = edges.applied(problem)
+            rows = problem.unweighted(state).edges
+            trust = edges.trust(problem, np.sum(rows**2, axis=-1))
+        if robust:
+            weight = settled_weights(problem, state, scale)
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
         found_readings = np.abs(factor - 1).max() < SCALE_CHANGE
-        if found_shading and found_readings and _settled(scale, fit.scale, weight, fit.weight):
+        found_edges = edges.close_to(fit.edges, SHADING_CHANGE)
+        found_all = found_shading and found_readings and found_edges
+        if found_all and _settled(scale, fit.scale, weight, fit.weight):
             break
         if estimates_shading:
             units = problem.data.shading / shading  # the same shifts in other units
@@ -167,7 +201,7 @@ def _settle(
             problem = problem.shaded(shading)
         if by_data.any():
             problem = replace(problem, joint_noise=problem.joint_noise * factor)
-        fit = _solved(problem, state, weight, scale, fit.solution.steps)
+        fit = _solved(problem, state, weight, scale, fit.solution.steps, edges, trust)
     return fit
 
 
@@ -198,13 +232,16 @@ def _solved(
     weight: Kinds[Array],
     scale: Kinds[Array],
     steps: Integers,
+    edges: EdgeScatter,
+    trust: Array,
 ) -> _Fit:
     """The problem solved with these weights, from a state that ``steps`` (B,) have led to."""
-    parts = zip(weight, scale, strict=True)
+    parts = zip(weight._replace(edges=weight.edges * trust), scale, strict=True)
     used = problem.weighted(Kinds(*(own / each[:, None, None] ** 2 for own, each in parts)))
     found = minimise(used, state)
     found = replace(found, steps=steps + found.steps)
-    return _Fit(found, weight, scale, information(used, found.state, found.normal))
+    info = information(used, found.state, found.normal)
+    return _Fit(found, weight, scale, info, edges, trust)
 
 
 def _scale(fit: _Fit, found: Components) -> Kinds[Array]:
@@ -313,7 +350,7 @@ def as_ended(measurements: Measurements, estimate: Estimate) -> tuple[Assembled,
     assembled = assemble(machine, measurements, default_gauge(machine), shading=shading)
     statistics = estimate.statistics
     weights = Kinds(
-        estimate.edge_weights / statistics.noise_scale**2,
+        estimate.edge_weights * estimate.edge_trust,
         estimate.pose_weights / statistics.pose_scale**2,
     )
     assembled = replace(assembled, problem=assembled.trusting(weights))
@@ -363,6 +400,10 @@ def _estimate(
         edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
         edge_residuals=residuals.edges,
         edge_weights=weights.edges,
+        edge_scale=result.edges.scale[0] * result.scale.edges[0],
+        edge_shading=result.edges.shading[0],
+        edge_tails=result.edges.tails[0],
+        edge_trust=assembled.places.edges.taken(result.trust[0]),
         joint_residuals=joints,
         data_share=data_share(machine, state.theta, full, gauge),
         configurations=assembled.seen,
@@ -399,6 +440,8 @@ def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Stat
     kinds = np.array(assembled.priors)
     rows = problem.kinds.edges.rows, problem.closure_rows, problem.kinds.poses.rows
     chi2 = [float(np.sum(value[0, :, part] ** 2)) for part in rows]
+    if problem.blocks.crowd.size:
+        chi2[0] = float(np.sum(result.edges.squares(problem, value[..., rows[0]])))
     drawn = ~np.isin(kinds, ("gauge", "mount"))
     prior = problem.prior_values(state)[0] - problem.prior_target
     chi2_drawing = float(np.sum(prior[drawn] ** 2))
@@ -420,7 +463,9 @@ def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Stat
         n_drawing=n_drawing,
         steps=int(result.steps[0]),
         stopped=result.solution.stop[0].value,
-        noise_scale=float(result.scale.edges[0]),
+        noise_scale=float(
+            result.scale.edges[0] * result.edges.factor(problem, result.weight.edges)[0]
+        ),
         chi2_poses=chi2[2],
         n_poses=n_poses,
         pose_scale=float(result.scale.poses[0]),

@@ -108,7 +108,11 @@ class Estimate:
         perturbation of T_camera_base and T_mount.
     edge_shift_sigma : (C,) px. intrinsics_covariance : (C, n, n) of the cameras' intrinsics
     after refinement; n = 0 where they were held.
-    edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1.
+    edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1. edge_scale : (T,)
+    factor on the stated noise of the edges of each tube of a leg, edge_shading : (T,) px, what they
+    are shaded by one by one, edge_tails : (T,) degrees of freedom of their distribution and
+    edge_trust : (N,) by how much more or less than on average each counts for it, see
+    :mod:`pkmcal.identify.edge_noise`.
     joint_residuals : (K, m) in standard deviations.
     data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
         data decide; near 0, the value is the drawing's.
@@ -128,6 +132,10 @@ class Estimate:
     edge_shift_sigma: Array
     edge_residuals: Array
     edge_weights: Array
+    edge_scale: Array
+    edge_shading: Array
+    edge_tails: Array
+    edge_trust: Array
     joint_residuals: Array
     data_share: Array
     configurations: Booleans
@@ -145,9 +153,14 @@ class Estimate:
     __repr__ = short_repr
 
     def as_found(self, measurements: Measurements) -> Measurements:
-        """The measurements with the readings' noise as the data show it."""
-        scale = self.statistics.reading_scale
-        return replace(measurements, joint_noise=measurements.joint_noise * scale)
+        """Measurements of the estimate, all or some, with the noise of readings and edges as the
+        data show it; what each edge counts besides is ``edge_trust``.
+        """
+        scale, edges = self.statistics.reading_scale, measurements.edges
+        covariance = edges.covariance * self.edge_scale[edges.tube, None, None] ** 2
+        edges = replace(edges, covariance=covariance, shading=self.edge_shading[edges.tube])
+        noise = measurements.joint_noise * scale
+        return replace(measurements, edges=edges, joint_noise=noise)
 
     @property
     def covariance(self) -> Array:

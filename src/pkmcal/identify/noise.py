@@ -71,7 +71,8 @@ class Components:
 
     def interval(self, kind: int) -> tuple[Array, Array]:
         """Factors on a kind's noise, smallest and largest (B,) each, that the data allow; 0 and
-        infinity where they say nothing.
+        infinity where they say nothing. Where less is left than the other kinds' noise alone would
+        leave, it is that which counts too much, and nothing is said of this one.
         """
         from scipy.special import chdtri
 
@@ -81,7 +82,8 @@ class Components:
         for share in (DOUBT / 2, 1 - DOUBT / 2):
             mean = self.chi2[:, kind] * dof / chdtri(np.where(known, dof, FEWEST), share)
             ends.append(np.sqrt(np.maximum(self._variance(kind, mean), 0.0)))
-        return np.where(known, ends[0], 0.0), np.where(known, ends[1], np.inf)
+        said = known & (ends[1] > 0)
+        return np.where(said, ends[0], 0.0), np.where(said, ends[1], np.inf)
 
     def contradicts(self, kind: int) -> Booleans:
         """Whether the data do not allow a kind's noise as it is, (B,)."""

@@ -127,7 +127,7 @@ class Problem:
     @property
     def closure_rows(self) -> slice:
         """Rows of a configuration that are the closure's."""
-        n_edge_rows = self.data.whiten.shape[2] * self.data.whiten.shape[3]
+        n_edge_rows = self.data.white.shape[2] * self.data.white.shape[3]
         return slice(n_edge_rows, n_edge_rows + self.layout.n_equations)
 
     def select(self, runs: Integers) -> Problem:

@@ -95,6 +95,8 @@ class EdgeBlocks:
     leg : (1, G). station, camera, radius : (K, G) station, camera, position of the tube's radius.
     side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
     its station, whose edges are shaded alike in all photographs, -1 where there is one edge alone;
+    empty where nothing is shaded. tube : (K, G) number of the tube on its leg. crowd : (K, G) how
+    many of its line share an edge's own shading (:func:`~pkmcal.identify.assembly.crowd`); both
     empty where nothing is shaded.
     """
 
@@ -105,6 +107,8 @@ class EdgeBlocks:
     side: Integers
     present: Booleans
     line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
+    tube: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
+    crowd: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def among(self, configurations: slice) -> EdgeBlocks:
         """Those of some configurations."""
@@ -115,26 +119,50 @@ class EdgeBlocks:
 class EdgeData:
     """Numbers measured in each run; leading axis B, or 1 where all runs share them.
 
-    basis : (B, K, G, g, 3, 2). whiten : (B, K, G, 2g, 2g). optics : (B, K, G, 2g, w) change of
+    basis : (B, K, G, g, 3, 2). white : (B, K, G, 2g, 2g) whitening of each block's noise as it was
+    stated, shading left out. optics : (B, K, G, 2g, w) change of
     the measured normals, less the predicted ones', by the w unknowns of their camera: the edge
     shift (px), then its intrinsics where they are refined (in units of their prior).
     joints : (B, K, m). weight : (B, K, G) of the blocks, 0..1 over the noise scale squared.
     shading : (B, n) px by which one unit of each line's shading moves its edges, its standard
     deviation; n = 1 where all have the same. breathing : (B, K, G, 2g, 1) the same change as optics
-    by a unit of their station's focal breathing; zero numbers where nothing breathes.
+    by a unit of their station's focal breathing; zero numbers where nothing breathes. scale :
+    (B, K, G) factor on the stated noise. own : (B, K, G) px, standard deviation of the shading of
+    each edge beside its line's, that of all who share it counted.
     """
 
     basis: Array
-    whiten: Array
+    white: Array
     optics: Array
     joints: Array
     weight: Array
     shading: Array = field(default_factory=lambda: np.full((1, 1), SHADING_SIGMA))
     breathing: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 1, 1)))
+    scale: Array = field(default_factory=lambda: np.ones((1, 1, 1)))
+    own: Array = field(default_factory=lambda: np.zeros((1, 1, 1)))
 
     def among(self, configurations: slice) -> EdgeData:
         """Those of some configurations."""
         return replace(_among(self, configurations, 1), shading=self.shading)
+
+    @cached_property
+    def by_shift(self) -> Array:
+        """Rows by a pixel of shift, in the noise as it was stated, (B or 1, K, G, 2g)."""
+        return (self.white @ self.optics[..., :1])[..., 0]
+
+    @cached_property
+    def whiten(self) -> Array:
+        """The whitening, (B or 1, K, G, 2g, 2g), with the noise's scale and the edges' own shading:
+        in the stated noise's units the covariance is ``scale^2 + own^2 v v^T``, v the
+        :attr:`by_shift`, and its inverse root turns only what lies along v.
+        """
+        if not self.own.any():
+            return self.white / self.scale[..., None, None]
+        v, square = self.by_shift, np.sum(self.by_shift**2, axis=-1)
+        ratio = self.scale / np.sqrt(self.scale**2 + self.own**2 * square)
+        along = v * ((ratio - 1) / np.where(square > 0, square, 1.0))[..., None]
+        turned = self.white + along[..., None] * (v[..., None, :] @ self.white)
+        return turned / self.scale[..., None, None]
 
     @cached_property
     def weighed(self) -> Array:

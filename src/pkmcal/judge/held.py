@@ -43,8 +43,8 @@ UNSCALED = Kinds(1.0, 1.0)
 
 @dataclass(frozen=True)
 class Trust:
-    """How far new data are believed: robust weights (N,) 0..1 of each kind, factors on its stated
-    noise and on that of readings, and the standard deviation (px) of shading.
+    """How far new data are believed: weights (N,) of each kind, factors on its noise and on that of
+    readings, and the standard deviation (px) of shading.
 
     Weights come from an estimate whose machine could move: with the machine held, a leg that has
     changed would be taken for an error of its edges, and be let go.
@@ -67,16 +67,17 @@ class Trust:
 
     @classmethod
     def of(cls, estimate: Estimate, scale: Kinds[float] = UNSCALED, readings: float = 1.0) -> Trust:
-        """An estimate's weights, and the larger of its factors and of the calibration's; of the
-        readings its own where its data contradict their stated noise.
+        """An estimate's weights, for data as it found them
+        (:meth:`~pkmcal.identify.estimate.Estimate.as_found`), where the calibration's factors on
+        the stated noise are larger by as much more; of the readings the estimate's own where its
+        data contradict their stated noise.
         """
-        own = Kinds(estimate.statistics.noise_scale, estimate.statistics.pose_scale)
-        own_readings = estimate.statistics.reading_scale
+        own = estimate.statistics
         return cls(
-            Kinds(estimate.edge_weights, estimate.pose_weights),
-            Kinds(*(max(pair) for pair in zip(own, scale, strict=True))),
-            readings if own_readings == 1 else own_readings,
-            estimate.statistics.shading,
+            Kinds(estimate.edge_weights * estimate.edge_trust, estimate.pose_weights),
+            Kinds(max(scale.edges / own.noise_scale, 1.0), max(own.pose_scale, scale.poses)),
+            readings if own.reading_scale == 1 else 1.0,
+            own.shading,
         )
 
 

@@ -131,13 +131,14 @@ def watch(
         old = saved.document.get("statistics") or {}
         before = Kinds(float(old.get("noise_scale", 1.0)), float(old.get("pose_scale", 1.0)))
         trust = Trust.of(looked.estimate, before, _readings(saved, session))
+        noise = looked.estimate.statistics.noise_scale * trust.scale.edges
         held = _hold_new(saved, session, looked, trust, ~known)
         judged, kept, moved = tests_with_kept(held, _kept(saved, session, same_place), alpha)
         around = LookedAt(
             session.configurations,
             known,
             seen,
-            trust.scale.edges / before.edges,
+            noise / before.edges,
             names_of(session),
             moved,
         )
@@ -149,7 +150,7 @@ def watch(
             residuals=held.residuals(),
             known=known,
             seen=seen & ~known,
-            noise_scale=trust.scale.edges,
+            noise_scale=noise,
             pose_scale=trust.scale.poses,
             same_place=tuple(session.station_names[k] for k in kept.stations),
             moved=moved,
@@ -238,7 +239,7 @@ def _hold_new(
     saved: SavedCalibration, session: Session, looked: Calibration, trust: Trust, keep: Booleans
 ) -> Held:
     """The calibrated machine held on the configurations to keep, (K,)."""
-    data = looked.measurements
+    data = looked.estimate.as_found(looked.measurements)
     cameras = [station.camera for station in session.stations]
     wide = magnified(data, looked.observation, cameras) if cameras else None
     kept = Kinds(

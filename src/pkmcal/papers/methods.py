@@ -20,7 +20,7 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import data_share, told_in_gauge
 from pkmcal.identify.estimate import Estimate, State, Statistics, told_unknowns
 from pkmcal.identify.gauge import apply, default_gauge
-from pkmcal.measurements import Measurements
+from pkmcal.measurements import OWN_SHADING, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.four_step import four_step
 from pkmcal.papers.four_step_base import with_boards
@@ -150,6 +150,7 @@ def _estimate(
     n_poses, n_edges = float(measurements.poses.rows.sum()), float(2 * weight.sum())
     pose_scale = max(float(np.sqrt(np.sum(poses**2) / n_poses)) if n_poses else 1.0, 1.0)
     chi2 = float(np.sum(weight[:, None] * (edges / scale) ** 2))
+    n_tubes = max(map(len, machine.layout.radius), default=0)
     # closures are zero to rounding, as poses come from the readings
     joints = machine.inverse(state.T_base_platform) - measurements.joints
     return Estimate(
@@ -161,6 +162,10 @@ def _estimate(
         pose_residuals=poses / pose_scale,
         pose_weights=np.ones(len(poses)),
         edge_weights=weight,
+        edge_scale=np.full(n_tubes, scale),
+        edge_shading=np.full(n_tubes, scale * OWN_SHADING),
+        edge_tails=np.full(n_tubes, np.inf),
+        edge_trust=np.ones(len(weight)),
         joint_residuals=joints / measurements.joint_noise,
         data_share=data_share(machine, state.theta, joint, gauge),
         configurations=assembled.seen,

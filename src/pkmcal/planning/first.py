@@ -18,7 +18,7 @@ from pkmcal.errors import ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import EdgeSet, Measurements, concatenate
+from pkmcal.measurements import OWN_SHADING, EdgeSet, Measurements, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.predict import tubes_of
@@ -46,12 +46,13 @@ SEED = 7
 
 class EdgePool(NamedTuple):
     """What one edge may tell: informations (n, 2, 2), px^-2 of shift and tilt, weights (n,), and
-    lengths (n,) in px of the edges that told it.
+    lengths (n,) in px of the edges that told it. shading : px, its own.
     """
 
     told: Array
     weight: Array
     length: Array
+    shading: float = OWN_SHADING
 
     def chances(self, length: Array) -> Array:
         """(m, n) chance of each, for edges of m lengths in px.
@@ -201,17 +202,21 @@ def _told(
     kept &= expected
     unit = np.zeros((*shape, 2, 2))
     unit[place(ideal)] = pixel_turns(ideal)
-    weight = estimate.edge_weights / estimate.statistics.noise_scale**2
+    scale = estimate.edge_scale[edges.tube]
+    weight = estimate.edge_weights * estimate.edge_trust / scale**2
     own = unit[place(edges)]
     told = np.zeros((*shape, 2, 2))  # lost edges stay zero
     told[place(edges)] = own.mT @ (np.linalg.inv(edges.covariance) * weight[:, None, None]) @ own
     kind = np.stack([tubes.tube, tubes.side], axis=1)
     long = np.ones(shape)
     long[place(ideal)] = pixel_lengths(ideal)
-    pools = tuple(_pools(told[s], long[s], expected[s], kind) for s in range(len(few)))
+    own_shading = estimate.edge_shading[tubes.tube]
+    pools = tuple(_pools(told[s], long[s], expected[s], kind, own_shading) for s in range(len(few)))
     sigma = np.full((len(few), n_legs), np.nan)
     pixel = np.linalg.norm(edges.shift, axis=-1)
-    across = np.sqrt(edges.covariance[:, 0, 0]) / pixel * estimate.statistics.noise_scale
+    across = np.hypot(
+        scale * np.sqrt(edges.covariance[:, 0, 0]) / pixel, estimate.edge_shading[edges.tube]
+    )
     for s, j in np.ndindex(len(few), n_legs):
         mine = (edges.station == s) & (edges.leg == j) & (estimate.edge_weights > 0.5)
         sigma[s, j] = np.median(across[mine]) if mine.any() else np.nan
@@ -222,12 +227,12 @@ def _told(
     return FirstEdges(estimate, pools, sigma, by_station)
 
 
-def _pools(told: Array, length: Array, expected: Booleans, kind: Integers) -> Pools:
+def _pools(told: Array, length: Array, expected: Booleans, kind: Integers, shading: Array) -> Pools:
     """What edges of a station may tell, by edge (E,): its tube's own, and that of all of its kind.
 
     told : (K, E, 2, 2), zero where lost; length : (K, E), px; expected : (K, E). kind : (E, 2) tube
-    and side. Edges differ: a mean would promise more than edges of which some tell much and others
-    nothing.
+    and side. shading : (E,) px. Edges differ: a mean would promise more than edges of which some
+    tell much and others nothing.
     """
     out: list[EdgePool] = []
     for e in range(told.shape[1]):
@@ -241,6 +246,7 @@ def _pools(told: Array, length: Array, expected: Booleans, kind: Integers) -> Po
                 np.concatenate([told[mine, e], told[:, alike][like]]),
                 weight,
                 np.concatenate([length[mine, e], length[:, alike][like]]),
+                float(shading[e]),
             )
         )
     return tuple(out)
@@ -254,6 +260,7 @@ def drawn_edges(
     """
     tubes = tubes_of(machine)
     own, length = np.zeros((len(edges), 2, 2)), pixel_lengths(edges)
+    shading = edges.shading.copy()
     for e in range(len(tubes)):
         alike = (edges.leg == tubes.leg[e]) & (edges.tube == tubes.tube[e])
         alike &= edges.side == tubes.side[e]
@@ -261,6 +268,7 @@ def drawn_edges(
             mine, pool = np.flatnonzero(alike & (edges.station == s)), station[e]
             if not len(pool.told) or not mine.size:
                 continue
+            shading[mine] = pool.shading
             chance = pool.chances(length[mine])
             if rng is None:
                 own[mine] = np.tensordot(chance, pool.told, axes=1)
@@ -268,7 +276,7 @@ def drawn_edges(
                 drawn = rng.random((len(mine), 1)) > np.cumsum(chance, axis=1)
                 own[mine] = pool.told[np.minimum(drawn.sum(axis=1), len(pool.told) - 1)]
     told = np.linalg.eigvalsh(own)[:, 0] > 0
-    edges, own = edges.select(told), own[told]
+    edges, own = replace(edges, shading=shading).select(told), own[told]
     unit = pixel_turns(edges)
     return replace(edges, covariance=unit @ np.linalg.inv(own) @ unit.mT)
 

@@ -149,18 +149,22 @@ def information_of(
     work: Array,
     known: Known | None = None,
     rng: np.random.Generator | None = None,
+    wanted: int | None = None,
 ) -> CandidateRows:
     """Rows of all candidates; see the module.
 
     work : T_base_platform (M, 4, 4) where the tool counts. known : what an earlier calibration
     knows of the machine, in place of its drawing. rng : as for
-    :meth:`~pkmcal.planning.rig.Instrument.measure`. Raises InputError where a group of stations
-    measures nothing at any configuration.
+    :meth:`~pkmcal.planning.rig.Instrument.measure`. wanted : how many of each group are to be
+    measured in the end, all by default: edges that are shaded alike count together. Raises
+    InputError where a group of stations measures nothing at any configuration.
     """
     machine, joints, poses = rig.machine, candidates.joints, candidates.T_base_platform
     measurements = rig.measured(joints, poses, candidates.pairs, rng)
     _check_seen(rig, candidates, measurements)
-    assembled, state = rig.assembled(measurements, poses)
+    each = len(joints) / len(candidates.groups)
+    share = 1.0 if wanted is None or each < 2 else min((wanted - 1) / (each - 1), 1.0)
+    assembled, state = rig.assembled(measurements, poses, share)
     problem = assembled.problem
     way, u = directions(machine, problem), problem.unknowns
     reduced = eliminate(problem.linearize(state), np.zeros(1)).rows[0]

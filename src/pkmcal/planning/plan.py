@@ -228,7 +228,8 @@ class _Making:
 
     def pool(self, candidates: Candidates, rng: np.random.Generator | None = None) -> _Pool:
         """Candidates with what they tell; rng : as of :func:`information_of`."""
-        return _Pool(candidates, information_of(self.rig, candidates, self.work, self.known, rng))
+        rig, work, known = self.rig, self.work, self.known
+        return _Pool(candidates, information_of(rig, candidates, work, known, rng, self.count))
 
     def chosen(self, pool: _Pool, rng: np.random.Generator, told: Told) -> Candidates:
         """The best of a pool, bettered about where they are."""

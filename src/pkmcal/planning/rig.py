@@ -253,11 +253,14 @@ class Rig:
         )
 
     def assembled(
-        self, measurements: Measurements, T_base_platform: Array
+        self, measurements: Measurements, T_base_platform: Array, share: float = 1.0
     ) -> tuple[Assembled, BatchState]:
-        """The joint estimate's problem of these measurements, at the true state."""
-        machine = self.machine
-        assembled = assemble(machine, measurements, default_gauge(machine), shading=self.shading)
+        """The joint estimate's problem of these measurements, at the true state. share : as of
+        :func:`~pkmcal.identify.assembly.assemble`.
+        """
+        machine, shading = self.machine, self.shading
+        gauge = default_gauge(machine)
+        assembled = assemble(machine, measurements, gauge, shading=shading, share=share)
         state = State(
             machine.values,
             self.T_station_base,

@@ -46,7 +46,7 @@ from pkmcal.identify.start import mean_pose
 from pkmcal.identify.tool import pose_by_parameters, without_frames
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.identify.verdict import TOO_NOISY
-from pkmcal.measurements import SHADING_SIGMA
+from pkmcal.measurements import ALIKE, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import forward
@@ -60,6 +60,9 @@ from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 ESTIMATE: Key = ("joint",)
 BATCH = 10
 """Runs that are solved at once, and that share a plan of photographs."""
+NEAR = 1e-9
+"""Of a variance, what two edges with the same normal are shaded by each for itself; a covariance of
+equal rows has no root."""
 ROUGH = np.repeat([np.deg2rad(1.0), 0.01], 3)
 """rad and m, standard deviations by which stations start off: so far is what a search for the drawn
 machine in photographs leaves, as the drawing's own errors do."""
@@ -391,15 +394,14 @@ def _measured_edges(
     line = blocks.line[at.row, at.place]
     lines = rng.standard_normal((runs, int(line.max(initial=0)) + 1))
     alone = rng.standard_normal((runs, n))
-    shaded = design.shading * np.where(line < 0, alone, lines[:, line])
+    own = OWN_SHADING / SHADING_SIGMA * _own(line, normal[0], rng, runs)
+    shaded = design.shading * (np.where(line < 0, alone, lines[:, line]) + own)
     turn = by_shift * (error[0] + outward + shaded)[..., None] + by_tilt * error[1][..., None]
     normal = normal + (basis @ turn[..., None])[..., 0]
     normal = normal / np.sqrt(dot(normal, normal))[..., None]
     basis = tangent_basis(normal, first)
     parts = design.edge_noise * np.stack([by_shift, by_tilt], axis=-1)
-    known = np.where(line < 0, SHADING_SIGMA, 0.0)[:, None] * by_shift
-    covariance = parts @ parts.mT + known[..., :, None] * known[..., None, :]
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    whiten = np.linalg.inv(np.linalg.cholesky(parts @ parts.mT))
 
     def placed(values: Array) -> Array:
         return np.moveaxis(at.filled(np.moveaxis(values, 0, 1)), 2, 0)
@@ -407,9 +409,23 @@ def _measured_edges(
     return replace(
         one.problem.data,
         basis=placed(basis)[:, :, :, None],
-        whiten=placed(whiten),
+        white=placed(whiten),
         optics=placed(by_shift[..., None]),
     )
+
+
+def _own(line: Integers, normal: Array, rng: np.random.Generator, runs: int) -> Array:
+    """What edges (n,) are shaded by one by one, of unit variance, (runs, n): alike where normals
+    (n, 3) of the same line are near.
+    """
+    out = rng.standard_normal((runs, len(line)))
+    for number in range(int(line.max(initial=-1)) + 1):
+        own = np.flatnonzero(line == number)
+        angle = np.arccos(np.clip(normal[own] @ normal[own].T, -1, 1))
+        out[:, own] = (
+            out[:, own] @ np.linalg.cholesky(np.exp(-angle / ALIKE) + NEAR * np.eye(len(own))).T
+        )
+    return out
 
 
 def _measured_boards(

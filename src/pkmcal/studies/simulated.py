@@ -158,11 +158,11 @@ def joint_problem(
         axis = data.axis.reshape(len(data.axis), -1, 4)
         radius = machine.parameters.drawing[blocks.radius[at.row, at.place]]
         found = as_edges(axis, data.noise.axis, np.broadcast_to(radius, axis.shape[:-1]))
-        basis, whiten = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in found)
-        basis[:, at.row, at.place], whiten[:, at.row, at.place] = found
+        basis, white = (np.zeros((len(axis), *at.shape, *part.shape[2:])) for part in found)
+        basis[:, at.row, at.place], white[:, at.row, at.place] = found
         blocks = replace(blocks, side=np.broadcast_to([0, 1], (*at.shape, 2)))
         none = np.zeros((1, *at.shape, 4, 1))
-        numbers = replace(numbers, basis=basis, whiten=whiten, optics=none)
+        numbers = replace(numbers, basis=basis, white=white, optics=none)
     poses = one.pose_data
     if data.view.T_platform_board is not None:
         poses = replace(poses, T_station_target=data.T_camera_board[:, :n, None])

@@ -1,0 +1,229 @@
+"""The edges' noise as the data show it: a scale, a shading and how heavy its tails are.
+
+What the profiles of an edge scatter by is stated with it, C. On real surfaces that is not what it
+is wrong by: within an edge the points agree better than their profiles promise, while a highlight
+or something mirrored moves an edge as a whole, some far more than others. So the errors of the
+edges of one tube (first, second, ... of all legs) have Student's distribution with the covariance
+
+    scale^2 C + shading^2 s s^T,      s the change of the normal by a pixel outward,
+
+and as many degrees of freedom as they show. All three are found by restricted maximum likelihood:
+what the unknowns have taken up of an edge's residual is added to its square, by the hat matrix. An
+edge then counts by its weight (Lange, Little, Taylor 1989), and the information of Student's
+distribution is what the covariance of the result is made of.
+
+What one edge alone is shaded by is not its own: edges of a line whose normals are near are moved
+alike (:func:`pkmcal.identify.assembly.crowd`), so its variance counts times their number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array
+from pkmcal.identify.covariance import UNKNOWN, Information
+from pkmcal.identify.problem import Problem
+from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
+from pkmcal.solver import divisions, normal_root
+
+PAIR = 2
+"""Numbers that an edge measures."""
+TAILS = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
+"""Degrees of freedom that are tried: the last is as good as the normal distribution."""
+STATED = 5.0
+"""Edges that the stated noise is worth when their own is found."""
+ROUNDS = 60
+ENOUGH = 1e-4
+"""Relative change of a variance below which it counts as found."""
+LARGEST = 4.0
+"""Largest factor on a variance in one round."""
+TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class EdgeScatter:
+    """The noise of the edges of T tubes in B runs; see the module.
+
+    scale : (B, T) factor on the stated standard deviations. shading : (B, T) px. tails : (B, T)
+    degrees of freedom. The standard deviations are such that normal errors with them would be worth
+    as much as these are.
+    """
+
+    scale: Array
+    shading: Array
+    tails: Array
+
+    @classmethod
+    def stated(cls, n_runs: int, problem: Problem) -> EdgeScatter:
+        """What edges are given with."""
+        full = (n_runs, max(map(len, problem.layout.radius), default=0))
+        return cls(np.ones(full), np.full(full, OWN_SHADING), np.full(full, TAILS[-1]))
+
+    def trust(self, problem: Problem, square: Array) -> Array:
+        """By how much more or less each edge counts than on average, (B, K, G), where the squares
+        of its whitened residuals are (B, K, G).
+        """
+        tails = self.tails[:, problem.blocks.tube]
+        return (tails + PAIR) / (tails + square * worth(tails))
+
+    def squares(self, problem: Problem, rows: Array) -> Array:
+        """Squares (B, K, G) of the edges' rows (B, K, r) in use, trust included, as large as those
+        of normal errors.
+        """
+        pairs = rows.reshape(*rows.shape[:2], -1, PAIR)
+        return np.sum(pairs**2, axis=-1) * worth(self.tails)[:, problem.blocks.tube]
+
+    def factor(self, problem: Problem, weight: Array) -> Array:
+        """What edges with weights (B, K, G) scatter by on average, in times of what they are stated
+        with, (B,); 1 of none.
+        """
+        if not problem.blocks.crowd.size:
+            return np.ones(len(self.scale))
+        size = np.sum(problem.data.by_shift**2, axis=-1)
+        scale, shading = (part[:, problem.blocks.tube] for part in (self.scale, self.shading))
+        along = (scale**2 + shading**2 * size) / (1 + OWN_SHADING**2 * size)
+        square = np.sum(weight * (along + scale**2) / 2, axis=(1, 2))
+        count = np.sum(weight, axis=(1, 2))
+        return np.sqrt(np.where(count > 0, square / np.maximum(count, TINY), 1.0))
+
+    def close_to(self, other: EdgeScatter, share: float) -> bool:
+        """Whether its deviations are another's up to a share, and its tails the same."""
+        pairs = ((self.scale, other.scale), (self.shading, other.shading))
+        change = [np.abs(new / old - 1).max(initial=0.0) for new, old in pairs]
+        return max(change) < share and bool(np.all(self.tails == other.tails))
+
+    def beyond(self, before: EdgeScatter, pace: float) -> EdgeScatter:
+        """Deviations as many times as far from another's, with these tails."""
+        scale = before.scale * (self.scale / before.scale) ** pace
+        shading = before.shading * (self.shading / before.shading) ** pace
+        return replace(self, scale=scale, shading=np.maximum(shading, OWN_SHADING))
+
+    def applied(self, problem: Problem) -> Problem:
+        """The problem with edges of this noise."""
+        blocks = problem.blocks
+        alone = np.where(blocks.line < 0, SHADING_SIGMA, 0.0)
+        own = np.hypot(self.shading[:, blocks.tube] * np.sqrt(blocks.crowd), alone)
+        return replace(
+            problem, data=replace(problem.data, scale=self.scale[:, blocks.tube], own=own)
+        )
+
+
+def worth(tails: Array) -> Array:
+    """The variance of normal errors that tell as much as those of Student's distribution of pairs,
+    over the square of its scale.
+    """
+    return (tails + PAIR + 2) / (tails + PAIR)
+
+
+def edge_noise(
+    info: Information, weight: Array, before: EdgeScatter, *, same_tails: bool = False
+) -> EdgeScatter:
+    """The edges' noise that a solution shows.
+
+    weight : (B, K, G) of edges, 0..1, their trust left out; those of 0 do not belong to the machine
+    and tell nothing. before : where the search begins, whose tails are kept where that is asked.
+    """
+    along, rest, size = _squares(info)
+    tube, found = info.problem.blocks.tube, []
+    for number in range(before.scale.shape[1]):
+        own = info.problem.kinds.edges.present & (tube == number)
+        parts = (np.broadcast_to(x, along.shape)[:, own] for x in (along, rest, size, weight))
+        scale, shading = before.scale[:, number], before.shading[:, number]
+        tails = before.tails[None, :, number] if same_tails else TAILS[:, None]
+        found.append(_student(*parts, scale, shading, tails))
+    scale, shading, tails = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
+    return EdgeScatter(scale, shading, tails)
+
+
+def _squares(info: Information) -> tuple[Array, Array, Array]:
+    """Squares expected of the edges' errors, in their stated noise, (B, K, G) each: along what a
+    shift outward does, and across; and the square of that shift by a pixel.
+    """
+    problem, rows = info.problem, info.problem.kinds.edges.rows
+    half = normal_root(info.by_kind.every + problem.prior.T @ problem.prior, UNKNOWN, loose=False)
+    n_runs, n_rows = len(half), problem.n_rows
+    squares = []
+    for cut in divisions(info.state.T_base_platform.shape[1], n_rows * n_runs):
+        part = Information(problem.among(cut), problem.state_among(info.state, cut))
+        data, reduced = part.problem.data, part.reduced
+        v, value = data.by_shift, part.linear.value[..., rows, None]
+        norm = np.sqrt(np.sum(v**2, axis=-1, keepdims=True))
+        unit = np.where(norm > 0, v / np.where(norm > 0, norm, 1.0), [1.0, 0.0])
+        unit = np.stack([unit, unit[..., ::-1] * [-1.0, 1.0]], axis=-2)
+        taken = reduced.q[..., rows, :], reduced.rows[..., rows, :] @ half[:, None]
+        parts = []
+        for columns in (value, *taken):
+            pairs = columns.reshape(*columns.shape[:2], -1, PAIR, columns.shape[-1])
+            parts.append(np.sum((unit @ pairs) ** 2, axis=-1))
+        parts = sum(parts)
+        size = np.sum(v**2, axis=-1)
+        weight = np.where(data.weight > 0, data.weight, 1.0)
+        squares.append(
+            np.stack(
+                [
+                    parts[..., 0] * (data.scale**2 + data.own**2 * size) / weight,
+                    parts[..., 1] * data.scale**2 / weight,
+                    np.broadcast_to(size, parts.shape[:-1]),
+                ]
+            )
+        )
+    along, rest, size = np.concatenate(squares, axis=2)
+    return along, rest, size
+
+
+def _student(
+    along: Array,
+    rest: Array,
+    size: Array,
+    weight: Array,
+    scale: Array,
+    shading: Array,
+    tried: Array,
+) -> tuple[Array, Array, Array]:
+    """Scale, shading and tails (B,) of n edges, all (B, n), by their likelihood.
+
+    scale, shading : (B,) where the search begins. tried : (V, B or 1) tails; for each of them
+    weights and the two variances in turns: with fixed weights these are components of the variances
+    of two normal variables, a step of Fisher's scoring each.
+    """
+    from scipy.special import gammaln
+
+    tails, norm = tried[..., None], worth(tried)
+    a = scale**2 / norm
+    b = np.broadcast_to(shading**2 / norm, a.shape)
+    for _ in range(ROUNDS):
+        s, t = a[..., None] + b[..., None] * size, a[..., None]
+        trust = (tails + PAIR) / (tails + along / s + rest / t)
+        left, of_s = trust * along - s, weight / s**2
+        of_t = np.sum(weight, axis=-1) / a**2 + STATED / a**2
+        # the stated noise counts as some edges more
+        by_a = np.sum(left * of_s, axis=-1) + (STATED * (1 - a)) / a**2
+        by_a += np.sum(weight * (trust * rest - t), axis=-1) / a**2
+        by_b = np.sum(left * of_s * size, axis=-1)
+        aa, ab = np.sum(of_s, axis=-1) + of_t, np.sum(of_s * size, axis=-1)
+        bb = np.sum(of_s * size**2, axis=-1) + TINY
+        det = aa * bb - ab**2
+        det = np.where(det > TINY * aa * bb, det, np.inf)
+        new_a, new_b = a + (bb * by_a - ab * by_b) / det, b + (aa * by_b - ab * by_a) / det
+        least = OWN_SHADING**2 / norm
+        # a shading at its least is known: the scale goes on alone
+        new_a = np.where(new_b > least, new_a, a + (by_a + (b - least) * ab) / aa)
+        new_a = np.clip(new_a, a / LARGEST, a * LARGEST)
+        new_b = np.maximum(np.clip(new_b, b / LARGEST, b * LARGEST), least)
+        change = max(np.abs(new_a / a - 1).max(), np.abs(new_b / b - 1).max())
+        a, b = new_a, new_b
+        if change < ENOUGH:
+            break
+    s, t = a[..., None] + b[..., None] * size, a[..., None]
+    distance = along / s + rest / t
+    cost = np.sum(
+        weight * (np.log(s * t) + (tails + PAIR) * np.log1p(distance / tails)) / 2, axis=-1
+    )
+    constant = gammaln((tried + PAIR) / 2) - gammaln(tried / 2) - PAIR / 2 * np.log(tried)
+    cost = cost - constant * np.sum(weight, axis=-1)
+    best, run = np.argmin(cost, axis=0), np.arange(len(scale))
+    factor = (norm * np.ones_like(a))[best, run]
+    found = np.broadcast_to(tried, a.shape)[best, run]
+    return np.sqrt(factor * a[best, run]), np.sqrt(factor * b[best, run]), found
