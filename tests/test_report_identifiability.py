@@ -29,14 +29,14 @@ def findings_of(scene, *views):
 
 
 def make_estimate_stub():
-    from pkmcal.identify.estimate import Estimate, Statistics
+    from pkmcal.identify.estimate import Estimate, Statistics, TubeNoise
 
     none = np.zeros(0)
     statistics = Statistics(0, 0, 0, 0, 0, 0, 0, 0, 0, "", 1.0)
     empty = load_mechanism("gough-stewart")
     return Estimate(
-        empty, make("gough-stewart", n=1).state(), none, none, none, none, none, none, none,
-        statistics, "",
+        empty, make("gough-stewart", n=1).state(), none, none, none, none,
+        TubeNoise(none, none, none), none, none, none, none, statistics, "",
     )  # fmt: skip
 
 

@@ -222,7 +222,8 @@ def _edge_noise(estimate: Estimate) -> list[dict[str, Any]]:
     """One entry for each tube of a leg, from 1: what its edges scatter by."""
     if not estimate.edge_weights.size:
         return []
-    rows = zip(estimate.edge_scale, estimate.edge_shading, estimate.edge_tails, strict=True)
+    found = estimate.edge_noise
+    rows = zip(found.scale, found.shading, found.tails, strict=True)
     return [
         {"tube": k, "scale": scale, "shading": shading, "tails": tails}
         for k, (scale, shading, tails) in enumerate(rows, start=1)

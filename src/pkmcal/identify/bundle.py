@@ -24,7 +24,7 @@ from pkmcal.identify.covariance import (
     machine_covariance,
 )
 from pkmcal.identify.edge_noise import EdgeScatter, edge_noise
-from pkmcal.identify.estimate import Estimate, State, Statistics
+from pkmcal.identify.estimate import Estimate, State, Statistics, TubeNoise
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.kinds import EDGES, POSES, READINGS
 from pkmcal.identify.noise import FEWEST, Components, components, counts
@@ -400,9 +400,11 @@ def _estimate(
         edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
         edge_residuals=residuals.edges,
         edge_weights=weights.edges,
-        edge_scale=result.edges.scale[0] * result.scale.edges[0],
-        edge_shading=result.edges.shading[0],
-        edge_tails=result.edges.tails[0],
+        edge_noise=TubeNoise(
+            result.edges.scale[0] * result.scale.edges[0],
+            result.edges.shading[0],
+            result.edges.tails[0],
+        ),
         edge_trust=assembled.places.edges.taken(result.trust[0]),
         joint_residuals=joints,
         data_share=data_share(machine, state.theta, full, gauge),

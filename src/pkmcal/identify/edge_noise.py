@@ -129,10 +129,10 @@ def edge_noise(
     tube, found = info.problem.blocks.tube, []
     for number in range(before.scale.shape[1]):
         own = info.problem.kinds.edges.present & (tube == number)
-        parts = (np.broadcast_to(x, along.shape)[:, own] for x in (along, rest, size, weight))
-        scale, shading = before.scale[:, number], before.shading[:, number]
+        begin = before.scale[:, number], before.shading[:, number]
         tails = before.tails[None, :, number] if same_tails else TAILS[:, None]
-        found.append(_student(*parts, scale, shading, tails))
+        squares = along[:, own], rest[:, own], size[:, own]
+        found.append(_student(*squares, weight[:, own], *begin, tails))
     scale, shading, tails = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
     return EdgeScatter(scale, shading, tails)
 
@@ -153,22 +153,15 @@ def _squares(info: Information) -> tuple[Array, Array, Array]:
         unit = np.where(norm > 0, v / np.where(norm > 0, norm, 1.0), [1.0, 0.0])
         unit = np.stack([unit, unit[..., ::-1] * [-1.0, 1.0]], axis=-2)
         taken = reduced.q[..., rows, :], reduced.rows[..., rows, :] @ half[:, None]
-        parts = []
+        square = np.zeros((*value.shape[:2], v.shape[2], PAIR))
         for columns in (value, *taken):
             pairs = columns.reshape(*columns.shape[:2], -1, PAIR, columns.shape[-1])
-            parts.append(np.sum((unit @ pairs) ** 2, axis=-1))
-        parts = sum(parts)
+            square += np.sum((unit @ pairs) ** 2, axis=-1)
         size = np.sum(v**2, axis=-1)
         weight = np.where(data.weight > 0, data.weight, 1.0)
-        squares.append(
-            np.stack(
-                [
-                    parts[..., 0] * (data.scale**2 + data.own**2 * size) / weight,
-                    parts[..., 1] * data.scale**2 / weight,
-                    np.broadcast_to(size, parts.shape[:-1]),
-                ]
-            )
-        )
+        along = square[..., 0] * (data.scale**2 + data.own**2 * size) / weight
+        rest = square[..., 1] * data.scale**2 / weight
+        squares.append(np.stack([along, rest, np.broadcast_to(size, along.shape)]))
     along, rest, size = np.concatenate(squares, axis=2)
     return along, rest, size
 

@@ -99,6 +99,21 @@ class Statistics:
 
 
 @dataclass(frozen=True)
+class TubeNoise:
+    """What the edges of each of a leg's T tubes scatter by, :mod:`pkmcal.identify.edge_noise`.
+
+    scale : (T,) factor on their stated noise. shading : (T,) px, what they are shaded by one by
+    one. tails : (T,) degrees of freedom of their distribution.
+    """
+
+    scale: Array
+    shading: Array
+    tails: Array
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True)
 class Estimate:
     """An identification's result, in the frames that ``gauge`` names.
 
@@ -108,11 +123,9 @@ class Estimate:
         perturbation of T_camera_base and T_mount.
     edge_shift_sigma : (C,) px. intrinsics_covariance : (C, n, n) of the cameras' intrinsics
     after refinement; n = 0 where they were held.
-    edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1. edge_scale : (T,)
-    factor on the stated noise of the edges of each tube of a leg, edge_shading : (T,) px, what they
-    are shaded by one by one, edge_tails : (T,) degrees of freedom of their distribution and
-    edge_trust : (N,) by how much more or less than on average each counts for it, see
-    :mod:`pkmcal.identify.edge_noise`.
+    edge_residuals : (N, 2) whitened. edge_weights : (N,) robust weights 0..1. edge_noise : of each
+    tube of a leg; edge_trust : (N,) by how much more or less than on average each edge counts for
+    its tails, see :mod:`pkmcal.identify.edge_noise`.
     joint_residuals : (K, m) in standard deviations.
     data_share : (P,) 1 - posterior variance / drawing variance in the same gauge: near 1, the
         data decide; near 0, the value is the drawing's.
@@ -132,9 +145,7 @@ class Estimate:
     edge_shift_sigma: Array
     edge_residuals: Array
     edge_weights: Array
-    edge_scale: Array
-    edge_shading: Array
-    edge_tails: Array
+    edge_noise: TubeNoise
     edge_trust: Array
     joint_residuals: Array
     data_share: Array
@@ -157,8 +168,9 @@ class Estimate:
         data show it; what each edge counts besides is ``edge_trust``.
         """
         scale, edges = self.statistics.reading_scale, measurements.edges
-        covariance = edges.covariance * self.edge_scale[edges.tube, None, None] ** 2
-        edges = replace(edges, covariance=covariance, shading=self.edge_shading[edges.tube])
+        found = self.edge_noise
+        covariance = edges.covariance * found.scale[edges.tube, None, None] ** 2
+        edges = replace(edges, covariance=covariance, shading=found.shading[edges.tube])
         noise = measurements.joint_noise * scale
         return replace(measurements, edges=edges, joint_noise=noise)
 

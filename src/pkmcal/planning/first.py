@@ -202,7 +202,7 @@ def _told(
     kept &= expected
     unit = np.zeros((*shape, 2, 2))
     unit[place(ideal)] = pixel_turns(ideal)
-    scale = estimate.edge_scale[edges.tube]
+    scale = estimate.edge_noise.scale[edges.tube]
     weight = estimate.edge_weights * estimate.edge_trust / scale**2
     own = unit[place(edges)]
     told = np.zeros((*shape, 2, 2))  # lost edges stay zero
@@ -210,12 +210,12 @@ def _told(
     kind = np.stack([tubes.tube, tubes.side], axis=1)
     long = np.ones(shape)
     long[place(ideal)] = pixel_lengths(ideal)
-    own_shading = estimate.edge_shading[tubes.tube]
+    own_shading = estimate.edge_noise.shading[tubes.tube]
     pools = tuple(_pools(told[s], long[s], expected[s], kind, own_shading) for s in range(len(few)))
     sigma = np.full((len(few), n_legs), np.nan)
     pixel = np.linalg.norm(edges.shift, axis=-1)
     across = np.hypot(
-        scale * np.sqrt(edges.covariance[:, 0, 0]) / pixel, estimate.edge_shading[edges.tube]
+        scale * np.sqrt(edges.covariance[:, 0, 0]) / pixel, estimate.edge_noise.shading[edges.tube]
     )
     for s, j in np.ndindex(len(few), n_legs):
         mine = (edges.station == s) & (edges.leg == j) & (estimate.edge_weights > 0.5)
