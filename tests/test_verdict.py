@@ -130,6 +130,16 @@ def test_the_share_of_the_drawings_error_decides(whole):
     assert verdict(*[sentence(50 * least, str(k), matters=False) for k in range(4)]).usable
 
 
+def test_what_is_open_does_not_refuse_a_result_that_is_worse_anyhow(whole):
+    """Few photographs: the deviation says it, and what is open is a small part of it."""
+    observation, estimate, findings, _ = whole
+    open_ = (sentence(2 * LEFT_OPEN * findings.by_drawing),)
+    findings = replace(findings, unidentified=open_)
+    assert not judge(observation, estimate, findings=findings).usable
+    unsure = replace(estimate, joint_covariance=1e4 * estimate.joint_covariance)
+    assert judge(observation, unsure, findings=findings).usable
+
+
 def test_what_the_drawing_knows_better_counts_where_a_value_is_undecided(whole):
     observation, estimate, findings, _ = whole
     name = "legs[3].length.offset"

@@ -33,7 +33,8 @@ TOO_MANY_LOST = 0.4
 LEFT_OPEN = 0.05
 """Share of the platform's error by the drawing that may be left undecided. A calibration makes the
 drawing's error twenty to fifty times smaller; what leaves a twentieth of it would be the result's
-largest error, and one that more of the same photographs do not shrink."""
+largest error, and one that more of the same photographs do not shrink; a result whose deviation is larger
+anyway is no worse for it."""
 MOSTLY = 0.5
 """Share of configurations near a singular pose from which on nothing said here can be trusted."""
 LARGE = 0.3
@@ -330,7 +331,9 @@ def _left_open(
     weak = tuple(s for s in findings.weak if s.matters and undecided & set(s.parameters))
     open_ = findings.unidentified + weak
     total = float(np.sqrt(sum(s.moves_platform**2 for s in open_ if s.matters)))
-    if total <= LEFT_OPEN * findings.by_drawing:
+    # where all else makes more of the deviation that was reached, that says enough
+    of_all_else = np.sqrt(max(_platform_sigma(estimate) ** 2 - total**2, 0.0))
+    if total <= max(LEFT_OPEN * findings.by_drawing, of_all_else):
         return (), open_
     least = min(LARGE * total, max(s.moves_platform for s in open_))
     large = tuple(s for s in open_ if s.matters and s.moves_platform >= least)
@@ -379,7 +382,7 @@ def _warnings(observation: Observation, estimate: Estimate, held_out: int) -> li
     if estimate.statistics.noise_scale > 1.5:
         out.append(
             f"The edges scatter {estimate.statistics.noise_scale:.1f} times more than their"
-            " profiles promise; all standard deviations are enlarged by as much."
+            " profiles promise; their deviations, and with them all others, are enlarged."
         )
     return out
 
