@@ -33,8 +33,8 @@ TOO_MANY_LOST = 0.4
 LEFT_OPEN = 0.05
 """Share of the platform's error by the drawing that may be left undecided. A calibration makes the
 drawing's error twenty to fifty times smaller; what leaves a twentieth of it would be the result's
-largest error, and one that more of the same photographs do not shrink; a result whose deviation is larger
-anyway is no worse for it."""
+largest error, and one that more of the same photographs do not shrink. A result whose deviation is
+larger anyway is no worse for it."""
 MOSTLY = 0.5
 """Share of configurations near a singular pose from which on nothing said here can be trusted."""
 LARGE = 0.3
