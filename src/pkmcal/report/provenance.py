@@ -30,6 +30,8 @@ MODEL_ERROR = Markup(
     " lens that its file does not describe. Photographs that the calibration has not seen are the"
     " test for those."
 )
+NORMAL = 50
+"""Degrees of freedom from which on a Student distribution is told as the normal one."""
 MOST_CASES = 400
 """Cases listed for one reason; calibration.json has all of them."""
 
@@ -133,6 +135,8 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     """(what, value) of everything that the result depends on besides the photographs."""
     s = estimate.statistics
     tolerance = session.machine.document.tolerance
+    noise = estimate.edge_noise
+    tubes = zip(noise.scale, noise.shading, noise.tails, strict=True)
     return (
         ("Session", session.folder.name),
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
@@ -167,6 +171,15 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
                 ("readings", s.reading_scale, s.n_joints),
             )
             if n
+        ),
+        *(
+            (
+                f"Edges of tube {k}",
+                f"{number(scale, 2)} times the stated noise, and {number(shading, 3)} px by shading"
+                + (f"; tails as of {tails:g} degrees of freedom" if tails < NORMAL else ""),
+            )
+            for k, (scale, shading, tails) in enumerate(tubes, start=1)
+            if s.n_edges
         ),
         *(
             (f"What the data allow of the {name}' stated noise", f"{_between(limits)} times")
