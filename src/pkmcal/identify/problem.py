@@ -424,8 +424,13 @@ class Problem:
         return out
 
     def unweighted(self, state: BatchState) -> Kinds[Array]:
-        """Whitened residuals of each kind of measurement without their weights, (B, K, G, n)."""
+        """Residuals of each kind, (B, K, G, n), in the deviations that each measurement has by
+        itself: without weights, and without what edges that are shaded alike count for together.
+        """
         plain = self.weighted(Kinds(*(kind.present[None].astype(float) for kind in self.kinds)))
+        if self.blocks.crowd.size:
+            crowd = np.where(self.blocks.present, self.blocks.crowd, 1.0)
+            plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
         edges = plain._edges(state, plain.closure(state))
         return Kinds(edges.value(state), plain._poses(state).value)
 
