@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import run
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
 from pkmcal.identify.bundle import bundle

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.check.check import Level, check_session
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, yaml_text

@@ -24,7 +24,7 @@ from pkmcal.session.photographs import Photograph, label_of
 
 if TYPE_CHECKING:
     from pkmcal.boards.board import Board, Detection
-    from pkmcal.calibration.results import SavedCalibration
+    from pkmcal.calibration.saved import SavedCalibration
     from pkmcal.observe.stations import StationView
 
 KEPT = 16
@@ -131,7 +131,7 @@ class Viewed:
     @cached_property
     def saved(self) -> SavedCalibration:
         """The calibration. Raises InputError where there is none, or it is another session's."""
-        from pkmcal.calibration.results import load
+        from pkmcal.calibration.saved import load
 
         if self.calibration is None:
             raise InputError(
