@@ -20,7 +20,7 @@ from rendered import once
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
-    from pkmcal.check.check import SessionCheck
+    from pkmcal.check.checked import SessionCheck
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,11 @@ from pkmcal.calibration.recognise import (
     recognise,
     station_poses,
 )
-from pkmcal.check.check import Level, check_session
+from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import apply, inverse, pose, pose_difference, rotation
 from pkmcal.mechanisms import load_mechanism
+from pkmcal.outcome import Level
 from pkmcal.session.load import load_session
 from pkmcal.simulation import board_for, load_truth
 from pkmcal.simulation.board import SIZE, board_from_fields

@@ -10,7 +10,7 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.check.check import Level, check_session
+from pkmcal.check.check import check_session
 from pkmcal.check.repeats import (
     Cylinders,
     _findings,
@@ -37,6 +37,7 @@ from pkmcal.observe.repeats import (
     repeat_scatter,
     same_edges,
 )
+from pkmcal.outcome import Level
 from pkmcal.papers.axis_measurements import to_coordinates
 from pkmcal.session.load import load_session
 from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges
