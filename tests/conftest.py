@@ -133,6 +133,15 @@ def checked(demo) -> Checked:
     return Checked(found, told)
 
 
+@pytest.fixture(scope="module")
+def quick_plans():
+    """Plans chosen among few candidates, where how good they are is not the question."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pkmcal.planning.plan.CANDIDATES", 60)
+        patch.setattr("pkmcal.planning.plan.AT_WORK", 20)
+        yield
+
+
 @pytest.fixture
 def session(demo, tmp_path) -> Path:
     """A copy of the demonstration's session, to spoil; without its truth."""

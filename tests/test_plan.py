@@ -275,14 +275,6 @@ def test_barred_steps_are_avoided():
 # ------------------------------------------------------------------ the command
 
 
-@pytest.fixture(scope="module")
-def quick_plans():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.planning.plan.CANDIDATES", 60)
-        patch.setattr("pkmcal.planning.plan.AT_WORK", 20)
-        yield
-
-
 def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):
     session = tmp_path / "session"
     shutil.copytree(demo.session, session)
