@@ -20,7 +20,7 @@ from rendered import once
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
-    from pkmcal.check.check import SessionCheck
+    from pkmcal.check.checked import SessionCheck
 
 
 @dataclass(frozen=True)
@@ -131,6 +131,15 @@ def checked(demo) -> Checked:
     told: list[tuple[float, str]] = []
     found = check_session(demo.session, progress=lambda text, share: told.append((share, text)))
     return Checked(found, told)
+
+
+@pytest.fixture(scope="module")
+def quick_plans():
+    """Plans chosen among few candidates, where how good they are is not the question."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pkmcal.planning.plan.CANDIDATES", 60)
+        patch.setattr("pkmcal.planning.plan.AT_WORK", 20)
+        yield
 
 
 @pytest.fixture

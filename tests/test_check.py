@@ -11,17 +11,12 @@ import pytest
 from conftest import run
 from pkmcal.calibration.numbering import equal_numberings, numbering_told
 from pkmcal.check import check
-from pkmcal.check.check import (
-    JointCheck,
-    Level,
-    StationCheck,
-    _kinematics,
-    _station_findings,
-    check_session,
-    joint_findings,
-)
+from pkmcal.check.check import _kinematics, check_session
+from pkmcal.check.checked import JointCheck, StationCheck
+from pkmcal.check.words import joint_findings, station_findings
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.region import Region, poses_in
+from pkmcal.outcome import Level
 from pkmcal.session.load import load_session
 
 GOOD = StationCheck("front", 15, True, 0.2, 0.04, 0.08, 5.5, 0.05, 0.01, 0.8)
@@ -181,7 +176,7 @@ def test_readings_that_the_drawing_cannot_take(session, x, where, said):
     ],
 )
 def test_a_stations_findings(station, said):
-    found = _station_findings(station, 6)
+    found = station_findings(station, 6)
     assert (said is None and not found) or (len(found) == 1 and said in found[0].text)
 
 

@@ -15,8 +15,9 @@ import yaml
 import pkmcal.report
 from conftest import run
 from pkmcal.check import advice as words
-from pkmcal.check.check import check_session, outcome_of
+from pkmcal.check.check import check_session
 from pkmcal.check.forecast import Forecast, LegForecast, forecast
+from pkmcal.check.words import outcome_of
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.outcome import Level

@@ -21,7 +21,7 @@ import pytest
 import pkmcal
 from conftest import run
 from pkmcal.boards.board import load_board
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.cameras import load_camera
 from pkmcal.commands.cli import main
 from pkmcal.errors import InputError

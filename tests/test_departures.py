@@ -16,7 +16,7 @@ from pkmcal.boards.poses import pose_set, size_departure
 from pkmcal.calibration.departures import LEVEL
 from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.outlines import outlines
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify import score
 from pkmcal.identify.assembly import assemble, batch_of

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.change import machine_change

@@ -10,7 +10,7 @@ from pkmcal.identify.assembly import assemble
 from pkmcal.identify.bundle import what_data_tell
 from pkmcal.identify.gauge import default_gauge, freedoms, pose_generators
 from pkmcal.mechanisms import kinematics, load_mechanism
-from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.mechanisms.closure import by_own, closure, dense
 from pose_sessions import (
     T_CAMERA_BASE,
     T_PLATFORM_BOARD,
@@ -188,11 +188,13 @@ def test_newton_of_the_rods_is_well_conditioned():
     machine = load_mechanism("h4-rods")
     poses = papers_poses()
     readings, phi = kinematics.inverse_result(machine.layout, machine.values, poses)
-    by_own = machine.layout.by_own(closure(machine.layout, machine.values, readings, poses, phi))
-    assert by_own.shape[-2:] == (8, 8)
+    by_motion = by_own(
+        machine.layout, closure(machine.layout, machine.values, readings, poses, phi)
+    )
+    assert by_motion.shape[-2:] == (8, 8)
     centres = machine.platform_centers()
     radius = np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1)))
-    condition = np.linalg.cond(by_own / np.array([radius] * 3 + [1] * 3 + [radius] * 2))
+    condition = np.linalg.cond(by_motion / np.array([radius] * 3 + [1] * 3 + [radius] * 2))
     assert 8 < condition.min() < condition.max() < 15
 
 

@@ -13,7 +13,7 @@ import printers
 from conftest import run
 from pkmcal.boards.board import load_board
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.calibration.source import Source, load_source
 from pkmcal.errors import InputError
 from pkmcal.export import reprap

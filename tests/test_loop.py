@@ -320,7 +320,7 @@ def test_a_photograph_is_a_goal_and_a_wrong_start_is_said():
 
 
 def test_a_calibration_gives_machine_camera_and_place(demo):
-    from pkmcal.calibration.results import load
+    from pkmcal.calibration.saved import load
 
     saved = load(demo.calibration)
     goal = saved.T_base_platform[0]

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import run
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
 from pkmcal.files import read_csv
 from pkmcal.identify.bundle import bundle
@@ -273,14 +273,6 @@ def test_barred_steps_are_avoided():
 
 
 # ------------------------------------------------------------------ the command
-
-
-@pytest.fixture(scope="module")
-def quick_plans():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.planning.plan.CANDIDATES", 60)
-        patch.setattr("pkmcal.planning.plan.AT_WORK", 20)
-        yield
 
 
 def test_a_session_planned_and_planned_again(demo, quick_plans, tmp_path):

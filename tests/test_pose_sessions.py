@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.results import load
-from pkmcal.check.check import Level, check_session
+from pkmcal.calibration.saved import load
+from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
 from pkmcal.files import csv_text, yaml_text
 from pkmcal.geometry.rigid import (
@@ -20,6 +20,7 @@ from pkmcal.geometry.rigid import (
     rotation_vector,
 )
 from pkmcal.mechanisms import load_mechanism, mechanism_text
+from pkmcal.outcome import Level
 from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.report.calibration import save
 from pkmcal.session.load import load_session

@@ -32,7 +32,7 @@ def result(demo, calibrated) -> pkmcal.api.calibrate.CalibrationResult:
 
 
 @pytest.fixture(scope="module")
-def planned(demo):
+def planned(demo, quick_plans):
     return pkmcal.plan(demo.session, count=3)
 
 

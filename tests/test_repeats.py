@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.calibration.calibrate import calibrate
-from pkmcal.check.check import Level, check_session
+from pkmcal.calibration.calibrate import Calibration, calibrate
+from pkmcal.check.check import check_session
+from pkmcal.check.checked import SessionCheck
 from pkmcal.check.repeats import (
     Cylinders,
+    RepeatStudy,
     _findings,
     _Look,
     _station_row,
@@ -37,6 +39,7 @@ from pkmcal.observe.repeats import (
     repeat_scatter,
     same_edges,
 )
+from pkmcal.outcome import Level
 from pkmcal.papers.axis_measurements import to_coordinates
 from pkmcal.session.load import load_session
 from pkmcal.simulation import EdgeNoise, Settings, load_truth, simulate_edges
@@ -368,14 +371,14 @@ def test_the_first_repeat_is_the_photograph_of_a_session_without(tmp_path):
     assert len(load_session(repeats).stations[0].photographs) == 16
 
 
-def test_repeats_do_not_promise_more_than_they_hold(repeats, tmp_path):
+def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):
     """The standard deviations of one photograph's calibration, hardly less with four: what
     differs from the truth is shading, the same in all of them."""
     single = tmp_path / "session"
     shutil.copytree(repeats, single)
     for path in single.glob("images/*/*_[234].png"):
         path.unlink()
-    one, four = calibrate(single), calibrate(repeats)
+    one, four = calibrate(single), looked.calibration
     sigma = [np.sqrt(np.diag(c.estimate.covariance)) for c in (one, four)]
     known = sigma[0] > 1e-9
     assert 0.7 < np.median(sigma[1][known] / sigma[0][known]) < 1.1
@@ -386,17 +389,35 @@ def test_repeats_do_not_promise_more_than_they_hold(repeats, tmp_path):
     assert four.observation.point_edge.max() < len(edges)
 
 
+@dataclass(frozen=True)
+class Looked:
+    """What the check finds in them, the study of the repeats, and the calibration it is made of."""
+
+    found: SessionCheck
+    study: RepeatStudy
+    calibration: Calibration
+
+
 @pytest.fixture(scope="module")
 def looked(repeats):
-    """What the check finds in them, and the study of the repeats."""
-    return check_session(repeats), study_repeats(repeats)
+    made: list[Calibration] = []
+
+    def once(*words, **more):
+        made.append(calibrate(*words, **more))
+        return made[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pkmcal.check.repeats.calibrate", once)
+        study = study_repeats(repeats)
+    (calibration,) = made
+    return Looked(check_session(repeats), study, calibration)
 
 
 @pytest.fixture
 def once(looked, monkeypatch):
     """Commands tell of one look at the photographs, as it does not depend on what they write."""
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: looked[0])
-    monkeypatch.setattr("pkmcal.check.repeats.study_repeats", lambda *_, **_more: looked[1])
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: looked.found)
+    monkeypatch.setattr("pkmcal.check.repeats.study_repeats", lambda *_, **_more: looked.study)
 
 
 @pytest.mark.usefixtures("once")

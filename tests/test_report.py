@@ -18,7 +18,7 @@ from pkmcal.identify.centres import free_of_gauge, joint_centres
 from pkmcal.identify.tool import pose_by_parameters, tool_error
 from pkmcal.observe.predict import legs_in_camera
 from pkmcal.outcome import Verdict
-from pkmcal.report import parameters, pictures, provenance, residuals
+from pkmcal.report import drawn, parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
 from pkmcal.report.charts import enlargement, ticks_between
 from pkmcal.report.drawn import CURVE, STRAIGHT
@@ -227,8 +227,8 @@ def test_joints_are_drawn_where_the_camera_sees_them(case):
 
 def test_straight_curves_are_two_points_and_bent_ones_are_kept():
     x = np.linspace(0, 100, 13)
-    assert len(pictures.straightened(np.stack([x, 2 * x], -1))) == 2
-    assert len(pictures.straightened(np.stack([x, 1e-3 * x * x], -1))) == 13
+    assert len(drawn.straightened(np.stack([x, 2 * x], -1))) == 2
+    assert len(drawn.straightened(np.stack([x, 1e-3 * x * x], -1))) == 13
 
 
 def album_of(case: Case, **changed) -> pictures.Album:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from pkmcal.calibration import results
-from pkmcal.calibration.results import base_camera_covariance, check_output, document_of, load
+from pkmcal.calibration.results import base_camera_covariance, check_output, document_of
+from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
 from pkmcal.files import json_text
 from pkmcal.geometry.rigid import inverse, perturb, pose, pose_difference, rotation

@@ -12,7 +12,7 @@ import pytest
 
 from export_sources import built, source_of, with_scales
 from pkmcal.calibration.doubts import scales_told
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
 from pkmcal.export.contract import export
 from pkmcal.judge.causes import single_causes

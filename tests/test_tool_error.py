@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.calibration.toolmap import map_of
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, perturb, pose_difference

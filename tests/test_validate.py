@@ -449,7 +449,7 @@ def test_validate_in_words(kept, session):
 
 def test_the_drawing_is_the_drawing_again(kept, demo):
     """Held-out regions must not know, through the drawing, what they told the calibration."""
-    from pkmcal.calibration.results import load
+    from pkmcal.calibration.saved import load
     from pkmcal.judge.validate import drawing_of
 
     drawn = load_mechanism(demo.session / "mechanism.yaml")

@@ -391,11 +391,17 @@ def test_a_station_that_was_left_out_is_told(page, monkeypatch):
 
 
 def test_cameras_are_those_that_the_calibration_left(demo, session, tmp_path):
+    """Under the names that it gives them: here the session's own lie in another folder than usual,
+    which is part of the name.
+    """
+    (session / "cameras").rename(session / "lenses")
+    text = (session / "session.yaml").read_text()
+    (session / "session.yaml").write_text(text.replace("cameras/", "lenses/"))
     folder = tmp_path / "calibration"
     shutil.copytree(demo.calibration, folder)
     camera = camera_of_size((320, 240))
     file = Path(load_session(session).stations[0].camera_file)
-    (folder / f"camera-{file.stem}.yaml").write_text(camera_text(camera))
+    (folder / f"camera-lenses-{file.stem}.yaml").write_text(camera_text(camera))
     document = json.loads((folder / "calibration.json").read_text())
     document["stations"][0]["focal_scale"] = 1.01
     (folder / "calibration.json").write_text(json.dumps(document))

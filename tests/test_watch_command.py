@@ -12,7 +12,7 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.results import load
+from pkmcal.calibration.saved import load
 from pkmcal.cameras import load_camera
 from pkmcal.files import csv_text, read_csv
 from pkmcal.geometry.cylinders import tangent_basis

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pkmcal.calibration.results import check_output, load
+from pkmcal.calibration.results import check_output
+from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError
 from pkmcal.files import (
     check_own_folder,

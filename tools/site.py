@@ -1,7 +1,8 @@
 """What the documentation's site does differently from the pages in the repository (a MkDocs hook).
 
 Pages link to sources, which are no pages of the site: there such a link is its text alone. The
-README, to which pages lead as well, is taken in as a page.
+README, to which pages lead as well, is taken in as a page, and from the report what makes its
+scrolling areas reachable by the keyboard.
 """
 
 from __future__ import annotations
@@ -13,14 +14,16 @@ from typing import Any
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
+SCROLL = ROOT / "src/pkmcal/report/templates/scroll.js"
 OUTSIDE = re.compile(r"\[([^\]]+)\]\(\.\./(?!README\.md)[^)]+\)")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Takes in the README."""
+    """Takes in the README, and a script of the report."""
     text = (ROOT / "README.md").read_text("utf-8").replace("](docs/", "](")
     text = re.sub(r"\[([^\]]+)\]\((?!https?:|#|pictures/)([^)]+?)\)", _inside, text)
     files.append(File.generated(config, "readme.md", content=text))
+    files.append(File.generated(config, SCROLL.name, abs_src_path=str(SCROLL)))
     return files
 
 

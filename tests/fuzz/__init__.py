@@ -5,6 +5,7 @@ that stand in relation to one another, so a number reproduces it on any machine,
 one at a time, while Hypothesis' strength, shrinking, would cost hundreds of runs of a command a
 fault; and each case wants a process of its own, whose memory and time are measured and bounded.
 
-    cd tests && python -m fuzz 300          the first 300, and a summary
-    cd tests && python -m fuzz --only 4711  one, with what it printed; its folder is kept
+    cd tests && python -m fuzz 300             the first 300, and a summary
+    cd tests && python -m fuzz 300 --telling   of these, each that tries something new
+    cd tests && python -m fuzz --only 4711     one, with what it printed; its folder is kept
 """

@@ -16,6 +16,7 @@ from pathlib import Path
 os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "80"}
 os.environ["OPENCV_LOG_LEVEL"] = "SILENT"
 
+from fuzz.cases import telling
 from fuzz.run import Summary, run, warm
 
 MAKE = "import sys; from pathlib import Path; from fuzz.bases import make; make(Path(sys.argv[1]))"
@@ -26,6 +27,8 @@ def main() -> int:
     parser.add_argument("count", nargs="?", type=int, default=300, help="of cases")
     parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--only", type=int, nargs="+", help="these cases; their folders are kept")
+    told = "only those of them that try something which none before them does"
+    parser.add_argument("--telling", action="store_true", help=told)
     parser.add_argument("--bases", type=Path, help="made by an earlier run, to go on with")
     given = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # one core, so that a study has one worker: this process
@@ -50,8 +53,11 @@ def fuzz(given, place: Path) -> Summary:
         subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
     warm()
     summary = Summary()
+    numbers = given.only or range(given.first, given.first + given.count)
+    if given.telling:
+        numbers = telling(numbers, bases, place)
     with suppress(KeyboardInterrupt):
-        for number in given.only or range(given.first, given.first + given.count):
+        for number in numbers:
             result = run(number, bases, place, keep=bool(given.only))
             summary.add(result)
             if result.faults or given.only:

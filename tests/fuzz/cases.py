@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -116,6 +117,32 @@ class Case:
     def __str__(self) -> str:
         how = "; ".join(f"{file}: {what}" for file, what, _ in self.spoilt)
         return f"case {self.number}: pkmcal {' '.join(self.words)}   [{how}]"
+
+    @property
+    def news(self) -> set[tuple[str, str]]:
+        """What one case may try before others: a way of spoiling a kind of file, and a file of a
+        command.
+        """
+        found = set()
+        for file, how, _ in self.spoilt:
+            path = Path(file)
+            found.add((path.suffix, how.split(" '")[0]))  # whatever it was renamed to
+            found.add((self.words[0], path.suffix if path.suffix in PICTURES else path.name))
+        return found
+
+
+def telling(numbers: Iterable[int], bases: Path, scratch: Path) -> list[int]:
+    """Those cases that try something which none before them does."""
+    met, chosen = set(), []
+    for number in numbers:
+        place = scratch / f"case-{number}"
+        place.mkdir(parents=True)
+        news = make(number, bases, place).news
+        shutil.rmtree(place)
+        if not news <= met:
+            chosen.append(number)
+        met |= news
+    return chosen
 
 
 def make(number: int, bases: Path, place: Path) -> Case:

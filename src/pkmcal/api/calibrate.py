@@ -9,7 +9,7 @@ from typing import Literal
 
 from pkmcal.calibration.calibrate import Calibration
 from pkmcal.calibration.calibrate import calibrate as run
-from pkmcal.calibration.results import SavedCalibration, load
+from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.report.calibration import save
 from pkmcal.report.rrd import write_rrd
 from pkmcal.session.load import Session

@@ -8,7 +8,8 @@ from typing import Literal
 
 from threadpoolctl import threadpool_limits
 
-from pkmcal.calibration.results import EVERYTHING, SavedCalibration, load
+from pkmcal.calibration.results import EVERYTHING
+from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.errors import InputError
 from pkmcal.judge.new_data import read

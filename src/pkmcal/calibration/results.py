@@ -1,7 +1,8 @@
-"""What a calibration leaves on disk: mechanism.yaml and calibration.json, written and read back.
+"""What a calibration leaves on disk: mechanism.yaml and calibration.json, written.
 
 calibration.json holds everything that a calibration found, in SI units, in the frames that
 ``gauge`` names; without dates, so that the same session gives the same file but for its timings.
+:mod:`pkmcal.calibration.saved` reads it back.
 """
 
 from __future__ import annotations
@@ -9,40 +10,20 @@ from __future__ import annotations
 import platform
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields, replace
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import ConfigDict, Field
 
-from pkmcal.arrays import Array, Booleans, Integers, short_repr
-from pkmcal.calibration.shown import Overview, ShownCalibration
+from pkmcal.arrays import Array, Integers
 from pkmcal.errors import InputError
-from pkmcal.files import (
-    Document,
-    Schema,
-    check_writable,
-    entries,
-    json_text,
-    plain,
-    read_json,
-    validate,
-)
+from pkmcal.files import check_writable, entries, json_text, plain
 from pkmcal.geometry.rigid import inverse, skew
-from pkmcal.identify.centres import free_of_gauge
-from pkmcal.identify.estimate import Estimate, Statistics
-from pkmcal.identify.tool import ToolError, checked_poses, tool_error
+from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import BREATHING_SIGMA
-from pkmcal.mechanisms import (
-    Machine,
-    MechanismDocument,
-    checked_machine,
-    mechanism_text,
-    with_exact_scales,
-)
-from pkmcal.outcome import Verdict
+from pkmcal.mechanisms import mechanism_text
 from pkmcal.session.load import digests, session_digest
 from pkmcal.wording import listed
 
@@ -55,9 +36,6 @@ MECHANISM, EVERYTHING, REPORT = "mechanism.yaml", "calibration.json", "report.ht
 FILES = (REPORT, MECHANISM, EVERYTHING)
 CAMERA_FILE = re.compile(r"camera-.+\.yaml")
 """Cameras as refined with the machine, where that was asked for."""
-EXACT = 1e-9
-"""Relative difference below which two numbers of a file are the same: rounding leaves 1e-15, a
-change by hand a millionth."""
 FORMAT_KEY, FORMAT = "pkmcal_calibration", 1
 PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
 CONVENTIONS = (
@@ -75,11 +53,6 @@ POSE_COLUMNS = (
 EDGE_WEIGHT, POSE_WEIGHT = EDGE_COLUMNS.index("weight"), POSE_COLUMNS.index("weight")
 OPEN = 1.0
 """m or rad; a target's place that is known no better is not told by the data."""
-
-Row3 = tuple[float, float, float]
-Row4 = tuple[float, float, float, float]
-Matrix4 = tuple[Row4, Row4, Row4, Row4]
-Factor = Annotated[float, Field(gt=0)]
 
 
 def check_output(folder: Path | str, *, force: bool = False) -> list[str]:
@@ -301,19 +274,19 @@ def _station_covariance(calibration: Calibration) -> dict[str, Any]:
     names = session.station_names
     kept = np.array([k for k, name in enumerate(names) if name not in nowhere], dtype=int)
     n = len(estimate.machine.parameters)
-    rows = _joint_rows(n, kept)
-    joint = _turned(
+    rows = joint_rows(n, kept)
+    joint = turned(
         estimate.joint_covariance[np.ix_(rows, rows)], estimate.state.T_camera_base[kept]
     )
     return {"stations": [names[k] for k in kept], "rows": joint[n:]}
 
 
-def _joint_rows(n: int, stations: Integers) -> Integers:
+def joint_rows(n: int, stations: Integers) -> Integers:
     """Rows of n parameters and then of some stations in a joint covariance."""
     return np.concatenate([np.arange(n), (n + 6 * stations[:, None] + np.arange(6)).ravel()])
 
 
-def _turned(joint: Array, T_a_b: Array) -> Array:
+def turned(joint: Array, T_a_b: Array) -> Array:
     """A joint covariance of parameters and poses (k, 4, 4), (omega, tau) of T_a_b, as that of the
     parameters and (omega, tau) of T_b_a.
     """
@@ -364,7 +337,7 @@ def _targets(calibration: Calibration) -> list[dict[str, Any]]:
 
 def base_camera_covariance(T_camera_base: Array, covariance: Array) -> Array:
     """Covariance (6, 6) of (omega, tau) of T_base_camera from that of T_camera_base, m and rad."""
-    return _turned(covariance, T_camera_base[None])
+    return turned(covariance, T_camera_base[None])
 
 
 def _inverse_errors(transform: Array) -> Array:
@@ -474,371 +447,3 @@ def _rejected(calibration: Calibration) -> list[dict[str, Any]]:
         {"reason": reason, "count": len(cases), "cases": cases}
         for reason, cases in sorted(groups.items(), key=lambda group: -len(group[1]))
     ]
-
-
-# ------------------------------------------------------------------ read back
-
-
-@dataclass(frozen=True)
-class SavedStation:
-    """One camera's pose as found: T_base_camera (4, 4), m.
-
-    sigma_rotation, sigma_translation : (3,) standard deviations, rad and m, base axes.
-    """
-
-    name: str
-    camera: str
-    T_base_camera: Array
-    sigma_rotation: Array
-    sigma_translation: Array
-
-    __repr__ = short_repr
-
-
-@dataclass(frozen=True, repr=False)
-class SavedCalibration(ShownCalibration):
-    """A calibration read back, in the frames that `gauge` names.
-
-    machine : with the calibrated values. drawing : (P,) values before.
-    placed : k stations whose covariance with the machine is known; none of an older file.
-    joint_covariance : (P + 6 k, P + 6 k) of the parameters and then of these stations, (omega, tau)
-    of T_camera_base, left perturbation, as :class:`~pkmcal.identify.estimate.Estimate` has it.
-    data_share : (P,), NaN where it means nothing.
-    configurations : K names. used : (K,). joints : (K, m). T_base_platform : (K, 4, 4).
-    document : the whole file.
-    """
-
-    path: Path
-    machine: Machine
-    drawing: Array
-    placed: tuple[str, ...]
-    joint_covariance: Array
-    data_share: Array
-    gauge: str
-    method: str
-    seed: int
-    verdict: Verdict
-    stations: tuple[SavedStation, ...]
-    configurations: tuple[str, ...]
-    used: Booleans
-    joints: Array
-    T_base_platform: Array
-    document: dict[str, Any]
-
-    @property
-    def covariance(self) -> Array:
-        """(P, P) of the machine's parameters."""
-        n = len(self.machine.parameters)
-        return self.joint_covariance[:n, :n]
-
-    def overview(self) -> Overview:
-        """What it shows of itself; an older file may not have all of it."""
-        document = self.document
-        residuals = document.get("residuals") or {}
-        parts = [
-            [x for row in residuals.get(key) or () if row[weight] >= 0.5 for x in row[weight + 1 :]]
-            for key, weight in (("edges", EDGE_WEIGHT), ("poses", POSE_WEIGHT))
-        ]
-        known = {f.name for f in fields(Statistics)}
-        statistics = {k: v for k, v in (document.get("statistics") or {}).items() if k in known}
-        needed = {f.name for f in fields(Statistics) if f.default is MISSING}
-        whole = needed <= statistics.keys()
-        return Overview(
-            source=str((document.get("session") or {}).get("folder", "")),
-            method=self.method,
-            machine=self.machine,
-            verdict=self.verdict,
-            drawing=self.drawing,
-            covariance=self.covariance,
-            data_share=self.data_share,
-            poses=self.T_base_platform[self.used],
-            stations=tuple(station.name for station in self.stations),
-            residuals=np.array([*parts[0], *parts[1]], dtype=float),
-            chi2=Statistics(**statistics).chi2_as_stated if whole else float("nan"),
-            warnings=tuple(document.get("warnings") or ()),
-        )
-
-    def tool_error(self, T_base_platform: Array) -> ToolError:
-        """As :meth:`pkmcal.calibration.calibrate.Calibration.tool_error`, from the file."""
-        edges = (self.document.get("residuals") or {}).get("edges")
-        # what the file's machine calls its drawing are the calibrated values
-        table = replace(self.machine.parameters, drawing=self.drawing)
-        machine = replace(self.machine, parameters=table)
-        return tool_error(
-            machine.with_values(self.drawing),
-            machine,
-            free_of_gauge(machine, self.covariance),
-            checked_poses(T_base_platform),
-            legs_seen=bool(edges),
-        )
-
-    def with_stations(self, names: Sequence[str]) -> Array:
-        """Joint covariance (P + 6 n, P + 6 n) of the parameters and of n stations in their order,
-        (omega, tau) of T_camera_base. Raises InputError for one that is not ``placed``.
-        """
-        for name in names:
-            if name in self.placed:
-                continue
-            hand = any(station.name == name for station in self.stations) and self.placed
-            raise InputError(
-                "where this station stood is not known together with the machine",
-                where=str(self.path),
-                found=name,
-                expected=listed(self.placed, 8) or "a calibration that tells it",
-                next_step="A photograph by hand is no place that a camera is left in"
-                if hand
-                else "Calibrate once more with this pkmcal, or name a station of the calibration",
-            )
-        where = np.array([self.placed.index(name) for name in names], dtype=int)
-        rows = _joint_rows(len(self.machine.parameters), where)
-        return self.joint_covariance[np.ix_(rows, rows)]
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations (P,) of the machine's parameters, m or rad."""
-        return np.sqrt(np.diag(self.covariance))
-
-
-class _Part(Schema):
-    """Fields that are needed here; a newer pkmcal may write more."""
-
-    model_config = ConfigDict(extra="ignore")
-
-
-class _Parameter(_Part):
-    name: str
-    drawing: float
-    value: float
-    data_share: float | None
-
-
-class _Station(_Part):
-    name: str
-    camera: str
-    T_base_camera: Matrix4
-    sigma_rotation: Row3
-    sigma_translation: Row3
-
-
-class _StationCovariance(_Part):
-    stations: tuple[str, ...]
-    rows: tuple[tuple[float, ...], ...]
-
-
-class _Configuration(_Part):
-    name: str
-    photographs: tuple[str, ...] = ()
-    used: bool
-    joints: tuple[float, ...]
-    T_base_platform: Matrix4
-
-
-class _Camera(_Part):
-    file: str
-    edge_shift: float
-
-
-class _Target(_Part):
-    name: str
-    T_platform_target: Matrix4 | None = None
-
-
-class _Residuals(_Part):
-    edges: list[Any] | None = None
-
-
-class _Statistics(_Part):
-    noise_scale: Factor = 1.0
-    pose_scale: Factor = 1.0
-    reading_scale: Factor = 1.0
-
-
-class _Readings(_Part):
-    noise: Factor | None = None
-    columns: tuple[str, ...] = ()
-
-
-class _Session(_Part):
-    folder: str = ""
-    joints: _Readings | None = None
-
-
-class _Saved(_Part):
-    pkmcal_calibration: Literal[1] = Field(description="the file's version, 1")
-    verdict: Verdict
-    method: str
-    seed: int
-    gauge: str
-    parameters: tuple[_Parameter, ...]
-    covariance: tuple[tuple[float, ...], ...]
-    stations: tuple[_Station, ...]
-    station_covariance: _StationCovariance | None = None
-    configurations: tuple[_Configuration, ...]
-    mechanism: MechanismDocument
-    # read where they are wanted, and absent from some older files
-    cameras: tuple[_Camera, ...] = ()
-    targets: tuple[_Target, ...] = ()
-    residuals: _Residuals | None = None
-    statistics: _Statistics | None = None
-    session: _Session | None = None
-
-
-def load(source: Path | str) -> SavedCalibration:
-    """Read a calibration from its folder or its calibration.json, and check that it is whole."""
-    document = _read(Path(source))
-    saved = validate(document, _Saved)
-    machine = checked_machine(_mechanism(saved), document, "mechanism")
-    _check_parameters(document, saved, machine)
-    for group, key in (
-        ("stations", "T_base_camera"),
-        ("configurations", "T_base_platform"),
-        ("targets", "T_platform_target"),
-    ):
-        _check_poses(document, group, key, getattr(saved, group))
-    for k, one in enumerate(saved.configurations):
-        if len(one.joints) != machine.n_joints:
-            wanted = f"the {machine.n_joints} readings of its machine, not {len(one.joints)}"
-            raise _edited(document, f"configurations[{k + 1}].joints", wanted)
-    placed, joint = _covariance(document, saved)
-    return SavedCalibration(
-        path=document.path,
-        machine=machine,
-        drawing=np.array([p.drawing for p in saved.parameters]),
-        placed=placed,
-        joint_covariance=joint,
-        data_share=np.array([p.data_share for p in saved.parameters], dtype=float),
-        gauge=saved.gauge,
-        method=saved.method,
-        seed=saved.seed,
-        verdict=saved.verdict,
-        stations=tuple(
-            SavedStation(
-                station.name,
-                station.camera,
-                np.array(station.T_base_camera),
-                np.array(station.sigma_rotation),
-                np.array(station.sigma_translation),
-            )
-            for station in saved.stations
-        ),
-        configurations=tuple(c.name for c in saved.configurations),
-        used=np.array([c.used for c in saved.configurations], dtype=bool),
-        joints=np.array([c.joints for c in saved.configurations]).reshape(-1, machine.n_joints),
-        T_base_platform=np.array([c.T_base_platform for c in saved.configurations]),
-        document=document.data,
-    )
-
-
-def _mechanism(saved: _Saved) -> MechanismDocument:
-    """The mechanism; of a file from before readings had scales, one whose scales are exact."""
-    mechanism = saved.mechanism
-    if any(p.name.endswith(".scale") for p in saved.parameters):
-        return mechanism
-    return with_exact_scales(mechanism)
-
-
-def _read(source: Path) -> Document:
-    path = source / EVERYTHING if source.is_dir() else source
-    if not path.is_file():
-        raise InputError(
-            "there is no calibration here",
-            where=str(source),
-            expected=f"a folder that pkmcal calibrate wrote, or its {EVERYTHING}",
-        )
-    document = read_json(path, label=str(path))
-    found = document.data.get(FORMAT_KEY)
-    if found != FORMAT:
-        raise InputError(
-            "this is not a calibration of a version that is known" if found else
-            "this is not a calibration",
-            where=f"{path}, {FORMAT_KEY}",
-            found=found,
-            expected=str(FORMAT),
-        )  # fmt: skip
-    return document
-
-
-def _check_parameters(document: Document, saved: _Saved, machine: Machine) -> None:
-    names = tuple(p.name for p in saved.parameters)
-    if names != machine.parameters.names:
-        raise _edited(document, "parameters", "the names of the mechanism's parameters")
-    values = np.array([p.value for p in saved.parameters])
-    if not np.allclose(values, machine.values, rtol=EXACT, atol=EXACT**2):
-        k = int(np.argmax(np.abs(values - machine.values)))
-        raise _edited(document, f"parameters[{k + 1}].value", f"the value of {names[k]}")
-
-
-def _covariance(document: Document, saved: _Saved) -> tuple[tuple[str, ...], Array]:
-    """Names of the stations that are known with the machine, and the covariance of both."""
-    count, known = len(saved.parameters), saved.station_covariance
-    _check_size(document, "covariance", saved.covariance, (count, count), "list of parameters")
-    if known is None:
-        matrix = np.array(saved.covariance)
-        _check_covariance(document, "covariance", matrix)
-        return (), matrix
-    poses = {station.name: np.array(station.T_base_camera) for station in saved.stations}
-    if not set(known.stations) <= set(poses):
-        raise _edited(document, "station_covariance.stations", "names of the stations")
-    more = 6 * len(known.stations)
-    key = "station_covariance"
-    _check_size(document, key, known.rows, (more, count + more), "lists of parameters and stations")
-    rows = np.array(known.rows).reshape(more, count + more)
-    upper = np.concatenate([np.array(saved.covariance), rows[:, :count].T], axis=1)
-    matrix = np.concatenate([upper, rows])
-    _check_covariance(document, "covariance", matrix[:count, :count])
-    _check_covariance(document, key, matrix)
-    found = np.array([poses[name] for name in known.stations]).reshape(-1, 4, 4)
-    return known.stations, _turned(matrix, found)
-
-
-def _check_size(
-    document: Document,
-    key: str,
-    rows: tuple[tuple[float, ...], ...],
-    shape: tuple[int, int],
-    of: str,
-) -> None:
-    if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
-        raise InputError(
-            f"the covariance has another size than the {of}",
-            where=document.where(key),
-            expected=f"{shape[0]} rows of {shape[1]} numbers",
-        )
-
-
-def _check_covariance(document: Document, key: str, matrix: Array) -> None:
-    """Raise `InputError` for a matrix that is not symmetric or not positive semidefinite."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    limit = scale[:, None] * scale
-    good = not np.any(np.abs(matrix - matrix.T) > EXACT * limit) and np.all(np.diag(matrix) >= 0)
-    if good:
-        unit = np.where(limit > 0, matrix / np.where(limit > 0, limit, 1.0), 0.0)
-        least = float(np.linalg.eigvalsh(0.5 * (unit + unit.T)).min(initial=0.0))
-        good = least > -EXACT * len(matrix)
-    if not good:
-        raise InputError(
-            "the covariance is not that of any numbers: not symmetric, or a combination of them has"
-            " a negative variance",
-            where=document.where(key),
-            next_step="Calibrate again; this file was changed after it was written",
-        )
-
-
-def _check_poses(document: Document, group: str, key: str, items: tuple[Any, ...]) -> None:
-    for k, item in enumerate(items):
-        if (rows := getattr(item, key)) is None:
-            continue
-        matrix = np.array(rows)
-        rot = matrix[:3, :3]
-        rigid = np.allclose(rot @ rot.T, np.eye(3), atol=1e-6) and np.linalg.det(rot) > 0
-        if not rigid or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-            raise _edited(document, f"{group}[{k + 1}].{key}", "a rotation and a translation")
-
-
-def _edited(document: Document, field: str, expected: str) -> InputError:
-    return InputError(
-        "the calibration does not agree with itself",
-        where=f"{document.label}, {field}",
-        expected=expected,
-        next_step="Calibrate again; this file was changed after it was written",
-    )

@@ -12,13 +12,8 @@ from types import MappingProxyType
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.results import (
-    EVERYTHING,
-    MECHANISM,
-    SavedCalibration,
-    load,
-    refined_camera,
-)
+from pkmcal.calibration.results import EVERYTHING, MECHANISM, refined_camera
+from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.cameras.contract import Camera
 from pkmcal.cameras.files import camera_path, load_camera
 from pkmcal.errors import InputError

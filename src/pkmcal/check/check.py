@@ -8,11 +8,10 @@ what readings and measured poses tell before any calibration.
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -35,12 +34,12 @@ from pkmcal.calibration.recognise import (
     station_poses,
 )
 from pkmcal.calibration.turns import identify_poses
-from pkmcal.check.advice import advice, forecast_figure, forecast_part
-from pkmcal.check.forecast import Forecast, forecast
+from pkmcal.check.advice import advice
+from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck
+from pkmcal.check.forecast import forecast
 from pkmcal.check.look import Look, StationLook
-from pkmcal.check.repeats import RepeatStudy, part_of
+from pkmcal.check.words import board_findings, joint_findings, station_findings
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.files import plain
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.verdict import POOR
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR
@@ -52,156 +51,21 @@ from pkmcal.observe.stations import FoundStation
 from pkmcal.outcome import (
     Finding,
     Level,
-    Mark,
-    Outcome,
-    Part,
-    Row,
-    Table,
-    Verdict,
     doubtful,
-    first_error,
     note,
     wrong,
 )
 from pkmcal.session.load import Session, Station, load_session
 from pkmcal.session.photographs import label_of
-from pkmcal.session.readings import same_pose
 from pkmcal.session.starter import untouched_files
 from pkmcal.wording import listed
 
 NAMED = 10
 """Broken photographs of a station that are named one by one; the others are counted."""
-OVEREXPOSED = 0.25
-"""Share of saturated pixels on the legs beyond which edges are lost: a highlight takes a tenth."""
-TOO_DARK = 0.5
-"""Share of black pixels on the legs beyond which the legs have no shading left."""
-BLURRED = 1.7
-"""Blur (px) beyond which edges are not measured well: the model of an edge ends at 1.5."""
-FEW_LEGS = 0.5
-"""Share of the legs found in a station's photographs below which it hardly contributes."""
 OTHER_MODE = np.deg2rad(20.0)
 """Turn to another assembly below which one could be taken for the other."""
-POOR_CORNERS = 0.5
-"""px rms from which the corners are worse than any sharp photograph of a flat board has them."""
-LITTLE_USED = 0.5
-"""Share of a joint's range below which its configurations are crowded."""
 END = 0.15
 """Part of a joint's range, at either end, in which a reading is an extreme one."""
-FEW_CONFIGURATIONS = 8
-"""Configurations below which standard deviations are large and mistakes go unnoticed."""
-STATION_LEGEND = (
-    "By chance: probability of other readings fitting as well (of a photograph by",
-    "hand, another place); good below 0.001, or 0.01 near a pose or by hand.",
-    "Moved: from the pose by hand to the one found. Legs: found in a photograph.",
-    "White, black: of the legs' pixels. Blur: of the sharpest edges.",
-)
-BOARD_LEGEND = (
-    "Seen: photographs that show it. Off: corners from their predicted places.",
-    "Wander: of the board on the base between photographs; a still one stays below 0.1 px.",
-)
-KINEMATICS = (
-    "The drawing's machine closes at all readings, {0.singularity:.2f} from a singular pose (0 is"
-    " singular, 1 far). These lengths allow {0.assemblies} assemblies; the one at home is taken."
-)
-
-
-@dataclass(frozen=True)
-class BoardCheck:
-    """The board in one station's photographs.
-
-    found : photographs that show it. corners : mean number in these, of ``corners_of``. rms : px
-    off their predicted places. scatter : px by which a board on the base wanders from photograph
-    to photograph; nan where it need not stand still, or is seen once. distance : m. unseen : an
-    outer row or column that no photograph shows though it shows all others, in words.
-    """
-
-    found: int
-    corners: float
-    corners_of: int
-    rms: float
-    scatter: float
-    distance: float
-    unseen: str = ""
-
-
-@dataclass(frozen=True)
-class JointCheck:
-    """One joint's readings, m or rad; used : share of its range, ends : readings near either end
-    of it (NaN and 0 where the mechanism file gives no range).
-    """
-
-    name: str
-    low: float
-    high: float
-    used: float
-    ends: tuple[int, int]
-
-
-@dataclass(frozen=True)
-class StationCheck:
-    """One station. mismatch : 0 perfect, 1 nothing fits; by_chance : probability that wrong
-    readings fit as well; NaN where not looked for.
-
-    moved, turned : from the pose by hand to the one found, m and rad. legs : mean number found in
-    a photograph. saturated, black : mean shares of the legs' pixels. blur : median, px. board :
-    where the station observes one and it was found.
-    """
-
-    name: str
-    photographs: int
-    recognised: bool
-    mismatch: float = math.nan
-    moved: float = math.nan
-    turned: float = math.nan
-    legs: float = math.nan
-    saturated: float = math.nan
-    black: float = math.nan
-    blur: float = math.nan
-    board: BoardCheck | None = None
-    by_chance: float = math.nan
-
-
-@dataclass(frozen=True)
-class SessionCheck:
-    """All that was found. singularity : least over the configurations, 1 good, 0 singular.
-
-    assemblies : ways to assemble the machine at the first configuration's readings. forecast : what
-    a full capture would give, where the first photographs tell. advice : what would make it better.
-    look : where the machine was looked for, for pictures; None where it could not be.
-    """
-
-    folder: str
-    findings: tuple[Finding, ...]
-    machine: str = ""
-    n_legs: int = 0
-    configurations: int = 0
-    stations: tuple[StationCheck, ...] = ()
-    joints: tuple[JointCheck, ...] = ()
-    singularity: float = math.nan
-    assemblies: int = 0
-    forecast: Forecast | None = None
-    advice: tuple[str, ...] = ()
-    look: Look | None = None
-
-    @property
-    def exit_code(self) -> int:
-        """2 where calibrating would be refused, 1 where its result would be doubtful, else 0."""
-        return _exit_code(self.findings)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Everything under its name, for ``--json``, and the first error as every command's."""
-        seen = self.forecast and replace(self.forecast, edges=())
-        out = plain(asdict(replace(self, look=None, forecast=seen, findings=())))
-        out.pop("look")
-        out["findings"] = [finding.document() for finding in self.findings]
-        if self.forecast:
-            out["forecast"].pop("edges")
-        return first_error(self.findings) | out
-
-
-def _exit_code(findings: Sequence[Finding]) -> int:
-    levels = {finding.level for finding in findings}
-    return 2 if Level.WRONG in levels else 1 if Level.DOUBTFUL in levels else 0
 
 
 def check_session(
@@ -238,7 +102,7 @@ def _check(folder: Path, seed: int, told: Progress) -> SessionCheck:
     by_hand = any(station.handheld for station in session.stations)  # no place to come back to
     expected = forecast(seen.look) if seen.look and not by_hand else None
     for station in stations:
-        findings += _station_findings(station, session.machine.n_legs)
+        findings += station_findings(station, session.machine.n_legs)
     return SessionCheck(
         folder=str(folder),
         findings=tuple(sorted(findings, key=lambda finding: list(Level).index(finding.level))),
@@ -468,34 +332,6 @@ def _summary(station: Station, what: Quality, recognised: bool) -> StationCheck:
     )
 
 
-def _station_findings(station: StationCheck, n_legs: int) -> list[Finding]:
-    """What is doubtful about a station's photographs."""
-    texts: list[str] = []
-    if station.saturated > OVEREXPOSED:
-        where = "the legs" if station.recognised else "the pictures"
-        texts.append(
-            f"{station.saturated:.0%} of {where} are overexposed: edges vanish in white. Take the"
-            " photographs again with a shorter exposure."
-        )
-    if station.black > TOO_DARK:
-        where = "the legs" if station.recognised else "the pictures"
-        texts.append(
-            f"{station.black:.0%} of {where} are black. Take the photographs again with a longer"
-            " exposure, or more light."
-        )
-    if station.blur > BLURRED:
-        texts.append(
-            f"The edges are blurred over {station.blur:.1f} px. Focus on the legs, close the"
-            " aperture, and wait until the machine stands still."
-        )
-    if station.recognised and station.legs < FEW_LEGS * n_legs:
-        texts.append(
-            f"Only {station.legs:.1f} of {n_legs} legs are found in a photograph on average."
-            " Move the camera back or aside, so that it sees the legs one beside the other."
-        )
-    return [doubtful(f"{station.name}: {t}", station.name) for t in texts]
-
-
 # ------------------------------------------------------------------ boards
 
 
@@ -530,7 +366,7 @@ def check_boards(session: Session, images: Mapping[int, Sequence[Integers]]) -> 
             findings.append(wrong(error, station.name))
     checks = {number: _board_check(one) for number, one in found.items()}
     for number, check in checks.items():
-        findings += _board_findings(session, number, check)
+        findings += board_findings(session, number, check)
     boards = Boards(found, session.board_body, board.tolerance)
     return BoardsCheck(boards, checks, tuple(findings))
 
@@ -560,31 +396,6 @@ def _board_check(one: StationBoard) -> BoardCheck:
     )
 
 
-def _board_findings(session: Session, number: int, check: BoardCheck) -> list[Finding]:
-    name = session.stations[number].name
-    found: list[Finding] = []
-    if check.rms > POOR_CORNERS:
-        text = (
-            f"{name}: The board's corners lie {check.rms:.2g} px off their places, rms; a flat"
-            " board, a sharp photograph and the right camera file leave a tenth of a pixel."
-        )
-        found.append(doubtful(text, name))
-    if check.unseen:
-        text = (
-            f"{name}: {check.unseen.capitalize()} of the board's corners is in no photograph: does"
-            " the board have as many squares as its file says?"
-        )
-        found.append(doubtful(text, name))
-    photographs = len(session.stations[number].photographs)
-    if session.board_body == "base" and check.found == 1 and photographs > 1:
-        text = (
-            f"{name}: Only one photograph shows the board on the base, so nobody can tell whether"
-            " it, or the camera, stood still."
-        )
-        found.append(note(text, name))
-    return found
-
-
 # ------------------------------------------------------------------ readings and poses
 
 
@@ -598,75 +409,6 @@ def joint_checks(session: Session) -> tuple[JointCheck, ...]:
         used = float(np.ptp(values) / stroke)
         found.append(JointCheck(name, float(values.min()), float(values.max()), used, ends))
     return tuple(found)
-
-
-def joint_findings(session: Session, joints: tuple[JointCheck, ...]) -> list[Finding]:
-    """What is doubtful, or worth knowing, about where the machine was photographed."""
-    findings: list[Finding] = []
-    if session.heights_alone:  # a bed lies where it lies
-        return findings
-    crowded = [joint for joint in joints if joint.used < LITTLE_USED]
-    if crowded:
-        findings.append(
-            note(
-                f"{listed([joint.name for joint in crowded])} used little of the range (down to"
-                f" {min(joint.used for joint in crowded):.0%}): readings near both ends of it"
-                " halve the standard deviations of the offsets.",
-            )
-        )
-    count = len(session.configurations)
-    if count < FEW_CONFIGURATIONS:
-        findings.append(
-            note(
-                f"There are only {count} configurations: standard deviations will be large and"
-                " mistakes hard to notice. 15 or more are usual.",
-            )
-        )
-    return findings + _poses_of_many_names(session)
-
-
-def _poses_of_many_names(session: Session) -> list[Finding]:
-    """That configurations are of one pose, by their readings, and how to say so."""
-    owner = same_pose(session.joints, session.joint_noise)
-    first, names = np.unique(owner, return_counts=True)
-    if len(first) == len(owner):
-        return []
-    alike = [
-        session.configurations[k] for k in np.flatnonzero(owner == first[np.argmax(names > 1)])
-    ]
-    others = ", and so on" if np.sum(names > 1) > 1 else ""
-    told = [
-        f"{len(owner)} configurations are of {len(first)} poses: the readings of"
-        f" {listed(alike)} are equal within their noise{others}. --holdout and --regions leave"
-        " those of a pose out together."
-    ]
-    again = {
-        station.entry or station.name
-        for station in session.stations
-        if len({owner[photo.configuration] for photo in station.photographs})
-        < len({photo.configuration for photo in station.photographs})
-    }
-    if session.stations:  # a tracker's table has one row a configuration
-        told.append(
-            "Where the machine moved away between them and came back, all is well. Where it stood"
-            " still, tell that it is one pose:"
-        )
-    if again:
-        entry = min(again)
-        pattern = session.document["stations"][entry]["images"]
-        if "{repeat}" not in pattern:
-            pattern = pattern.replace("{configuration}", "{configuration}_{repeat}")
-        files = [pattern.format(configuration=alike[0], repeat=k) for k in (1, 2)]
-        told.append(
-            f"at {listed(sorted(again))} name its photographs {' and '.join(files)}, with"
-            f" images: {pattern}, and keep one of its rows in joints.csv."
-        )
-    elif session.stations:
-        told.append(
-            f"its photographs bear one name at all stations, such as {alike[0]}, and it has one row"
-            " in joints.csv."
-        )
-    return [note(" ".join(told))]
 
 
 def pose_findings(session: Session, boards: Boards) -> list[Finding]:
@@ -700,115 +442,3 @@ def _fit(session: Session, boards: Boards) -> list[Finding]:
     told = f" With --model {better.name} it is {better.scale:.2f} times." if better else ""
     text = f"The machine explains the measured poses only to {scale:.1f} times their noise.{told}"
     return [doubtful(text)]
-
-
-# ------------------------------------------------------------------ in words
-
-
-def outcome_of(found: SessionCheck, study: RepeatStudy | None = None) -> Outcome:
-    """What was found, for people and programs; study : of the session's repeats."""
-    findings = (*found.findings, *(study.findings if study else ()))
-    headlines = (
-        f"Nothing is wrong. Next: pkmcal calibrate {shlex.quote(found.folder)}",
-        "It can be calibrated, but the marked points will cost accuracy.",
-        "It cannot be calibrated yet.",
-    )
-    code = _exit_code(findings)
-    name = found.folder
-    if Path(name).name in ("", ".."):  # "." and the like name nothing to a reader
-        name = Path(name).resolve().name or name
-    parts: tuple[Part, ...] = ()
-    if found.machine:
-        said = KINEMATICS.format(found) if math.isfinite(found.singularity) else ""
-        tables = (_stations_table(found), _boards_table(found), _joints_table(found.joints))
-        parts = (
-            Part(
-                "session",
-                "What was looked at",
-                said=(said,) if said else (),
-                tables=tuple(table for table in tables if table.rows),
-            ),
-        )
-    if found.forecast:
-        parts = (*parts, forecast_part(found.forecast))
-    photographs = sum(station.photographs for station in found.stations)
-    return Outcome(
-        command="check",
-        title=f"Check of {name}",
-        subject=f"{name}: {found.machine}, {found.n_legs} legs,"
-        f" {found.configurations} configurations, {photographs} photographs"
-        if found.machine
-        else "",
-        verdict=Verdict(code == 0, headlines[code], advice=found.advice),
-        stamp=("Ready", "Doubtful", "Not yet")[code],
-        level=Level.WRONG if code == 2 else Level.DOUBTFUL,
-        figures=(forecast_figure(found.forecast),) if found.forecast else (),
-        parts=(*parts, part_of(study)) if study else parts,
-        findings=findings,
-        document=found.as_dict(),
-    )
-
-
-def _stations_table(found: SessionCheck) -> Table:
-    rows: list[Row] = []
-    for station in found.stations:
-        levels = {f.level for f in found.findings if f.station == station.name}
-        if not station.recognised:
-            levels.add(Level.WRONG)
-        worst = [level for level in Level if level in levels]
-        mark: Mark = worst[0] if worst else "good"
-        moved = f"{station.moved * 1e3:.0f} mm, {math.degrees(station.turned):.1f}°"
-        seen = station.recognised and math.isfinite(station.legs)
-        cells = (
-            str(station.photographs),
-            _number(station.by_chance, "{:.0e}"),
-            moved if math.isfinite(station.moved) else "–",
-            f"{station.legs:.1f}/{found.n_legs}" if seen else "–",
-            _number(station.saturated, "{:.0%}"),
-            _number(station.black, "{:.0%}"),
-            _number(station.blur, "{:.1f} px"),
-        )
-        rows.append(Row(station.name, cells, mark=mark))
-    columns = ("Station", "Photos", "By chance", "Moved", "Legs", "White", "Black", "Blur")
-    return Table("", columns, tuple(rows), " ".join(STATION_LEGEND), legend=STATION_LEGEND)
-
-
-def _boards_table(found: SessionCheck) -> Table:
-    rows = tuple(
-        Row(
-            station.name,
-            (
-                f"{board.found} of {station.photographs}",
-                f"{board.corners:.0f}/{board.corners_of}",
-                f"{board.rms:.3f} px",
-                _number(board.scatter, "{:.3f} px"),
-                f"{board.distance:.2f} m",
-            ),
-            mark="good",
-        )
-        for station in found.stations
-        if (board := station.board) is not None
-    )
-    columns = ("Board", "Seen", "Corners", "Off", "Wander", "Distance")
-    return Table("", columns, rows, legend=BOARD_LEGEND)
-
-
-def _joints_table(joints: tuple[JointCheck, ...]) -> Table:
-    rows = tuple(
-        Row(
-            joint.name,
-            (
-                f"{joint.low:.4f}",
-                f"{joint.high:.4f}",
-                _number(joint.used, "{:.0%}"),
-                f"{joint.ends[0]} + {joint.ends[1]}" if math.isfinite(joint.used) else "–",
-            ),
-            mark=Level.NOTE if joint.used < LITTLE_USED else "good",
-        )
-        for joint in joints
-    )
-    return Table("", ("Joint", "Lowest", "Highest", "Of its range", "Near the ends"), rows)
-
-
-def _number(value: float, form: str) -> str:
-    return form.format(value) if math.isfinite(value) else "–"

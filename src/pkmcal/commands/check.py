@@ -35,7 +35,8 @@ def check(
     as_json: console.Json = False,
 ) -> int:
     """Find what is wrong with a session before any work is spent."""
-    from pkmcal.check.check import check_session, outcome_of
+    from pkmcal.check.check import check_session
+    from pkmcal.check.words import outcome_of
     from pkmcal.files import check_own_folder, check_writable
 
     if out is not None:

@@ -140,7 +140,7 @@ class VisualServo:
         the class. Raises InputError where the calibration has no such station, and ResultError
         for a calibration that was refused.
         """
-        from pkmcal.calibration.results import load
+        from pkmcal.calibration.saved import load
         from pkmcal.calibration.source import load_source
 
         saved = load(folder)

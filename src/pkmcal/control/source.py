@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.calibration.results import SavedCalibration, SavedStation, load
+from pkmcal.calibration.saved import SavedCalibration, SavedStation, load
 from pkmcal.calibration.source import Source, load_source
 from pkmcal.cameras import Camera, load_camera
 from pkmcal.control.seen import seen_machine

@@ -20,6 +20,7 @@ from pkmcal.export.limbs import FIXED, SLIDE, TELESCOPE, TURN
 from pkmcal.geometry.rigid import cross, dot, pose, rotation, rotation_vector
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import PLANAR, platform_carriers
+from pkmcal.outcome import Finding, Level
 
 COLOURS = {
     "base": "0.35 0.35 0.38 1",
@@ -37,6 +38,13 @@ WHY_RESTRICTED = {
     "schoenflies": "The platform stays upright by its own three slides and its hinge, which stand "
     "for the parallelograms that hold it.",
 }
+NOT_WEIGHED = "NOT KNOWN: masses and inertias, since photographs weigh nothing"
+"""How the conventions begin that say what a format makes of it."""
+
+
+def without_masses(so: str) -> Finding:
+    """That links have no masses; so : what follows for the format, from its first comma on."""
+    return Finding(Level.NOTE, f"Links have no masses, since photographs weigh nothing{so}")
 
 
 @dataclass(frozen=True)

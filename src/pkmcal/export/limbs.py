@@ -16,7 +16,8 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import cross, dot
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import Chain
-from pkmcal.mechanisms.closure import CarrierGroup, scales
+from pkmcal.mechanisms.closure import scales
+from pkmcal.mechanisms.layout import CarrierGroup
 
 CONSTANT, TELESCOPE, SLIDE, TURN = "constant", "telescope", "slide", "turn"
 FIXED, FLOAT = "fixed", "float"

@@ -13,12 +13,14 @@ from pkmcal.calibration.source import Source
 from pkmcal.export.agreement import differences
 from pkmcal.export.bodies import (
     COLOURS,
+    NOT_WEIGHED,
     BodyJoint,
     BodyTree,
     Loop,
     RoundBar,
     TreeBody,
     body_tree,
+    without_masses,
 )
 from pkmcal.export.contract import Difference, Exporter
 from pkmcal.export.home import SAME
@@ -38,7 +40,7 @@ CONVENTIONS = (
     " numbers, which SDF has no word for. All other joints have an effort of 0: no motor.",
     "Joints legN_loop close the loops, as SDF has them: joints between links of two branches, drawn"
     " closed. Not every program that reads SDF closes them: see docs/export.md.",
-    "NOT KNOWN: masses and inertias, since photographs weigh nothing. Where SDF finds none it takes"
+    f"{NOT_WEIGHED}. Where SDF finds none it takes"
     " 1 kg and 1 kg m2 for each link, which is not this machine's: the model is for kinematics, and"
     " gravity is off.",
 )
@@ -69,10 +71,8 @@ class SdfExporter(Exporter):
                 "The loops are joints, as SDF has them; a program that reads SDF may leave them"
                 " open or refuse them.",
             ),
-            Finding(
-                Level.NOTE,
-                "Links have no masses, since photographs weigh nothing, and SDF takes 1 kg for"
-                " each: the model is for kinematics. Gravity is off.",
+            without_masses(
+                ", and SDF takes 1 kg for each: the model is for kinematics. Gravity is off."
             ),
         )
 

@@ -14,12 +14,14 @@ from pkmcal.calibration.source import Source
 from pkmcal.export.agreement import differences
 from pkmcal.export.bodies import (
     COLOURS,
+    NOT_WEIGHED,
     BodyJoint,
     BodyTree,
     Loop,
     RoundBar,
     TreeBody,
     body_tree,
+    without_masses,
 )
 from pkmcal.export.contract import Difference, Exporter, commented
 from pkmcal.export.markup import comment, document, file_name, numbers
@@ -41,7 +43,7 @@ CONVENTIONS = (
     " have to come from a closed machine: nothing in this file holds them together.",
     "NO PARTS OF THE MACHINE: the joints platform_x and so on, by which the tree holds the"
     " platform. {pose}",
-    "NOT KNOWN: masses and inertias, since photographs weigh nothing; no link has any, so this file"
+    f"{NOT_WEIGHED}; no link has any, so this file"
     " is for kinematics and pictures. URDF demands limits: an effort and a velocity of 0 stand for"
     " not known, and slides without a range have {reach:g} of the rods' mean lengths to either side"
     " of home.",
@@ -87,11 +89,7 @@ class UrdfExporter(Exporter):
                 f"A URDF is a tree: {tree} holds every leg at the base alone. What closes"
                 f" the machine stands in {loops}, for programs that take loops beside a URDF.",
             ),
-            Finding(
-                Level.NOTE,
-                "Links have no masses, since photographs weigh nothing: for kinematics and"
-                " pictures, not for a simulator.",
-            ),
+            without_masses(": for kinematics and pictures, not for a simulator."),
         )
 
 

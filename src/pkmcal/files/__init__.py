@@ -1,5 +1,6 @@
 """Files in and out: YAML with line numbers, schemas, CSV tables, outputs whole or not at all."""
 
+from pkmcal.files.alone import alone_in
 from pkmcal.files.cache import remember, remembered
 from pkmcal.files.documents import (
     Document,
@@ -18,7 +19,6 @@ from pkmcal.files.documents import (
 from pkmcal.files.edits import with_numbers
 from pkmcal.files.exif import Exif, read_exif, with_exif
 from pkmcal.files.headers import ENDINGS, stated_size
-from pkmcal.files.locking import alone_in
 from pkmcal.files.quantities import (
     TOO_LARGE,
     Metres,

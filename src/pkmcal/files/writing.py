@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from pkmcal.errors import InputError
-from pkmcal.files.locks import lock
+from pkmcal.files.lock import lock
 from pkmcal.wording import listed
 
 COMMITTED = ".pkmcal-replacing"

@@ -30,7 +30,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import cross, inverse, perturb, skew
 from pkmcal.identify.estimate import State, told_unknowns
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import LimbLayout
+from pkmcal.mechanisms.layout import LimbLayout
 
 
 class Gauge(Protocol):

@@ -40,7 +40,8 @@ from pkmcal.identify.rows import (
     pose_rows,
 )
 from pkmcal.identify.unknowns import BatchState, Unknowns
-from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense, on_tangents
+from pkmcal.mechanisms.closure import Closure, by_own, closure, dense, on_tangents
+from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.solver import Compact, Linear, Memory, Values, of_runs
 
 CLOSINGS = 2
@@ -383,7 +384,7 @@ class Problem:
         lost = ~np.isfinite(out.sum(axis=-1))
         if lost.any():
             out[lost] = 0.0
-        return out, self._by_noise(c, self.layout.by_own(c))
+        return out, self._by_noise(c, by_own(self.layout, c))
 
     def _of_boards(self, poses: PoseRows) -> tuple[Array, Array]:
         """The same of the boards' poses by all shared unknowns, (B, K, 6 G, na)."""
@@ -572,10 +573,10 @@ class Problem:
         change = shared[:, self.unknowns.machine] @ self.free.T
         change = np.pad(change, ((0, 0), (0, 1)))[:, c.index][:, None]
         wanted = c.value + np.sum(c.by_theta * change, axis=-1)
-        wanted = wanted + (layout.by_own(c) @ own[..., None])[..., 0]
+        wanted = wanted + (by_own(layout, c) @ own[..., None])[..., 0]
         for _ in range(CLOSINGS):
             c = self.closure(trial)
-            back = np.linalg.pinv(layout.by_own(c)) @ (wanted - c.value)[..., None]
+            back = np.linalg.pinv(by_own(layout, c)) @ (wanted - c.value)[..., None]
             step = back[..., 0] @ layout.own_motion.T
             trial = replace(
                 trial,

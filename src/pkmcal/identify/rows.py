@@ -31,7 +31,8 @@ from pkmcal.geometry.cylinders import EdgeNormals, edge_normal_jacobians
 from pkmcal.geometry.rigid import cross, dot, pose_difference, skew
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import SHADING_SIGMA
-from pkmcal.mechanisms.closure import Closure, LimbLayout
+from pkmcal.mechanisms.closure import Closure
+from pkmcal.mechanisms.layout import LimbLayout
 
 PERFECT = 1e-6
 """Standard deviation (m) of closures without a reading: joints and rods without play. A third of

@@ -16,7 +16,7 @@ from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, pose_generators, respecting_motion
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.mechanisms.closure import by_own, closure, dense
 from pkmcal.mechanisms.kinematics import on_manifold
 
 SAMPLES = 40
@@ -40,7 +40,7 @@ def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
     internal = machine.forward_result(joints, poses).internal if layout.n_internal else None
     c = closure(layout, machine.values, joints, poses, internal)
     by_theta = dense(c, len(machine.values))
-    return -layout.own_motion[:6] @ np.linalg.pinv(layout.by_own(c)) @ by_theta
+    return -layout.own_motion[:6] @ np.linalg.pinv(by_own(layout, c)) @ by_theta
 
 
 def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:

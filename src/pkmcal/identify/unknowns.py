@@ -16,7 +16,7 @@ Shared by all configurations, in this order of columns:
 
 Each configuration has unknowns of its own besides: the platform's motion (left perturbation of
 T_base_platform, along the directions that the machine has) and, on an articulated platform, its
-hinges; :attr:`~pkmcal.mechanisms.closure.LimbLayout.own_motion` says how.
+hinges; :attr:`~pkmcal.mechanisms.layout.LimbLayout.own_motion` says how.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array, short_repr
-from pkmcal.calibration.results import SavedCalibration
+from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.calibration.source import loaded
 from pkmcal.calibration.toolmap import ToolMap, map_of
 from pkmcal.errors import InputError, PkmcalError

@@ -14,7 +14,7 @@ import numpy as np
 
 from pkmcal.arrays import Booleans
 from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
-from pkmcal.calibration.results import SavedCalibration, load
+from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.errors import InputError
 from pkmcal.session.load import Session, digests, load_session
 from pkmcal.wording import listed

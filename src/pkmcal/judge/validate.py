@@ -15,7 +15,7 @@ import numpy as np
 
 from pkmcal.arrays import Booleans, short_repr
 from pkmcal.calibration.calibrate import Progress
-from pkmcal.calibration.results import SavedCalibration
+from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.errors import InputError, ResultError
 from pkmcal.files import plain
 from pkmcal.judge.comparison import BesideDrawing, compare

@@ -18,7 +18,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, short_repr
 from pkmcal.calibration.aside import select
 from pkmcal.calibration.calibrate import Calibration, Progress
-from pkmcal.calibration.results import SavedCalibration
+from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.errors import InputError
 from pkmcal.files import plain
 from pkmcal.geometry.rigid import inverse

@@ -12,8 +12,9 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import from_quaternion, pose, pose_difference, rotation
-from pkmcal.mechanisms.closure import LimbLayout, base_ends, platform_ends
+from pkmcal.mechanisms.closure import base_ends, platform_ends
 from pkmcal.mechanisms.kinematics import CONVERGED, Closed, close, inverse_result, typical_reach
+from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.mechanisms.velocities import assembly_sign
 
 BATCH = 1000

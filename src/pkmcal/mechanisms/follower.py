@@ -22,8 +22,9 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import cross, dot, nearest_rotation, pose
 from pkmcal.mechanisms.carriers.contract import Chain
-from pkmcal.mechanisms.closure import CarrierGroup, LimbLayout, scales
+from pkmcal.mechanisms.closure import scales
 from pkmcal.mechanisms.kinematics import CONVERGED, forward
+from pkmcal.mechanisms.layout import CarrierGroup, LimbLayout
 
 MOST_STEPS = 8
 """A pose a millimetre away takes three or four."""

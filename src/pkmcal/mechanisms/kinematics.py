@@ -20,9 +20,9 @@ from pkmcal.geometry.batches import WORTH, batch_last, damped_step, fresh, picke
 from pkmcal.geometry.rigid import perturb, pose, rotation
 from pkmcal.mechanisms.closure import (
     BaseEnds,
-    LimbLayout,
     Rows,
     base_ends,
+    by_own,
     by_readings,
     limb_lines,
     platform_ends,
@@ -32,6 +32,7 @@ from pkmcal.mechanisms.closure import (
     rows_between,
     scales,
 )
+from pkmcal.mechanisms.layout import LimbLayout
 
 MAX_STEPS = 60
 CONVERGED = 1e-12
@@ -153,7 +154,7 @@ def _at(task: _Task, poses: Array, internal: Array) -> _State:
     rows = rows_between(task.layout, task.theta, task.base, platform, poses)
     cost = (rows.value * rows.value).sum(axis=-1)
     worst = np.maximum.reduce(np.abs(rows.value), axis=-1, initial=0.0)
-    return _State(poses, internal, rows.value, task.layout.by_own(rows), cost, worst)
+    return _State(poses, internal, rows.value, by_own(task.layout, rows), cost, worst)
 
 
 def _moved(layout: LimbLayout, now: _State, step: Array) -> tuple[Array, Array]:
@@ -362,7 +363,7 @@ def _at_least(
     """
     for _ in range(LEVELLING):
         rows = pose_rows(layout, theta, readings, poses, internal)
-        back = np.linalg.pinv(np.nan_to_num(layout.by_own(rows)))
+        back = np.linalg.pinv(np.nan_to_num(by_own(layout, rows)))
         step = (back @ np.nan_to_num(rows.value)[..., None])[..., 0] @ layout.own_motion.T
         poses, internal = perturb(poses, -step[..., :6]), internal - step[..., 6:]
     rows = pose_rows(layout, theta, readings, poses, internal)
@@ -385,7 +386,7 @@ def scaled_rows(layout: LimbLayout, theta: Array, rows: Rows) -> Array:
     """Rows (..., E, d + n) by the pose's own freedoms, hinges last, without units: turns, which the
     hinges' are too, count as the platform's joints' ways.
     """
-    return layout.by_own(rows) * own_scale(layout, theta)[..., None, :]
+    return by_own(layout, rows) * own_scale(layout, theta)[..., None, :]
 
 
 def singularity_of(layout: LimbLayout, scaled: Array) -> Array:

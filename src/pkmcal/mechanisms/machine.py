@@ -19,7 +19,7 @@ from pkmcal.mechanisms.carriers.contract import (
     of_part,
     platform_carriers,
 )
-from pkmcal.mechanisms.closure import LimbLayout, layout_of, limb_ends
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.document import (
     CONSTANT,
     OFFSET,
@@ -31,6 +31,7 @@ from pkmcal.mechanisms.document import (
 from pkmcal.mechanisms.document_checks import check_drawing
 from pkmcal.mechanisms.follower import Follower
 from pkmcal.mechanisms.joints import AXIS, axes_in_use
+from pkmcal.mechanisms.layout import LimbLayout, layout_of
 from pkmcal.mechanisms.motors import (
     built_in_fixed,
     built_in_ties,

@@ -25,15 +25,16 @@ from pkmcal.arrays import Array, Booleans
 from pkmcal.geometry.rigid import dot, skew
 from pkmcal.mechanisms.closure import (
     BaseEnds,
-    LimbLayout,
     Rows,
     base_ends,
+    by_own,
     by_readings,
     platform_ends,
     pose_rows,
     rows_between,
 )
 from pkmcal.mechanisms.kinematics import inverse_result, own_scale, platform_radius, scaled_rows
+from pkmcal.mechanisms.layout import LimbLayout
 
 LOST = 1e-9
 """Smallest singular value of a scaled Jacobian that still gives rates: a pose is right to 1e-12 m
@@ -78,7 +79,7 @@ def forward_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     """
     c = _moving(layout, theta, poses)
     scale = own_scale(layout, theta)
-    inverted = _pseudo_inverse(layout.by_own(c.rows) * scale[..., None, :])
+    inverted = _pseudo_inverse(by_own(layout, c.rows) * scale[..., None, :])
     return -layout.own_motion[:6] @ (
         scale[..., :, None] * (inverted @ by_motors(layout, c.by_reading))
     )

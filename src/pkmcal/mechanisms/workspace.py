@@ -16,7 +16,6 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb, pose, pose_difference
-from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import (
     MAX_STEPS,
     NEAR_SINGULAR,
@@ -28,6 +27,7 @@ from pkmcal.mechanisms.kinematics import (
     typical_reach,
     undriven,
 )
+from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.mechanisms.velocities import sign_of
 
 ALLOWED = 1e-6

@@ -173,13 +173,12 @@ def without_highlights(profiles: Profiles) -> Profiles:
     light allows, whose cosine changes by LIMB down to that depth, and by more than noise.
     """
     offsets = profile_offsets()
-    noise = np.hypot(_noise(profiles), MODEL_ERROR)
-    grey = profiles.grey
+    grey, contrast = profiles.grey, profiles.contrast()
     background = np.median(grey[:, offsets >= CLEAR_OUTSIDE], axis=1, keepdims=True)
     inside = np.flatnonzero(offsets <= -STEP)[::-1]  # from the limb inwards
     away = np.abs(grey[:, inside] - background)
     most = np.maximum.accumulate(away, axis=1)
-    noise = (noise * profiles.contrast())[:, None]
+    noise = (np.hypot(_noise(profiles), MODEL_ERROR) * contrast)[:, None]
     less = most - away > np.maximum(TURNED * noise, LIMB * most)
     # the last place that was its own largest before it was less
     before = np.arange(len(inside)) < np.argmax(less, axis=1)[:, None]

@@ -31,7 +31,8 @@ from pkmcal.identify.rows import PERFECT
 from pkmcal.identify.unknowns import Name, Unknowns
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine, kinematics
-from pkmcal.mechanisms.closure import Closure, LimbLayout, closure, dense
+from pkmcal.mechanisms.closure import Closure, closure, dense
+from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.papers.hand_eye import start_from_poses
 from pkmcal.papers.measured_platform import SeenPlatform, Taken, seen_platform, taken
 from pkmcal.papers.rotation_axis import axis_frames

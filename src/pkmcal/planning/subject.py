@@ -18,7 +18,7 @@ from pkmcal.calibration.recognise import (
     read_photographs,
     station_poses,
 )
-from pkmcal.calibration.results import SavedCalibration
+from pkmcal.calibration.saved import SavedCalibration
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError, PkmcalError
 from pkmcal.geometry.rigid import inverse
@@ -228,7 +228,53 @@ def of_session(
         words.append(f"The machine, and what is known of it, as calibrated in {saved.path.parent}.")
     seen = _Photographed.of(session, saved, np.random.default_rng(seed))
     T_camera_base = _places(session, saved, seen, anywhere, seed)
-    noise = _Noise(edge, corner)
+    found = _instruments(session, saved, seen, T_camera_base, edge, corner, seed)
+    files = [station.camera_file for station in session.stations]
+    numbers = [list(dict.fromkeys(files)).index(f) for f in files] + [0] * len(session.trackers)
+    rig = Rig(
+        session.machine,
+        session.station_names,
+        T_camera_base,
+        np.array(numbers, dtype=int),
+        session.joint_noise,
+        found.instruments,
+        found.mounts,
+        found.T_mount,
+        found.shading,
+    )
+    known = None if saved is None else _known(saved, session, same_place)
+    columns = tuple(session.document["joints"]["columns"])
+    names = session.configurations
+    fields = found.board.document if found.board else None
+    return Subject(rig, known, columns, names, (*words, *found.words), fields)
+
+
+class _Instruments(NamedTuple):
+    """What a session's stations and trackers measure with.
+
+    T_mount : (M, 4, 4) of what is measured on the platform. shading : of a leg's edges, in a
+    station. board : on the platform. words : where the noise is known from.
+    """
+
+    instruments: tuple[Instrument, ...]
+    mounts: tuple[Mount, ...]
+    T_mount: Array
+    shading: float
+    board: Board | None
+    words: tuple[str, ...]
+
+
+def _instruments(
+    session: Session,
+    saved: SavedCalibration | None,
+    seen: _Photographed,
+    T_camera_base: Array,
+    edge: float,
+    corner: float,
+    seed: int,
+) -> _Instruments:
+    """As :func:`of_session`; T_camera_base : (S, 4, 4) of stations and trackers."""
+    words: list[str] = []
     instruments: list[Instrument] = []
     mounts: list[Mount] = []
     T_mount: list[Array] = []
@@ -238,7 +284,7 @@ def of_session(
         board = load_board(session.board)
         mounts.append(Mount(BOARD, "platform", board.tolerance))
         T_mount.append(_board_place(session, board, saved, seen, T_camera_base, seed))
-        sigma, told = _corner_noise(seen.boards, noise.corner)
+        sigma, told = _corner_noise(seen.boards, corner)
         words.append(told)
         for s, station in enumerate(session.stations):
             if "board" in station.observe:
@@ -250,7 +296,7 @@ def of_session(
     legs = [s for s, station in enumerate(session.stations) if "legs" in station.observe]
     if legs:
         check_tubes(session.machine, f"{session.document['mechanism']}, legs")
-        pools, shading, told = _edge_noise(session, legs, seen, T_camera_base, noise.edge)
+        pools, shading, told = _edge_noise(session, legs, seen, T_camera_base, edge)
         words.append(told)
         for s, pool in zip(legs, pools, strict=True):
             instruments.append(LegsFrom(s, session.stations[s].camera, T_camera_base[s], pool))
@@ -260,24 +306,8 @@ def of_session(
         T_mount.append(np.eye(4) if place is None else place)
         target = TargetFrom(s, T_camera_base[s], T_mount[-1], table.whiten, len(mounts) - 1)
         instruments.append(target)
-    files = [station.camera_file for station in session.stations]
-    numbers = [list(dict.fromkeys(files)).index(f) for f in files] + [0] * len(session.trackers)
-    rig = Rig(
-        session.machine,
-        session.station_names,
-        T_camera_base,
-        np.array(numbers, dtype=int),
-        session.joint_noise,
-        tuple(instruments),
-        tuple(mounts),
-        np.array(T_mount).reshape(-1, 4, 4),
-        shading,
-    )
-    known = None if saved is None else _known(saved, session, same_place)
-    columns = tuple(session.document["joints"]["columns"])
-    names = session.configurations
-    fields = board.document if board else None
-    return Subject(rig, known, columns, names, tuple(words), fields)
+    poses = np.array(T_mount).reshape(-1, 4, 4)
+    return _Instruments(tuple(instruments), tuple(mounts), poses, shading, board, tuple(words))
 
 
 def _one_camera(session: Session) -> Session:

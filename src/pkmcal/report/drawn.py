@@ -27,6 +27,8 @@ from pkmcal.wording import number
 
 CURVE = 13
 """Points of an edge's curve: a mirror bends an edge by less than a pixel between them."""
+SIDES = ("right", "left")
+"""The two edges of a leg as a picture shows them, looking along the leg from A to B."""
 FRACTIONS = np.linspace(0, 1, CURVE)
 STRAIGHT = 0.1
 """Curves that stay within this many pixels of their chord are written as two points."""
@@ -49,6 +51,19 @@ class Drawn:
     def path(self) -> str:
         """SVG path data."""
         return "M" + "L".join(f"{x:.1f},{y:.1f}" for x, y in self.points)
+
+
+def edge_name(leg: int, tube: int, side: int) -> str:
+    """One edge of a leg's tube in words; all count from 0 here."""
+    return f"leg {leg + 1}, tube {tube + 1}, {SIDES[side]} edge"
+
+
+def polyline(leg: int, curve: Array, quiet: bool, tip: str) -> Drawn | None:
+    """What is drawn of a curve (n, 2), where two points of it are seen; leg : from 0."""
+    points = straightened(curve[np.isfinite(curve).all(axis=-1)])
+    if len(points) < 2:
+        return None
+    return Drawn(leg + 1, tuple(map(tuple, points.tolist())), quiet, tip)
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ from pkmcal.outcome import Part
 from pkmcal.report import page
 from pkmcal.report.charts import enlargement
 from pkmcal.report.corners import BoardCorners, board_corners
-from pkmcal.report.drawn import CURVE, Drawn, Spot, measured_curves, straightened
+from pkmcal.report.drawn import CURVE, Drawn, Spot, edge_name, measured_curves, polyline
 from pkmcal.report.jpegs import small_and_large
 from pkmcal.report.links import Links, Place
-from pkmcal.report.residuals import KEPT, SIDES
+from pkmcal.report.residuals import KEPT
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import Photograph
 from pkmcal.wording import brief, count, number
@@ -264,12 +264,12 @@ class _Found:
             across, tilt = estimate.edge_residuals[n].tolist()
             leg, tube, side = (int(x[n]) for x in (edges.leg, edges.tube, edges.side))
             tip = (
-                f"Leg {leg + 1}, tube {tube + 1}, {SIDES[side]} edge: "
+                f"{edge_name(leg, tube, side).capitalize()}: "
                 f"{number(float(shifts[n]), 2, signed=True)} px outward; residual "
                 f"{number(across, 1, signed=True)} σ across, "
                 f"{number(tilt, 1, signed=True)} σ tilt; weight {number(weight, 2)}"
             )
-            drawn = _line(leg, curve, weight < KEPT, tip)
+            drawn = polyline(leg, curve, weight < KEPT, tip)
             if drawn:
                 self.edges[s, int(edges.configuration[n])].append(drawn)
 
@@ -296,11 +296,9 @@ class _Found:
             meant = (tubes.leg == one.leg) & ((one.tube < 0) | (tubes.tube == one.tube))
             meant &= (one.side < 0) | (tubes.side == one.side)
             for e in np.flatnonzero(meant).tolist():
-                tip = (
-                    f"Leg {one.leg + 1}, tube {tubes.tube[e] + 1}, {SIDES[tubes.side[e]]} edge,"
-                    f" not used: {one.reason}"
-                )
-                drawn = _line(one.leg, pixel[at, e][inside[at, e]], True, tip)
+                edge = edge_name(one.leg, int(tubes.tube[e]), int(tubes.side[e]))
+                tip = f"{edge.capitalize()}, not used: {one.reason}"
+                drawn = polyline(one.leg, pixel[at, e][inside[at, e]], True, tip)
                 if drawn:
                     self.missed[s, one.configuration].append(drawn)
 
@@ -353,14 +351,6 @@ def _size(corners: BoardCorners) -> str:
     """How far corners are off, in words."""
     rms = float(np.sqrt(np.mean(np.sum(corners.off**2, axis=1))))
     return f"{brief(rms)} px off"
-
-
-def _line(leg: int, curve: Array, quiet: bool, tip: str) -> Drawn | None:
-    """What is drawn of a curve (n, 2), where two points of it are seen."""
-    points = straightened(curve[np.isfinite(curve).all(axis=-1)])
-    if len(points) < 2:
-        return None
-    return Drawn(leg + 1, tuple(map(tuple, points.tolist())), quiet, tip)
 
 
 def _pair(point: Array) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from pkmcal.identify.unidentified import Findings
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.report import page, parameters
-from pkmcal.report.residuals import SIDES
+from pkmcal.report.drawn import SIDES
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, decimals, number
 

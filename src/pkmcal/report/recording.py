@@ -19,9 +19,9 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
 from pkmcal.report import poses
-from pkmcal.report.drawn import laid_over
+from pkmcal.report.drawn import edge_name, laid_over
 from pkmcal.report.pictures import edge_curves
-from pkmcal.report.residuals import KEPT, SIDES, rms
+from pkmcal.report.residuals import KEPT, rms
 from pkmcal.session.photographs import label_of
 from pkmcal.wording import number
 
@@ -223,7 +223,7 @@ def _tip(c: Calibration, n: int) -> str:
     edges, estimate = c.observation.edges, c.estimate
     across, tilt = estimate.edge_residuals[n].tolist()
     return (
-        f"leg {edges.leg[n] + 1}, tube {edges.tube[n] + 1}, {SIDES[edges.side[n]]} edge: residual"
+        f"{edge_name(int(edges.leg[n]), int(edges.tube[n]), int(edges.side[n]))}: residual"
         f" {number(across, 1, signed=True)} σ across, {number(tilt, 1, signed=True)} σ tilt;"
         f" weight {number(float(estimate.edge_weights[n]), 2)}"
     )

@@ -23,7 +23,7 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
-from pkmcal.report.drawn import radius_positions
+from pkmcal.report.drawn import SIDES, radius_positions
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
@@ -37,8 +37,6 @@ SHADED = 0.05
 SIGMAS = "standard deviations"
 HISTOGRAM = 5.0
 """Standard deviations that the histogram spans to either side."""
-SIDES = ("right", "left")
-"""The two edges of a leg as a picture shows them, looking along the leg from A to B."""
 READING = (
     "Measured against predicted, in standard deviations. Bars hold the middle half of the values,"
     " lines nine tenths; the grey band is where nine tenths belong if noise is all that is left."

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any
 from urllib.parse import urlsplit
 
-from pkmcal import __version__
 from pkmcal.errors import InputError, ResultError
 from pkmcal.studies.tasks import Done, Finished, Job, Runner, work
 
@@ -28,8 +28,8 @@ def _is_address(text: str) -> bool:
 
 
 def _version() -> str:
-    """On a worker: the program's version there."""
-    return __version__
+    """The program's version, here or on a worker."""
+    return version("pkmcal")
 
 
 def _worked(task: Job) -> Done:
@@ -101,13 +101,13 @@ def _checked(client: Any, address: str) -> int:
         versions = set(client.run(_version).values())
     except (ImportError, AttributeError) as error:
         versions = {str(error)}
-    if versions != {__version__}:
+    if versions != {_version()}:
         raise InputError(
             "the cluster's workers have another pkmcal, so they would not give the same numbers",
             where="--scheduler",
             found=", ".join(sorted(versions)),
-            expected=__version__,
-            next_step=f"Install pkmcal {__version__} where the workers run",
+            expected=_version(),
+            next_step=f"Install pkmcal {_version()} where the workers run",
         )
     return sum(client.nthreads().values())
 

@@ -15,8 +15,8 @@ from pkmcal.identify.bundle import BatchResult, solve_batch
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import LimbLayout
 from pkmcal.mechanisms.kinematics import forward, inverse, on_manifold
+from pkmcal.mechanisms.layout import LimbLayout
 from pkmcal.papers.hand_eye import Pair, PairProblem
 from pkmcal.solver import directions, eliminate, minimise
 from pkmcal.studies.simulated import SimulatedRuns

@@ -10,7 +10,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import closure, dense
+from pkmcal.mechanisms.closure import by_own, closure, dense
 from pkmcal.mechanisms.kinematics import forward
 from pkmcal.papers.four_step import solve
 from pkmcal.papers.leg_axes import centres_from_axes
@@ -96,7 +96,7 @@ def _tool(machine: Machine, true: Array, fit: Fitted, rng: np.random.Generator) 
     )
     off = pose_difference(there, T_true)
     c = closure(layout, fit.theta[:, None], readings, there)
-    by = layout.own_motion @ np.linalg.solve(layout.by_own(c), dense(c, true.shape[1]))
+    by = layout.own_motion @ np.linalg.solve(by_own(layout, c), dense(c, true.shape[1]))
     if fit.covariance is None:
         return np.stack([off, np.full(off.shape, np.nan)])
     variance = np.einsum("bkip,bpq,bkiq->bki", by, fit.covariance, by, optimize=True)

@@ -64,12 +64,20 @@ def figures_compared(study: StudyResult[HexapodByLegs]) -> list[Compared]:
 
 def checks(study: StudyResult[HexapodByLegs], ran: ControlledHexapod) -> tuple[Check, ...]:
     """What must hold, or the reproduction has failed."""
+    return (
+        *_calibrated(study),
+        *_controlled(ran),
+        prototype_check(
+            figures_compared(study), f"within {TOLERANCE:.0%}, Monte-Carlo error aside"
+        ),
+    )
+
+
+def _calibrated(study: StudyResult[HexapodByLegs]) -> tuple[Check, ...]:
+    """Of the calibrations from legs' edges."""
 
     def error(*key: str) -> Summary:
         return study.of(*key)["centre"]
-
-    def mm(*values: float, places: int = 2) -> str:
-        return ", ".join(number(1e3 * v, places) for v in values) + " mm"
 
     right = {view: error(view, "right", ROBUST) for view in VIEWS}
     held = [ratio(error(view, "35 % wrong", ROBUST), right[view]) for view in VIEWS]
@@ -81,14 +89,10 @@ def checks(study: StudyResult[HexapodByLegs], ran: ControlledHexapod) -> tuple[C
         for case in ("right", "shifted", "radius")
     }
     depth = study.of(PERSPECTIVE, "right", ROBUST)["depth"].value / right[PERSPECTIVE].value
-    far = {name: float(np.median(trial.astray)) for name, trial in ran.trials.items()}
-    reached = sum(trial.reached for trial in ran.trials.values())
-    all_runs = sum(len(trial.runs.end) for trial in ran.trials.values())
-    worst = max(float(trial.overshoot.max()) for trial in ran.trials.values())
     return (
         Check(
             "linear on right edges, mirror and camera",
-            mm(*(found.value for found in right.values())),
+            _mm(*(found.value for found in right.values())),
             "below a millimetre",
             max(found.value for found in right.values()) < 1e-3,
         ),
@@ -100,13 +104,13 @@ def checks(study: StudyResult[HexapodByLegs], ran: ControlledHexapod) -> tuple[C
         ),
         Check(
             "least squares and M-estimators with 5 % of wrong edges",
-            f"{mm(min(fallen), places=0)} at least",
+            f"{_mm(min(fallen), places=0)} at least",
             "collapsed, beyond 50 mm",
             min(fallen) > COLLAPSED,
         ),
         Check(
             "linear, edges 0.1 px outside",
-            mm(*shifted.values(), places=1),
+            _mm(*shifted.values(), places=1),
             "millimetres, no more than the paper's 12 and 8",
             all(1e-3 < found < 1.1 * CAD[view] for view, found in shifted.items()),
         ),
@@ -122,6 +126,16 @@ def checks(study: StudyResult[HexapodByLegs], ran: ControlledHexapod) -> tuple[C
             "above 90 %",
             depth > 0.9,
         ),
+    )
+
+
+def _controlled(ran: ControlledHexapod) -> tuple[Check, ...]:
+    """Of the platform that is controlled by its legs' images."""
+    far = {name: float(np.median(trial.astray)) for name, trial in ran.trials.items()}
+    reached = sum(trial.reached for trial in ran.trials.values())
+    all_runs = sum(len(trial.runs.end) for trial in ran.trials.values())
+    worst = max(float(trial.overshoot.max()) for trial in ran.trials.values())
+    return (
         Check(
             "runs that reach the goal, whatever is believed",
             f"{reached} of {all_runs}",
@@ -136,13 +150,14 @@ def checks(study: StudyResult[HexapodByLegs], ran: ControlledHexapod) -> tuple[C
         ),
         Check(
             "beside the way: E1, E2, E3",
-            mm(far[E1], far[E2], far["hand"]),
+            _mm(far[E1], far[E2], far["hand"]),
             "E1 and E2 alike, E3 five times as far",
             far[E2] < ALIKE * far[E1]
             and far[E1] < ALIKE * far[E2]
             and far["hand"] > 5 * max(far[E1], far[E2]),
         ),
-        prototype_check(
-            figures_compared(study), f"within {TOLERANCE:.0%}, Monte-Carlo error aside"
-        ),
     )
+
+
+def _mm(*values: float, places: int = 2) -> str:
+    return ", ".join(number(1e3 * v, places) for v in values) + " mm"

@@ -15,12 +15,12 @@ import zipfile
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pkmcal import __version__
 from pkmcal.arrays import Array
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
@@ -53,7 +53,7 @@ class Store:
         """
         folder = out / FOLDER
         path = folder / DESCRIPTION
-        own = {"study": told, "seed": seed, "pkmcal": __version__}
+        own = {"study": told, "seed": seed, "pkmcal": version("pkmcal")}
         own |= {"digest": digest([plainly(setting) for setting in settings], seed)}
         with alone_in(folder, "study"):
             if any(folder.glob("*.npz")):
@@ -111,7 +111,7 @@ class Store:
 
 def digest(settings: Any, seed: int) -> str:
     """What tells studies apart: the program, what is studied, and the seed; not how many runs."""
-    text = json.dumps([__version__, settings, seed], sort_keys=True)
+    text = json.dumps([version("pkmcal"), settings, seed], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

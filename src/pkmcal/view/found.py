@@ -15,18 +15,15 @@ from pkmcal.arrays import Array
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
-from pkmcal.report.drawn import CURVE, Drawn, measured_curves, own_edges, straightened
+from pkmcal.report.drawn import CURVE, edge_name, measured_curves, own_edges, polyline
+from pkmcal.report.residuals import KEPT
 from pkmcal.view.overlay import moved, pane_of
 from pkmcal.view.requests import LookRequest
 from pkmcal.view.viewed import Pane, Viewed
 from pkmcal.wording import count, number
 
-KEPT = 0.5
-"""Weight in the estimate below which an edge counts as put aside."""
 SIGMAS = 2.0
 """Standard deviations, of drawing and search, within which the middle edge has to lie."""
-SIDES = ("right", "left")
-"""The two edges of a leg as a picture shows them, looking along the leg from A to B."""
 
 
 class _Judged(NamedTuple):
@@ -72,7 +69,8 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
     curves, away = _off(pane, T_camera_base, seen.edges)
     for n, curve in enumerate(curves):
         place = (int(seen.edges.leg[n]), int(seen.edges.tube[n]), int(seen.edges.side[n]))
-        tip = f"{_name(*place)}: {number(float(away[n]), 2, signed=True)} px outward"
+        shift = number(float(away[n]), 2, signed=True)
+        tip = f"{edge_name(*place).capitalize()}: {shift} px outward"
         quiet = False
         if (of := judged.get(place)) is not None:
             quiet = of.weight < KEPT
@@ -82,10 +80,8 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
             )
         if place in reasons:
             quiet, tip = True, f"{tip}; {reasons[place]}"
-        line = straightened(curve[np.isfinite(curve).all(axis=-1)])
-        if len(line) > 1:
-            points = tuple((float(x), float(y)) for x, y in line)
-            drawn = Drawn(place[0] + 1, points, quiet, tip)
+        drawn = polyline(place[0], curve, quiet, tip)
+        if drawn:
             out["edges"].append({"leg": drawn.leg, "d": drawn.path, "quiet": quiet, "tip": tip})
     missed = _missed(pane, T_camera_base, seen.edges, seen.rejected, reasons)
     out["missed"] = missed
@@ -160,15 +156,15 @@ def _missed(
     out: list[dict[str, Any]] = []
     for e, curve in enumerate(pixel):
         place = (int(tubes.leg[e]), int(tubes.tube[e]), int(tubes.side[e]))
-        inside = curve[pane.camera.in_image(curve)]
-        if place in seen or len(inside) < 2:
+        if place in seen:
             continue
         whole = (place[0], -1, -1)
         why = reasons.get(place) or now.get(place) or reasons.get(whole) or now.get(whole)
-        points = tuple((float(x), float(y)) for x, y in straightened(inside))
-        leg, why = place[0] + 1, why or "too little of it is seen"
-        path = Drawn(leg, points, True, why).path
-        out.append({"leg": leg, "d": path, "tip": f"{_name(*place)}: {why}", "reason": why})
+        why = why or "too little of it is seen"
+        tip = f"{edge_name(*place).capitalize()}: {why}"
+        drawn = polyline(place[0], curve[pane.camera.in_image(curve)], True, tip)
+        if drawn:
+            out.append({"leg": drawn.leg, "d": drawn.path, "tip": drawn.tip, "reason": why})
     return out
 
 
@@ -201,7 +197,3 @@ def _words(
         f"{verdict}: {said}, and the middle one lies {off} from the drawing. The drawing's"
         f" tolerance of {tolerance * 1e3:.3g} mm is {number(allowed, 1)} px here."
     ]
-
-
-def _name(leg: int, tube: int, side: int) -> str:
-    return f"Leg {leg + 1}, tube {tube + 1}, {SIDES[side]} edge"

@@ -24,7 +24,7 @@ from pkmcal.session.photographs import Photograph, label_of
 
 if TYPE_CHECKING:
     from pkmcal.boards.board import Board, Detection
-    from pkmcal.calibration.results import SavedCalibration
+    from pkmcal.calibration.saved import SavedCalibration
     from pkmcal.observe.stations import StationView
 
 KEPT = 16
@@ -118,10 +118,12 @@ class Viewed:
 
         Raises InputError where the calibration is another session's, or has not this station.
         """
+        from pkmcal.calibration.results import refined_camera
+
         saved, row, station = self.saved, self.photograph(s, k).configuration, self.station(s)
         number = self.number(s)
         T_camera_base = inverse(saved.stations[number].T_base_camera)
-        refined = saved.path.parent / f"camera-{Path(station.camera_file).stem}.yaml"
+        refined = saved.path.parent / refined_camera(station.camera_file)
         camera = load_camera(refined) if refined.is_file() else station.camera
         excess = saved.document["stations"][number].get("focal_scale", 1.0) - 1.0
         camera = replace(camera, parameters=camera.parameters + excess * camera.focal_part)
@@ -131,7 +133,7 @@ class Viewed:
     @cached_property
     def saved(self) -> SavedCalibration:
         """The calibration. Raises InputError where there is none, or it is another session's."""
-        from pkmcal.calibration.results import load
+        from pkmcal.calibration.saved import load
 
         if self.calibration is None:
             raise InputError(

@@ -22,19 +22,6 @@
   addEventListener("scroll", hide, { passive: true });
 })();
 
-// What can be scrolled sideways can be reached by the keyboard, as long as there is anything to scroll.
-(() => {
-  const areas = [...document.querySelectorAll(".scroll")];
-  const mark = () => {
-    for (const area of areas) {
-      if (area.scrollWidth > area.clientWidth) area.tabIndex = 0;
-      else area.removeAttribute("tabindex");
-    }
-  };
-  addEventListener("load", mark);
-  addEventListener("resize", mark);
-})();
-
 // Enlarged photographs; a click inside comes nearer still.
 (() => {
   const dialog = document.getElementById("large");

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pkmcal.errors import InputError
-from pkmcal.files.locks import lock
+from pkmcal.files.lock import lock
 from pkmcal.files.writing import check_writable
 
 LOCK = "lock"
