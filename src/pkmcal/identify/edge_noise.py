@@ -32,6 +32,9 @@ PAIR = 2
 """Numbers that an edge measures."""
 TAILS = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 """Degrees of freedom that are tried: the last is as good as the normal distribution."""
+LEAST = 0.75
+"""Of the stated deviation at least, whatever the data say: what neighbours have in common beside
+what shades them, the parameters take up in part, and residuals come out smaller than errors are."""
 STATED = 5.0
 """Edges that the stated noise is worth when their own is found."""
 ROUNDS = 60
@@ -98,7 +101,8 @@ class EdgeScatter:
         """Deviations as many times as far from another's, with these tails."""
         scale = before.scale * (self.scale / before.scale) ** pace
         shading = before.shading * (self.shading / before.shading) ** pace
-        return replace(self, scale=scale, shading=np.maximum(shading, OWN_SHADING))
+        least = np.maximum(scale, LEAST), np.maximum(shading, OWN_SHADING)
+        return replace(self, scale=least[0], shading=least[1])
 
     def applied(self, problem: Problem) -> Problem:
         """The problem with edges of this noise."""
@@ -134,7 +138,7 @@ def edge_noise(
         squares = along[:, own], rest[:, own], size[:, own]
         found.append(_student(*squares, weight[:, own], *begin, tails))
     scale, shading, tails = (np.stack(part, axis=-1) for part in zip(*found, strict=True))
-    return EdgeScatter(scale, shading, tails)
+    return EdgeScatter(np.maximum(scale, LEAST), shading, tails)
 
 
 def _squares(info: Information) -> tuple[Array, Array, Array]:
