@@ -104,7 +104,7 @@ class UprightBar:
 class BarChart:
     """Bars side by side from zero; ``curve`` is a line to compare them with, in bars and value.
 
-    note : small words beside the title.
+    unit : what stands side by side, and what upwards. note : small words beside the title.
     """
 
     width: ClassVar[float] = WIDTH

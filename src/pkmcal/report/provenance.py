@@ -133,11 +133,12 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     """(what, value) of everything that the result depends on besides the photographs."""
     s = estimate.statistics
     tolerance = session.machine.document.tolerance
+    units = dict.fromkeys(session.machine.joint_units)
     return (
         ("Session", session.folder.name),
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
         ("Frames", estimate.gauge),
-        ("Noise of a joint reading", f"{session.joint_noise:.3g} m or rad"),
+        ("Noise of a joint reading", f"{session.joint_noise:.3g} {' or '.join(units)}"),
         (
             "Drawing's tolerances, 1σ",
             f"centres {tolerance.center * 1e3:g} mm, offsets {tolerance.offset * 1e3:g} mm, "
