@@ -232,7 +232,10 @@ def _joints(session: Session, estimate: Estimate, links: Links) -> RowChart | No
         for column, (legs, k) in enumerate(zip(moved, worst, strict=True))
     ]
     alt = "Boxes of the readings' residuals by joint"
-    return row_chart("Joint readings, by leg", SIGMAS, boxes, NORMAL_90, alt)
+    # readings that poses follow are near zero whatever their noise: few freedoms say so
+    s = estimate.statistics
+    note = f"{count(s.n_joints, 'reading')}, {count(s.dof_joints, 'degree')} of freedom"
+    return row_chart("Joint readings, by leg", SIGMAS, boxes, NORMAL_90, alt, note)
 
 
 def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array) -> tuple[str, ...]:
