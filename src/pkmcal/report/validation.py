@@ -34,17 +34,18 @@ def outcome_of(v: Validation) -> Outcome:
     """Everything that ``pkmcal validate`` tells and writes."""
     known = [n for n, flag in zip(v.session.configurations, v.known, strict=True) if flag]
     again = [n for n, flag in zip(v.session.configurations, v.repeated, strict=True) if flag]
-    notes = (
-        known and f"Left out, for the calibration had seen them: {', '.join(known)}.",
-        again and f"At poses that the calibration used, photographed anew: {', '.join(again)}.",
+    told = (
+        ("Left out, for the calibration had seen them", known),
+        ("At poses that the calibration used, photographed anew", again),
     )
+    notes = tuple(f"{what}: {', '.join(names)}." for what, names in told if names)
     parts = (
         v.judged and _readings(v.judged, v.session),
         Part("paths", "Paths", tables=(paths_table(v.paths),)) if v.paths else None,
         Part("regions", "Regions", tables=(regions_table(v.regions, v.session),))
         if v.regions
         else None,
-        Part("how", "How it was computed", HOW, notes=tuple(filter(None, notes))),
+        Part("how", "How it was computed", HOW, notes=notes),
     )
     return Outcome(
         command="validate",
