@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from pkmcal.measurements import Rejection
-from pkmcal.outcome import Verdict
+from pkmcal.outcome import Level, Outcome, Part, Row, Table, Verdict
 from pkmcal.report.calibration import report_of
+from pkmcal.report.charts import UprightBar, bar_chart
 from pkmcal.report.page import page_html
 from test_report_case import Case, make_case, report_html
 
@@ -114,6 +115,28 @@ def test_hostile_names_stay_text(tmp_path):
     assert not [a for tag, a in found.tags if "onerror" in a or tag == "img"]
     assert sum(tag == "script" for tag, _ in found.tags) == 6
     assert found.text.count("<script>alert('x')") > 10
+
+
+def test_a_scale_of_long_numbers_has_room():
+    """Digits are less than 7 px wide; those of 0.005 px began outside."""
+    bars = [UprightBar("one", "one", 0.0074)]
+    chart = bar_chart("Errors", "photographs; px", bars, (), "bars")
+    assert chart is not None
+    assert all(7 * len(text) <= chart.left for _, text in chart.ticks)
+    assert chart.x(0) == chart.left
+    assert chart.x(1) == chart.width - 8
+
+
+@pytest.mark.parametrize(
+    ("marks", "bold"),
+    [(("good", "good"), 0), ((None, "good"), 1), (("good", "doubtful"), 1), (("wrong",) * 2, 0)],
+)
+def test_a_row_stands_out_where_others_do_not(marks, bold):
+    marks = [Level(mark) if mark in ("doubtful", "wrong") else mark for mark in marks]
+    rows = tuple(Row(f"row {k}", ("1",), mark=mark) for k, mark in enumerate(marks))
+    part = Part("part", "Part", tables=(Table("Table", ("", "mm"), rows),))
+    outcome = Outcome(command="check", title="Check", verdict=Verdict(True, "Fine."), parts=(part,))
+    assert page_html(outcome).count(' marked"') == bold
 
 
 def test_a_page_without_a_single_edge(case):
@@ -218,6 +241,8 @@ def test_points_lead_to_photographs_and_paper_is_light(page, tmp_path):
         tell.screen = width();
         dispatchEvent(new Event("beforeprint"));
         tell.paper = width();
+        tell.low = plot.querySelector(".main-svg").getAttribute("height")
+          / parseFloat(plot.style.getPropertyValue("--tall"));
         tell.light = getComputedStyle(document.documentElement).getPropertyValue("--ink");
         dispatchEvent(new Event("afterprint"));
         setInterval(() => {
@@ -234,6 +259,7 @@ def test_points_lead_to_photographs_and_paper_is_light(page, tmp_path):
     assert str(root["data-bar"]).startswith("#photograph-")
     assert root["data-point"] == "#photograph-1-2"
     assert root["data-paper"] == "672"
+    assert float(str(root["data-low"])) == pytest.approx(0.78)  # as the style has it on paper
     assert root["data-screen"] == root["data-again"] != "672"
     assert root["data-light"] == "#1a1e24"
     # what is drawn in space has a picture for paper, twice as fine as a screen

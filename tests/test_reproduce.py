@@ -13,6 +13,7 @@ import pytest
 from conftest import run
 from pkmcal.commands.reproduce import Paper
 from pkmcal.files import read_yaml
+from pkmcal.outcome import Check
 from pkmcal.papers.axis_measurements import AxisNoise
 from pkmcal.report.page import page_html
 from pkmcal.studies import engine, reproduction
@@ -20,7 +21,7 @@ from pkmcal.studies import paper_a_expected as expected
 from pkmcal.studies.paper_a import BOUND, JOINT, METHODS, PRINTED, HexapodByAxes
 from pkmcal.studies.paper_a_photographs import MeasuredNoise
 from pkmcal.studies.paper_a_report import table_1
-from pkmcal.studies.reproduction import PAPERS, Compared, Options, reproduce
+from pkmcal.studies.reproduction import PAPERS, Compared, Options, Words, reproduce
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Sample
 from test_report_page import Found, browse
@@ -105,6 +106,28 @@ def test_what_is_not_reproduced_is_no_green_sign(found, page, tmp_path, monkeypa
     assert "\n! Reproduced: the end-effector" in done.out
     assert "\n! Not reproduced: 0.08 mm" in done.out
     assert done.code == 0  # all that is expected of it holds
+
+
+def test_where_an_expectation_is_missed_nothing_is_called_reproduced():
+    document = {"title": "t", "cited": "c", "headline": "Reproduced: all.", "not_reproduced": []}
+    words = Words("a", {**document, "remarks": {}, "cards": []}, {})
+    good, bad = (Check(what, "5", "4", what == "good") for what in ("good", "bad"))
+    assert words.reproduction((), (good,), (), {}).verdict.headline == "Reproduced: all."
+    found = words.reproduction((), (good, bad), (), {})
+    assert found.verdict.headline == (
+        "Not reproduced: this run misses 1 of the 2 expectations that it is held against."
+    )
+    assert found.document["headline"] == found.verdict.headline
+    assert found.verdict.reasons == (bad.sentence,)
+
+
+def test_few_runs_that_miss_are_told_to_be_more(monkeypatch, found):
+    failed = replace(found, verdict=replace(found.verdict, usable=False))
+    monkeypatch.setattr("pkmcal.studies.paper_a_report.reproduce", lambda _options: failed)
+    assert reproduce("a", Options(runs=100)).verdict.advice == ()
+    (advice,) = reproduce("a", Options(runs=8)).verdict.advice
+    assert advice.startswith("8 runs are few")
+    assert advice.endswith("simulate 100 or more.")
 
 
 def test_another_seed_draws_anew():

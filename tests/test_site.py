@@ -67,6 +67,11 @@ def test_no_mark_of_the_pages_source_is_left_over(site):
         assert not re.search(r"```|^#+ |^\| ?---", text, re.MULTILINE), path.name
 
 
+def test_no_head_of_a_table_is_empty(site):
+    for path in site.glob("*.html"):
+        assert not re.search(r"<th[^>]*>\s*</th>", path.read_text("utf-8")), path.name
+
+
 def test_the_page_of_python_has_every_public_name(site):
     text = (site / "api.html").read_text("utf-8")
     for name in pkmcal.__all__:

@@ -12,6 +12,7 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.aside import by_region, chosen, clusters, places, regions, select, spread
+from pkmcal.calibration.saved import load
 from pkmcal.errors import InputError, ResultError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.identify.bundle import bundle
@@ -19,12 +20,14 @@ from pkmcal.identify.start import start_state
 from pkmcal.judge.comparison import compare, finite_rms, promise, ratio, weighed
 from pkmcal.judge.held import held_machine
 from pkmcal.judge.holdouts import by_regions, hold_out
+from pkmcal.judge.new_data import repeated_rows
 from pkmcal.judge.paths import straightness
 from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
 from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.validation import held_out
+from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings
 from pkmcal.simulation.demo import demo_camera
 from pkmcal.simulation.edges import EdgeNoise, simulate_edges
@@ -234,6 +237,14 @@ def test_a_board_on_an_h4(h4):
     verdict = validation_verdict(judged, (), estimate.machine, new.measurements)
     assert verdict.usable, verdict
     assert "° against" in verdict.headline
+    assert "readings at the poses" not in verdict.headline
+    assert not verdict.warnings
+    for again, told in ((12, "12 are at poses"), (1, "1 is at a pose")):
+        repeated = np.arange(12) < again
+        said = validation_verdict(judged, (), estimate.machine, new.measurements, repeated)
+        (warning,) = said.warnings
+        assert warning.startswith(f"Of 12 configurations {told} that the calibration used, ")
+        assert ("readings at the poses that it was calibrated from" in said.headline) == (again > 1)
     assert new.measurements.joint_noise == JOINT_NOISE
 
 
@@ -429,6 +440,7 @@ def test_validate_on_what_was_held_out(kept, demo):
     out = kept.made.json["holdout"]["left_out"]["configurations"]
     assert result["new_data"]["configurations"] == out
     assert set(result["known_configurations"]).isdisjoint(out)
+    assert result["repeated_configurations"] == []
     assert result["exit_code"] == kept.found.code == (0 if result["verdict"]["usable"] else 1)
     page = (kept.folder / "v" / "validation.html").read_text()
     assert result["verdict"]["headline"] in page
@@ -447,9 +459,19 @@ def test_validate_in_words(kept, session):
     assert (session / "validation" / "validation.html").is_file()
 
 
+def test_poses_that_the_calibration_used_are_known_by_their_readings(demo):
+    """Within the readings' noise, in any order, and what was held out is none of them."""
+    saved, session = load(demo.calibration), load_session(demo.session)
+    rows = np.arange(len(session.joints))
+    off = np.where(rows % 2, 2.0, 2e3)[:, None] * session.joint_noise
+    anew = replace(session, joints=(session.joints + off)[::-1])
+    assert np.array_equal(repeated_rows(saved, anew), (rows % 2 == 1)[::-1])
+    unused = replace(saved, used=rows < 4)
+    assert np.array_equal(repeated_rows(unused, session), rows < 4)
+
+
 def test_the_drawing_is_the_drawing_again(kept, demo):
     """Held-out regions must not know, through the drawing, what they told the calibration."""
-    from pkmcal.calibration.saved import load
     from pkmcal.judge.validate import drawing_of
 
     drawn = load_mechanism(demo.session / "mechanism.yaml")

@@ -382,6 +382,23 @@ def test_all_legs_are_fixed_in_one_entry_beside_what_is_fixed_already():
     assert advice(scales, machine.document) == f"fixed: [{every}] in"
 
 
+def test_a_model_is_fixed_where_its_own_entries_stand():
+    """Of the file's own ``fixed`` nothing holds where a model of it was asked for."""
+    seen = np.ones((1, 3), bool)
+
+    def advice(model):
+        machine = load_mechanism("linear-delta", model=model)
+        change = unit(machine, {f"legs[{j}].length.constant": 1.0 for j in (1, 2)})[None]
+        around = Situation(machine, seen, moved(machine, np.random.default_rng(0), 5))
+        (sentence,) = describe(around, change)
+        return re.search(r"; or (.*) if the drawing", sentence.advice)[1]
+
+    assert advice(None).endswith("] in the mechanism file")
+    assert advice("firmware").endswith(
+        " beside what stands under fixed: in the mechanism file's model firmware"
+    )
+
+
 @pytest.mark.parametrize("name", ["gough-stewart", "3-rps"])
 def test_how_far_the_platform_moves_agrees_with_the_forward_solution(name):
     """Of both machines, at the same readings, the one's frames laid over the other's."""

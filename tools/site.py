@@ -42,3 +42,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     del page
     markdown = FENCE.sub(r"```\1", markdown)
     return OUTSIDE.sub(r"\1", markdown).replace("(../README.md", "(readme.md")
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Heads of tables that are empty are no heads to a screen reader, as in the program's pages."""
+    del page
+    return re.sub(r"<th([^>]*)></th>", r"<td\1></td>", html)

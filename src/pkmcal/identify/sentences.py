@@ -258,6 +258,9 @@ def _fixing(around: Situation, names: tuple[str, ...]) -> str:
         alike = len(having) > 1 and all(other in entries for other in having)
         said[f"{EVERY}{rest}" if alike else entry] = None
     line = ", ".join(json.dumps(entry) for entry in said)
+    where = "in the mechanism file"
+    if around.machine.model is not None:  # the file's own entries do not hold then
+        where += f"'s model {around.machine.model}"
     if around.machine.document.fixed:
-        return f"{line} beside what stands under fixed: in the mechanism file"
-    return f"fixed: [{line}] in the mechanism file"
+        return f"{line} beside what stands under fixed: {where}"
+    return f"fixed: [{line}] {where}"

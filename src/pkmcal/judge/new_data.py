@@ -17,6 +17,7 @@ from pkmcal.calibration.calibrate import Calibration, Progress, calibrate
 from pkmcal.calibration.saved import SavedCalibration, load
 from pkmcal.errors import InputError
 from pkmcal.session.load import Session, digests, load_session
+from pkmcal.session.readings import same_pose
 from pkmcal.wording import listed
 
 FAR = 10.0
@@ -53,6 +54,13 @@ def known_rows(saved: SavedCalibration, session: Session) -> Booleans:
             for name, alike in zip(session.configurations, same, strict=True)
         ]
     )
+
+
+def repeated_rows(saved: SavedCalibration, session: Session) -> Booleans:
+    """(K,) configurations of a session at poses that the calibration used, by the readings."""
+    used = saved.joints[saved.used]
+    owner = same_pose(np.concatenate([used, session.joints]), session.joint_noise)
+    return owner[len(used) :] < len(used)
 
 
 def look(

@@ -20,7 +20,7 @@ from pkmcal.errors import InputError, ResultError
 from pkmcal.files import plain
 from pkmcal.judge.comparison import BesideDrawing, compare
 from pkmcal.judge.holdouts import HoldOut, by_regions
-from pkmcal.judge.new_data import known_rows, look, read
+from pkmcal.judge.new_data import known_rows, look, read, repeated_rows
 from pkmcal.judge.paths import LinePath, line_path, paths_of
 from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
@@ -36,8 +36,9 @@ class Validation:
     """Everything that a validation found.
 
     calibration : as read back. judged : on configurations that it did not see; None where there are
-    none, and only regions were held out. known : (K,) configurations that it had seen.
-    regions : hold-outs within the session. paths : the straight ones.
+    none, and only regions were held out. known : (K,) configurations that it had seen. repeated :
+    (K,) those that are new measurements of poses that it used. regions : hold-outs within the
+    session. paths : the straight ones.
     """
 
     calibration: SavedCalibration
@@ -45,6 +46,7 @@ class Validation:
     verdict: Verdict
     judged: BesideDrawing | None
     known: Booleans
+    repeated: Booleans
     regions: tuple[HoldOut, ...]
     paths: tuple[LinePath, ...]
     timings: dict[str, float] = field(default_factory=dict)
@@ -59,6 +61,9 @@ class Validation:
             "verdict": asdict(self.verdict),
             "new_data": self.judged.document(names) if self.judged else None,
             "known_configurations": [n for n, flag in zip(names, self.known, strict=True) if flag],
+            "repeated_configurations": [
+                n for n, flag in zip(names, self.repeated, strict=True) if flag
+            ],
             "regions": [item.document(names) for item in self.regions],
             "paths": [asdict(path) for path in self.paths],
             "joints": {
@@ -104,6 +109,7 @@ def validate(
         if not regions:
             _check_independent(known, found.seen)
         judged = None
+        repeated = ~known & repeated_rows(saved, session)
         new = np.flatnonzero(found.seen & ~known)
         if new.size:
             try:
@@ -117,9 +123,10 @@ def validate(
         return Validation(
             calibration=saved,
             session=session,
-            verdict=validation_verdict(judged, held_out, saved.machine, data),
+            verdict=validation_verdict(judged, held_out, saved.machine, data, repeated),
             judged=judged,
             known=known,
+            repeated=repeated,
             regions=held_out,
             paths=tuple(line_path(*line, drawing, session, found) for line in lines.items()),
             timings={**looked.timings, "all": time.perf_counter() - began},

@@ -57,10 +57,12 @@ def validation_verdict(
     holdouts: Sequence[HoldOut],
     machine: Machine,
     measurements: Measurements,
+    repeated: Booleans | None = None,
 ) -> Verdict:
     """The verdict on new data, or, without any, on the regions held out, pooled.
 
-    measurements : of all configurations.
+    measurements : of all configurations. repeated : (K,) those that the session has at poses that
+    the calibration used; None for nowhere.
     """
     units = machine.joint_units
     unit = units[0] if len(set(units)) == 1 else None
@@ -71,16 +73,28 @@ def validation_verdict(
     floor = finite_rms(np.concatenate([np.full(len(g.rows), g.floor) for g in groups]))
     gain = ratio(before, after)
     reasons = [*_not_better(gain), *_broken(groups, units)]
-    headline = _validation_headline(gain, before, after, unit, bool(judged))
+    again = int(repeated[judged.rows].sum()) if judged and repeated is not None else 0
+    every = judged is not None and again == len(judged.rows)
+    where = " of regions that it did not see" if judged is None else ""
+    if every:
+        where = " at the poses that it was calibrated from"
+    headline = _validation_headline(gain, before, after, unit, where)
     warnings = _regions(holdouts, unit)
+    if judged and again:
+        those = "1 is at a pose" if again == 1 else f"{again} are at poses"
+        warnings.insert(
+            0,
+            f"Of {count(len(judged.rows), 'configuration')} {those} that the calibration used,"
+            " photographed anew: what is wrong there was wrong then, so they say little of other"
+            " poses. Photograph poses that it did not see.",
+        )
     noise = _noise(after, floor, unit, measurements, np.concatenate([g.rows for g in groups]))
     return Verdict(not reasons, headline, tuple(reasons), tuple(warnings), noise)
 
 
 def _validation_headline(
-    gain: Ratio, before: Array, after: Array, unit: str | None, new: bool
+    gain: Ratio, before: Array, after: Array, unit: str | None, where: str
 ) -> str:
-    where = "" if new else " of regions that it did not see"
     if gain.high < 1:
         core = (
             f"The drawing predicts the readings{where} {factor(1 / gain.value)} times better than"

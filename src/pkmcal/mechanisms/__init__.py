@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
@@ -70,7 +71,7 @@ def load_mechanism(
         if chosen.mechanism is not None:
             return load_mechanism(_beside(path, chosen.mechanism))
         checked = checked.model_copy(update={"fixed": chosen.fixed, "tied": chosen.tied})
-    return checked_machine(checked, document)
+    return replace(checked_machine(checked, document), model=model)
 
 
 def checked_machine(checked: MechanismDocument, document: Document, *keys: str) -> Machine:

@@ -50,12 +50,14 @@ class Machine:
     document : the mechanism file it was read from.
     parameters : names, drawing values, tolerances, roles.
     values : (P,) present values, in the table's order.
+    model : the name of the file's model whose ``fixed`` and ``tied`` hold, None for the file's own.
     """
 
     document: MechanismDocument
     parameters: ParameterTable
     layout: LimbLayout
     values: Array
+    model: str | None = None
 
     def __repr__(self) -> str:
         what = f"{count(self.n_legs, 'leg')}, {count(self.n_joints, 'reading')}"

@@ -80,7 +80,7 @@ class RotationAxis:
         )
         facts = (
             f"the poses are {rms:.3f}° off, noise alone gives {expected:.3f}°"
-            f" (chi2 {self.chi2:.0f} on {self.dof} degrees of freedom)"
+            f" (χ² {self.chi2:.0f} on {self.dof} degrees of freedom)"
         )
         one = self.hypothesis == "one axis"
         if self.tenable:

@@ -301,6 +301,6 @@ def _angles_chart(c: CameraCalibration) -> charts.BarChart | None:
     every = max(1, len(bars) // 8)
     labels = tuple((float(k), f"{k * ANGLE_STEP:.0f}") for k in range(0, len(bars) + 1, every))
     return charts.bar_chart(
-        "Corners by their angle from the axis", "degrees", bars, labels,
+        "Corners by their angle from the axis", "degrees; number of corners", bars, labels,
         f"Corners from {angle.min(initial=180):.0f} to {angle.max(initial=0):.0f} degrees",
     )  # fmt: skip

@@ -104,7 +104,7 @@ class UprightBar:
 class BarChart:
     """Bars side by side from zero; ``curve`` is a line to compare them with, in bars and value.
 
-    note : small words beside the title.
+    unit : what stands side by side, and what upwards. note : small words beside the title.
     """
 
     width: ClassVar[float] = WIDTH
@@ -121,13 +121,18 @@ class BarChart:
     note: str = ""
 
     @property
+    def left(self) -> float:
+        """Where the bars begin: beside the longest number of the scale."""
+        return 12 + 6.5 * max([4, *(len(text) for _, text in self.ticks)])
+
+    @property
     def step(self) -> float:
         """Width of a bar with its gap."""
-        return (WIDTH - 44) / max(len(self.bars), 1)
+        return (WIDTH - self.left - 8) / max(len(self.bars), 1)
 
     def x(self, bar: float) -> float:
         """Place of a bar's left side, counted from 0."""
-        return 36 + bar * self.step
+        return self.left + bar * self.step
 
     def y(self, value: float) -> float:
         """Place of a value, kept inside the frame."""

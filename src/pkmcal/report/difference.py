@@ -217,7 +217,7 @@ def _joints(d: MachineDifference) -> Plot:
         "margin": {"l": 56, "r": 12, "t": 10, "b": 36},
         "xaxis": {**AXIS},
         "yaxis": {**AXIS, "title": {"text": "moved, mm"}, "rangemode": "tozero"},
-        "legend": {"orientation": "h", "y": 1.08},
+        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
     }
     return Plot(
         "joints",

@@ -145,7 +145,8 @@ def _by_configuration(
         if n
     ]
     alt = "Bars of the poses' residuals by configuration"
-    return bar_chart("Poses, by configuration", SIGMAS, bars, charts.six_labels(bars), alt)
+    title, unit = "Poses, by configuration", f"configurations; root mean square, {SIGMAS}"
+    return bar_chart(title, unit, bars, charts.six_labels(bars), alt)
 
 
 def _bars(
@@ -171,7 +172,8 @@ def _bars(
             )
         )
     alt = f"Bars of the poses' errors in {unit}"
-    return bar_chart(title, unit, bars, charts.six_labels(bars), alt)
+    under = f"configurations; largest of each, {unit}"
+    return bar_chart(title, under, bars, charts.six_labels(bars), alt)
 
 
 def axes(poses: PoseSet, estimate: Estimate) -> RowChart | None:

@@ -137,11 +137,12 @@ def _settings(session: Session, estimate: Estimate) -> tuple[tuple[str, str], ..
     tolerance = session.machine.document.tolerance
     noise = estimate.edge_noise
     tubes = zip(noise.scale, noise.shading, noise.tails, strict=True)
+    units = dict.fromkeys(session.machine.joint_units)
     return (
         ("Session", session.folder.name),
         ("Machine", f"{session.machine.name}, {count(session.machine.n_legs, 'leg')}"),
         ("Frames", estimate.gauge),
-        ("Noise of a joint reading", f"{session.joint_noise:.3g} m or rad"),
+        ("Noise of a joint reading", f"{session.joint_noise:.3g} {' or '.join(units)}"),
         (
             "Drawing's tolerances, 1σ",
             f"centres {tolerance.center * 1e3:g} mm, offsets {tolerance.offset * 1e3:g} mm, "

@@ -148,7 +148,7 @@ def _configurations(
         of = f" over {count(len(weights), 'edge')}"
         lead = links.to_configuration(k)
         bars.append(level_bar(name, level, 2 * float(weights.sum()), of, lead))
-    title, unit = "Edges, by configuration", "root mean square, standard deviations"
+    title, unit = "Edges, by configuration", f"configurations; root mean square, {SIGMAS}"
     alt = "Bars of the residuals by configuration"
     return bar_chart(title, unit, bars, charts.six_labels(bars), alt)
 
@@ -189,7 +189,9 @@ def histogram(white: Array) -> BarChart | None:
     curve = tuple(zip(((x + HISTOGRAM) * 2).tolist(), density.tolist(), strict=True))
     labels = tuple(((v + HISTOGRAM) * 2, number(v, 0)) for v in (-4.0, -2.0, 0.0, 2.0, 4.0))
     alt = "Histogram of the residuals with the normal density over it"
-    return bar_chart("All edge residuals", SIGMAS, bars, labels, alt, curve)
+    return bar_chart(
+        "All edge residuals", f"{SIGMAS}; number of residuals", bars, labels, alt, curve
+    )
 
 
 def _outward(edges: EdgeSet, shifts: Array, links: Links) -> RowChart | None:
@@ -228,7 +230,10 @@ def _joints(session: Session, estimate: Estimate, links: Links) -> RowChart | No
         for column, (legs, k) in enumerate(zip(moved, worst, strict=True))
     ]
     alt = "Boxes of the readings' residuals by joint"
-    return row_chart("Joint readings, by leg", SIGMAS, boxes, NORMAL_90, alt)
+    # readings that poses follow are near zero whatever their noise: few freedoms say so
+    s = estimate.statistics
+    note = f"{count(s.n_joints, 'reading')}, {count(s.dof_joints, 'degree')} of freedom"
+    return row_chart("Joint readings, by leg", SIGMAS, boxes, NORMAL_90, alt, note)
 
 
 def remarks(session: Session, edges: EdgeSet, estimate: Estimate, shifts: Array) -> tuple[str, ...]:

@@ -313,7 +313,11 @@ def choices_table(found: Study) -> Table:
 
 def settings_table(found: Study) -> Table:
     """What was simulated."""
-    s = _settings(found)
+    s, units = _settings(found), dict.fromkeys(found.eye.true.machine.joint_units)
+    s |= {
+        "hand_position": 1e3 * s["hand_position"],
+        "hand_rotation": float(np.degrees(s["hand_rotation"])),
+    }
     names = {
         "law": "Control by",
         "legs": "Legs seen",
@@ -321,11 +325,11 @@ def settings_table(found: Study) -> Table:
         "rate": "Images a second",
         "delay": "Delay, images",
         "noise": "Noise of an edge, px",
-        "joint_noise": "Noise of a reading, m or rad",
-        "speed": "Fastest drive, m/s or rad/s",
+        "joint_noise": f"Noise of a reading, {' or '.join(units)}",
+        "speed": f"Fastest drive, {' or '.join(f'{unit}/s' for unit in units)}",
         "duration": "Time of a run, s",
-        "hand_position": "Camera's place by hand, off by m",
-        "hand_rotation": "and by rad",
+        "hand_position": "Camera's place by hand, off by mm",
+        "hand_rotation": "and by °",
         "runs": "Runs of every estimate",
         "seed": "Seed",
     }
@@ -486,7 +490,7 @@ def _plane(x: str, y: str) -> dict[str, Any]:
     return {
         **LOOKS,
         "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
-        "legend": {"orientation": "h", "y": 1.12, "x": 0, "bgcolor": "rgba(0,0,0,0)"},
+        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
         "xaxis": {**AXIS, "title": {"text": x}},
         "yaxis": {**AXIS, "title": {"text": y}},
     }
@@ -551,7 +555,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
     )
     layout = space_layout({"x": 1.3, "y": -1.3, "z": 0.7}) | {
         "margin": {"l": 0, "r": 0, "t": 0, "b": 70},
-        "legend": {"orientation": "v", "y": 1, "x": 0, "bgcolor": "rgba(0,0,0,0)"},
+        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
         "updatemenus": [_player()],
     }
     return {"data": [*data, camera], "layout": layout, "config": {"scrollZoom": True}}
@@ -614,7 +618,7 @@ def image(s: Study, run: int) -> dict[str, Any]:
     layout = {
         **LOOKS,
         "margin": {"l": 48, "r": 12, "t": 8, "b": 40},
-        "legend": {"orientation": "h", "y": 1.1, "x": 0, "bgcolor": "rgba(0,0,0,0)"},
+        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
         "xaxis": {**AXIS, "title": {"text": "pixels"}, "range": [-0.04 * width, 1.04 * width]},
         "yaxis": {
             **AXIS,

@@ -267,7 +267,7 @@ def _plane(x: str, y: str) -> dict[str, Any]:
     return {
         **LOOKS,
         "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
-        "legend": {"orientation": "h", "y": 1.12, "x": 0, "bgcolor": "rgba(0,0,0,0)"},
+        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
         "xaxis": {**AXIS, "title": {"text": x}},
         "yaxis": {**AXIS, "title": {"text": y}, "rangemode": "tozero"},
     }

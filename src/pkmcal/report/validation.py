@@ -33,14 +33,19 @@ HOW = (
 def outcome_of(v: Validation) -> Outcome:
     """Everything that ``pkmcal validate`` tells and writes."""
     known = [n for n, flag in zip(v.session.configurations, v.known, strict=True) if flag]
-    left_out = f"Left out, for the calibration had seen them: {', '.join(known)}."
+    again = [n for n, flag in zip(v.session.configurations, v.repeated, strict=True) if flag]
+    told = (
+        ("Left out, for the calibration had seen them", known),
+        ("At poses that the calibration used, photographed anew", again),
+    )
+    notes = tuple(f"{what}: {', '.join(names)}." for what, names in told if names)
     parts = (
         v.judged and _readings(v.judged, v.session),
         Part("paths", "Paths", tables=(paths_table(v.paths),)) if v.paths else None,
         Part("regions", "Regions", tables=(regions_table(v.regions, v.session),))
         if v.regions
         else None,
-        Part("how", "How it was computed", HOW, notes=(left_out,) if known else ()),
+        Part("how", "How it was computed", HOW, notes=notes),
     )
     return Outcome(
         command="validate",
@@ -48,15 +53,16 @@ def outcome_of(v: Validation) -> Outcome:
         kicker=v.session.called,
         verdict=v.verdict,
         stamp="Confirmed" if v.verdict.usable else "Not confirmed",
-        figures=_cards(v.judged, v.session) if v.judged else (),
+        figures=_cards(v.judged, v) if v.judged else (),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in v.session.warnings),
         document=v.document(),
     )
 
 
-def _cards(judged: BesideDrawing, session: Session) -> tuple[Figure, ...]:
+def _cards(judged: BesideDrawing, v: Validation) -> tuple[Figure, ...]:
     """The main numbers."""
+    session, again = v.session, int(v.repeated[judged.rows].sum())
     new, old = judged.figures(judged.calibrated), judged.figures(judged.drawing)
     test, gain, unit = judged.promise, judged.ratio, _unit(session)
     weighed = ""
@@ -88,7 +94,8 @@ def _cards(judged: BesideDrawing, session: Session) -> tuple[Figure, ...]:
         Figure(
             "What is it based on?",
             ((str(len(judged.rows)), "configurations"),),
-            "seen by the session, not used by the calibration",
+            "seen by the session, not used by the calibration"
+            + (f"; {again} of them at poses that it used" if again else ""),
         ),
     )
 
@@ -278,7 +285,7 @@ def _by_configuration(judged: BesideDrawing, session: Session) -> charts.BarChar
     ]
     return charts.bar_chart(
         "Residuals of the readings by configuration",
-        name,
+        f"configurations; root mean square, {name}",
         bars,
         charts.ends_and_middle(bars),
         f"Residuals of {count(len(bars), 'configuration')}, calibrated and by the drawing",

@@ -306,7 +306,7 @@ def _by_configuration(w: Watch) -> charts.BarChart | None:
     ]
     return charts.bar_chart(
         "Residuals by configuration, the machine held as calibrated",
-        "standard deviations",
+        "configurations; standard deviations",
         bars,
         charts.ends_and_middle(bars),
         f"Residuals of {count(len(bars), 'configuration')}",

@@ -216,7 +216,7 @@ def _picture(s: Found, view: str, ran: ControlledHexapod | None = None) -> dict[
     gap = np.full((1, 2), np.nan)
     legs = np.concatenate([np.concatenate([leg, gap]) for leg in pixels])
     true, estimated = (camera.project(points) for points in _joints(s, view))
-    data = [_trace("legs at home", legs[:, 0], legs[:, 1], "--rule", "lines")]
+    data = [_trace("legs at home", legs[:, 0], legs[:, 1], "--quiet", "lines")]
     if ran is None:
         data.append(_marks("true joints", true, "--ink", "x-thin", 11))
     else:
@@ -228,7 +228,7 @@ def _picture(s: Found, view: str, ran: ControlledHexapod | None = None) -> dict[
         data.append(_marks("by hand", true + off, "--calibrated", "x-thin", 11))
     data.append(_marks("estimated joints", estimated, "--drawing", "circle-open", 13))
     width, height = camera.image_size
-    layout = _plane("pixels", "")
+    layout = _plane("x, pixels", "y, pixels")
     layout["xaxis"] |= {"range": [-0.5, width - 0.5]}
     layout["yaxis"] |= {"range": [height - 0.5, -0.5], "scaleanchor": "x", "scaleratio": 1}
     return {"data": data, "layout": layout, "config": {}}
@@ -238,13 +238,14 @@ def _geometry_part(words: Words, s: Found) -> Part:
     """[B] Fig. 7."""
     drawing = study_machine().base_centers()
     sets: list[tuple[str, Array, str, str, float]] = [("drawing", drawing, "--ink", "square", 8)]
-    for view, colour in ((MIRROR, "--calibrated"), (PERSPECTIVE, "--leg7")):
+    looks = (MIRROR, "--calibrated", "circle-open"), (PERSPECTIVE, "--drawing", "diamond-open")
+    for view, colour, symbol in looks:
         true, estimated = _joints(s, view)
         # the run's own machine is the drawing's here, so that its errors are the method's alone
         fitted = register(true, estimated)
         off = apply(inverse(fitted), estimated) - true
         turned = views()[view].T_camera_base[:3, :3]
-        sets.append((view, drawing + ENLARGED * off @ turned, colour, "circle-open", 10))
+        sets.append((view, drawing + ENLARGED * off @ turned, colour, symbol, 10))
     plots: dict[str, dict[str, Any]] = {}
     for name, axes in (("lateral", (0, 2)), ("top", (0, 1))):
         data = [

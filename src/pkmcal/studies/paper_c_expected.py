@@ -26,6 +26,21 @@ from pkmcal.studies.statistics import ratio
 from pkmcal.studies.tasks import Key
 from pkmcal.wording import number
 
+LABELS = {
+    DRAWING: "a priori",
+    EQ3: "eq. 3 as printed",
+    EQ5: "eq. 5 as printed",
+    WHITENED: "eq. 5 whitened",
+    JOINT: "joint estimate",
+    BOUND: "Cramér-Rao bound",
+}
+MODELS: dict[str, str] = {"design": "Model 12", "calibration": "Model 31", "rods": "Rods"}
+WHERE: dict[str, str] = {
+    "design": "the machine is a Model 12",
+    "calibration": "the machine is a Model 31",
+    "rods": "the machine has rods",
+}
+TRUTHS = {kind: where[0].upper() + where[1:] for kind, where in WHERE.items()}
 BEFORE = Before(26e-3, 0.022)
 """[C] IV.C: the nacelle's mean error with the a priori parameters, m and rad."""
 TABLE_3 = {
@@ -93,6 +108,7 @@ def figures_compared(study: StudyResult[H4ByBoard]) -> list[Compared]:
         PROTOTYPE,
         tolerance=lambda _key, _quantity: TOLERANCE,
         held=lambda key: key[:2] not in FOLLOWS_MACHINE,
+        named=lambda key, _quantity: f"{MODELS[key[1]]}, {LABELS[key[2]]}, where {WHERE[key[0]]}",
     )
 
 

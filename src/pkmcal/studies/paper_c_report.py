@@ -27,35 +27,24 @@ from pkmcal.studies.paper_c import (
 )
 from pkmcal.studies.paper_c_expected import (
     BEFORE,
+    LABELS,
+    MODELS,
     PROTOTYPE,
     SPREAD,
     SQUARE_AFTER,
     SQUARE_BEFORE,
     TABLE_3,
     TABLE_4,
+    TRUTHS,
     checks,
     figures_compared,
 )
-from pkmcal.studies.paper_c_machine import A_PRIORI, IDENTIFIED, Kind
+from pkmcal.studies.paper_c_machine import A_PRIORI, IDENTIFIED
 from pkmcal.studies.paper_c_validation import Before, before
 from pkmcal.studies.reproduction import Column, Options, Words, accuracy_rows, deg, mm
 from pkmcal.studies.statistics import each_rms, ratio, rms
 from pkmcal.wording import number
 
-LABELS = {
-    DRAWING: "a priori",
-    EQ3: "eq. 3 as printed",
-    EQ5: "eq. 5 as printed",
-    WHITENED: "eq. 5 whitened",
-    JOINT: "joint estimate",
-    BOUND: "Cramér-Rao bound",
-}
-MODELS: dict[str, str] = {"design": "Model 12", "calibration": "Model 31", "rods": "Rods"}
-TRUTHS: dict[Kind, str] = {
-    "design": "The machine is a Model 12",
-    "calibration": "The machine is a Model 31",
-    "rods": "The machine has rods",
-}
 ANGLES = ("α₁", "α₂", "α₃", "α₄", "q₀₁", "q₀₂", "q₀₃", "q₀₄")
 REMARKS = ("models", "floor", "axis", "apart")
 """The last where there is something to tell."""
@@ -83,7 +72,7 @@ def reproduced(found: Found) -> Outcome:
             words.part(
                 "accuracy",
                 *_accuracy_tables(found),
-                plots={"tool": {"figure": _accuracy_plot(found), "height": 430, "width": 760}},
+                plots={"tool": {"figure": _accuracy_plot(found), "height": 520}},
             ),
             words.part("table-2", *_tables_2(found)),
             words.part(
@@ -122,9 +111,7 @@ def _words(s: Found, start: Before) -> Words:
         before_rad=start.turn,
         over_bound=ratio(*(s.of(*right, m)["larger_shift"] for m in (JOINT, BOUND))).value,
         line=1e3 * rms(s.values("straightness", "design", "calibration", EQ5)[:, :2]).value,
-        apart="; ".join(
-            f"{', '.join(f.key)} {f.found.value:.3g} for {f.expected:g}" for f in apart
-        ),
+        apart="; ".join(f"{f.name} {f.found.value:.3g} for {f.expected:g} {f.unit}" for f in apart),
         larger=LARGER,
         noise_mm=1e3 * setting.shift,
         noise_deg=float(np.degrees(setting.turn)),
@@ -167,9 +154,9 @@ def _tables_2(s: Found) -> tuple[Table, Table]:
         for name, method in (("equation 3", EQ3), ("joint estimate", JOINT))
     )
 
-    def rows(of: slice, *found: tuple[str, Array]) -> tuple[Row, ...]:
+    def rows(of: slice, places: int, *found: tuple[str, Array]) -> tuple[Row, ...]:
         def cells(values: Array) -> tuple[str, ...]:
-            return tuple(number(float(v), 4) for v in values[of])
+            return tuple(number(float(v), places) for v in values[of])
 
         out = [Row(f"The paper, {name}", cells(values), "paper") for name, values in printed]
         for name, values in found:
@@ -177,7 +164,8 @@ def _tables_2(s: Found) -> tuple[Table, Table]:
             out.append(Row("  its scatter", cells(values.std(axis=0)), "prototype"))
         return tuple(out)
 
-    sizes, angles = rows(slice(4), equation, best), rows(slice(4, None), equation)
+    # the paper has four decimals; the scatter of sizes needs five
+    sizes, angles = rows(slice(4), 5, equation, best), rows(slice(4, None), 4, equation)
     return (
         Table("Table 2: sizes, m", ("", "h", "arm", "R", "forearm"), sizes),
         Table("Table 2: angles, rad", ("", *ANGLES), angles, brief=False),
@@ -268,25 +256,34 @@ def _accuracy_plot(s: Found) -> dict[str, Any]:
     beside it, whose workspace fits that one.
     """
     data: list[dict[str, Any]] = []
-    printed: dict[str, float] = {}
+    places: list[int] = []
+    labels: list[str] = []
+    printed: dict[int, float] = {}
     for kind, models in PLAN.items():
-        bars: dict[str, float] = {}
-        for name, methods in models.items():
-            for method in methods:
-                where = f"{MODELS[kind]} ← {MODELS[name]}, {LABELS[method]}"
-                bars[where] = 1e3 * s.of(kind, name, method)["larger_shift"].value
-                known = PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
-                if known:
-                    printed[where] = float(known)
+        bars: dict[int, float] = {}
+        for name, method in ((name, m) for name, methods in models.items() for m in methods):
+            place = len(labels) + len(data)  # a gap between machines
+            labels.append(f"{MODELS[name]}, {LABELS[method]}")
+            places.append(place)
+            bars[place] = 1e3 * s.of(kind, name, method)["larger_shift"].value
+            known = PROTOTYPE.get((kind, name, method), {}).get("larger_shift")
+            if known:
+                printed[place] = float(known)
         colour = {"design": "--drawing", "calibration": "--calibrated", "rods": "--leg3"}[kind]
         data.append(_series("bar", TRUTHS[kind], bars, colour))
     dots = _series("scatter", "independent prototype", printed, "--ink")
     marks = {"color": "--ink", "size": 9, "symbol": "diamond-open"}
     data.append({**dots, "mode": "markers", "marker": marks})
-    layout = _plane("mm", {"l": 58, "r": 8, "t": 34, "b": 200})
-    layout["xaxis"] |= {"tickangle": -55, "showgrid": False}
-    layout["yaxis"] |= {"type": "log", "tickvals": [0.05, 0.1, 0.2, 0.5, 1, 2, 5]}
-    return {"data": data, "layout": layout, "config": {}}
+    for series in data:  # lying, so that names can be read
+        series |= {"x": series["y"], "y": series["x"], "hovertemplate": "%{x:.3g} mm"}
+    for series in data[:-1]:
+        series |= {"orientation": "h", "width": 0.8}
+    layout = _plane("", {"l": 8, "r": 16, "t": 34, "b": 44})
+    layout["xaxis"] |= {"type": "log", "title": {"text": "mm"}}
+    layout["xaxis"] |= {"tickvals": [0.05, 0.1, 0.2, 0.5, 1, 2, 5], "range": [-1.5, 0.9]}
+    layout["yaxis"] |= {"tickvals": places, "ticktext": labels, "showgrid": False}
+    layout["yaxis"] |= {"range": [places[-1] + 0.6, -0.6], "automargin": True}
+    return {"data": data, "layout": layout | {"barmode": "overlay"}, "config": {}}
 
 
 def _residual_plot(s: Found) -> dict[str, Any]:
@@ -305,7 +302,7 @@ def _residual_plot(s: Found) -> dict[str, Any]:
     return {"data": data, "layout": layout, "config": {}}
 
 
-def _series(kind: str, name: str, values: Mapping[str, float], colour: str) -> dict[str, Any]:
+def _series(kind: str, name: str, values: Mapping[Any, float], colour: str) -> dict[str, Any]:
     return {
         "type": kind,
         "name": name,

@@ -8,7 +8,7 @@ Its figures are held against what the paper reports, or an independent prototype
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from math import degrees, isfinite
 from pathlib import Path
@@ -19,7 +19,7 @@ from pkmcal.outcome import Check, Figure, Finding, Level, Outcome, Part, Plot, R
 from pkmcal.studies.engine import StudyResult
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.tasks import Key, Setting
-from pkmcal.wording import brief, number
+from pkmcal.wording import brief, count, number
 
 PAPERS = ("a", "b", "c")
 PrintedFigures = Mapping[Key, Mapping[str, str]]
@@ -51,7 +51,14 @@ class Options:
 
 def reproduce(paper: str, options: Options) -> Outcome:
     """One paper's figures beside ours. paper : its letter, small."""
-    return import_module(f"pkmcal.studies.paper_{paper}_report").reproduce(options)
+    found: Outcome = import_module(f"pkmcal.studies.paper_{paper}_report").reproduce(options)
+    if found.verdict.usable or options.runs >= Options.runs:
+        return found
+    advice = (
+        f"{options.runs} runs are few, and what is expected leaves room for twice their Monte-Carlo"
+        f" error only: simulate {Options.runs} or more.",
+    )
+    return replace(found, verdict=replace(found.verdict, advice=advice))
 
 
 class Shown(float):
@@ -129,6 +136,11 @@ class Words:
         passed = all(check.passed for check in checks)
         failed = tuple(check.sentence for check in checks if not check.passed)
         headline, cited = self.say(self.document["headline"]), self.document["cited"]
+        if failed:  # what the words call reproduced may be what is missed
+            headline = (
+                f"Not reproduced: this run misses {len(failed)} of the"
+                f" {count(len(checks), 'expectation')} that it is held against."
+            )
         said = {name: self.say(self.document["remarks"][name]) for name in remarks}
         open_ = [said[name] for name in self.document["not_reproduced"] if name in said]
         return Outcome(
@@ -203,10 +215,11 @@ def accuracy_rows(
 
 
 class Compared(NamedTuple):
-    """One figure in its printed unit with its Monte-Carlo error, and the prototype's.
+    """One figure in its printed ``unit`` with its Monte-Carlo error, and the prototype's.
 
     rounding : half of the prototype's last digit. tolerance : relative difference that is one of
-    the setting, not of the method. held : whether the setting leaves the two comparable.
+    the setting, not of the method. held : whether the setting leaves it comparable. name : what it
+    is, in words.
     """
 
     key: Key
@@ -216,6 +229,8 @@ class Compared(NamedTuple):
     rounding: float
     tolerance: float
     held: bool = True
+    name: str = ""
+    unit: str = ""
 
     @property
     def differs(self) -> bool:
@@ -234,15 +249,23 @@ def compared(
     prototype: PrintedFigures,
     tolerance: Callable[[Key, str], float],
     held: Callable[[Key], bool] = lambda _: True,
+    named: Callable[[Key, str], str] = lambda key, quantity: ", ".join((*key, quantity)),
 ) -> list[Compared]:
-    """Every figure that the prototype gives."""
+    """Every figure that the prototype gives. named : one in words, by its method and quantity."""
     out: list[Compared] = []
     for key, figures in prototype.items():
         for quantity, printed in figures.items():
-            found = study.of(*key)[quantity].times(study.setting.quantities[quantity].factor)
+            shown = study.setting.quantities[quantity]
+            found = study.of(*key)[quantity].times(shown.factor)
             rounding = 0.5 * 10.0 ** -len(printed.partition(".")[2])
             allowed = tolerance(key, quantity)
-            out.append(Compared(key, quantity, found, float(printed), rounding, allowed, held(key)))
+            name = named(key, quantity)
+            out.append(
+                Compared(
+                    key, quantity, found, float(printed), rounding, allowed, held(key),
+                    name, shown.unit,
+                )
+            )  # fmt: skip
     return out
 
 
@@ -252,7 +275,7 @@ def prototype_check(figures: list[Compared], within: str) -> Check:
     """
     held = [f for f in figures if f.held]
     bad = [
-        f"{', '.join(f.key)}, {f.quantity}: {f.found.value:.3g} against {f.expected:g}"
+        f"{f.name}: {f.found.value:.3g} against {f.expected:g} {f.unit}"
         for f in held
         if not f.tolerable
     ]

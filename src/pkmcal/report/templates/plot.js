@@ -14,14 +14,16 @@
     return Object.fromEntries(Object.entries(node).map(([name, value]) => [name, themed(value)]));
   };
   const options = { displayModeBar: false, responsive: true };
-  const draw = (size = {}) => Promise.all(plots.map((plot, i) => {
+  const draw = (size = () => ({})) => Promise.all(plots.map((plot, i) => {
     const figure = themed(figures[i]);
-    return Plotly.react(plot, figure.data, { ...figure.layout, ...size }, { ...options, ...figure.config });
+    return Plotly.react(plot, figure.data, { ...figure.layout, ...size(plot) }, { ...options, ...figure.config });
   }));
-  // On paper: in light colours, and as wide as a panel on A4 between its margins.
+  // On paper: in light colours, as wide as a panel on A4 between its margins, and lower, as the style
+  // has it there, so that two find room on a sheet.
+  const sheet = (plot) => ({ width: 672, height: 0.78 * parseFloat(plot.style.getPropertyValue("--tall")) });
   const paper = async (printing) => {
     document.documentElement.classList.toggle("paper", printing);
-    await draw(printing ? { width: 672 } : { autosize: true });
+    await draw(printing ? sheet : () => ({ autosize: true }));
     if (!printing) for (const plot of plots) Plotly.Plots.resize(plot);
   };
   // What WebGL draws does not reach paper: there a picture of it stands, in light colours, as wide as
@@ -31,7 +33,8 @@
     if (screen) root.classList.add("paper");
     const { data, layout } = themed(figure);
     if (screen) root.classList.remove("paper");
-    const size = { width: 672, height: 440 };  // lower than wide: cameras stand to the sides
+    // alone in its section as low as on a screen: cameras stand to the sides
+    const size = { width: 672, height: plot.closest("#geometry") ? 440 : 320 };
     const margin = { ...layout.margin, b: 8 };  // without the slider
     const still = { ...layout, ...size, margin, autosize: false, sliders: [], updatemenus: [] };
     const image = new Image();

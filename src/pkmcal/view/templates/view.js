@@ -113,7 +113,8 @@ function show(answer) {
   }
   const reasons = new Map();
   for (const edge of answer.missed) reasons.set(edge.reason, [...(reasons.get(edge.reason) ?? []), edge.leg]);
-  const list = lines([...reasons].map(([why, legs]) => `${legs.length === 1 ? "An edge" : `${legs.length} edges`} of leg ${[...new Set(legs)].join(", ")}: ${why}.`), "li");
+  const named = (legs) => legs.length === 1 ? `leg ${legs[0]}` : `legs ${legs.slice(0, -1).join(", ")} and ${legs.at(-1)}`;
+  const list = lines([...reasons].map(([why, legs]) => `${legs.length === 1 ? "An edge" : `${legs.length} edges`} of ${named([...new Set(legs)])}: ${why}.`), "li");
   const ul = document.createElement("ul");
   ul.append(...list);
   $("reasons").replaceChildren(...(list.length ? [ul] : []));
