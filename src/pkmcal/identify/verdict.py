@@ -106,6 +106,7 @@ def judge(
     warnings = (
         *_warnings(observation, estimate, held_out),
         *_poses_doubted(estimate, richer),
+        *(_touch_unnoticed(bed) if bed else ()),
         *cautions,
         *(f"{s.text} {s.advice}" for s in matter),
     )
@@ -149,26 +150,28 @@ def _headline(observation: Observation, estimate: Estimate) -> str:
 
 def _bed_unknown(bed: Bed) -> list[str]:
     """Why heights are of no use, if they are not."""
-    largest = BED_LEFT * bed.by_drawing
-    out: list[str] = []
-    if bed.unnoticed is None or bed.unnoticed > largest:
-        bends = (
-            "as far as it likes" if bed.unnoticed is None else f"by {bed.unnoticed * 1e3:.2g} mm"
-        )
-        more = max(ENOUGH_TOUCHES - bed.touches, ENOUGH_TOUCHES // 2)
-        out.append(
-            f"So few heights, {bed.touches}, do not show a wrong one: a crumb under the probe could"
-            f" bend the bed {bends} unnoticed, and the drawing's tolerances alone bend it by"
-            f" {bed.by_drawing * 1e3:.2g} mm. Probe {more} more places, spread to the edge of the"
-            " bed."
-        )
-    if bed.sigma <= largest:
-        return out
+    if bed.sigma <= BED_LEFT * bed.by_drawing:
+        return []
     return [
-        *out,
         f"The heights leave the tool's height above the bed known to {bed.sigma * 1e3:.2g} mm, and"
         f" the drawing's tolerances alone to {bed.by_drawing * 1e3:.2g} mm: that is no gain. Probe"
         " more points, spread to the edge of the bed, or with a probe that repeats better.",
+    ]
+
+
+def _touch_unnoticed(bed: Bed) -> list[str]:
+    """What one wrong height could do that nothing shows, where that is much: no deviation holds it,
+    for nobody knows how wrong a crumb is.
+    """
+    if bed.unnoticed is not None and bed.unnoticed <= BED_LEFT * bed.by_drawing:
+        return []
+    bends = "as far as it likes" if bed.unnoticed is None else f"by {bed.unnoticed * 1e3:.2g} mm"
+    more = max(ENOUGH_TOUCHES - bed.touches, ENOUGH_TOUCHES // 2)
+    return [
+        f"So few heights, {bed.touches}, do not show a wrong one: a crumb under the probe could"
+        f" bend the bed {bends} unnoticed, and the drawing's tolerances alone bend it by"
+        f" {bed.by_drawing * 1e3:.2g} mm. Probe these again and compare, or {more} more places,"
+        " spread to the edge of the bed.",
     ]
 
 
