@@ -34,7 +34,9 @@ TAILS = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 """Degrees of freedom that are tried: the last is as good as the normal distribution."""
 LEAST = 0.75
 """Of the stated deviation at least, whatever the data say: what neighbours have in common beside
-what shades them, the parameters take up in part, and residuals come out smaller than errors are."""
+what shades them, the parameters take up in part, and residuals come out smaller than errors are.
+How much is no result of theory: on seventeen path-traced sessions errors were as stated with it,
+and with residuals believed as they are, a tenth larger."""
 STATED = 5.0
 """Edges that the stated noise is worth when their own is found."""
 ROUNDS = 60
