@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from pkmcal.control.simulation import End
-from pkmcal.geometry.rigid import inverse
+from pkmcal.geometry.rigid import apply, inverse
+from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.report.page import page_html
 from pkmcal.studies import engine, paper_b
 from pkmcal.studies import paper_b_expected as expected
@@ -32,7 +33,7 @@ from pkmcal.studies.paper_b import (
     study_machine,
     views,
 )
-from pkmcal.studies.paper_b_control import BY_HAND, E1, E2, controlled
+from pkmcal.studies.paper_b_control import BY_HAND, E1, E2, GOAL, START, controlled
 from pkmcal.studies.paper_b_report import reproduced
 
 RUNS = 16
@@ -178,13 +179,34 @@ def test_figures_of_the_prototype_are_compared(short):
 def test_the_page_has_the_papers_figures(found):
     assert found.verdict.usable
     page = page_html(found)
-    for name in ("shares", "mirror", "lateral", "top", "camera", "error", "beside"):
+    names = ("shares", "mirror", "lateral", "top", "camera", "start", "goal", "error", "beside")
+    for name in names:
         text = re.search(rf'id="figure-{name}">(.*?)</script>', page, re.DOTALL)
         figure = json.loads(text[1], parse_constant=pytest.fail)
         assert all(len(trace["x"]) == len(trace["y"]) > 0 for trace in figure["data"]), name
     for said in ("12 and 8 mm", "Not reproduced: the overshoot of E3", "E1 and E2 cannot be told"):
         assert said in " ".join(page.split())
     assert "{" not in found.verdict.headline
+
+
+def test_legs_are_drawn_as_the_camera_has_them(ran, found):
+    """[B] Fig. 9: a leg's outline is as wide as its cylinder there, and nearer legs hide others."""
+    parts = {plot.name: plot for part in found.parts for plot in part.plots}
+    machine, T = ran.eye.true.machine, ran.eye.true.T_camera_base
+    for name, readings in (("start", START), ("goal", GOAL)):
+        legs = [t for t in parts[name].figure["data"] if t["name"].startswith("leg ")]
+        ends = limb_ends(machine.layout, machine.values, readings, machine.forward(readings))
+        depth = apply(T, ends.a)[:, 2] + apply(T, ends.b)[:, 2]
+        order = [int(leg["name"][4:]) - 1 for leg in legs]
+        assert sorted(order) == list(range(6))
+        assert (np.diff(depth[order]) <= 0).all()
+        focal = ran.eye.camera.parameters[0]
+        for leg, k in zip(legs, order, strict=True):
+            x, y = (np.array(leg[axis], dtype=float)[:-1] for axis in "xy")
+            there, back = np.stack([x, y], 1).reshape(2, -1, 2)
+            width = np.linalg.norm(there - back[::-1], axis=1)
+            across = 2 * ran.eye.true.radius[k] * focal / (depth[k] / 2)
+            assert width == pytest.approx(across, rel=0.25), (name, k)
 
 
 def test_numbers_for_programs(short, ran, found):

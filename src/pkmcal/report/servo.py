@@ -15,8 +15,6 @@ from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
 from pkmcal.outcome import (
-    AXIS,
-    LOOKS,
     Figure,
     Finding,
     Level,
@@ -26,6 +24,7 @@ from pkmcal.outcome import (
     Row,
     Table,
     Verdict,
+    plane,
 )
 from pkmcal.report.scene import coordinates, line, markers, ring, space_layout
 from pkmcal.wording import brief, number
@@ -448,7 +447,7 @@ def curves(s: Study) -> dict[str, Any]:
     for o in s.outcomes:
         values = np.maximum(np.median(shares(o, o.runs.error)[:, rows], axis=0), LEAST)
         data.append(_curve(o, time[rows], values, "%{y:.2g} after %{x:.2f} s"))
-    layout = _plane("time, s", "error / error at the start")
+    layout = plane("time, s", "error / error at the start")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
     return {"data": data, "layout": layout, "config": {}}
 
@@ -461,7 +460,7 @@ def tail(s: Study) -> dict[str, Any]:
     for o in s.outcomes:
         values = 100 * np.median(shares(o, o.runs.way)[:, rows], axis=0)
         data.append(_curve(o, time[rows], values, "%{y:.2f} % after %{x:.2f} s"))
-    layout = _plane("time, s", "% of the way")
+    layout = plane("time, s", "% of the way")
     layout["yaxis"] |= {"range": [0, 10]}
     return {"data": data, "layout": layout, "config": {}}
 
@@ -484,16 +483,6 @@ def _band(time: Array, values: Array, colour: str, name: str) -> dict[str, Any]:
     edge = np.concatenate([values.max(axis=0), values.min(axis=0)[::-1]])
     fill = {"fill": "toself", "fillcolor": colour, "showlegend": False}
     return _flat(f"{name}, all runs", _rounded(both), _rounded(edge), {"width": 0}, **fill)
-
-
-def _plane(x: str, y: str) -> dict[str, Any]:
-    return {
-        **LOOKS,
-        "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
-        "xaxis": {**AXIS, "title": {"text": x}},
-        "yaxis": {**AXIS, "title": {"text": y}},
-    }
 
 
 # ------------------------------------------------------------------ in space
@@ -615,18 +604,10 @@ def image(s: Study, run: int) -> dict[str, Any]:
     data += _edges(s, goal, 2.6, "at the goal", "solid")
     data += _ways(s, run, "identified", "solid")
     data += _ways(s, run, "hand", "dash")
-    layout = {
-        **LOOKS,
-        "margin": {"l": 48, "r": 12, "t": 8, "b": 40},
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
-        "xaxis": {**AXIS, "title": {"text": "pixels"}, "range": [-0.04 * width, 1.04 * width]},
-        "yaxis": {
-            **AXIS,
-            "range": [1.04 * height, -0.04 * height],
-            "scaleanchor": "x",
-            "scaleratio": 1,
-        },
-    }
+    layout = plane("x, pixels", "y, pixels")
+    layout["xaxis"] |= {"range": [-0.04 * width, 1.04 * width]}
+    layout["yaxis"] |= {"range": [1.04 * height, -0.04 * height], "scaleanchor": "x"}
+    layout["yaxis"] |= {"scaleratio": 1}
     return {"data": data, "layout": layout, "config": {}}
 
 

@@ -14,8 +14,6 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.outcome import (
-    AXIS,
-    LOOKS,
     Figure,
     Level,
     Outcome,
@@ -25,6 +23,7 @@ from pkmcal.outcome import (
     Table,
     Verdict,
     note,
+    plane,
 )
 from pkmcal.studies.calibrations import ESTIMATE
 from pkmcal.studies.engine import StudyResult
@@ -263,16 +262,6 @@ def _kind(name: str) -> str:
 # ------------------------------------------------------------------ plots
 
 
-def _plane(x: str, y: str) -> dict[str, Any]:
-    return {
-        **LOOKS,
-        "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
-        "xaxis": {**AXIS, "title": {"text": x}},
-        "yaxis": {**AXIS, "title": {"text": y}, "rangemode": "tozero"},
-    }
-
-
 def _trace(name: str, x: list[Any], y: list[float], colour: str, **more: Any) -> dict[str, Any]:
     shape = {"type": "scatter", "mode": "lines+markers", "name": name, "x": x}
     values = [None if not np.isfinite(v) else round(v, 6) for v in y]
@@ -314,7 +303,8 @@ def _curves(study: SweepResult) -> tuple[Plot, ...]:
                 told = f"stated, {label}" if label else "stated"
                 data.append(_trace(told, x, stated, colour, line=dash, mode="lines"))
         unit = study.subject.names[name].unit
-        layout = _plane(_name(name) + (f", {unit}" if unit else ""), "tool's position, mm")
+        layout = plane(_name(name) + (f", {unit}" if unit else ""), "tool's position, mm")
+        layout["yaxis"] |= {"rangemode": "tozero"}
         numbers = [v for v in x if not isinstance(v, str)]
         if numbers and min(numbers) > 0 and max(numbers) / min(numbers) >= 8:
             layout["xaxis"] |= {"type": "log"}
@@ -348,8 +338,7 @@ def _held(study: SweepResult) -> Plot:
         _trace("parameters", x, own.tolist(), "--calibrated"),
         _trace("tool's pose", x, tool.tolist(), "--drawing"),
     ]
-    layout = _plane("interval, %", "hold the truth, %")
-    layout["yaxis"] |= {"rangemode": "normal"}
+    layout = plane("interval, %", "hold the truth, %")
     return Plot(
         "held",
         "Intervals that hold",

@@ -1,4 +1,4 @@
-"""[B] V computed again: Figs. 6, 7, 8 and 10, 12 mm and 8 mm, beside the paper's figures."""
+"""[B] V computed again: Figs. 6 to 10, 12 mm and 8 mm, beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.geometry.rigid import apply, inverse, register
+from pkmcal.geometry.rigid import apply, inverse, pose_difference, register
 from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.outcome import AXIS, LOOKS, Outcome, Part, Row, Table
+from pkmcal.outcome import Outcome, Part, Row, Table, plane
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_b import (
     CASES,
@@ -32,7 +32,7 @@ from pkmcal.studies.paper_b import (
     study_machine,
     views,
 )
-from pkmcal.studies.paper_b_control import E1, E2, ControlledHexapod, controlled
+from pkmcal.studies.paper_b_control import E1, E2, GOAL, START, ControlledHexapod, controlled
 from pkmcal.studies.paper_b_expected import CAD, PROTOTYPE, checks, figures_compared
 from pkmcal.studies.reproduction import Column, Options, Words, accuracy_rows
 from pkmcal.wording import number
@@ -60,6 +60,8 @@ COLUMNS = [
     Column("pixel", 3, 3),
     Column("cad", 1, 1),
 ]
+ALONG = 9
+"""Places along an edge that is drawn."""
 ENLARGED = 10.0
 """Times that errors are drawn enlarged."""
 RUNS_SHOWN = 0
@@ -92,9 +94,16 @@ def reproduced(found: Found, ran: ControlledHexapod, elapsed: float) -> Outcome:
     return words.reproduction(
         (
             words.part("accuracy", *_tables(found), plots={"shares": {"figure": _shares(found)}}),
-            words.part("figure-6", plots={"mirror": {"figure": _picture(found, MIRROR)}}),
+            words.part("figure-6", plots={"mirror": _picture(found, MIRROR)}),
             _geometry_part(words, found),
-            words.part("figure-8", plots={"camera": {"figure": _picture(found, PERSPECTIVE, ran)}}),
+            words.part("figure-8", plots={"camera": _picture(found, PERSPECTIVE, ran)}),
+            words.part(
+                "figure-9",
+                plots={
+                    name: _configuration(ran, readings)
+                    for name, readings in (("start", START), ("goal", GOAL))
+                },
+            ),
             words.part(
                 "figure-10",
                 _control_table(ran),
@@ -120,6 +129,8 @@ def _words(s: Found, ran: ControlledHexapod, elapsed: float) -> Words:
     astray = {
         f"{name}_astray": 1e3 * float(np.median(trial.astray)) for name, trial in ran.trials.items()
     }
+    start, goal = ran.eye.true.machine.forward(np.array([START, GOAL]))
+    way = pose_difference(goal, start)
     return Words.of(
         "b",
         s,
@@ -131,6 +142,8 @@ def _words(s: Found, ran: ControlledHexapod, elapsed: float) -> Words:
         mirror_pixel=float(np.linalg.norm(project(estimated) - project(true), axis=-1).max()),
         mirror_off=1e3 * float(np.linalg.norm(estimated - true, axis=-1).max()),
         hand_pixel=float(np.median(by_hand)),
+        way=1e3 * float(np.linalg.norm(way[3:])),
+        way_tilt=float(np.degrees(np.linalg.norm(way[:3]))),
         **astray,
     )
 
@@ -198,7 +211,7 @@ def _shares(s: Found) -> dict[str, Any]:
         }  # fmt: skip
         trace = _trace(LABELS[method], list(cases), list(cases.values()), colour, "lines+markers")
         data.append({**trace, "hovertemplate": "%{y:.3g} mm with %{x} %"})
-    layout = _plane("wrong edges, %", "error of a joint, mm")
+    layout = plane("wrong edges, %", "error of a joint, mm")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
     return {"data": data, "layout": layout, "config": {}}
 
@@ -227,11 +240,17 @@ def _picture(s: Found, view: str, ran: ControlledHexapod | None = None) -> dict[
         )
         data.append(_marks("by hand", true + off, "--calibrated", "x-thin", 11))
     data.append(_marks("estimated joints", estimated, "--drawing", "circle-open", 13))
-    width, height = camera.image_size
-    layout = _plane("x, pixels", "y, pixels")
-    layout["xaxis"] |= {"range": [-0.5, width - 0.5]}
-    layout["yaxis"] |= {"range": [height - 0.5, -0.5], "scaleanchor": "x", "scaleratio": 1}
-    return {"data": data, "layout": layout, "config": {}}
+    return _photograph(camera.image_size, data)
+
+
+def _photograph(image_size: tuple[int, int], data: list[dict[str, Any]]) -> dict[str, Any]:
+    """A plot whose axes are a picture's, framed, with y downwards."""
+    width, height = image_size
+    layout = plane("x, pixels", "y, pixels")
+    framed = {"showline": True, "mirror": True, "constrain": "domain"}
+    layout["xaxis"] |= {**framed, "range": [-0.5, width - 0.5]}
+    layout["yaxis"] |= {**framed, "range": [height - 0.5, -0.5], "scaleanchor": "x"}
+    return {"figure": {"data": data, "layout": layout, "config": {}}, "height": 500}
 
 
 def _geometry_part(words: Words, s: Found) -> Part:
@@ -252,11 +271,32 @@ def _geometry_part(words: Words, s: Found) -> Part:
             _marks(title, points[:, axes], colour, symbol, size)
             for title, points, colour, symbol, size in sets
         ]
-        layout = _plane("xyz"[axes[0]] + ", m", "xyz"[axes[1]] + ", m")
+        layout = plane("xyz"[axes[0]] + ", m", "xyz"[axes[1]] + ", m")
         layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
         figure = {"data": data, "layout": layout, "config": {}}
         plots[name] = {"figure": figure, "height": 300 if name == "lateral" else 420}
     return words.part("figure-7", plots=plots)
+
+
+def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
+    """[B] Fig. 9: the camera's picture at readings (m,); nearer legs before those behind them."""
+    machine, camera, T = ran.eye.true.machine, ran.eye.camera, ran.eye.true.T_camera_base
+    pose = machine.forward(readings)
+    edges = ran.eye.points(pose[None], readings[None], ALONG).pixel[0].reshape(-1, 2, ALONG, 2)
+    ends = limb_ends(machine.layout, machine.values, readings, pose)
+    base, platform = apply(T, ends.a), apply(T, ends.b)
+    data: list[dict[str, Any]] = []
+    for leg in np.argsort(-(base + platform)[:, 2]):
+        first, second = edges[ran.eye.true.legs.tolist().index(leg)]
+        outline = np.concatenate([first, second[::-1], first[:1]])
+        drawn = _trace(f"leg {leg + 1}", *outline.T, f"--leg{leg + 1}", "lines")
+        data.append({**drawn, "fill": "toself", "fillcolor": "--card", "legendrank": int(leg)})
+    x, y, _ = (machine.platform_centers() - machine.platform_centers().mean(axis=0)).T
+    around = np.argsort(np.arctan2(y, x))
+    ring = camera.project(platform)[[*around, around[0]]]
+    data.append(_trace("platform", *ring.T, "--ink", "lines"))
+    data.append(_marks("base joints", camera.project(base), "--ink", "circle", 6))
+    return _photograph(camera.image_size, data)
 
 
 def _errors(ran: ControlledHexapod) -> dict[str, Any]:
@@ -268,7 +308,7 @@ def _errors(ran: ControlledHexapod) -> dict[str, Any]:
         trace = _trace(title, runs.time, np.maximum(share, 1e-5), colour, "lines")
         trace["line"] |= {"dash": dash, "width": 2}
         data.append(trace)
-    layout = _plane("time, s", "error / error at the start")
+    layout = plane("time, s", "error / error at the start")
     layout["yaxis"] |= {"type": "log", "exponentformat": "power", "dtick": 1}
     return {"data": data, "layout": layout, "config": {}}
 
@@ -285,7 +325,7 @@ def _beside(ran: ControlledHexapod) -> dict[str, Any]:
         trace = _trace(title, ideal.time, 1e3 * np.median(off, axis=0), colour, "lines")
         trace["line"] |= {"dash": dash, "width": 2}
         data.append(trace)
-    return {"data": data, "layout": _plane("time, s", "mm"), "config": {}}
+    return {"data": data, "layout": plane("time, s", "mm"), "config": {}}
 
 
 def _trace(name: str, x: Any, y: Any, colour: str, mode: str) -> dict[str, Any]:
@@ -308,16 +348,6 @@ def _marks(name: str, points: Array, colour: str, symbol: str, size: float) -> d
 
 def _plain(values: Any) -> list[float | None]:
     return [float(f"{v:.5g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
-
-
-def _plane(x: str, y: str) -> dict[str, Any]:
-    return {
-        **LOOKS,
-        "margin": {"l": 64, "r": 12, "t": 8, "b": 44},
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
-        "xaxis": {**AXIS, "title": {"text": x}},
-        "yaxis": {**AXIS, "title": {"text": y}},
-    }
 
 
 # ------------------------------------------------------------------ for programs

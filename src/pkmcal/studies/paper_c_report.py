@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.outcome import AXIS as OF_PLOTS
-from pkmcal.outcome import LOOKS, Outcome, Row, Table
+from pkmcal.outcome import Outcome, Row, Table, plane
 from pkmcal.studies.engine import StudyResult, run
 from pkmcal.studies.paper_c import (
     AXIS,
@@ -278,12 +277,12 @@ def _accuracy_plot(s: Found) -> dict[str, Any]:
         series |= {"x": series["y"], "y": series["x"], "hovertemplate": "%{x:.3g} mm"}
     for series in data[:-1]:
         series |= {"orientation": "h", "width": 0.8}
-    layout = _plane("", {"l": 8, "r": 16, "t": 34, "b": 44})
-    layout["xaxis"] |= {"type": "log", "title": {"text": "mm"}}
+    layout = plane("mm", "") | {"margin": {"l": 8, "r": 16, "t": 34, "b": 44}, "barmode": "overlay"}
+    layout["xaxis"] |= {"type": "log"}
     layout["xaxis"] |= {"tickvals": [0.05, 0.1, 0.2, 0.5, 1, 2, 5], "range": [-1.5, 0.9]}
     layout["yaxis"] |= {"tickvals": places, "ticktext": labels, "showgrid": False}
     layout["yaxis"] |= {"range": [places[-1] + 0.6, -0.6], "automargin": True}
-    return {"data": data, "layout": layout | {"barmode": "overlay"}, "config": {}}
+    return {"data": data, "layout": layout, "config": {}}
 
 
 def _residual_plot(s: Found) -> dict[str, Any]:
@@ -298,7 +297,7 @@ def _residual_plot(s: Found) -> dict[str, Any]:
         bars = _series("bar", f"{label}: the paper", paper, colours[key])
         data.append({**bars, "marker": {"color": colours[key], "opacity": 0.35}})
         data.append(_series("bar", f"{label}: found", found, colours[key]))
-    layout = _plane("mrad", {"l": 58, "r": 8, "t": 34, "b": 40})
+    layout = plane("", "mrad") | {"margin": {"l": 58, "r": 8, "t": 34, "b": 40}}
     return {"data": data, "layout": layout, "config": {}}
 
 
@@ -310,17 +309,6 @@ def _series(kind: str, name: str, values: Mapping[Any, float], colour: str) -> d
         "y": [round(v, 4) for v in values.values()],
         "marker": {"color": colour},
         "hovertemplate": "%{x}: %{y:.3g}",
-    }
-
-
-def _plane(unit: str, margin: dict[str, int]) -> dict[str, Any]:
-    return {
-        **LOOKS,
-        "margin": margin,
-        "barmode": "group",
-        "legend": {"orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom"},
-        "xaxis": {**OF_PLOTS, "fixedrange": True},
-        "yaxis": {**OF_PLOTS, "fixedrange": True, "title": {"text": unit}},
     }
 
 
