@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import cv2
@@ -118,6 +119,10 @@ def test_a_delta_kit_with_a_board(workplace):
         assert done.code == 0, done.out + done.err
         first = form(shown).partition(" #")[0]
         assert form(done.out, workplace).startswith(first), command
+    text = (kit / "calibration" / "calibration.json").read_text()
+    # the readings are rounded, and exact beside that; 0.004 mm is a step's deviation
+    most = json.loads(text)["statistics"]["reading_range"][1]
+    assert most is None or most * 0.004 > 0.001 / np.sqrt(12)
     values = (kit / "export-klipper" / "pkmcal_printer.cfg").read_text()
     radius = re.search(r"delta_radius: ([\d.]+)", values)
     assert radius

@@ -434,14 +434,17 @@ def noise_told(session: Session, estimate: Estimate, departed: bool = False) -> 
     s, out = estimate.statistics, list[str]()
     units, file = set(session.machine.joint_units), "session.yaml"
     if s.reading_scale != 1 and not _within(1.0, s.reading_range):
-        found, stated = (
-            _lengths(session.joint_noise * scale, units) for scale in (s.reading_scale, 1.0)
+        least, most = s.reading_range
+        used, stated, bound = (
+            _lengths(session.joint_noise * scale, units)
+            for scale in (s.reading_scale, 1.0, most or 0.0)
         )
-        bound = "" if s.reading_range[0] else "no more than some "
+        found, taken = used, "What they scatter by"
+        if most is not None and not least:
+            found, taken = f"no more than some {bound}", used
         out.append(
-            f"The readings scatter by {bound}{found}; joints.noise in {file} says {stated}. What"
-            f" they scatter by was used (the data allow {_between(s.reading_range)} times the"
-            " stated noise): "
+            f"The readings scatter by {found}; joints.noise in {file} says {stated}. {taken} was"
+            f" used (the data allow {_between(s.reading_range)} times the stated noise): "
             + (
                 "what is named before may be all that they scatter by."
                 if departed

@@ -190,7 +190,10 @@ def _settle(
         if robust:
             weight = settled_weights(problem, state, scale)
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
-        found_readings = np.abs(factor - 1).max() < SCALE_CHANGE
+        readings = problem.joint_noise
+        if by_data.any():
+            readings = problem.joint_noise_times(factor, state)
+        found_readings = np.abs(readings / problem.joint_noise - 1).max() < SCALE_CHANGE
         found_edges = edges.close_to(fit.edges, SHADING_CHANGE)
         found_all = found_shading and found_readings and found_edges
         if found_all and _settled(scale, fit.scale, weight, fit.weight):
@@ -199,8 +202,7 @@ def _settle(
             units = problem.data.shading / shading  # the same shifts in other units
             state = replace(state, shading=state.shading * units)
             problem = problem.shaded(shading)
-        if by_data.any():
-            problem = replace(problem, joint_noise=problem.joint_noise * factor)
+        problem = replace(problem, joint_noise=readings)
         fit = _solved(problem, state, weight, scale, fit.solution.steps, edges, trust)
     return fit
 

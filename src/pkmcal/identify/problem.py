@@ -37,6 +37,7 @@ from pkmcal.identify.rows import (
     by_noise,
     edge_rows,
     joint_rows,
+    least_joint_noise,
     pose_rows,
 )
 from pkmcal.identify.unknowns import BatchState, Unknowns
@@ -470,6 +471,11 @@ class Problem:
             state.breathing,
             state.sizes,
         )
+
+    def joint_noise_times(self, factor: Array, state: BatchState) -> Array:
+        """The readings' noise (B,) times a factor, but not less than their closures can tell."""
+        least = least_joint_noise(self.layout, self.closure(state).by_reading)
+        return np.maximum(factor * self.joint_noise, np.minimum(least, self.joint_noise))
 
     def _by_noise(self, c: Closure, rows: Array) -> Array:
         """Rows (B, K, E, n) of the closure in standard deviations."""

@@ -384,6 +384,16 @@ def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> 
     return np.where(layout.row_motor >= 0, sigma, PERFECT)
 
 
+def least_joint_noise(layout: LimbLayout, by_reading: Array) -> Array:
+    """Noise of the readings (B,) below which no closure counts more, for slopes (B, K, E); 0 where
+    a rod is read, whose closure is as sharp as its reading.
+    """
+    if layout.rod_reads[layout.closing].any() and not layout.shares_motors:
+        return np.zeros(len(by_reading))
+    steepest = np.abs(by_reading * (layout.row_motor >= 0)).max(axis=(1, 2))
+    return PERFECT / np.maximum(steepest, PERFECT)
+
+
 def joint_rows(layout: LimbLayout, by_reading: Array, rows: Array) -> Array:
     """Whitened closure rows (..., E) as one a reading, (..., m)."""
     if not layout.shares_motors:

@@ -277,7 +277,8 @@ def _accuracy_plot(s: Found) -> dict[str, Any]:
         series |= {"x": series["y"], "y": series["x"], "hovertemplate": "%{x:.3g} mm"}
     for series in data[:-1]:
         series |= {"orientation": "h", "width": 0.8}
-    layout = plane("mm", "") | {"margin": {"l": 8, "r": 16, "t": 34, "b": 44}, "barmode": "overlay"}
+    layout = plane("mm", "")
+    layout |= {"margin": {"l": 8, "r": 16, "t": 34, "b": 44}, "barmode": "overlay"}
     layout["xaxis"] |= {"type": "log"}
     layout["xaxis"] |= {"tickvals": [0.05, 0.1, 0.2, 0.5, 1, 2, 5], "range": [-1.5, 0.9]}
     layout["yaxis"] |= {"tickvals": places, "ticktext": labels, "showgrid": False}
@@ -297,7 +298,8 @@ def _residual_plot(s: Found) -> dict[str, Any]:
         bars = _series("bar", f"{label}: the paper", paper, colours[key])
         data.append({**bars, "marker": {"color": colours[key], "opacity": 0.35}})
         data.append(_series("bar", f"{label}: found", found, colours[key]))
-    layout = plane("", "mrad") | {"margin": {"l": 58, "r": 8, "t": 34, "b": 40}}
+    layout = plane("", "mrad")
+    layout["margin"] = {"l": 58, "r": 8, "t": 34, "b": 40}
     return {"data": data, "layout": layout, "config": {}}
 
 
