@@ -289,12 +289,12 @@ def _configuration(ran: ControlledHexapod, readings: Array) -> dict[str, Any]:
     for leg in np.argsort(-(base + platform)[:, 2]):
         first, second = edges[ran.eye.true.legs.tolist().index(leg)]
         outline = np.concatenate([first, second[::-1], first[:1]])
-        drawn = _trace(f"leg {leg + 1}", *outline.T, f"--leg{leg + 1}", "lines")
+        drawn = _trace(f"leg {leg + 1}", outline[:, 0], outline[:, 1], f"--leg{leg + 1}", "lines")
         data.append({**drawn, "fill": "toself", "fillcolor": "--card", "legendrank": int(leg)})
     x, y, _ = (machine.platform_centers() - machine.platform_centers().mean(axis=0)).T
     around = np.argsort(np.arctan2(y, x))
     ring = camera.project(platform)[[*around, around[0]]]
-    data.append(_trace("platform", *ring.T, "--ink", "lines"))
+    data.append(_trace("platform", ring[:, 0], ring[:, 1], "--ink", "lines"))
     data.append(_marks("base joints", camera.project(base), "--ink", "circle", 6))
     return _photograph(camera.image_size, data)
 
