@@ -196,6 +196,24 @@ def test_better_than_the_drawing(hexapod):
     assert some.startswith("14 of 24 of these configurations are seen from one of the 3 stations")
 
 
+def test_rows_that_contradict_the_verdict_are_explained(hexapod):
+    """One station sees depth badly: plain root mean squares are its noise, the weighed ones not."""
+    drawing, true, estimate, _ = hexapod
+    _, _, stations, data = legs_case(60, true)
+    judged = judged_on(drawing, estimate, estimate.machine, data, stations)
+    assert not validation_verdict(judged, (), estimate.machine, data).warnings
+    seen, as_drawn = judged.calibrated, judged.figures(judged.drawing)
+    worse = as_drawn.joint_rms[2] / judged.figures(seen).joint_rms[2]
+    off = seen.residuals * np.where(np.arange(6) == 2, 1.1 * worse, 1.0)
+    blurred = replace(judged, calibrated=replace(seen, residuals=off))
+    (told,) = validation_verdict(blurred, (), estimate.machine, data).warnings
+    promised = f"{1e3 * judged.promise.joint_rms[2]:.2g} mm"
+    assert f"(joint 3: to {promised}) that single rows" in told
+    far = replace(judged, calibrated=replace(seen, position=judged.drawing.position * 1.1))
+    (told,) = validation_verdict(far, (), estimate.machine, data).warnings
+    assert told.startswith("Some directions are seen so badly in these photographs that single")
+
+
 def test_a_leg_that_changed_is_named(hexapod):
     drawing, true, estimate, _ = hexapod
     _, _, stations, data = legs_case(60, changed(true, "legs[3].length.offset", 1e-3))

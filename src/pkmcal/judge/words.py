@@ -88,6 +88,8 @@ def validation_verdict(
             " photographed anew: what is wrong there was wrong then, so they say little of other"
             " poses. Photograph poses that it did not see.",
         )
+    if judged and gain.better:
+        warnings += _hardly_seen(judged, units)
     noise = _noise(after, floor, unit, measurements, np.concatenate([g.rows for g in groups]))
     return Verdict(not reasons, headline, tuple(reasons), tuple(warnings), noise)
 
@@ -156,6 +158,25 @@ def _too_large(group: BesideDrawing, units: tuple[str, ...]) -> str:
         f" deviations and the photographs' noise promise{said}; chance does not explain that."
         " The machine has changed since, or something that the model leaves out moves it."
     )
+
+
+def _hardly_seen(group: BesideDrawing, units: tuple[str, ...]) -> list[str]:
+    """Where plain root mean squares contradict the verdict, which weighs what was seen better."""
+    by_drawing, by_calibrated = (group.figures(e) for e in (group.drawing, group.calibrated))
+    worse = by_calibrated.joint_rms > by_drawing.joint_rms
+    if not worse.any() and by_calibrated.position <= by_drawing.position:
+        return []
+    told = ""
+    if worse.any():
+        joint = int(np.argmax(np.where(worse, by_calibrated.joint_rms, -np.inf)))
+        promised = amount(float(group.promise.joint_rms[joint]), units[joint])
+        told = f" (joint {joint + 1}: to {promised})"
+    return [
+        f"Some directions are seen so badly in these photographs{told} that single rows of the"
+        " table show their noise rather than the machine, the calibrated one's above the"
+        " drawing's; the comparison above weighs every direction by how well it is seen."
+        " Photographs from a second place see what one place does not."
+    ]
 
 
 def _in_common(group: BesideDrawing, units: tuple[str, ...]) -> str:
