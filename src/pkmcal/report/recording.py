@@ -173,20 +173,20 @@ def _tubes(
 
 def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     """A station's photograph with what was found in it, and the calibrated machine's contour."""
-    import cv2
-
     at, session, estimate = k + 1, c.session, c.estimate
     station = session.stations[s]
     path = ("machine", "cameras", station.name, "image")
     photo = next((p for p in station.photographs if p.configuration == k), None)
     if photo is None:
-        for part in ("photograph", "edges", "aside", "contour"):
+        # black: rerun's viewer goes on showing a coded picture that was cleared (its issue 12793)
+        width, height = station.camera.image_size
+        yield Logged((*path, "photograph"), "photograph", _coded(np.zeros((height, width))), at)
+        for part in ("edges", "aside", "contour"):
             yield Logged((*path, part), "clear", {}, at)
         return
     label = label_of(session.folder, photo.path)
     grey: Any = decode(photo.path, station.camera.image_size, label)
-    coded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
-    yield Logged((*path, "photograph"), "photograph", {"jpeg": coded}, at)
+    yield Logged((*path, "photograph"), "photograph", _coded(grey), at)
     edges = c.observation.edges
     mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
     curves = edge_curves(session, c.observation, estimate, mine, s)
@@ -216,6 +216,12 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     if len(mine):
         level = rms(estimate.edge_residuals[mine], estimate.edge_weights[mine])
         yield Logged(("residuals", "edges", station.name), "numbers", {"value": level}, at)
+
+
+def _coded(grey: Any) -> dict[str, Any]:
+    import cv2
+
+    return {"jpeg": cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()}
 
 
 def _tip(c: Calibration, n: int) -> str:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 APPLICATION = "pkmcal"
 TIMELINE = "configuration"
 ENDING = ".rrd"
+BESIDE = 4
+"""Stations whose photographs stand beside each other; those of more behind each other."""
 
 
 def check_rrd(path: Path | str) -> None:
@@ -109,11 +111,12 @@ def _blueprint(stations: tuple[str, ...]) -> Any:
         )
         for name in stations
     ]
+    beside = rrb.Grid if len(stations) <= BESIDE else rrb.Tabs
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Spatial3DView(origin="/machine", name="Machine"),
             rrb.Vertical(
-                rrb.Tabs(*photographs) if photographs else rrb.TextDocumentView(),
+                beside(*photographs) if photographs else rrb.TextDocumentView(),
                 rrb.TimeSeriesView(origin="/residuals", name="Residuals, standard deviations"),
                 rrb.Tabs(
                     rrb.TextDocumentView(origin="/result/summary", name="Result"),
