@@ -1,23 +1,28 @@
 """Where photographs by hand were taken from.
 
 Each photograph is searched by itself (:mod:`pkmcal.observe.alone`), for nothing but the machine
-joins it to others. A board on the base places those that see it beside one that is placed. What is
-unsure is left out and told, for one photograph in a wrong place spoils the rest; and where the
-joint estimate gives up most of a photograph's edges, it was in a wrong place.
+joins it to others, and from the places that it could show it is looked at more closely
+(:mod:`pkmcal.calibration.closely`). A board on the base places those that see it beside one that is
+placed. Those that are sure tell the machine better than its drawing, and with that the others are
+asked again, until none is added. What stays unsure is left out and told, for one photograph in a
+wrong place spoils the rest; and where the joint estimate gives up most of a photograph's edges, it
+was in a wrong place.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
+from pkmcal.calibration.closely import Together, join, look_closer
 from pkmcal.calibration.recognise import WORKERS, Progress
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import dot, pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Measurements
@@ -59,43 +64,75 @@ def place_by_hand(
 ) -> Placed:
     """Find the places of the photographs by hand; those that are not found are left out and told.
 
-    photographs : of all stations that observe legs. poses : T_base_platform (K, 4, 4) by the
-    drawing. known : T_camera_base (S, 4, 4) of the stations that are placed already, NaN for the
-    others. told : called with the step in words and the share done. Raises `InputError` where no
-    photograph by hand is placed.
+    Raises `InputError` where no photograph by hand is placed; see :func:`search_by_hand`.
     """
-    found = found_alone(session, photographs, poses, told)
-    believed = _believed(found, boards, known)
+    found, believed = search_by_hand(session, photographs, poses, boards, known, told)
     lost = {k: why_lost(one) for k, one in found.items() if np.isnan(believed[k]).any()}
     return _without(session, photographs, boards, believed, lost)
 
 
-def found_alone(
+def search_by_hand(
     session: Session,
     photographs: list[legs.Photographs],
     poses: Array,
+    boards: Boards,
+    known: Array,
     told: Progress | None = None,
-) -> dict[int, Alone]:
-    """The places that each photograph by hand could show, by its station's number."""
+) -> tuple[dict[int, Alone], Array]:
+    """The places that each photograph by hand could show, by its station's number; and the poses
+    T_camera_base (S, 4, 4) that are believed, NaN for the others.
+
+    photographs : of all stations that observe legs. poses : T_base_platform (K, 4, 4) by the
+    drawing. known : T_camera_base (S, 4, 4) of the stations that are placed already, NaN for the
+    others. told : called with the step in words and the share done.
+    """
     at = {p.station: p for p in photographs}
     by_hand = [k for k in at if session.stations[k].handheld]
     tubes = tubes_of(session.machine)
+    machine = Together.as_drawn(session.machine, poses)
 
-    def search(k: int) -> Alone:
+    def search(k: int) -> tuple[Alone, Alone]:
         p, image = at[k], at[k].images[0]
         tables = distance_tables([image])
         view = StationView(
             session.machine, p.camera, tubes, p.configuration, session.joints, poses, tables
         )
-        return find_alone(view, image)
+        rough = find_alone(view, image)
+        return rough, look_closer(session, p, machine, rough)
 
+    rough: dict[int, Alone] = {}
     found: dict[int, Alone] = {}
     with ThreadPoolExecutor(WORKERS) as pool:
-        for k, one in zip(by_hand, pool.map(search, by_hand), strict=True):
-            found[k] = one
+        for k, both in zip(by_hand, pool.map(search, by_hand), strict=True):
+            rough[k], found[k] = both
             if told is not None:
                 told(f"Placing photographs by hand: {len(found)} of {len(by_hand)}", 0.25)
-    return found
+        while True:
+            believed = _believed(found, boards, known)
+            sure = {k: believed[k] for k in at if not np.isnan(believed[k]).any()}
+            unsure = [k for k in by_hand if k not in sure]
+            if not unsure or sure.keys() == machine.edges.keys():
+                return found, believed
+            if told is not None:
+                placed = len(by_hand) - len(unsure)
+                told(f"Asking again, with {placed} of {len(by_hand)} photographs placed", 0.3)
+            try:
+                new = {k: T for k, T in sure.items() if k not in machine.edges}
+                machine = join(session, at, machine, new)
+            except PkmcalError:
+                return found, believed  # which tells why better, with all that was observed
+            closer = partial(_closer, session, at, machine, rough)
+            found |= zip(unsure, pool.map(closer, unsure), strict=True)
+
+
+def _closer(
+    session: Session,
+    photographs: dict[int, legs.Photographs],
+    machine: Together,
+    rough: dict[int, Alone],
+    k: int,
+) -> Alone:
+    return look_closer(session, photographs[k], machine, rough[k])
 
 
 def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:

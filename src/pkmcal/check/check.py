@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards, StationBoard, board_of, station_board
-from pkmcal.calibration.byhand import found_alone, why_lost
+from pkmcal.calibration.byhand import search_by_hand, why_lost
 from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.doubts import check_poses, richer_models, turning
 from pkmcal.calibration.gather import measurements_of, refinement_of
@@ -268,7 +268,8 @@ def _observed(
     fixed = [p for p in whole if not session.stations[p.station].handheld]
     recognition = recognise(session, fixed, poses, rngs[1 : len(fixed) + 1], boards.boards, starts)
     places = {p.station: found for p, found in zip(fixed, recognition.found, strict=True)}
-    alone = found_alone(session, whole, poses)
+    known = np.full((len(session.stations), 4, 4), np.nan) if starts is None else starts
+    alone, _ = search_by_hand(session, whole, poses, boards.boards, known)
     for k, one in alone.items():  # what chance is to others, another place is to one alone
         places[k] = FoundStation(
             one.T_camera_base[0], math.nan, float(one.evidence[0]), one.doubt, told=True

@@ -47,6 +47,8 @@ FEWER, FEW = 400, 120
 """How many go on after the first descents, and to the finer picture."""
 MANY_DIRECTIONS = 24
 """Directions of the tables: each takes its neighbours in, so edges within 11 degrees count."""
+FINEST = 4 * WORKING_WIDTH, MANY_DIRECTIONS
+"""Width (px) and directions of the tables on which places are weighed."""
 FEWEST = 40
 """How many go on to the finest picture, and beside them the look-alikes of the first two."""
 ALIKE = np.radians(20.0)
@@ -97,20 +99,24 @@ def find_alone(view: StationView, image: Integers) -> Alone:
 def weighed(view: StationView, image: Integers, found: Array) -> Alone:
     """Places (H, 4, 4) settled on the finest tables, those that are not the same place."""
     one = np.zeros(1, dtype=int)
-    view = replace(view, tables=distance_tables([image], 4 * WORKING_WIDTH, MANY_DIRECTIONS))
+    view = replace(view, tables=distance_tables([image], *FINEST))
     found = settle(view, found, one, 16, 6)
     evidence = evidence_of(view, found, one, 16).sum(axis=-1)
     order = np.argsort(-evidence)
     order = order[evidence[order] > 0]
     if not len(order):
         order = np.array([int(np.argmax(evidence))])
-    order = order[apart(view, found[order], one)]
-    found, evidence = found[order], evidence[order]
-    turned = found[0, :3, :3] @ found[:, :3, :3].mT
+    order = order[distinct(view, found[order])]
+    return Alone(found[order], evidence[order], _unit(view, found[order[:1]]))
+
+
+def distinct(view: StationView, found: Array) -> Integers:
+    """Of places (H, 4, 4), best first, those that are not the same place as a better one."""
+    kept = np.array(apart(view, found, np.zeros(1, dtype=int)))
+    turned = found[0, :3, :3] @ found[kept, :3, :3].mT
     angle = np.arccos(np.clip((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
     # near the first lies the same place, less well settled
-    keep = (angle >= ALIKE) | (np.arange(len(found)) == 0)
-    return Alone(found[keep], evidence[keep], _unit(view, found[:1]))
+    return kept[(angle >= ALIKE) | (kept == 0)]
 
 
 def _unit(view: StationView, found: Array) -> float:

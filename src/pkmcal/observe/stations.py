@@ -212,9 +212,9 @@ def find_station(
         score=float(scores.min()),
         evidence=float(evidence[0]),
         by_chance=_by_chance(surely),
-        second=_second(evidence, grain := _grain(view, candidates[0])),
+        second=_second(evidence, each := grain(view, candidates[0])),
         told=T_camera_base is not None,
-        grain=grain,
+        grain=each,
     )
 
 
@@ -520,7 +520,7 @@ def _surely(
     return -ndtri(np.maximum(stdtr(count - 1, -away), 1e-300))
 
 
-def _grain(view: StationView, T_camera_base: Array) -> float:
+def grain(view: StationView, T_camera_base: Array) -> float:
     """Reduced pixels of half a predicted edge: what moves an edge moves its places together, so
     each half counts as one measurement.
     """

@@ -1,0 +1,153 @@
+"""Where a photograph by hand was taken from, asked of the joint estimate.
+
+A search in the picture alone knows the machine by its drawing, whose errors of millimetres are
+pixels: a machine of equal parts then fits nearly as well when it is turned by one of them. Here the
+photograph is measured from each of the places that it could show, and the machine is estimated with
+it there. What the drawing has wrong is explained by that, and paid for by the drawing's tolerances;
+what photographs that are placed already know of the machine is paid for as well. How well the
+machine, so changed, lies on the picture (the evidence of :mod:`pkmcal.observe.stations`) less what
+was paid is the log likelihood of the place. With the drawing's errors explained, half an edge
+counts as one measurement, as it does in a station's photographs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pkmcal.arrays import Array, Integers
+from pkmcal.boards.views import Boards
+from pkmcal.calibration.gather import measurements_of
+from pkmcal.errors import PkmcalError
+from pkmcal.identify.bundle import bundle
+from pkmcal.identify.estimate import Estimate, State
+from pkmcal.identify.start import start_state
+from pkmcal.measurements import EdgeSet, concatenate
+from pkmcal.mechanisms import Machine
+from pkmcal.observe import legs
+from pkmcal.observe.alone import FINEST, Alone, distinct
+from pkmcal.observe.predict import tubes_of
+from pkmcal.observe.stations import StationView, evidence_of, grain, settle
+from pkmcal.observe.tables import distance_tables
+from pkmcal.session.load import Session
+
+CLOSER, BEHIND = 8, 12.0
+"""Most places of a photograph that are asked about, and by how many measurements of the search one
+may be behind the best: what is further behind has odds of one in a hundred thousand."""
+FIRST: tuple[float | None, ...] = (legs.REACH, legs.AGAIN, None, None)
+LATER: tuple[float | None, ...] = (legs.REACH, None)
+"""Pixels within which legs are looked for, one look after the other; None: edges are measured. The
+drawing is off by pixels, a machine that photographs have told is not."""
+GIVEN_UP = 9.0
+"""What an edge costs at least that the estimate gives up: three standard deviations."""
+
+
+class Together(NamedTuple):
+    """Photographs whose places are believed, and what they make of the machine.
+
+    machine, T_base_platform : (K, 4, 4) as they are known. T_camera_base : (4, 4) by station.
+    edges : and what was measured from there. cost : by station, half the squares of its edges.
+    own : half the squares of the drawing's values and of the readings.
+    """
+
+    machine: Machine
+    T_base_platform: Array
+    T_camera_base: Mapping[int, Array]
+    edges: Mapping[int, EdgeSet]
+    cost: Mapping[int, float]
+    own: float
+
+    @classmethod
+    def as_drawn(cls, machine: Machine, T_base_platform: Array) -> Together:
+        """What is known before any photograph is placed."""
+        return cls(machine, T_base_platform, {}, {}, {}, 0.0)
+
+    def paid(self, but: int) -> float:
+        """What is paid for the machine, by all but one station's edges."""
+        return self.own + sum(cost for k, cost in self.cost.items() if k != but)
+
+
+def join(
+    session: Session,
+    photographs: Mapping[int, legs.Photographs],
+    known: Together,
+    places: Mapping[int, Array],
+) -> Together:
+    """What is known together with photographs at places T_camera_base (4, 4).
+
+    photographs : by station. Raises a `PkmcalError` where there is nothing to be estimated.
+    """
+    at = {**known.T_camera_base, **places}
+    stations = sorted(at)
+    # boards and trackers are left out: what a place is asked is how the legs look from there
+    only = replace(session.of_stations(stations), trackers=())
+    edges = dict(known.edges)
+    state: State | None = None
+    for reach in LATER if edges else FIRST:
+        for k in places:
+            p = photographs[k]
+            seen = known.machine, at[k], known.T_base_platform[p.configuration]
+            look = legs.measure(p, *seen) if reach is None else legs.search(p, *seen, reach)
+            edges[k] = look.edges
+        numbered = [
+            replace(edges[k], station=np.full(len(edges[k]), n)) for n, k in enumerate(stations)
+        ]
+        measurements = measurements_of(only, Boards(), concatenate(numbered))
+        T = np.stack([at[k] for k in stations])
+        start = state or start_state(known.machine, measurements, T)
+        estimate = bundle(session.machine, measurements, start)
+        state = estimate.state
+        at = dict(zip(stations, state.T_camera_base, strict=True))
+        known = Together(
+            estimate.machine, state.T_base_platform, at, edges,
+            _costs(estimate, measurements.edges.station, stations),
+            (estimate.statistics.chi2_drawing + estimate.statistics.chi2_joints) / 2,
+        )  # fmt: skip
+    return known
+
+
+def _costs(estimate: Estimate, station: Integers, stations: Sequence[int]) -> dict[int, float]:
+    """Half the squares of each station's edges; one that is given up costs GIVEN_UP at least."""
+    weight = estimate.edge_weights
+    square = estimate.edge_trust * np.sum(estimate.edge_residuals**2, axis=-1)
+    cost = (weight * square + (1 - weight) * GIVEN_UP) / 2
+    sums = np.bincount(station, cost, len(stations)).tolist()
+    return dict(zip(stations, sums, strict=True))
+
+
+def look_closer(
+    session: Session, photograph: legs.Photographs, before: Together, found: Alone
+) -> Alone:
+    """The places of one photograph, weighed with what is known of the machine, the likeliest first;
+    evidence is then a log likelihood.
+    """
+    p = photograph.decoded()
+    one = np.zeros(1, dtype=int)
+    view = StationView(
+        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
+        before.T_base_platform, distance_tables(p.images, *FINEST),
+    )  # fmt: skip
+    near = found.evidence > found.evidence[0] - BEHIND * found.unit
+    worth: list[float] = []
+    places: list[Array] = []
+
+    def weigh(known: Together, T: Array) -> None:
+        seen = replace(view, machine=known.machine, all_poses=known.T_base_platform)
+        settled = settle(seen, T[None], one, 16, 6)
+        evidence = float(evidence_of(seen, settled, one, 16).sum()) / grain(seen, settled[0])
+        worth.append(evidence - known.paid(but=p.station) + before.paid(but=p.station))
+        places.append(settled[0])
+
+    for T in found.T_camera_base[near][:CLOSER]:
+        weigh(before, T)  # the machine as it is known; where it fits better changed, that is taken
+        try:
+            known = join(session, {p.station: p}, before, {p.station: T})
+        except PkmcalError:
+            continue  # too few legs are where they should be
+        weigh(known, known.T_camera_base[p.station])
+    order = np.argsort(-np.array(worth))
+    order = order[distinct(view, np.stack(places)[order])]
+    return Alone(np.stack(places)[order], np.array(worth)[order], 1.0)
