@@ -12,7 +12,8 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration import byhand
 from pkmcal.calibration.byhand import Placed, misplaced, without_misplaced
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.recognise import platform_poses, read_photographs
+from pkmcal.calibration.closely import Together, join, look_closer
+from pkmcal.calibration.recognise import KnownScene, platform_poses, read_photographs
 from pkmcal.calibration.results import document_of
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
@@ -23,7 +24,7 @@ from pkmcal.identify.gauge import default_gauge
 from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe import legs
-from pkmcal.observe.alone import Alone, find_alone, turned_about
+from pkmcal.observe.alone import Alone, find_alone, turn_between, turned_about
 from pkmcal.observe.images import decode
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import DOUBT, StationView
@@ -274,9 +275,10 @@ def at_truth(monkeypatch, folder, off=2e-3):
     """Let photographs by hand be placed where they were taken, nearly."""
     rng = np.random.default_rng(1)
 
-    def place(session, photographs, _poses, boards, _known, _told):
+    def place(session, photographs, boards, known, _told):
         truth = load_truth(folder, session.machine).T_camera_base
-        return Placed(session, photographs, boards, perturb(truth, off * rng.normal(size=(3, 6))))
+        near = perturb(truth, off * rng.normal(size=(3, 6)))
+        return Placed(session, photographs, boards, known._replace(T_camera_base=near))
 
     monkeypatch.setattr("pkmcal.calibration.calibrate.place_by_hand", place)
 
@@ -386,14 +388,14 @@ def looked(simulated):
 
 def found_with(monkeypatch, truth, doubts):
     """Photographs are found where they were taken, with doubts."""
-    left = iter(zip(truth.T_camera_base, doubts, strict=True))
 
-    def find(_view, _image):
-        T, doubt = next(left)
+    def look(_session, photograph, _before, _found):
+        T, doubt = truth.T_camera_base[photograph.station], doubts[photograph.station]
         lead = np.log(1 / doubt - 1)
         return Alone(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
 
-    monkeypatch.setattr(byhand, "find_alone", find)
+    monkeypatch.setattr(byhand, "find_alone", lambda _view, _image: None)
+    monkeypatch.setattr(byhand, "look_closer", look)
     monkeypatch.setattr(byhand, "WORKERS", 1)
 
 
@@ -401,15 +403,18 @@ def placed(looked, monkeypatch, doubts):
     """Places of photographs that are found where they were taken, with doubts; none: elsewhere."""
     session, photographs, poses, truth = looked
     found_with(monkeypatch, truth, doubts)
-    nowhere = np.full((3, 4, 4), np.nan)
-    return byhand.place_by_hand(session, photographs, poses, Boards(), nowhere)
+    known = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
+    return byhand.place_by_hand(session, photographs, Boards(), known)
 
 
 def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
     found = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4])
     assert [s.name for s in found.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert [p.station for p in found.photographs] == [0, 1]
-    np.testing.assert_array_equal(found.T_camera_base, looked[3].T_camera_base[[0, 2]])
+    off = pose_difference(found.known.T_camera_base, looked[3].T_camera_base[[0, 2]])
+    # as the joint estimate has them: two photographs tell little of a machine
+    assert np.degrees(np.linalg.norm(off[:, :3], axis=1)).max() < 4
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.1
     (warning,) = found.session.warnings
     assert warning.startswith(
         "images/phone/0001-1.jpg: left out, for its edges fit the legs nearly"
@@ -451,7 +456,8 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     assert wrong == [1]
     turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
     assert misplaced(session, measurements, estimate, perturb(T, turn)) == [2]
-    rest = without_misplaced(session, [], Boards(), T, wrong)
+    known = KnownScene(estimate.machine, T, estimate.state.T_base_platform)
+    rest = without_misplaced(session, [], Boards(), known, wrong)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert "too few of its edges agree" in rest.session.warnings[-1]
 
@@ -501,3 +507,38 @@ def test_turns_of_a_machine_onto_itself(looked):
         apart = np.linalg.norm(turned[:, None] - first, axis=-1)
         assert np.all(apart.min(axis=1) < 0.06)
         assert np.all(apart.argmin(axis=1) != np.arange(6))
+
+
+def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
+    """A search holds the place and those from which the machine is turned onto itself for equal."""
+    session, photographs, poses, truth = looked
+    p = photographs[1]
+    view = StationView(
+        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
+        poses, distance_tables(p.images),
+    )  # fmt: skip
+    true = truth.T_camera_base[1]
+    places = np.concatenate([turned_about(view, true[None]), true[None]])
+    equal = Alone(places, np.full(len(places), 20.0), 1.0)
+    drawn = Together.as_drawn(session.machine, poses)
+    found = look_closer(session, p, drawn, equal)
+    assert equal.doubt == 0.5
+    assert found.doubt < 1e-3
+    assert np.degrees(turn_between(found.T_camera_base[0], true)) < 4
+    # one place alone is weighed against chance
+    alone = look_closer(session, p, drawn, Alone(true[None], np.array([20.0]), equal.unit))
+    assert alone.doubt < 1e-3
+
+
+def test_photographs_join_what_is_known(looked):
+    """One of the same machine costs the others nothing; with another's readings no leg is there."""
+    session, photographs, poses, truth = looked
+    at = {p.station: p for p in photographs}
+    places = dict(enumerate(truth.T_camera_base[:2]))
+    known = join(session, at, Together.as_drawn(session.machine, poses), places)
+    assert sorted(known.edges) == [0, 1]
+    right = join(session, at, known, {2: truth.T_camera_base[2]})
+    assert len(right.edges[2]) > 6
+    assert right.paid(but=2) - known.paid(but=2) < 3
+    other = {2: replace(at[2], configuration=at[0].configuration, joints=at[0].joints)}
+    assert len(join(session, other, known, {2: truth.T_camera_base[2]}).edges[2]) < 3

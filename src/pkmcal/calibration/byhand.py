@@ -21,7 +21,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.closely import Together, join, look_closer
-from pkmcal.calibration.recognise import WORKERS, Progress
+from pkmcal.calibration.recognise import WORKERS, KnownScene, Progress
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import dot, pose_difference
 from pkmcal.identify.estimate import Estimate
@@ -45,94 +45,83 @@ take seven."""
 
 class Placed(NamedTuple):
     """A session without the photographs by hand that could not be placed, its photographs and
-    boards numbered alike, and poses T_camera_base (S, 4, 4) of its stations.
+    boards numbered alike, and what is known of machine, stations and platforms.
     """
 
     session: Session
     photographs: list[legs.Photographs]
     boards: Boards
-    T_camera_base: Array
+    known: KnownScene
 
 
 def place_by_hand(
     session: Session,
     photographs: list[legs.Photographs],
-    poses: Array,
     boards: Boards,
-    known: Array,
+    known: KnownScene,
     told: Progress | None = None,
 ) -> Placed:
     """Find the places of the photographs by hand; those that are not found are left out and told.
 
     Raises `InputError` where no photograph by hand is placed; see :func:`search_by_hand`.
     """
-    found, believed = search_by_hand(session, photographs, poses, boards, known, told)
-    lost = {k: why_lost(one) for k, one in found.items() if np.isnan(believed[k]).any()}
-    return _without(session, photographs, boards, believed, lost)
+    found, known = search_by_hand(session, photographs, boards, known, told)
+    lost = {k: why_lost(one) for k, one in found.items() if np.isnan(known.T_camera_base[k]).any()}
+    return _without(session, photographs, boards, known, lost)
 
 
 def search_by_hand(
     session: Session,
     photographs: list[legs.Photographs],
-    poses: Array,
     boards: Boards,
-    known: Array,
+    known: KnownScene,
     told: Progress | None = None,
-) -> tuple[dict[int, Alone], Array]:
-    """The places that each photograph by hand could show, by its station's number; and the poses
-    T_camera_base (S, 4, 4) that are believed, NaN for the others.
+) -> tuple[dict[int, Alone], KnownScene]:
+    """The places that each photograph by hand could show, by its station's number; and what is
+    known with those that are believed, T_camera_base NaN for the others.
 
-    photographs : of all stations that observe legs. poses : T_base_platform (K, 4, 4) by the
-    drawing. known : T_camera_base (S, 4, 4) of the stations that are placed already, NaN for the
-    others. told : called with the step in words and the share done.
+    photographs : of all stations that observe legs. known : by the drawing, T_camera_base of the
+    stations that are placed already, NaN for the others. told : called with the step in words and
+    the share done.
     """
     at = {p.station: p for p in photographs}
     by_hand = [k for k in at if session.stations[k].handheld]
     tubes = tubes_of(session.machine)
-    machine = Together.as_drawn(session.machine, poses)
 
-    def search(k: int) -> tuple[Alone, Alone]:
+    def search(joined: Together, k: int) -> Alone:
         p, image = at[k], at[k].images[0]
-        tables = distance_tables([image])
         view = StationView(
-            session.machine, p.camera, tubes, p.configuration, session.joints, poses, tables
-        )
-        rough = find_alone(view, image)
-        return rough, look_closer(session, p, machine, rough)
+            joined.machine, p.camera, tubes, p.configuration, session.joints,
+            joined.T_base_platform, distance_tables([image]),
+        )  # fmt: skip
+        return look_closer(session, p, joined, find_alone(view, image))
 
-    rough: dict[int, Alone] = {}
+    joined = Together.as_drawn(session.machine, known.T_base_platform)
     found: dict[int, Alone] = {}
     with ThreadPoolExecutor(WORKERS) as pool:
-        for k, both in zip(by_hand, pool.map(search, by_hand), strict=True):
-            rough[k], found[k] = both
+        for k, one in zip(by_hand, pool.map(partial(search, joined), by_hand), strict=True):
+            found[k] = one
             if told is not None:
                 told(f"Placing photographs by hand: {len(found)} of {len(by_hand)}", 0.25)
         while True:
-            believed = _believed(found, boards, known)
+            believed = _believed(found, boards, known.T_camera_base)
             sure = {k: believed[k] for k in at if not np.isnan(believed[k]).any()}
             unsure = [k for k in by_hand if k not in sure]
-            if not unsure or sure.keys() == machine.edges.keys():
-                return found, believed
+            new = {k: T for k, T in sure.items() if k not in joined.edges}
+            if not new:
+                break
             if told is not None:
                 placed = len(by_hand) - len(unsure)
                 told(f"Asking again, with {placed} of {len(by_hand)} photographs placed", 0.3)
             try:
-                new = {k: T for k, T in sure.items() if k not in machine.edges}
-                machine = join(session, at, machine, new)
+                joined = join(session, at, joined, new)
             except PkmcalError:
-                return found, believed  # which tells why better, with all that was observed
-            closer = partial(_closer, session, at, machine, rough)
-            found |= zip(unsure, pool.map(closer, unsure), strict=True)
-
-
-def _closer(
-    session: Session,
-    photographs: dict[int, legs.Photographs],
-    machine: Together,
-    rough: dict[int, Alone],
-    k: int,
-) -> Alone:
-    return look_closer(session, photographs[k], machine, rough[k])
+                break  # with all that is observed it is told better why
+            found |= zip(unsure, pool.map(partial(search, joined), unsure), strict=True)
+    for k in by_hand:
+        if k in joined.T_camera_base:
+            believed[k] = joined.T_camera_base[k]
+    return found, KnownScene(joined.machine, believed, joined.T_base_platform)
 
 
 def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
@@ -167,29 +156,30 @@ def without_misplaced(
     session: Session,
     photographs: list[legs.Photographs],
     boards: Boards,
-    T_camera_base: Array,
+    known: KnownScene,
     wrong: list[int],
 ) -> Placed:
     """The session without these photographs, each told."""
     why = dict.fromkeys(wrong, "too few of its edges agree with the other photographs")
-    return _without(session, photographs, boards, T_camera_base[: len(session.stations)], why)
+    return _without(session, photographs, boards, known, why)
 
 
 def _of(
     session: Session,
     photographs: list[legs.Photographs],
     boards: Boards,
-    known: Array,
+    known: KnownScene,
     kept: list[int],
     warnings: tuple[str, ...] = (),
 ) -> Placed:
     """Some of the stations, numbered anew."""
     number = {k: new for new, k in enumerate(kept)}
+    trackers = range(len(session.stations), len(known.T_camera_base))
     return Placed(
         session.of_stations(kept, warnings),
         [replace(p, station=number[p.station]) for p in photographs if p.station in number],
         boards.of(np.array(kept, dtype=int)),
-        known[kept],
+        known._replace(T_camera_base=known.T_camera_base[[*kept, *trackers]]),
     )
 
 
@@ -205,7 +195,7 @@ def _without(
     session: Session,
     photographs: list[legs.Photographs],
     boards: Boards,
-    known: Array,
+    known: KnownScene,
     lost: dict[int, str],
 ) -> Placed:
     """The session without the photographs that are lost, each told; an error where none is left."""

@@ -31,6 +31,7 @@ from pkmcal.calibration.gather import CameraRefinement, refinement_of
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
+    KnownScene,
     Progress,
     boards_of,
     check_observable,
@@ -172,13 +173,13 @@ def calibrate(
         session, seen = _observe(session, seed, clock)
         cameras = refinement_of(session, refine_camera)  # of the stations that are left
         found = _identify(session, seen, cameras, method, seed, holdout, clock)
-        wrong = misplaced(
-            session, found.turns.measurements, found.turns.estimate, seen.T_camera_base
-        )
+        turns = found.turns
+        wrong = misplaced(session, turns.measurements, turns.estimate, seen.known.T_camera_base)
         if wrong:
-            where = found.turns.estimate.state.T_camera_base
-            rest = without_misplaced(session, seen.photographs, seen.boards, where, wrong)
-            session, seen = rest.session, _Seen(rest.photographs, rest.boards, rest.T_camera_base)
+            state = turns.estimate.state
+            known = KnownScene(turns.estimate.machine, state.T_camera_base, state.T_base_platform)
+            rest = without_misplaced(session, seen.photographs, seen.boards, known, wrong)
+            session, seen = rest.session, _Seen(rest.photographs, rest.boards, rest.known)
             cameras = refinement_of(session, refine_camera)
             found = _identify(session, seen, cameras, method, seed, holdout, clock)
         return _judge(session, seen, found, method, seed, clock)
@@ -202,11 +203,13 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
 
 
 class _Seen(NamedTuple):
-    """A session's photographs, decoded, the boards in them, and all stations' poses (S, 4, 4)."""
+    """A session's photographs, decoded, the boards in them, and what is known of machine, stations
+    and platforms.
+    """
 
     photographs: list[Photographs]
     boards: Boards
-    T_camera_base: Array
+    known: KnownScene
 
 
 class _Identified(NamedTuple):
@@ -245,13 +248,14 @@ def _observe(session: Session, seed: int, clock: _Clock) -> tuple[Session, _Seen
     rng = np.random.default_rng(seed)
     if any(station.handheld for station in session.stations):
         fixed = [p for p in photographs if not session.stations[p.station].handheld]
-        known = station_poses(session, fixed, boards, rng, by_hand=True, told=clock.told)
-        poses = platform_poses(session)
+        stations = station_poses(session, fixed, boards, rng, by_hand=True, told=clock.told)
+        drawn = KnownScene(session.machine, stations, platform_poses(session))
         session, photographs, boards, known = place_by_hand(
-            session, photographs, poses, boards, known, clock.told
+            session, photographs, boards, drawn, clock.told
         )
     else:
-        known = station_poses(session, photographs, boards, rng, told=clock.told)
+        stations = station_poses(session, photographs, boards, rng, told=clock.told)
+        known = KnownScene.as_drawn(session.machine, stations, session.joints)
     clock.lap("observe")
     return session, _Seen(photographs, boards, known)
 
@@ -269,7 +273,7 @@ def _identify(
     if seen.photographs:
         turns = take_turns(session, *seen, cameras, clock.told, clock.lap)
     else:
-        turns = identify_poses(session, seen.boards, seen.T_camera_base, cameras, clock.told)
+        turns = identify_poses(session, seen.boards, seen.known.T_camera_base, cameras, clock.told)
     clock.lap("identify")
     clock.told("Looking for mistakes that explain the data", 0.88)
     stated = as_stated(session.machine, turns.measurements, turns.estimate)

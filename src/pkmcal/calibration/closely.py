@@ -6,8 +6,10 @@ photograph is measured from each of the places that it could show, and the machi
 it there. What the drawing has wrong is explained by that, and paid for by the drawing's tolerances;
 what photographs that are placed already know of the machine is paid for as well. How well the
 machine, so changed, lies on the picture (the evidence of :mod:`pkmcal.observe.stations`) less what
-was paid is the log likelihood of the place. With the drawing's errors explained, half an edge
-counts as one measurement, as it does in a station's photographs.
+was paid is the log likelihood of the place. Between places from which the machine lies on the same
+legs, turned onto itself, half an edge counts as one measurement, as it does in a station's
+photographs; against other places half a leg, since what chance puts under a leg in a picture full
+of edges, it puts under all of it.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from pkmcal.identify.start import start_state
 from pkmcal.measurements import EdgeSet, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
-from pkmcal.observe.alone import FINEST, Alone, distinct
+from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turn_between, turned_about
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import StationView, evidence_of, grain, settle
 from pkmcal.observe.tables import distance_tables
@@ -122,7 +124,7 @@ def look_closer(
     session: Session, photograph: legs.Photographs, before: Together, found: Alone
 ) -> Alone:
     """The places of one photograph, weighed with what is known of the machine, the likeliest first;
-    evidence is then a log likelihood.
+    evidence is then a log likelihood against chance.
     """
     p = photograph.decoded()
     one = np.zeros(1, dtype=int)
@@ -131,14 +133,14 @@ def look_closer(
         before.T_base_platform, distance_tables(p.images, *FINEST),
     )  # fmt: skip
     near = found.evidence > found.evidence[0] - BEHIND * found.unit
-    worth: list[float] = []
+    weighed: list[tuple[float, float]] = []  # evidence and what was paid
     places: list[Array] = []
 
     def weigh(known: Together, T: Array) -> None:
         seen = replace(view, machine=known.machine, all_poses=known.T_base_platform)
         settled = settle(seen, T[None], one, 16, 6)
-        evidence = float(evidence_of(seen, settled, one, 16).sum()) / grain(seen, settled[0])
-        worth.append(evidence - known.paid(but=p.station) + before.paid(but=p.station))
+        evidence = float(evidence_of(seen, settled, one, 16).sum())
+        weighed.append((evidence, known.paid(but=p.station) - before.paid(but=p.station)))
         places.append(settled[0])
 
     for T in found.T_camera_base[near][:CLOSER]:
@@ -148,6 +150,14 @@ def look_closer(
         except PkmcalError:
             continue  # too few legs are where they should be
         weigh(known, known.T_camera_base[p.station])
-    order = np.argsort(-np.array(worth))
-    order = order[distinct(view, np.stack(places)[order])]
-    return Alone(np.stack(places)[order], np.array(worth)[order], 1.0)
+    at, (evidence, paid) = np.stack(places), np.array(weighed).T
+    edge = grain(view, at[np.argmax(evidence)])
+    by_edges, by_legs = evidence / edge - paid, evidence / found.unit - paid
+    first = at[np.argmax(by_edges)]
+    turned = turn_between(at[:, None], turned_about(view, first[None])).min(axis=1, initial=np.inf)
+    here = turn_between(at, first) < ALIKE
+    same = here | (turned < ALIKE)
+    worth = np.where(same, by_edges - by_edges.max() + by_legs[here].max(), by_legs)
+    order = np.argsort(-worth, kind="stable")
+    order = order[distinct(view, at[order])]
+    return Alone(at[order], worth[order], 1.0)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.views import Boards, find_boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.errors import GeometryError, InputError, ResultError
+from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.images import KEPT, Pictures, fitting
@@ -41,6 +43,21 @@ NEARLY = 2.0
 MOST = 0.5
 """Share of the configurations that the drawing has to reach for the rest to be believed."""
 ALMOST_ALL = 0.9
+
+
+class KnownScene(NamedTuple):
+    """What is known before the edges are measured: the machine, T_camera_base (S, 4, 4) of the
+    stations, and T_base_platform (K, 4, 4) of the configurations.
+    """
+
+    machine: Machine
+    T_camera_base: Array
+    T_base_platform: Array
+
+    @classmethod
+    def as_drawn(cls, machine: Machine, T_camera_base: Array, joints: Array) -> KnownScene:
+        """A drawing; of platforms the nearest poses, where it does not quite close."""
+        return cls(machine, T_camera_base, machine.forward_result(joints).T_base_platform)
 
 
 def check_observable(session: Session) -> None:

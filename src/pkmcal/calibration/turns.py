@@ -19,7 +19,7 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
-from pkmcal.calibration.recognise import WORKERS, Progress
+from pkmcal.calibration.recognise import WORKERS, KnownScene, Progress
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
@@ -61,24 +61,21 @@ def take_turns(
     session: Session,
     photographs: list[legs.Photographs],
     boards: Boards,
-    T_camera_base: Array,
+    known: KnownScene,
     cameras: CameraRefinement,
     told: Progress,
     lap: Callable[[str], None],
 ) -> Turns:
     """Observation and identification in turns, the search narrowing.
 
-    T_camera_base : (S, 4, 4) of all stations. lap : called with the name of a step that is done.
+    lap : called with the name of a step that is done.
     """
     total = sum(len(p.images) for p in photographs)
     machine = session.machine
-    # the nearest poses, where the drawing does not quite close: recognition has seen to it
-    poses = machine.forward_result(session.joints).T_base_platform
-    seen = machine, T_camera_base, poses
     text, searched = "Finding the legs", partial(_whole_legs, session, photographs, boards, lap)
-    estimate = searched(seen, legs.REACH, _counted(told, text, total, 0.35))
+    estimate = searched(known, legs.REACH, _counted(told, text, total, 0.35))
     start = estimate.state
-    seen = estimate.machine, start.T_camera_base, start.T_base_platform
+    seen = KnownScene(estimate.machine, start.T_camera_base, start.T_base_platform)
     text = "Finding the legs again"
     estimate = searched(seen, legs.AGAIN, _counted(told, text, total, 0.4), start)
     blur: dict[int, float | None] = {p.station: None for p in photographs}
@@ -95,8 +92,9 @@ def take_turns(
         measurements = measurements_of(session, boards, _edges(looks), cameras)
         lap("observe")
         told("Identifying", share + 0.05)
-        known = _at_cameras(estimate.state, cameras)
-        start = better_start(machine, measurements, known) if turn == 0 else known
+        start = _at_cameras(estimate.state, cameras)
+        if turn == 0:
+            start = better_start(machine, measurements, start)
         estimate = bundle(machine, measurements, start)
         lap("identify")
         if max(look.moved for look in looks) < SETTLED and not cameras.active:
@@ -191,15 +189,12 @@ def _whole_legs(
     photographs: list[legs.Photographs],
     boards: Boards,
     lap: Callable[[str], None],
-    seen: tuple[Machine, Array, Array],
+    seen: KnownScene,
     reach: float,
     done: legs.Done,
     start: State | None = None,
 ) -> Estimate:
-    """The estimate from legs that are looked for within ``reach`` px of where they should be.
-
-    seen : machine, stations (S, 4, 4) and platforms (K, 4, 4) as they are known.
-    """
+    """The estimate from legs that are looked for within ``reach`` px of where they should be."""
     machine, stations, poses = seen
 
     def search(p: legs.Photographs) -> legs.StationEdges:
@@ -207,7 +202,7 @@ def _whole_legs(
 
     measurements = measurements_of(session, boards, _edges(_each(photographs, search)))
     lap("observe")
-    start = start or start_state(session.machine, measurements, stations)
+    start = start or start_state(machine, measurements, stations)
     estimate = bundle(session.machine, measurements, start)
     lap("identify")
     return estimate

@@ -24,6 +24,7 @@ from pkmcal.calibration.doubts import check_poses, richer_models, turning
 from pkmcal.calibration.gather import measurements_of, refinement_of
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.recognise import (
+    KnownScene,
     board_images,
     check_observable,
     known_stations,
@@ -268,8 +269,9 @@ def _observed(
     fixed = [p for p in whole if not session.stations[p.station].handheld]
     recognition = recognise(session, fixed, poses, rngs[1 : len(fixed) + 1], boards.boards, starts)
     places = {p.station: found for p, found in zip(fixed, recognition.found, strict=True)}
-    known = np.full((len(session.stations), 4, 4), np.nan) if starts is None else starts
-    alone, _ = search_by_hand(session, whole, poses, boards.boards, known)
+    nowhere = np.full((len(session.stations), 4, 4), np.nan)
+    known = KnownScene(session.machine, nowhere if starts is None else starts, poses)
+    alone, _ = search_by_hand(session, whole, boards.boards, known)
     for k, one in alone.items():  # what chance is to others, another place is to one alone
         places[k] = FoundStation(
             one.T_camera_base[0], math.nan, float(one.evidence[0]), one.doubt, told=True

@@ -113,10 +113,14 @@ def weighed(view: StationView, image: Integers, found: Array) -> Alone:
 def distinct(view: StationView, found: Array) -> Integers:
     """Of places (H, 4, 4), best first, those that are not the same place as a better one."""
     kept = np.array(apart(view, found, np.zeros(1, dtype=int)))
-    turned = found[0, :3, :3] @ found[kept, :3, :3].mT
-    angle = np.arccos(np.clip((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
     # near the first lies the same place, less well settled
-    return kept[(angle >= ALIKE) | (kept == 0)]
+    return kept[(turn_between(found[kept], found[0]) >= ALIKE) | (kept == 0)]
+
+
+def turn_between(one: Array, other: Array) -> Array:
+    """Angles (...) rad between poses (..., 4, 4)."""
+    turned = one[..., :3, :3] @ other[..., :3, :3].mT
+    return np.arccos(np.clip((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
 
 
 def _unit(view: StationView, found: Array) -> float:
