@@ -28,7 +28,7 @@ from pkmcal.outcome import (
 )
 from pkmcal.planning.plan import PAYS, Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
-from pkmcal.report.scene import line, markers, space_layout
+from pkmcal.report.scene import line, markers, seen_whole
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.wording import SCALES, amount, brief, count, listed, number
 
@@ -335,7 +335,7 @@ def _where(found: MeasurementPlan) -> Part:
         ]  # fmt: skip
     if found.tried:
         data.append(_tried(found.tried))
-    layout = space_layout({"x": 1.0, "y": -1.0, "z": 0.6})
+    layout = seen_whole(data, np.array([1.0, -1.0, 0.6]))
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     plot = Plot(
         "where",
