@@ -470,6 +470,11 @@ def test_configurations_are_of_different_poses(name, shared):
     truth = draw_truth(load_mechanism(name), (demo_camera(),) * 3, settings, 1)
     owner = same_pose(truth.readings, settings.joint_noise)
     assert len(np.unique(owner)) == len(truth.readings) == (15 if shared else 45)
+    low, high = truth.machine.joint_ranges.T
+    place = (truth.joints - low) / (high - low)
+    extreme = np.sum(np.all((place < 0.04) | (place > 0.96), axis=1))
+    # about half, or as many as there are: a delta has eight
+    assert 0.3 * len(place) < extreme < 0.7 * len(place) or extreme == 8
 
 
 def test_photographs_by_hand_are_of_different_poses():

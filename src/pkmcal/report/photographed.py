@@ -19,7 +19,7 @@ from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
 from pkmcal.outcome import Plot
 from pkmcal.report.links import Links
 from pkmcal.report.page import N_COLOURS
-from pkmcal.report.scene import line, markers, ring, seen_whole
+from pkmcal.report.scene import beside, line, markers, ring, seen_whole
 from pkmcal.session.load import Session
 from pkmcal.wording import count
 
@@ -34,8 +34,6 @@ BORDER = 6
 """Points of each side of a picture's border that a frustum is drawn through."""
 NAMED = 12
 """Cameras up to which each has its name beside it."""
-BESIDE = 1.2
-"""rad that the eye stands beside a camera at most, so that a single one looks across."""
 
 
 class PosedLimbs(NamedTuple):
@@ -270,12 +268,7 @@ def _layout(
 ) -> dict[str, Any]:
     """Seen from between the cameras (S, 3), m, with all that is drawn in the picture."""
     middle = np.concatenate([limbs.a[0], limbs.b[0]]).mean(axis=0)
-    out = cameras - middle
-    around = np.sort(np.append(np.arctan2(out[:, 1], out[:, 0]), -np.pi / 4 * (not len(out))))
-    gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
-    angle = float(around[np.argmax(gaps)] + min(gaps.max() / 2, BESIDE))
-    way = np.array([0.92 * np.cos(angle), 0.92 * np.sin(angle), 0.4])
-    layout = seen_whole(data, way)
+    layout = seen_whole(data, beside(cameras - middle))
     layout["legend"] = {"orientation": "h", "y": 1, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     layout["margin"]["b"] = 78
     if len(names) > 1:

@@ -34,6 +34,8 @@ NEAR = 9.0
 """SVG units within which two labels are written as one."""
 RING = 25
 """Points of an ellipsoid's ring."""
+BESIDE = 1.2
+"""rad that the eye stands beside a camera at most, so that a single one looks across."""
 VIEW = np.pi / 4
 """From below to above in a picture in space, rad: Plotly's."""
 WIDE, NARROW = (1.5, 0.76), (1.0, 0.66)
@@ -364,6 +366,16 @@ def space_layout(eye: dict[str, float]) -> dict[str, Any]:
             },
         },
     }
+
+
+def beside(cameras: Array) -> Array:
+    """The way (3,) from which a machine and its cameras, at (S, 3) m from its middle, are looked
+    at: between two cameras, so that none stands before it.
+    """
+    around = np.sort(np.arctan2(cameras[:, 1], cameras[:, 0])) if len(cameras) else [-np.pi / 4]
+    gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
+    angle = float(around[np.argmax(gaps)] + min(gaps.max() / 2, BESIDE))
+    return np.array([0.92 * np.cos(angle), 0.92 * np.sin(angle), 0.4])
 
 
 def seen_whole(data: list[dict[str, Any]], way: Array) -> dict[str, Any]:

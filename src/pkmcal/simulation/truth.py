@@ -278,11 +278,14 @@ def _configurations(
 def _without_repeats(rows: Integers, groups: Sequence[Booleans], joints: Array) -> Integers:
     """The chosen candidates (K,), as many of each group; where one repeats a pose, another instead.
 
-    Poses with every leg near an end are two to the power of the legs, so they are drawn again. The
-    others keep their places, and with these their names and their noise. groups : of each, the
-    candidates (N,) that its stations see. joints : (N, m).
+    Poses with every leg near an end are two to the power of the legs, so they are drawn again;
+    another such stands in as long as there are any. The rest keep their places, and with these
+    their names and their noise. groups : of each, the candidates (N,) that its stations see.
+    joints : (N, m).
     """
     rows, pose = rows.copy(), same_pose(joints, SAME)
+    ends = (joints < joints.min(axis=0) + SAME) | (joints > joints.max(axis=0) - SAME)
+    extreme = ends.all(axis=1)
     n = len(rows) // len(groups)
     for place in range(len(rows)):
         if not np.isin(pose[rows[place]], pose[rows[:place]]):
@@ -295,7 +298,7 @@ def _without_repeats(rows: Integers, groups: Sequence[Booleans], joints: Array) 
                 expected=str(len(rows)),
                 next_step="ask for fewer, or for fewer with every leg near an end of its range",
             )
-        rows[place] = free[0]
+        rows[place] = free[np.argmax(extreme[free])]
     return rows
 
 
