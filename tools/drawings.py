@@ -309,15 +309,18 @@ def repeats(edges: Array, photographs: Array) -> str:
     x = np.linspace(-5, 5, 201)
     normal = np.exp(-x * x / 2) / np.sqrt(2 * np.pi)
     plots: list[Plot] = []
+    borders = np.arange(-5, 5.1, 0.5)
+    high = max(np.histogram(v, borders, density=True)[0].max() for v in (edges, photographs))
+    top = float(np.ceil(10 * high)) / 10
     for values, title in (
         (edges, "Edges simulated with their stated noise"),
         (photographs, "Rendered photographs, whole program"),
     ):
         label = "error of a centre's coordinate, in its σ"
-        plot = Plot((-5, 5), (0, 0.5), (label, "density"), (430, 320), title)
-        plot.histogram(values, np.arange(-5, 5.1, 0.5), MUTED)
+        plot = Plot((-5, 5), (0, top), (label, "density"), (430, 320), title)
+        plot.histogram(values, borders, MUTED)
         plot.curve(x, normal, INK, 1.6)
-        plot.words(1.7, 0.45, f"rms {np.sqrt(np.mean(values**2)):.2f}", INK)
+        plot.words(1.7, 0.9 * top, f"rms {np.sqrt(np.mean(values**2)):.2f}", INK)
         plots.append(plot)
     return _beside(*plots)
 
