@@ -1,11 +1,13 @@
 """The machine in space as it was photographed: tubes, arms, cameras, and the slider's poses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.cameras.unified import Unified
-from pkmcal.geometry.rigid import apply, inverse, perturb
+from pkmcal.geometry.rigid import apply, inverse, look_at, perturb
 from pkmcal.identify.centres import joint_centres
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report import photographed, pictures, scene
@@ -101,6 +103,39 @@ def test_points_lead_to_photographs_that_are_on_the_page(case):
     for link, k in zip(poses["customdata"], range(5), strict=True):
         assert link in there
         assert link.endswith(f"-{k + 1}")
+
+
+@pytest.mark.parametrize("scale", [1.0, 6.0])
+def test_all_that_is_drawn_is_in_the_picture(case, scale):
+    """By a look-at of its own, at Plotly's angle of 45 degrees, in a square and in a wide picture;
+    and no smaller than needed. scale : of the cameras' distances.
+    """
+    estimate = case.estimate
+    away = [T.copy() for T in estimate.state.T_camera_base]
+    for T in away:
+        T[:3, 3] *= scale
+    state = replace(estimate.state, T_camera_base=np.stack(away))
+    none = np.zeros((0, 3)), np.zeros(0, dtype=int)
+    links = figure(case)[0].links
+    plot = photographed.plot(case.session, replace(estimate, state=state), links, none)
+    drawn = np.concatenate([points(trace) for trace in plot.figure["data"]])
+    drawn = drawn[np.isfinite(drawn).all(axis=1)]
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    unit = np.prod(1.0625 * (high - low)) ** (1 / 3)  # Plotly's, with its room about the data
+    corners = ((drawn - (low + high) / 2) / unit).tolist()
+    layout = plot.figure["layout"]
+    looks = [(layout["meta"]["wide"], layout["scene"]["camera"]), (1.0, layout["meta"]["narrow"])]
+    for width, camera in looks:
+        eye, center = (
+            np.array([camera[name][axis] for axis in "xyz"]) for name in ("eye", "center")
+        )
+        T = look_at(eye, center, np.array([0.0, 0.0, 1.0]))
+        x, y, z = apply(T, np.array(corners)).T
+        assert np.all(z > 0)
+        half = np.tan(np.pi / 8) * z
+        across, up = np.abs(x / half).max() / width, np.abs(y / half).max()
+        assert max(across, up) < 0.8  # the names and numbers stand beside it
+        assert max(across, up) > 0.35
 
 
 def test_many_poses_are_thinned_and_that_is_said(case, monkeypatch):

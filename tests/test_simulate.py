@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from pkmcal.cameras import camera_models
-from pkmcal.errors import InputError
+from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.cylinders import contour_point, edge_normals
 from pkmcal.geometry.rigid import apply, inverse, look_at, pose_difference
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.closure import closure
 from pkmcal.session.load import load_session, look_at_pose
+from pkmcal.session.readings import same_pose
 from pkmcal.simulation import (
     EdgeNoise,
     Sensor,
@@ -460,6 +461,33 @@ def test_shared_configurations_are_photographed_by_all(machine):
     assert {tuple(pair) for pair in truth.photographs} == {
         (s, k) for s in range(3) for k in range(4)
     }
+
+
+@pytest.mark.parametrize("name", ["gough-stewart", "delta"])
+@pytest.mark.parametrize("shared", [False, True])
+def test_configurations_are_of_different_poses(name, shared):
+    settings = Settings(configurations=15, shared=shared)
+    truth = draw_truth(load_mechanism(name), (demo_camera(),) * 3, settings, 1)
+    owner = same_pose(truth.readings, settings.joint_noise)
+    assert len(np.unique(owner)) == len(truth.readings) == (15 if shared else 45)
+    low, high = truth.machine.joint_ranges.T
+    place = (truth.joints - low) / (high - low)
+    extreme = np.sum(np.all((place < 0.04) | (place > 0.96), axis=1))
+    # about half, or as many as there are: a delta has eight
+    assert 0.3 * len(place) < extreme < 0.7 * len(place) or extreme == 8
+
+
+def test_photographs_by_hand_are_of_different_poses():
+    settings = Settings(configurations=12, repeats=2, handheld=True)
+    truth = draw_truth(load_mechanism("delta"), (demo_camera(),) * 24, settings, 1)
+    assert len(np.unique(same_pose(truth.readings, settings.joint_noise))) == 12
+
+
+def test_more_ends_of_the_ranges_than_there_are_cannot_be_had():
+    settings = Settings(configurations=15, extreme=1.0)
+    with pytest.raises(GeometryError, match="not enough different configurations") as raised:
+        draw_truth(load_mechanism("delta"), (demo_camera(),) * 3, settings, 1)
+    assert raised.value.found == "8"  # three arms, each near one of two ends
 
 
 def test_a_session_is_written_whole_or_not_at_all(machine, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -19,9 +20,10 @@ from pkmcal.identify.verdict import judge
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
+from pkmcal.report import correlations
 from pkmcal.report.identifiability import held as held_in_words
 from pkmcal.report.identifiability import tied as tied_in_words
-from pkmcal.report.parameters import bound_together, grouped, tight_pairs
+from pkmcal.report.parameters import TIGHT, bound_together, grouped, tight_pairs
 from pkmcal.solver import Stop
 from pose_sessions import estimated, measured, papers_poses, upright
 
@@ -227,11 +229,39 @@ def test_ties_are_said_once_with_their_signs():
 
 def test_pairs_that_a_finding_names_are_not_said_again():
     _, findings, estimate = told_of("h4")
-    pairs = {(i, j) for i, j, _ in tight_pairs(estimate.covariance)}
+    pairs = {(i, j) for i, j, _ in tight_pairs(estimate)}
     names = estimate.machine.parameters.names
     turning = [(names[i], names[j]) for i, j in pairs if "axis" in names[i] and "axis" in names[j]]
     assert turning
     assert not [text for text in bound_together(estimate, findings) if text.count("base axis") > 1]
+
+
+@pytest.mark.parametrize("name", ["h4", "linear-delta", "gough-stewart"])
+def test_what_the_picture_of_correlations_says_fits_the_sentences_on_pairs(name):
+    _, _, estimate = told_of(name)
+    table, said = estimate.machine.parameters, bound_together(estimate)
+    part = correlations.section(estimate)
+    (heat,) = part.plots[0].figure["data"]
+    closest = float(re.search(r", ([+−]\d\.\d\d)\.", part.text[0])[1].replace("−", "-"))
+    assert bool(said) == (abs(closest) > TIGHT)
+    for i, j, rho in tight_pairs(estimate)[:1]:
+        assert (
+            f"{table.in_words(table.names[i])} and {table.in_words(table.names[j])}" in part.text[0]
+        )
+        assert closest == pytest.approx(rho, abs=0.005)
+        assert table.in_words(table.names[j]) in said[0]
+    # of a tie, one stands for all: another name of it would have a correlation of one
+    again = {table.in_words(x) for group in table.tied for x in group[1:]}
+    assert not again & set(heat["x"])
+
+
+def test_a_sum_that_alone_is_known_is_named_though_its_parts_correlate_fully():
+    _, _, estimate = told_of("linear-delta")
+    (i, j, rho), *_ = tight_pairs(estimate)
+    names = estimate.machine.parameters.names
+    assert (names[i], names[j]) == ("legs[2].base.center.y", "legs[2].platform.center.y")
+    assert rho == pytest.approx(-1)
+    assert "their sum is known far better than each alone" in bound_together(estimate)[0]
 
 
 def test_the_design_models_assumptions_are_no_conventions():

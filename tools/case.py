@@ -54,7 +54,8 @@ class Case:
         poses = platform_poses(self.session)
         rngs = np.random.default_rng(0).spawn(len(self.photographs) + 1)
         found = recognise(self.session, self.photographs, poses, rngs[1:])
-        return [np.stack(found.rough), np.stack([f.T_camera_base for f in found.found])]
+        by_hand = [s.T_camera_base for s in self.session.stations if s.T_camera_base is not None]
+        return [np.stack(by_hand), np.stack([f.T_camera_base for f in found.found])]
 
 
 def simulated(folder: Path, seed: int) -> Path:

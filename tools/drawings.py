@@ -18,7 +18,6 @@ from pkmcal.geometry.rigid import apply, inverse, look_at
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe import legs, profiles
-from pkmcal.observe.legs import sample
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of, unobstructed
 from pkmcal.simulation import Truth
 
@@ -217,25 +216,24 @@ def measured_places(case: Case) -> Places:
     """All profiles of the session, taken about the edges that truth predicts."""
     found: list[tuple[Array, ...]] = []
     truth = case.truth
-    middles = np.arange(legs.SEGMENTS) * 5 + 2
     for p in case.photographs:
-        tubes, points, clear = legs._predict(
-            p, truth.machine, truth.T_camera_base[p.station],
-            truth.T_base_platform[p.configuration], legs.PLACES, legs.CLEARANCE,
+        at_edges = (
+            truth.machine, truth.T_camera_base[p.station], truth.T_base_platform[p.configuration],
         )  # fmt: skip
-        grey = sample(p.images, legs._profile_pixels(p.camera, points))
-        places = legs._at_samples(points, middles)
-        half = places.gain * truth.machine.values[tubes.radius][:, None]
-        clear = np.repeat(clear, legs.BETWEEN, axis=-1)
-        full, across = legs._segment_profiles(grey, clear, half)
-        blur = profiles.estimate_blur(across)
-        at = profiles.locate(across, blur)
-        good = at.found
-        tube = tubes.tube[np.nonzero(full)[1]]
-        steep = strongest_gradient(across.grey)
-        blurs = np.full(len(good), blur)
-        columns = (across.grey, across.half_width, blurs, tube, at.position, steep)
-        found.append(tuple(c[good] for c in columns))
+        seen = legs._seen(p.decoded(), *at_edges)
+        blur = profiles.estimate_blur(seen.across)
+        dull = profiles.without_highlights(seen.across)
+        curves = profiles.residual_curves(dull, blur)
+        chances = profiles.likelihood(dull, curves)
+        about = legs._leg_lines(chances, seen.places.along, seen.full, seen.tubes)
+        at = profiles.locate(dull, curves, about)
+        tube = seen.tubes.tube[np.nonzero(seen.full)[1]]
+        steep = strongest_gradient(seen.across.grey)
+        blurs = np.full(len(tube), blur)
+        columns = (
+            seen.across.grey, seen.across.half_width, blurs, tube, at.position, steep,
+        )  # fmt: skip
+        found.append(tuple(c[at.found] for c in columns))
     return Places(*(np.concatenate(c) for c in zip(*found, strict=True)))
 
 
@@ -311,15 +309,18 @@ def repeats(edges: Array, photographs: Array) -> str:
     x = np.linspace(-5, 5, 201)
     normal = np.exp(-x * x / 2) / np.sqrt(2 * np.pi)
     plots: list[Plot] = []
+    borders = np.arange(-5, 5.1, 0.5)
+    high = max(np.histogram(v, borders, density=True)[0].max() for v in (edges, photographs))
+    top = float(np.ceil(10 * high)) / 10
     for values, title in (
         (edges, "Edges simulated with their stated noise"),
         (photographs, "Rendered photographs, whole program"),
     ):
         label = "error of a centre's coordinate, in its σ"
-        plot = Plot((-5, 5), (0, 0.5), (label, "density"), (430, 320), title)
-        plot.histogram(values, np.arange(-5, 5.1, 0.5), MUTED)
+        plot = Plot((-5, 5), (0, top), (label, "density"), (430, 320), title)
+        plot.histogram(values, borders, MUTED)
         plot.curve(x, normal, INK, 1.6)
-        plot.words(1.7, 0.45, f"rms {np.sqrt(np.mean(values**2)):.2f}", INK)
+        plot.words(1.7, 0.9 * top, f"rms {np.sqrt(np.mean(values**2)):.2f}", INK)
         plots.append(plot)
     return _beside(*plots)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from pkmcal.identify.estimate import Estimate
 from pkmcal.outcome import AXIS, LOOKS, Part, Plot
+from pkmcal.report.parameters import correlations
 
 MOST = 250
 """Parameters up to which they are shown: of more, a cell would be less than three pixels."""
@@ -15,26 +16,26 @@ COLOURS = [[0.0, "--drawing"], [0.5, "--card"], [1.0, "--calibrated"]]
 HOW = (
     "Orange: when one is larger than told, so is the other; blue: the other is smaller. Only their"
     " sum, or difference, is as sure as the small deviations of other values suggest. In the"
-    " frames that the parameters are told in; what a frame or the file holds is left out."
+    " frames that the parameters are told in; what a frame or the file holds is left out, and of"
+    " values that are tied one stands for all."
 )
 
 
 def section(estimate: Estimate) -> Part | None:
     """The section; None where nothing was estimated, or too much to be drawn."""
     table = estimate.machine.parameters
-    sigma = np.sqrt(np.maximum(np.diag(estimate.covariance), 0.0))
-    shown = np.flatnonzero(sigma > 0)
+    shown, rho, pairs = correlations(estimate)
     if not 1 < len(shown) <= MOST:
         return None
-    rho = estimate.covariance[np.ix_(shown, shown)] / np.outer(sigma[shown], sigma[shown])
     names = [table.in_words(table.names[k]) for k in shown]
-    off = np.abs(rho - np.diag(np.diag(rho)))
+    off = np.abs(rho) * pairs
     a, b = np.unravel_index(np.argmax(off), off.shape)
-    strong = int(np.sum(np.triu(off, 1) > 0.8))
     said = (
-        f"Of {len(shown) * (len(shown) - 1) // 2} pairs, {strong} have a correlation of more than"
-        f" 0.8; the closest are {names[a]} and {names[b]}, {rho[a, b]:+.2f}."
+        f"Of {np.count_nonzero(pairs)} pairs, {np.count_nonzero(off > 0.8)} have a correlation of"
+        f" more than 0.8; the closest are {names[a]} and {names[b]}, {rho[a, b]:+.2f}."
     ).replace("-", "−")
+    if np.count_nonzero(pairs) < len(shown) * (len(shown) - 1) // 2:
+        said += " Components of one axis, which its length binds, are not counted."
     plot = Plot(
         "correlations",
         "Correlations of the parameters",

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pkmcal.arrays import Array
+from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.files import json_text
 from pkmcal.identify.decided import EXACT, Decider, decided_by
 from pkmcal.identify.estimate import Estimate
@@ -206,9 +206,8 @@ def bound_together(estimate: Estimate, findings: Findings | None = None) -> tupl
     said = [{_whole_axis(name) for name in s.parameters} for s in found]
     pairs = [
         (names[i], names[j], rho)
-        for i, j, rho in tight_pairs(estimate.covariance)
-        for pair in [{_whole_axis(names[i]), _whole_axis(names[j])}]
-        if len(pair) == 2 and not any(pair <= s for s in said)
+        for i, j, rho in tight_pairs(estimate)
+        if not any({_whole_axis(names[i]), _whole_axis(names[j])} <= s for s in said)
     ]
     return tuple(_pair_text(table, *pair) for pair in pairs[:MOST_PAIRS])
 
@@ -259,14 +258,25 @@ def grouped(table: ParameterTable, names: tuple[str, ...]) -> list[str]:
     return out
 
 
-def tight_pairs(covariance: Array) -> list[tuple[int, int, float]]:
-    """Pairs of parameters (i, j, correlation) beyond ``TIGHT``, the tightest first.
+def correlations(estimate: Estimate) -> tuple[Integers, Array, Booleans]:
+    """Parameters (n,) that have a deviation of their own, their correlations (n, n), and which
+    pairs (n, n) say something: each once, i < j.
 
-    Ties, which are one parameter under several names, are left out.
+    Of a tie, which is one parameter under several names, the first stands for all; that an axis has
+    unit length says nothing of what its components are bound to.
     """
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0))
-    free = np.flatnonzero(sigma > EXACT)
-    rho = covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
-    i, j = np.nonzero(np.triu((np.abs(rho) > TIGHT) & (np.abs(rho) < 1 - 1e-9), 1))
+    table, sigma = estimate.machine.parameters, np.sqrt(np.diag(estimate.covariance).clip(0))
+    again = {name for group in table.tied for name in group[1:]}
+    own = np.array([name not in again for name in table.names], dtype=bool)
+    free = np.flatnonzero((sigma > EXACT) & own)
+    rho = estimate.covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
+    whole = np.array([_whole_axis(table.names[k]) for k in free])
+    return free, rho, np.triu(whole[:, None] != whole, 1)
+
+
+def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
+    """Pairs of parameters (i, j, correlation) beyond ``TIGHT``, the tightest first."""
+    free, rho, pairs = correlations(estimate)
+    i, j = np.nonzero(pairs & (np.abs(rho) > TIGHT))
     order = np.argsort(-np.abs(rho[i, j]), kind="stable")
     return [(int(free[i[n]]), int(free[j[n]]), float(rho[i[n], j[n]])) for n in order]

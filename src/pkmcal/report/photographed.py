@@ -19,7 +19,7 @@ from pkmcal.mechanisms.closure import joint_values, limb_ends, skeletons
 from pkmcal.outcome import Plot
 from pkmcal.report.links import Links
 from pkmcal.report.page import N_COLOURS
-from pkmcal.report.scene import line, markers, ring, space_layout
+from pkmcal.report.scene import beside, line, markers, ring, seen_whole
 from pkmcal.session.load import Session
 from pkmcal.wording import count
 
@@ -34,12 +34,6 @@ BORDER = 6
 """Points of each side of a picture's border that a frustum is drawn through."""
 NAMED = 12
 """Cameras up to which each has its name beside it."""
-CLOSE, FAR = 2.1, 4.2
-"""Distance of the eye at first, in sizes of the machine: so that all of it is seen, and so that it
-is not small though its cameras stand far away."""
-
-BESIDE = 1.2
-"""rad that the eye stands beside a camera at most, so that a single one looks across."""
 
 
 class PosedLimbs(NamedTuple):
@@ -272,29 +266,9 @@ def frustum(camera: Camera, T_base_camera: Array, depth: float) -> list[Array]:
 def _layout(
     limbs: PosedLimbs, cameras: Array, data: list[dict[str, Any]], names: list[str]
 ) -> dict[str, Any]:
-    """Seen from between the cameras (S, 3), m, so that these are in the picture as far as the
-    machine is not small in it.
-    """
-    ends = np.concatenate([limbs.a[0], limbs.b[0]])
-    middle, size = ends.mean(axis=0), float(np.ptp(ends, axis=0).max())
-    out = cameras - middle
-    far = float(np.linalg.norm(out, axis=1).max(initial=0.0))
-    around = np.sort(np.append(np.arctan2(out[:, 1], out[:, 0]), -np.pi / 4 * (not len(out))))
-    gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
-    angle = float(around[np.argmax(gaps)] + min(gaps.max() / 2, BESIDE))
-    whole = np.array(
-        [
-            [f([v for t in data for v in t[axis] if v is not None]) for axis in "xyz"]
-            for f in (np.nanmin, np.nanmax)
-        ]
-    )
-    # Plotly makes the geometric mean of the sides one, and has the eye in those units
-    unit = 1e-3 * float(np.prod(np.maximum(np.ptp(whole, axis=0), 1e-9)) ** (1 / 3))
-    centre = (middle - 1e-3 * whole.mean(axis=0)) / unit
-    away = float(np.clip(1.5 * far, CLOSE * size, FAR * size)) / unit
-    eye = centre + away * np.array([0.92 * np.cos(angle), 0.92 * np.sin(angle), 0.4])
-    layout = space_layout(dict(zip("xyz", eye.round(3).tolist(), strict=True)))
-    layout["scene"]["camera"]["center"] = dict(zip("xyz", centre.round(3).tolist(), strict=True))
+    """Seen from between the cameras (S, 3), m, with all that is drawn in the picture."""
+    middle = np.concatenate([limbs.a[0], limbs.b[0]]).mean(axis=0)
+    layout = seen_whole(data, beside(cameras - middle))
     layout["legend"] = {"orientation": "h", "y": 1, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     layout["margin"]["b"] = 78
     if len(names) > 1:

@@ -28,7 +28,7 @@ from pkmcal.outcome import (
 )
 from pkmcal.planning.plan import PAYS, Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
-from pkmcal.report.scene import line, markers, space_layout
+from pkmcal.report.scene import beside, line, markers, seen_whole
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.wording import SCALES, amount, brief, count, listed, number
 
@@ -322,8 +322,10 @@ def _where(found: MeasurementPlan) -> Part:
             hovertext=hover, hoverinfo="text",
         ),
     ]  # fmt: skip
+    eyes: list[Array] = []
     for name, camera, T_camera_base in _cameras(found):
         eye, frame = _frustum(camera, T_camera_base, middle)
+        eyes.append(eye)
         look = {"size": 4, "color": "--ink", "symbol": "square"}
         data += [
             line(name, "--ink", 3, frame, showlegend=False),
@@ -335,7 +337,7 @@ def _where(found: MeasurementPlan) -> Part:
         ]  # fmt: skip
     if found.tried:
         data.append(_tried(found.tried))
-    layout = space_layout({"x": 1.0, "y": -1.0, "z": 0.6})
+    layout = seen_whole(data, beside(np.reshape(eyes, (-1, 3)) - middle))
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     plot = Plot(
         "where",

@@ -225,6 +225,7 @@ def left_out(
         "rejected.html.j2",
         reasons=reasons(session, rejected),
         told=bool(findings),
+        tight=parameters.TIGHT,
         unidentified=parameters.bound_together(estimate)
         if findings
         else parameters.unidentified(groups, estimate),

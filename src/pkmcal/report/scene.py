@@ -34,6 +34,13 @@ NEAR = 9.0
 """SVG units within which two labels are written as one."""
 RING = 25
 """Points of an ellipsoid's ring."""
+BESIDE = 1.2
+"""rad that the eye stands beside a camera at most, so that a single one looks across."""
+VIEW = np.pi / 4
+"""From below to above in a picture in space, rad: Plotly's."""
+WIDE, NARROW = (1.5, 0.76), (1.0, 0.66)
+"""Widths of pictures in space, in heights, and the part of each that what is drawn may take: names
+and numbers stand beside it, of the same size in a small picture."""
 
 
 @dataclass(frozen=True)
@@ -353,9 +360,57 @@ def space_layout(eye: dict[str, float]) -> dict[str, Any]:
             "aspectmode": "data",
             "dragmode": "turntable",
             "camera": {"eye": eye},
-            **{f"{name}axis": {**axis, "title": {"text": f"{name} (mm)"}} for name in "xyz"},
+            **{
+                f"{name}axis": {**axis, "title": {"text": f"{name} (mm)", "font": {"size": 11}}}
+                for name in "xyz"
+            },
         },
     }
+
+
+def beside(cameras: Array) -> Array:
+    """The way (3,) from which a machine and its cameras, at (S, 3) m from its middle, are looked
+    at: between two cameras, so that none stands before it.
+    """
+    around = np.sort(np.arctan2(cameras[:, 1], cameras[:, 0])) if len(cameras) else [-np.pi / 4]
+    gaps = np.diff(np.append(around, around[0] + 2 * np.pi))
+    angle = float(around[np.argmax(gaps)] + min(gaps.max() / 2, BESIDE))
+    return np.array([0.92 * np.cos(angle), 0.92 * np.sin(angle), 0.4])
+
+
+def seen_whole(data: list[dict[str, Any]], way: Array) -> dict[str, Any]:
+    """The layout of a figure in space that is seen with all of ``data`` in the picture.
+
+    way : (3,) from what is drawn towards the eye. In ``meta`` stands how ``NARROW`` pictures are
+    looked at; the page takes it where they are narrower than ``WIDE``.
+    """
+    least, most = (
+        np.array([f([v for t in data for v in t[axis] if v is not None]) for axis in "xyz"])
+        for f in (np.nanmin, np.nanmax)
+    )
+    # Plotly's box is a sixteenth larger, and has a geometric mean of its sides of one
+    sides = np.where(most > least, (most - least) * 17 / 16, 2.0)
+    corners = sides / float(np.prod(sides)) ** (1 / 3) * (list(np.ndindex(2, 2, 2)) - np.array(0.5))
+    way = way / np.linalg.norm(way)
+    right = np.cross([0.0, 0.0, 1.0], way) / np.linalg.norm(way[:2])
+    axes = np.stack([right, np.cross(way, right)], axis=1)
+
+    def camera(width: float, inside: float) -> dict[str, dict[str, float]]:
+        # a corner at depth d before the eye is inside where it lies within slope d of the middle,
+        # so on each axis the corners on either side decide how far away, and what the middle is
+        slope = inside * np.tan(VIEW / 2) * np.array([width, 1.0])
+        near, across = (corners @ way)[:, None], corners @ axes / slope
+        one, other = (near + across).max(axis=0), (near - across).max(axis=0)
+        middle = axes @ (slope * (one - other) / 2)
+        eye = middle + (one + other).max() / 2 * way
+        return {
+            name: dict(zip("xyz", point.round(3).tolist(), strict=True))
+            for name, point in (("eye", eye), ("center", middle))
+        }
+
+    layout = space_layout({})
+    layout["scene"]["camera"] = camera(*WIDE)
+    return layout | {"meta": {"wide": WIDE[0], "narrow": camera(*NARROW)}}
 
 
 def _ellipsoids(scene: BeforeAfter) -> dict[str, Any]:

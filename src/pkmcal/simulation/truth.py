@@ -8,13 +8,14 @@ changing one setting does not reshuffle the rest.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pkmcal.arrays import Array, Integers, short_repr
+from pkmcal.arrays import Array, Booleans, Integers, short_repr
 from pkmcal.boards.board import Board
 from pkmcal.cameras import Camera
 from pkmcal.errors import GeometryError, InputError
@@ -22,6 +23,7 @@ from pkmcal.files import read_text
 from pkmcal.measurements import BREATHING_SIGMA
 from pkmcal.mechanisms import Machine
 from pkmcal.session.load import load_session
+from pkmcal.session.readings import same_pose
 from pkmcal.session.schema import Body
 from pkmcal.simulation.board import place_board
 from pkmcal.simulation.placement import (
@@ -40,6 +42,8 @@ FILE = "truth.json"
 STREAMS = (
     "machine", "stations", "configurations", "readings", "room", "photographs", "board", "focal",
 )  # fmt: skip
+SAME = 1e-9
+"""By which readings that were drawn at one end differ from each other, m or rad: rounding."""
 HANDHELD = "phone"
 """The name in session.yaml of a station whose camera is held by hand."""
 
@@ -64,14 +68,15 @@ class Settings:
     tolerance : true values differ from the drawing by this many times its tolerances.
     joint_noise : standard deviation of a reading, m. rough_position, rough_angle : by how much
     the session's station poses are off, m and rad. extreme : share of configurations with legs
-    near the ends of their ranges. board : seen by every station, fixed to ``board_on``. observe :
-    what the session says of the stations that see one. repeats :
-    photographs of each configuration from each station, with sensor noise of their own. shake :
-    standard deviations (m, rad) by which the camera moves between them. finish, light : of the
-    legs and of the room. as_built : motors, rings and cables, which no drawing shows, on the legs.
-    asked : these configurations, in place of drawn ones. handheld : each photograph
-    from a place of its own about the machine, ``repeats`` of each configuration, with focal lengths
-    that differ by ``breathing``, one standard deviation; ``stations`` then says nothing.
+    near the ends of their ranges, as far as there are that many: no two are of one pose. board :
+    seen by every station, fixed to ``board_on``. observe : what the session says of the stations
+    that see one. repeats : photographs of each configuration from each station, with sensor noise
+    of their own. shake : standard deviations (m, rad) by which the camera moves between them.
+    finish, light : of the legs and of the room. as_built : motors, rings and cables, which no
+    drawing shows, on the legs. asked : these configurations, in place of drawn ones. handheld :
+    each photograph from a place of its own about the machine, ``repeats`` of each configuration,
+    with focal lengths that differ by ``breathing``, one standard deviation; ``stations`` then says
+    nothing.
     """
 
     stations: int | tuple[StationPlace, ...] = 3
@@ -243,7 +248,7 @@ def _configurations(
             for camera, T in zip(cameras, T_camera_base, strict=True)
         ]
     )
-    groups = [seen.all(axis=0)] if settings.shared else list(seen)
+    groups = [np.asarray(seen.all(axis=0))] if settings.shared else list(seen)
     if settings.handheld:  # each configuration by its own photographs
         n, groups = 1, list(np.all(seen.reshape(n, repeats, -1), axis=1, keepdims=True)[:, 0])
     taken = np.zeros(len(poses), dtype=bool)
@@ -259,6 +264,7 @@ def _configurations(
             )
         taken[rows] = True
         chosen.append(rows)
+    rows = _without_repeats(np.concatenate(chosen), groups, joints)
     stations = range(len(cameras))
     if settings.handheld:
         pairs = [(s, s // repeats) for s in stations]
@@ -266,8 +272,34 @@ def _configurations(
         pairs = [(s, k) for s in stations for k in range(n)]
     else:
         pairs = [(s, s * n + k) for s in stations for k in range(n)]
-    rows = np.concatenate(chosen)
     return poses[rows], joints[rows], np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def _without_repeats(rows: Integers, groups: Sequence[Booleans], joints: Array) -> Integers:
+    """The chosen candidates (K,), as many of each group; where one repeats a pose, another instead.
+
+    Poses with every leg near an end are two to the power of the legs, so they are drawn again;
+    another such stands in as long as there are any. The rest keep their places, and with these
+    their names and their noise. groups : of each, the candidates (N,) that its stations see.
+    joints : (N, m).
+    """
+    rows, pose = rows.copy(), same_pose(joints, SAME)
+    ends = (joints < joints.min(axis=0) + SAME) | (joints > joints.max(axis=0) - SAME)
+    extreme = ends.all(axis=1)
+    n = len(rows) // len(groups)
+    for place in range(len(rows)):
+        if not np.isin(pose[rows[place]], pose[rows[:place]]):
+            continue
+        free = np.flatnonzero(groups[place // n] & ~np.isin(pose, pose[rows]))
+        if not free.size:
+            raise GeometryError(
+                what="there are not enough different configurations in which the legs are seen",
+                found=str(len(np.unique(pose[rows]))),
+                expected=str(len(rows)),
+                next_step="ask for fewer, or for fewer with every leg near an end of its range",
+            )
+        rows[place] = free[np.argmax(extreme[free])]
+    return rows
 
 
 def _as_asked(drawing: Machine, machine: Machine, asked: Asked) -> tuple[Array, Array, Integers]:

@@ -13,10 +13,18 @@
     if (node === null || typeof node !== "object") return node;
     return Object.fromEntries(Object.entries(node).map(([name, value]) => [name, themed(value)]));
   };
+  // A figure in space that is told how it is seen in narrow pictures.
+  const seen = ({ meta, ...layout }, width, height) => {
+    if (meta?.narrow && width < meta.wide * height) {
+      layout.scene = { ...layout.scene, camera: meta.narrow };
+    }
+    return layout;
+  };
   const options = { displayModeBar: false, responsive: true };
   const draw = (size = () => ({})) => Promise.all(plots.map((plot, i) => {
     const figure = themed(figures[i]);
-    return Plotly.react(plot, figure.data, { ...figure.layout, ...size(plot) }, { ...options, ...figure.config });
+    const layout = seen({ ...figure.layout, ...size(plot) }, plot.clientWidth, plot.clientHeight);
+    return Plotly.react(plot, figure.data, layout, { ...options, ...figure.config });
   }));
   // On paper: in light colours, as wide as a panel on A4 between its margins, and lower, as the style
   // has it there, so that two find room on a sheet.
@@ -36,7 +44,8 @@
     // alone in its section as low as on a screen: cameras stand to the sides
     const size = { width: 672, height: plot.closest("#geometry") ? 440 : 320 };
     const margin = { ...layout.margin, b: 8 };  // without the slider
-    const still = { ...layout, ...size, margin, autosize: false, sliders: [], updatemenus: [] };
+    const bare = { ...layout, ...size, margin, autosize: false, sliders: [], updatemenus: [] };
+    const still = seen(bare, size.width, size.height);
     const image = new Image();
     image.src = await Plotly.toImage({ data, layout: still }, { format: "png", scale: 2, ...size });
     image.alt = plot.getAttribute("aria-label");
