@@ -20,18 +20,15 @@ from pkmcal.papers.hand_eye import solve_pairs
 from pkmcal.report.corners import board_corners
 from pkmcal.session.load import load_session
 from pkmcal.simulation import load_truth
+from rendered import by_command
 
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     """One station, twelve configurations, by the command; nobody writes into it."""
     folder = tmp_path_factory.mktemp("platform") / "session"
-    done = run(
-        "simulate", folder, "--on-platform", "--stations", "1", "--configurations", "12",
-        "--size", "640x480",
-    )  # fmt: skip
-    assert done.code == 0
-    return folder
+    words = ("--on-platform", "--stations", "1", "--configurations", "12", "--size", "640x480")
+    return by_command(folder, *words)
 
 
 @pytest.fixture
