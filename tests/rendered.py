@@ -50,6 +50,22 @@ def rendered(folder: Path, machine, camera, settings: Settings, seed: int = 0) -
     return folder
 
 
+def by_command(folder: Path, *words: str) -> Path:
+    """A session in ``folder`` as ``pkmcal simulate`` writes it with these words, truth included."""
+    from conftest import run
+
+    package = Path(pkmcal.__file__).parent
+    parts = [_code(), (package / "commands" / "simulate.py").read_text(), *words]
+    key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:24]
+
+    def make(part: Path) -> None:
+        done = run("simulate", part, *words)
+        assert done.code == 0, done.err
+
+    shutil.copytree(once(KEPT / _code() / key, make), folder)
+    return folder
+
+
 @cache
 def _code() -> str:
     """The digest of the code that renders; sessions of older code are let go."""

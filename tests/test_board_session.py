@@ -30,6 +30,7 @@ from pkmcal.session.load import load_session
 from pkmcal.simulation import board_for, load_truth
 from pkmcal.simulation.board import SIZE, board_from_fields
 from pkmcal.simulation.scene import discs_of
+from rendered import by_command
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +38,7 @@ def rendered(tmp_path_factory):
     """Two stations of four configurations each, by the command; nobody writes into it."""
     folder = tmp_path_factory.mktemp("board") / "session"
     words = ("--board", "--stations", "2", "--configurations", "4", "--size", "640x480")
-    done = run("simulate", folder, *words)
-    assert done.code == 0
-    return folder
+    return by_command(folder, *words)
 
 
 @pytest.fixture

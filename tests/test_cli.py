@@ -323,7 +323,8 @@ def test_new_in_a_folder_that_is_not_empty(demo):
 # check
 
 
-def test_check_of_a_good_session(session):
+def test_check_of_a_good_session(session, checked, monkeypatch):
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     done = run("check", session)
     assert done.code == 0
     assert "Nothing is wrong. Next: pkmcal calibrate" in done.out
@@ -425,8 +426,9 @@ def test_calibrate_as_json_in_a_process_of_its_own(session, tmp_path):
     assert 0 < result["figures"]["joint_centre_sigma"] < 1e-3
 
 
-def test_the_four_steps_on_four_configurations_a_station(session):
+def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
     """Barely enough for them: told apart as comparison, or refused with [A]'s own condition."""
+    monkeypatch.setattr("pkmcal.papers.methods.REPETITIONS", 12)  # asked: the verdict, no deviation
     done = run("calibrate", session, "--method", "four-step", "--json")
     assert done.code == 1
     if (session / "calibration").exists():
@@ -437,8 +439,8 @@ def test_the_four_steps_on_four_configurations_a_station(session):
         assert "[A] 3.3" in done.json["expected"]
 
 
-def test_an_unusable_result_is_told_and_written(session, monkeypatch):
-    found = pkmcal.calibrate(session)
+def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch):
+    found = calibrated
     doubts = ("Somebody ran into the machine.",)
     verdict = judge(found.observation, found.estimate, findings=found.findings, doubts=doubts)
     found = replace(found, verdict=verdict)

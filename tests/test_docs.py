@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
-from functools import reduce
+from functools import cache, reduce
 from pathlib import Path
 
 import pytest
@@ -152,10 +152,11 @@ def test_commands_named_exist():
 
 
 def test_options_named_exist():
+    told = cache(lambda command: run(command, "--help").out)
     for name in NAMES:
         for command, rest in calls(text_of(name)):
             for option in re.findall(r"(?<!\S)--[a-z-]+", rest):
-                assert option in run(command, "--help").out, f"{name}: {command} {option}"
+                assert option in told(command), f"{name}: {command} {option}"
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -82,6 +82,12 @@ def hexapod():
 
 
 @pytest.fixture(scope="module")
+def new(hexapod):
+    """The same machine seen once more: where the stations stand, and what was measured."""
+    return legs_case(60, hexapod[1])[2:]
+
+
+@pytest.fixture(scope="module")
 def h4():
     """[C]'s machine and its calibration from 71 poses."""
     drawing = load_mechanism("h4", model="calibration")
@@ -114,10 +120,10 @@ def test_residuals_scatter_as_promised(hexapod):
     assert all(test.kept for test in chi2)
 
 
-def test_own_readings_have_no_part_in_a_pose(hexapod):
+def test_own_readings_have_no_part_in_a_pose(hexapod, new):
     """A reading that is wrong by 5 mm shows as 5 mm, and moves no seen pose."""
-    _, true, estimate, _ = hexapod
-    _, _, stations, data = legs_case(60, true)
+    estimate = hexapod[2]
+    stations, data = new
     start = start_state(estimate.machine, data, stations)
     wrong = replace(data, joints=data.joints + 5e-3 * (np.arange(len(data.joints)) == 4)[:, None])
     good, bad = (predict(estimate.machine, d, start) for d in (data, wrong))
@@ -126,10 +132,10 @@ def test_own_readings_have_no_part_in_a_pose(hexapod):
     assert np.abs(bad.T_base_platform[4] - good.T_base_platform[4]).max() < 2e-5
 
 
-def test_a_refined_camera_is_no_part_of_the_machine(hexapod):
+def test_a_refined_camera_is_no_part_of_the_machine(hexapod, new):
     """Intrinsics that are refined with the machine are found beside it, and ask for nothing."""
-    _, true, estimate, _ = hexapod
-    _, _, stations, data = legs_case(60, true)
+    estimate = hexapod[2]
+    stations, data = new
     start = start_state(estimate.machine, data, stations)
     wide = replace(
         data,
@@ -168,9 +174,9 @@ def test_a_board_in_one_configuration_tells_nothing(h4):
 # verdicts
 
 
-def test_better_than_the_drawing(hexapod):
-    drawing, true, estimate, _ = hexapod
-    _, _, stations, data = legs_case(60, true)
+def test_better_than_the_drawing(hexapod, new):
+    drawing, _, estimate, _ = hexapod
+    stations, data = new
     judged = judged_on(drawing, estimate, estimate.machine, data, stations)
     verdict = validation_verdict(judged, (), estimate.machine, data)
     assert verdict.usable
@@ -225,9 +231,9 @@ def test_a_leg_that_changed_is_named(hexapod):
     assert abs(judged.promise.common[2] + 1e-3) < 4 * judged.promise.common_sigma[2]
 
 
-def test_a_calibration_that_made_it_worse(hexapod):
-    drawing, true, estimate, _ = hexapod
-    _, _, stations, data = legs_case(60, true)
+def test_a_calibration_that_made_it_worse(hexapod, new):
+    drawing, _, estimate, _ = hexapod
+    stations, data = new
     worse = changed(estimate.machine, "legs[3].length.offset", 0.02)
     judged = judged_on(drawing, estimate, worse, data, stations)
     verdict = validation_verdict(judged, (), worse, data)
@@ -237,9 +243,9 @@ def test_a_calibration_that_made_it_worse(hexapod):
     assert "larger than the calibration's deviations" in verdict.reasons[1]
 
 
-def test_the_drawing_itself_is_not_better_than_the_drawing(hexapod):
-    drawing, true, estimate, _ = hexapod
-    _, _, stations, data = legs_case(60, true)
+def test_the_drawing_itself_is_not_better_than_the_drawing(hexapod, new):
+    drawing, _, estimate, _ = hexapod
+    stations, data = new
     judged = judged_on(drawing, estimate, drawing, data, stations)
     verdict = validation_verdict(judged, (), drawing, data)
     assert not verdict.usable

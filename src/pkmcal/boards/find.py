@@ -483,6 +483,55 @@ def _curvature(first: Array, axes: Array, bends: Array | None) -> Array:
     return across / np.maximum(np.sum(axes**2, axis=-1), 1e-9)
 
 
+class _Fit(NamedTuple):
+    """A fit on its way: numbers (k,) of the corners that have not settled, their parameters (k, 7)
+    and pixels (k, m), what is left of the grey levels, and the model's derivatives (k, 7, m) there.
+    """
+
+    number: Integers
+    p: Array
+    grey: Array
+    weight: Array
+    shape: _Shape
+    left: Array
+    by: Array
+    cost: Array
+    damping: Array
+
+    @classmethod
+    def begun(cls, grey: Array, weight: Array, shape: _Shape, p: Array) -> _Fit:
+        """Before the first step."""
+        value, by = _model(p, shape)
+        left = grey - value
+        cost = np.sum(weight * left**2, axis=1)
+        return cls(np.arange(len(p)), p, grey, weight, shape, left, by, cost, np.full(len(p), 1e-3))
+
+    def stepped(self) -> tuple[_Fit, Array]:
+        """After a damped step, where it is better, and that step (k, 7)."""
+        weighted = self.by * self.weight[:, None]
+        normal, right = weighted @ self.by.mT, weighted @ self.left[..., None]
+        diagonal = np.einsum("nii->ni", normal)
+        normal = normal + (self.damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
+        step = np.clip(np.linalg.solve(normal, right)[..., 0], -LONGEST_STEP, LONGEST_STEP)
+        value, by = _model(self.p + step, self.shape)
+        left = self.grey - value
+        cost = np.sum(self.weight * left**2, axis=1)
+        better = cost < self.cost
+        after = self._replace(
+            p=_taken(better, self.p + step, self.p),
+            left=_taken(better, left, self.left),
+            by=_taken(better, by, self.by),
+            cost=np.where(better, cost, self.cost),
+            damping=self.damping * np.where(better, 0.1, 10.0),
+        )
+        return after, step
+
+    def select(self, keep: Booleans) -> _Fit:
+        """Of some of the corners."""
+        parts = self._replace(shape=self.shape.select(keep))._asdict()
+        return _Fit(**{n: v if n == "shape" else v[keep] for n, v in parts.items()})
+
+
 def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Array]:
     """Weighted Levenberg-Marquardt of all corners at once; parameters (n, 7), residuals (n, m).
 
@@ -490,32 +539,15 @@ def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Ar
     """
     p = _levelled(grey, weight, shape, p)
     residual = np.empty_like(grey)
-    todo = np.arange(len(p))
-    value, by = _model(p, shape)
-    left, damping = grey - value, np.full(len(p), 1e-3)
-    cost = np.sum(weight * left**2, axis=1)
+    fit = _Fit.begun(grey, weight, shape, p)
     for _ in range(STEPS):
-        weighted = by * weight[:, None]
-        normal, right = weighted @ by.mT, weighted @ left[..., None]
-        diagonal = np.einsum("nii->ni", normal)
-        normal = normal + (damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
-        step = np.clip(np.linalg.solve(normal, right)[..., 0], -LONGEST_STEP, LONGEST_STEP)
-        trial = p[todo] + step
-        trial_value, trial_by = _model(trial, shape)
-        trial_left = grey - trial_value
-        trial_cost = np.sum(weight * trial_left**2, axis=1)
-        better = trial_cost < cost
-        p[todo] = _taken(better, trial, p[todo])
-        left, by = _taken(better, trial_left, left), _taken(better, trial_by, by)
-        cost = np.where(better, trial_cost, cost)
-        damping = damping * np.where(better, 0.1, 10.0)
-        residual[todo] = left
+        fit, step = fit.stepped()
+        p[fit.number], residual[fit.number] = fit.p, fit.left
         on = np.abs(step[:, :2]).max(axis=1) >= SETTLED
         if not on.any():
             break
         if not on.all():
-            grey, weight, left, by = grey[on], weight[on], left[on], by[on]
-            cost, damping, todo, shape = cost[on], damping[on], todo[on], shape.select(on)
+            fit = fit.select(on)
     return p, residual
 
 

@@ -190,9 +190,10 @@ def _student(
     from scipy.special import gammaln
 
     tails, norm = tried[..., None], worth(tried)
-    a = scale**2 / norm
-    b = np.broadcast_to(shading**2 / norm, a.shape)
-    for _ in range(ROUNDS):
+    least = OWN_SHADING**2 / norm
+
+    def scored(a: Array, b: Array) -> tuple[Array, Array]:
+        """One step of the two variances."""
         s, t = a[..., None] + b[..., None] * size, a[..., None]
         trust = (tails + PAIR) / (tails + along / s + rest / t)
         left, of_s = trust * along - s, weight / s**2
@@ -206,13 +207,16 @@ def _student(
         det = aa * bb - ab**2
         det = np.where(det > TINY * aa * bb, det, np.inf)
         new_a, new_b = a + (bb * by_a - ab * by_b) / det, b + (aa * by_b - ab * by_a) / det
-        least = OWN_SHADING**2 / norm
         # a shading at its least is known: the scale goes on alone
         new_a = np.where(new_b > least, new_a, a + (by_a + (b - least) * ab) / aa)
         new_a = np.clip(new_a, a / LARGEST, a * LARGEST)
-        new_b = np.maximum(np.clip(new_b, b / LARGEST, b * LARGEST), least)
-        change = max(np.abs(new_a / a - 1).max(), np.abs(new_b / b - 1).max())
-        a, b = new_a, new_b
+        return new_a, np.maximum(np.clip(new_b, b / LARGEST, b * LARGEST), least)
+
+    a = scale**2 / norm
+    b = np.broadcast_to(shading**2 / norm, a.shape)
+    for _ in range(ROUNDS):
+        before, (a, b) = (a, b), scored(a, b)
+        change = max(np.abs(new / old - 1).max() for new, old in zip((a, b), before, strict=True))
         if change < ENOUGH:
             break
     s, t = a[..., None] + b[..., None] * size, a[..., None]

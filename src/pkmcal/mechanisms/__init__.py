@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
@@ -61,8 +62,7 @@ def load_mechanism(
             found=str(source),
             expected=guess or f"a mechanism file, or {listed(sorted(built_in), len(built_in))}",
         )
-    document = read_yaml(path, label)
-    checked = validate(document, MechanismDocument)
+    document, checked = _drawing(path, label) if str(source) in built_in else _read(path, label)
     if model is not None:
         try:
             chosen = _model(checked, model)
@@ -72,6 +72,16 @@ def load_mechanism(
             return load_mechanism(_beside(path, chosen.mechanism))
         checked = checked.model_copy(update={"fixed": chosen.fixed, "tied": chosen.tied})
     return replace(checked_machine(checked, document), model=model)
+
+
+def _read(path: Path, label: str | None) -> tuple[Document, MechanismDocument]:
+    """A file's fields, as they stand there and as the schema has them."""
+    document = read_yaml(path, label)
+    return document, validate(document, MechanismDocument)
+
+
+_drawing = cache(_read)
+"""The same of a built-in machine, read once: the package's own files stay as they are."""
 
 
 def checked_machine(checked: MechanismDocument, document: Document, *keys: str) -> Machine:
