@@ -78,11 +78,13 @@ def numbering_told(session: Session) -> tuple[str, ...]:
     if not orders:
         return ()
     names, file = session.document["joints"]["columns"], session.document["joints"]["file"]
+    pose = ""  # which photographs by hand have none of
+    if not all(station.handheld for station in session.stations):
+        pose = ", or give one station its pose by hand, even roughly, which tells"
     others = " or ".join(names[order[0]] for order in orders)
     return (
         f"The drawing is alike from {in_full(len(orders) + 1)} sides: with the legs counted from"
         f" the column {others} of {file} on, photographs and readings would fit as well, in a"
         " turned base frame. They tell the order of the legs, not which is the first: make sure"
-        f" that {names[0]} is the drawing's first leg, or give one station its pose by hand, even"
-        " roughly, which tells.",
+        f" that {names[0]} is the drawing's first leg{pose}.",
     )

@@ -605,9 +605,9 @@ def image(s: Study, run: int) -> dict[str, Any]:
     data += _ways(s, run, "identified", "solid")
     data += _ways(s, run, "hand", "dash")
     layout = plane("x, pixels", "y, pixels")
-    layout["xaxis"] |= {"range": [-0.04 * width, 1.04 * width]}
-    layout["yaxis"] |= {"range": [1.04 * height, -0.04 * height], "scaleanchor": "x"}
-    layout["yaxis"] |= {"scaleratio": 1}
+    layout["xaxis"] |= {"range": [-0.04 * width, 1.04 * width], "constrain": "domain"}
+    layout["yaxis"] |= {"range": [1.04 * height, -0.04 * height], "constrain": "domain"}
+    layout["yaxis"] |= {"scaleanchor": "x"}
     return {"data": data, "layout": layout, "config": {}}
 
 
