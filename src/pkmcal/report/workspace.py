@@ -259,6 +259,9 @@ def _place_axes(
     common |= {"nticks": 4, "tickangle": 0}
     last = row == down - 1
     one, other = "xyz"[cut.across], "xyz"[cut.up]
+    named = (
+        column == 0 or other == "z"
+    )  # slices side by side share their y
     layout[f"xaxis{panel}"] = {
         **common,
         "domain": [left, left + wide],
@@ -275,7 +278,7 @@ def _place_axes(
         "anchor": f"x{panel}",
         "scaleanchor": f"x{panel}",
         "constrain": "domain",
-        "title": {"text": f"{other}, mm", "font": {"size": 11}, "standoff": 2},
+        "title": {"text": f"{other}, mm" if named else "", "font": {"size": 11}, "standoff": 2},
     }
 
 
