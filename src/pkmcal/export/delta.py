@@ -27,6 +27,8 @@ from pkmcal.geometry.rigid import apply, dot, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Finding, Level
 
+WAY = 8
+"""Steps from home to a pose of the grid."""
 STEPS = 7
 """Readings of each motor in the grid: ends, middle, and two on each side."""
 LEAST = 0.12
@@ -171,8 +173,12 @@ def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Ar
     ends = machine.joint_ranges
     axes = [np.linspace(low, high, STEPS) for low, high in ends]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(ends))
-    found = machine.forward_result(grid)
-    poses = found.T_base_platform
+    # from home on in small steps: from afar the tool is also found above the carriages
+    home = machine.home()
+    poses, begin = np.broadcast_to(home, (len(grid), 4, 4)), machine.inverse(home)
+    for share in np.linspace(0, 1, WAY + 1)[1:]:
+        found = machine.forward_result(begin + share * (grid - begin), poses)
+        poses = found.T_base_platform
     back = machine.inverse(poses)
     good = found.converged & (found.singularity > LEAST)
     good &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
