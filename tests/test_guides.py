@@ -128,3 +128,33 @@ def test_a_delta_kit_with_a_board(workplace):
     assert radius
     # the board's size is known to 0.1 %, so two deviations are 0.2 mm
     assert float(radius[1]) == pytest.approx(printers.BUILT.radius, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("rod", "radius", "endstop"),
+    [(218.0, 97.3, 300.0), (270.0, 105.4, 400.0), (300.0, 146.0, 400.0), (397.0, 200.0, 540.0)],
+)
+def test_a_printers_drawing_is_what_its_firmware_holds(tmp_path, monkeypatch, rod, radius, endstop):
+    """Exported as it was read it comes back, also where home is above the lowest carriage, which
+    is below the tool there.
+    """
+    monkeypatch.chdir(tmp_path)
+    settings = printers.Settings(radius=radius, rod=(rod,) * 3, endstop=(endstop,) * 3)
+    (tmp_path / "printer.cfg").write_text(printers.printer_cfg(settings))
+    done = [
+        typed(f"pkmcal {words}")
+        for words in (
+            "new kit --printer printer.cfg --board",
+            "export kit/mechanism.yaml --to klipper",
+        )
+    ]
+    assert [d.code for d in done] == [0, 0], done[-1].out + done[-1].err
+    (values,) = tmp_path.rglob("pkmcal_printer.cfg")
+    for name, value in (
+        ("delta_radius", radius),
+        ("arm_length", rod),
+        ("position_endstop", endstop),
+    ):
+        found = re.findall(rf"^{name}: ([\d.]+)", values.read_text(), re.MULTILINE)
+        assert [float(v) for v in found] == pytest.approx([value] * len(found), abs=2e-4)
+        assert found

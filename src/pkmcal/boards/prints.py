@@ -134,11 +134,12 @@ def sheet_pdf(board: Board, paper: str | None = None) -> tuple[bytes, str]:
     words = [
         f"{1e3 * ruler:.0f} mm here, along the ruler at the left as well: print in actual size"
         " (100 %), not fitted to the page.",
-        f"{_described(board)}; over all {1e3 * size[0]:.2f} x {1e3 * size[1]:.2f} mm.",
-        "Fix it to something stiff and flat. Measure it over all, and correct board.yaml by what"
-        " you found.",
+        f"Over all {1e3 * size[0]:.2f} x {1e3 * size[1]:.2f} mm: measure it, and correct board.yaml"
+        " by what you found. Fix it to something stiff and flat.",
+        f"{_described(board)}.",
     ]
-    text = [f"BT /F {LETTER} Tf {on_page(corner[0], below + 0.005)} Td 10 TL"]
+    # from the page's edge on where the board is small: beside it there is no room for a line
+    text = [f"BT /F {LETTER} Tf {on_page(min(corner[0], LETTERING), below + 0.005)} Td 10 TL"]
     text += [f"({_escaped(line)}) Tj T*" for line in words] + ["ET"]
     # all in one path: no seams between neighbours where a viewer smoothes their borders
     content = "\n".join(["0 g", *rectangles, "f", "0.4 w", *lines, "S", *text])

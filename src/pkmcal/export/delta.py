@@ -176,6 +176,7 @@ def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Ar
     # from home on in small steps: from afar the tool is also found above the carriages
     home = machine.home()
     poses, begin = np.broadcast_to(home, (len(grid), 4, 4)), machine.inverse(home)
+    begin = np.where(np.isfinite(begin), begin, grid)  # a motor that cannot reach home
     for share in np.linspace(0, 1, WAY + 1)[1:]:
         found = machine.forward_result(begin + share * (grid - begin), poses)
         poses = found.T_base_platform
@@ -389,12 +390,14 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
 
 def _lift(delta: Delta) -> float:
     """How far, mm, the firmware's Z is above the base's z: so that it is 0 on a bed that was felt;
-    else not, or so that no Z is negative.
+    else not where home is above z = 0, which then is the bed; of a machine that hangs from its base
+    so that no Z is negative.
     """
     if delta.bed is not None:
         return -MM * delta.bed
     lowest = float(MM * delta.positions[:, 2].min())
-    return 0.0 if lowest >= 0 else float(np.ceil(-lowest))
+    above = delta.machine.home()[2, 3] > 0
+    return 0.0 if above or lowest >= 0 else float(np.ceil(-lowest))
 
 
 def _order(azimuth: Array, nominal: Array) -> Integers:

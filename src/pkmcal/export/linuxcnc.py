@@ -154,7 +154,7 @@ def _hal(source: Source, struts: Limbs) -> str:
     limit = max(MAX_ERROR, STRUTS * float(np.nanmax(limits, initial=0.0)))
     lines = [
         commented((*_hexapod_header(source), "", *source.sigma_lines(HEXAPOD)), "#"),
-        "loadrt genhexkins\n",
+        "# your own HAL file loads it before: loadrt genhexkins\n",
     ]
     for n, leg in enumerate(struts.leg):
         lines.append(f"# strut {n}: leg {leg} of the mechanism file")
@@ -257,7 +257,8 @@ def _delta_hal(source: Source, delta: Delta, fit: Fit) -> str:
             f"setp rotarydeltakins.thighlength {mm(fit.arm[0])}",
             f"setp rotarydeltakins.shinlength {mm(fit.rod[0])}",
         ]
-    return "\n".join([commented(lines, "#"), f"loadrt {fit.kind}deltakins", *pins]) + "\n"
+    loaded = f"# your own HAL file loads it before: loadrt {fit.kind}deltakins"
+    return "\n".join([commented(lines, "#"), loaded, *pins]) + "\n"
 
 
 def _delta_ini(source: Source, delta: Delta, fit: Fit) -> str:

@@ -259,9 +259,7 @@ def _place_axes(
     common |= {"nticks": 4, "tickangle": 0}
     last = row == down - 1
     one, other = "xyz"[cut.across], "xyz"[cut.up]
-    named = (
-        column == 0 or other == "z"
-    )  # slices side by side share their y
+    named = column == 0 or other == "z"  # slices side by side share their y
     layout[f"xaxis{panel}"] = {
         **common,
         "domain": [left, left + wide],
