@@ -175,11 +175,13 @@ def _workspace(machine: Machine, joint: Integers, arm: Array) -> tuple[Array, Ar
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(ends))
     # from home on in small steps: from afar the tool is also found above the carriages
     home = machine.home()
-    poses, begin = np.broadcast_to(home, (len(grid), 4, 4)), machine.inverse(home)
-    begin = np.where(np.isfinite(begin), begin, grid)  # a motor that cannot reach home
+    begin = machine.inverse(home)
+    begin = np.where(np.isfinite(begin), begin, grid)  # of a motor that cannot reach home
+    found = machine.forward_result(begin, np.broadcast_to(home, (len(grid), 4, 4)))
     for share in np.linspace(0, 1, WAY + 1)[1:]:
-        found = machine.forward_result(begin + share * (grid - begin), poses)
-        poses = found.T_base_platform
+        here = begin + share * (grid - begin)
+        found = machine.forward_result(here, found.T_base_platform)
+    poses = found.T_base_platform
     back = machine.inverse(poses)
     good = found.converged & (found.singularity > LEAST)
     good &= np.nan_to_num(np.abs(back - grid).max(axis=1), nan=1.0) < 1e-9
