@@ -16,7 +16,7 @@ from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import perturb
 from pkmcal.identify.change import machine_change
 from pkmcal.identify.gauge import moved_centres
-from pkmcal.judge.difference import difference
+from pkmcal.judge.difference import _shared, difference
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.report.difference import outcome_of
 from pkmcal.report.page import page_html
@@ -180,7 +180,21 @@ def test_shared_photographs_are_counted(saved):
     assert found.verdict.headline == (
         "The two are the same: no number differs by more than rounding."
     )
-    assert any("100% of those" in text for text in found.assumed)
+    assert any("100% of what" in text for text in found.assumed)
+
+
+def test_photographs_are_counted_however_they_are_grouped(saved):
+    """Three photographs under one name or under three are as much in common."""
+    each = [{"photographs": {f"{k}.png"}} for k in range(6)]
+    grouped = [{"photographs": {f"{k}.png" for k in row}} for row in ((0, 1, 2), (6, 7, 8))]
+
+    def of(configurations):
+        used = np.ones(len(configurations), dtype=bool)
+        return replace(saved, document={"configurations": configurations}, used=used)
+
+    assert _shared([of(each), of(grouped)]) == (3, 3 / 6)
+    assert _shared([of(grouped), of(each)]) == (1, 3 / 6)
+    assert _shared([of(each), of(each)]) == (6, 1.0)
 
 
 def test_a_refused_calibration_is_no_base_for_a_comparison(saved):

@@ -224,16 +224,17 @@ def _one_drawing(both: list[SavedCalibration]) -> bool:
 
 
 def _shared(both: list[SavedCalibration]) -> tuple[int, float]:
-    """Configurations that two calibrations used, and their share of the fewer: by their
-    photographs, or, without any, by readings that agree to the last digit.
+    """Configurations of the first that both calibrations saw, and what both saw as a share of what
+    the one that saw less did: photographs, however they are grouped, or, without any, readings that
+    agree to the last digit.
     """
     if len(both) < 2:
         return 0, 0.0
     one, other = ([_marks(saved, k) for k in np.flatnonzero(saved.used).tolist()] for saved in both)
-    every = set().union(*other)
-    number_of = sum(bool(marks & every) for marks in one)
-    fewest = min(len(one), len(other))
-    return number_of, min(1.0, number_of / fewest) if fewest else 0.0
+    first, second = set().union(*one), set().union(*other)
+    number_of = sum(bool(marks & second) for marks in one)
+    fewest = min(len(first), len(second))
+    return number_of, len(first & second) / fewest if fewest else 0.0
 
 
 def _marks(saved: SavedCalibration, k: int) -> set[object]:
@@ -290,8 +291,8 @@ def _assumed(
         " independent."
     )
     out.append(
-        f"{count(shared, 'configuration')} were seen by both, {share:.0%} of those of the one that"
-        " has fewer; their noise is taken to be common to both, and each configuration to tell as"
+        f"{count(shared, 'configuration')} were seen by both, {share:.0%} of what the one that has"
+        " fewer saw; their noise is taken to be common to both, and each configuration to tell as"
         " much as any other."
         if shared
         else "They share no configuration, so the noise of one is independent of the other's."
