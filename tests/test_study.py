@@ -35,8 +35,9 @@ from pkmcal.studies.findings import SweepResult, clustered, study
 from pkmcal.studies.paper_a_joint import JointByAxes
 from pkmcal.studies.statistics import Summary
 from pkmcal.studies.store import Store
-from pkmcal.studies.sweep import cells_of, parsed, scaled, subject_of
+from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of
 from pkmcal.studies.tasks import Batch, Job, Population, Sample
+from pkmcal.wording import brief
 
 SMALL = ("--vary", "configurations=6", "--vary", "stations=1,2")
 """Of 3-rpr: two combinations in a second or two."""
@@ -336,6 +337,11 @@ def test_parameters_keep_their_names_where_legs_and_boards_are_compared(alone):
     radius = "legs[1].tubes[1].radius"
     assert radius in told[1]
     assert radius not in told[0]
+    head, *lines = found.summary().splitlines()
+    assert head == f"{found.subject.name}, 2 calibrations a combination"
+    for line, cell in zip(lines, found.found, strict=True):
+        assert line.startswith(f"  {in_words(cell.values)}: tool ")
+        assert f"stated {brief(1e3 * cell.position_sigma)} mm, " in line
 
 
 def test_what_chance_does_is_no_gain():

@@ -33,6 +33,7 @@ from pkmcal.studies.sweep import (
     subject_of,
 )
 from pkmcal.studies.tasks import Runner
+from pkmcal.wording import brief, count, number
 
 PROMISE = 0.95
 HELD = 0.02
@@ -126,6 +127,20 @@ class SweepResult:
     seed: int
 
     __repr__ = short_repr
+
+    def summary(self) -> str:
+        """As the command tells it, a line a combination: the tool's error over the workspace with
+        its standard error, what calibrations state of it, and how many 95 % intervals hold.
+        """
+        lines = [f"{self.subject.name}, {count(self.runs, 'calibration')} a combination"]
+        for cell in self.found:
+            found, error, stated = (1e3 * value for value in (*cell.position, cell.position_sigma))
+            lines.append(
+                f"  {in_words(cell.values) or 'as it is'}: tool {brief(found)} ± {brief(error)} mm,"
+                f" stated {brief(stated)} mm, {number(100 * cell.covered.value, 1)} % of the 95 %"
+                f" intervals hold, {number(100 * cell.failed.value, 1)} % failed"
+            )
+        return "\n".join(lines)
 
     @property
     def wall(self) -> float:
