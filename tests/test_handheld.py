@@ -570,10 +570,10 @@ def test_photographs_join_what_is_known(looked):
     session, photographs, poses, truth = looked
     at = {p.station: p for p in photographs}
     places = dict(enumerate(truth.T_camera_base[:2]))
-    known = join(session, at, Together.as_drawn(session.machine, poses), places)
+    known = join(session, at, Together.as_drawn(session.machine, poses), places, Boards())
     assert sorted(known.edges) == [0, 1]
-    right = join(session, at, known, {2: truth.T_camera_base[2]})
+    right = join(session, at, known, {2: truth.T_camera_base[2]}, Boards())
     assert len(right.edges[2]) > 6
     assert right.paid(but=2) - known.paid(but=2) < 3
     other = {2: replace(at[2], configuration=at[0].configuration, joints=at[0].joints)}
-    assert len(join(session, other, known, {2: truth.T_camera_base[2]}).edges[2]) < 3
+    assert len(join(session, other, known, {2: truth.T_camera_base[2]}, Boards()).edges[2]) < 3

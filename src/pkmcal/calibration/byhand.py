@@ -111,7 +111,7 @@ def search_by_hand(
                 count = len(by_hand) - len(unsure)
                 told(f"Asking again, with {count} of {len(by_hand)} photographs placed", 0.3)
             try:
-                joined = join(session, at, joined, new)
+                joined = join(session, at, joined, new, boards)
             except PkmcalError:
                 break  # with all that is observed it is told better why
             placed = {

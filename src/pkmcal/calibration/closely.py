@@ -77,15 +77,17 @@ def join(
     photographs: Mapping[int, legs.Photographs],
     known: Together,
     places: Mapping[int, Array],
+    boards: Boards,
 ) -> Together:
     """What is known together with photographs at places T_camera_base (4, 4).
 
-    photographs : by station. Raises a `PkmcalError` where there is nothing to be estimated.
+    photographs : by station. boards : what they show of a board. Raises a `PkmcalError` where there
+    is nothing to be estimated.
     """
     at = {**known.T_camera_base, **places}
     stations = sorted(at)
-    # boards and trackers are left out: what a place is asked is how the legs look from there
     only = replace(session.of_stations(stations), trackers=())
+    shown = boards.of(np.array(stations, dtype=int))
     edges = dict(known.edges)
     state: State | None = None
     for reach in LATER if edges else FIRST:
@@ -97,7 +99,7 @@ def join(
         numbered = [
             replace(edges[k], station=np.full(len(edges[k]), n)) for n, k in enumerate(stations)
         ]
-        measurements = measurements_of(only, Boards(), concatenate(numbered))
+        measurements = measurements_of(only, shown, concatenate(numbered))
         T = np.stack([at[k] for k in stations])
         start = state or start_state(known.machine, measurements, T)
         estimate = bundle(session.machine, measurements, start)
@@ -148,7 +150,8 @@ def look_closer(
     for T in (*found.T_camera_base[near][:CLOSER], *others):
         weigh(before, T)  # the machine as it is known; where it fits better changed, that is taken
         try:
-            known = join(session, {p.station: p}, before, {p.station: T})
+            # without boards: what a place is asked is how the legs look from there
+            known = join(session, {p.station: p}, before, {p.station: T}, Boards())
         except PkmcalError:
             continue  # too few legs are where they should be
         weigh(known, known.T_camera_base[p.station])
