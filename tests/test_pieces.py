@@ -48,7 +48,7 @@ def test_noise_and_estimate_are_the_same(runs, in_pieces):
         np.testing.assert_allclose(getattr(at, name), getattr(at_whole, name), rtol=1e-9)
     np.testing.assert_array_equal(found.info.by_kind.value.shape, whole.info.by_kind.value.shape)
     np.testing.assert_allclose(found.solution.state.z, whole.solution.state.z, atol=1e-8)
-    np.testing.assert_allclose(found.scale.edges, whole.scale.edges, rtol=1e-6)
+    np.testing.assert_allclose(found.noise_scale, whole.noise_scale, rtol=1e-6)
 
 
 def test_the_rows_of_pieces_say_the_same(in_pieces):
