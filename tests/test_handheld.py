@@ -10,10 +10,11 @@ import pytest
 
 from pkmcal.boards.views import Boards
 from pkmcal.calibration import byhand
-from pkmcal.calibration.byhand import Placed, misplaced, without_misplaced
+from pkmcal.calibration.byhand import misplaced, without_misplaced
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.closely import Together, join, look_closer
-from pkmcal.calibration.recognise import KnownScene, platform_poses, read_photographs
+from pkmcal.calibration.closely import join, look_closer
+from pkmcal.calibration.known import KnownScene, SeenSession
+from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.results import document_of
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
@@ -275,12 +276,13 @@ def at_truth(monkeypatch, folder, off=2e-3):
     """Let photographs by hand be placed where they were taken, nearly."""
     rng = np.random.default_rng(1)
 
-    def place(session, photographs, boards, known, _told):
+    def place(session, photographs, boards, _rng, _told):
         truth = load_truth(folder, session.machine).T_camera_base
         near = perturb(truth, off * rng.normal(size=(3, 6)))
-        return Placed(session, photographs, boards, known._replace(T_camera_base=near))
+        known = KnownScene.as_drawn(session.machine, near, session.joints)
+        return SeenSession(session, photographs, boards, known)
 
-    monkeypatch.setattr("pkmcal.calibration.calibrate.place_by_hand", place)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
 
 
 @pytest.fixture(scope="module")
@@ -401,10 +403,9 @@ def found_with(monkeypatch, truth, doubts):
 
 def placed(looked, monkeypatch, doubts):
     """Places of photographs that are found where they were taken, with doubts; none: elsewhere."""
-    session, photographs, poses, truth = looked
+    session, photographs, _, truth = looked
     found_with(monkeypatch, truth, doubts)
-    known = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
-    return byhand.place_by_hand(session, photographs, Boards(), known)
+    return byhand.place(session, photographs, Boards(), np.random.default_rng(0))
 
 
 def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
@@ -457,7 +458,7 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
     assert misplaced(session, measurements, estimate, perturb(T, turn)) == [2]
     known = KnownScene(estimate.machine, T, estimate.state.T_base_platform)
-    rest = without_misplaced(session, [], Boards(), known, wrong)
+    rest = without_misplaced(SeenSession(session, [], Boards(), known), wrong)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert "too few of its edges agree" in rest.session.warnings[-1]
 
@@ -520,7 +521,7 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     true = truth.T_camera_base[1]
     places = np.concatenate([turned_about(view, true[None]), true[None]])
     equal = Alone(places, np.full(len(places), 20.0), 1.0)
-    drawn = Together.as_drawn(session.machine, poses)
+    drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
     found = look_closer(session, p, drawn, equal)
     assert equal.doubt == 0.5
     assert found.doubt < 1e-3
@@ -535,7 +536,8 @@ def test_photographs_join_what_is_known(looked):
     session, photographs, poses, truth = looked
     at = {p.station: p for p in photographs}
     places = dict(enumerate(truth.T_camera_base[:2]))
-    known = join(session, at, Together.as_drawn(session.machine, poses), places)
+    drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
+    known = join(session, at, drawn, places)
     assert sorted(known.edges) == [0, 1]
     right = join(session, at, known, {2: truth.T_camera_base[2]})
     assert len(right.edges[2]) > 6
