@@ -388,6 +388,13 @@ def looked(simulated):
     return session, read_photographs(session), platform_poses(session), truth
 
 
+def view_of(session, p, poses):
+    """What a search looks at in one photograph."""
+    tables = distance_tables(p.images)
+    machine, tubes = session.machine, tubes_of(session.machine)
+    return StationView(machine, p.camera, tubes, p.configuration, session.joints, poses, tables)
+
+
 def found_with(monkeypatch, truth, doubts):
     """Photographs are found where they were taken, with doubts."""
 
@@ -480,10 +487,7 @@ def test_one_photograph_is_found_from_nothing(looked):
     session, photographs, poses, truth = looked
     k = EASIEST
     p = photographs[k]
-    view = StationView(
-        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        poses, distance_tables(p.images),
-    )  # fmt: skip
+    view = view_of(session, p, poses)
     found = find_alone(view, p.images[0])
     off = pose_difference(found.T_camera_base[0], truth.T_camera_base[k])
     assert found.doubt < DOUBT
@@ -495,10 +499,7 @@ def test_turns_of_a_machine_onto_itself(looked):
     """A hexapod has equal thirds: two other places from which it looks alike."""
     session, photographs, poses, truth = looked
     p = photographs[0]
-    view = StationView(
-        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        poses, distance_tables(p.images),
-    )  # fmt: skip
+    view = view_of(session, p, poses)
     alike = turned_about(view, truth.T_camera_base[:1])
     assert len(alike) == 2
     base = session.machine.base_centers()
@@ -514,10 +515,7 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     """A search holds the place and those from which the machine is turned onto itself for equal."""
     session, photographs, poses, truth = looked
     p = photographs[1]
-    view = StationView(
-        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        poses, distance_tables(p.images),
-    )  # fmt: skip
+    view = view_of(session, p, poses)
     true = truth.T_camera_base[1]
     places = np.concatenate([turned_about(view, true[None]), true[None]])
     equal = Alone(places, np.full(len(places), 20.0), 1.0)
