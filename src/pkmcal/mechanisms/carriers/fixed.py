@@ -7,9 +7,7 @@ from typing import final
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.mechanisms.carriers.contract import (
-    BaseCarrier,
-)
+from pkmcal.mechanisms.carriers.contract import BaseCarrier
 from pkmcal.mechanisms.carriers.joint import JointEnd
 
 

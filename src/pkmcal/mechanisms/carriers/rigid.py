@@ -8,9 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.geometry.batches import turned
-from pkmcal.mechanisms.carriers.contract import (
-    PlatformCarrier,
-)
+from pkmcal.mechanisms.carriers.contract import PlatformCarrier
 from pkmcal.mechanisms.carriers.joint import JointEnd
 
 
