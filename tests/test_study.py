@@ -258,6 +258,25 @@ def test_coverage(subject, vary):
         assert 0.93 <= found.value <= 0.97
 
 
+def test_edges_that_scatter_more_than_stated_are_told():
+    """Ten times as much, which no session's judgement would let pass."""
+    setting = SimulatedCalibrations(design_of("gough-stewart", "configurations=8"))
+    batch = batch_of(setting, 2)
+    data = setting.draw(batch)
+    problem = data.assembled.problem
+    sharp = replace(problem.data, white=10 * problem.data.white)
+    assembled = replace(data.assembled, problem=replace(problem, data=sharp))
+    usual, noisy = (
+        setting.solve(batch, one)[ESTIMATE].told
+        for one in (data, replace(data, assembled=assembled))
+    )
+    np.testing.assert_allclose(usual["scale"], 1, atol=0.25)
+    assert (usual["scale"] != 1).all()
+    assert not usual["failed"].any()
+    assert (noisy["scale"] > 4).all()
+    assert noisy["failed"].all()
+
+
 def test_wrong_deviations_are_told():
     """Half of the true deviations: the study says so, and exit code and page with it."""
     rng = np.random.default_rng(0)
