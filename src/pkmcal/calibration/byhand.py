@@ -24,11 +24,11 @@ from pkmcal.calibration.closely import join, look_closer
 from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.recognise import WORKERS, Progress, station_poses
 from pkmcal.errors import InputError, PkmcalError
-from pkmcal.geometry.rigid import dot, pose_difference
+from pkmcal.geometry.rigid import dot, inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Measurements
 from pkmcal.observe import legs
-from pkmcal.observe.alone import ALIKE, Alone, find_alone
+from pkmcal.observe.alone import ALIKE, Alone, find_alone, turn_between
 from pkmcal.observe.predict import LegsInCamera, legs_in_camera, tubes_of
 from pkmcal.observe.stations import StationView
 from pkmcal.observe.surroundings import Landmarks, Neighbour, Surroundings
@@ -88,12 +88,15 @@ def search_by_hand(
     room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
     joined = known
     found: dict[int, Alone] = {}
+    # with the machine that the first of them tell; later ones change it by little
+    looked: dict[int, Alone] = {}
     with ThreadPoolExecutor(WORKERS) as pool:
-        alone = partial(_search, session, at, room, joined, {}, {})
-        for k, one in zip(by_hand, pool.map(alone, by_hand), strict=True):
+        alone = partial(_search, session, at, room, joined, {}, {}, {})
+        for k, (_, one) in zip(by_hand, pool.map(alone, by_hand), strict=True):
             found[k] = one
             if told is not None:
                 told(f"Placing photographs by hand: {len(found)} of {len(by_hand)}", 0.25)
+        found |= _on_board(found, boards)
         while True:
             believed = _believed(found, boards, known.T_camera_base)
             sure = {k: believed[k] for k in at if not np.isnan(believed[k]).any()}
@@ -112,8 +115,10 @@ def search_by_hand(
             for k in sorted(joined.edges):
                 T = joined.T_camera_base[k]
                 placed[k] = Neighbour(at[k].camera, T, _legs(session, at[k], joined, T)[0])
-            again = partial(_search, session, at, room, joined, placed, room.landmarks(placed))
-            found |= zip(unsure, pool.map(again, unsure), strict=True)
+            landmarks = room.landmarks(placed)
+            again = partial(_search, session, at, room, joined, placed, landmarks, looked)
+            for k, (seen, one) in zip(unsure, pool.map(again, unsure), strict=True):
+                looked[k], found[k] = seen, one
     for k in by_hand:
         if k in joined.edges:
             believed[k] = joined.T_camera_base[k]
@@ -127,23 +132,27 @@ def _search(
     joined: KnownScene,
     placed: Mapping[int, Neighbour],
     landmarks: Mapping[int, Landmarks],
+    looked: Mapping[int, Alone],
     k: int,
-) -> Alone:
-    """The places that photograph k could show: by its legs, and by what it shares of the room with
-    those that are placed.
+) -> tuple[Alone, Alone]:
+    """The places that photograph k could show: by the search in it alone, unless it was looked at,
+    and weighed by its legs and by what it shares of the room with those that are placed.
     """
     p = photographs[k]
-    view = StationView(
-        joined.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        joined.T_base_platform, distance_tables([p.images[0]]),
-    )  # fmt: skip
-    found, others = find_alone(view, p.images[0]), room.place(k, landmarks)
+    alone = looked.get(k)
+    if alone is None:
+        view = StationView(
+            joined.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
+            joined.T_base_platform, distance_tables([p.images[0]]),
+        )  # fmt: skip
+        alone = find_alone(view, p.images[0])
+    others = room.place(k, landmarks)
     if placed:
-        axes = _legs(session, p, joined, found.T_camera_base)
-        others = np.concatenate([others, room.about(found, k, p.camera, axes, placed)])
-    found = look_closer(session, p, joined, found, others)
+        axes = _legs(session, p, joined, alone.T_camera_base)
+        others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])
+    found = look_closer(session, p, joined, alone, others)
     axes = _legs(session, p, joined, found.T_camera_base)
-    return room.weighed(found, k, p.camera, axes, placed)
+    return alone, room.weighed(found, k, p.camera, axes, placed)
 
 
 def _legs(
@@ -153,6 +162,38 @@ def _legs(
     first = photograph.configuration[:1]
     pose, readings = joined.T_base_platform[first], session.joints[first]
     return legs_in_camera(joined.machine, T_camera_base, pose, readings)
+
+
+def _on_board(found: Mapping[int, Alone], boards: Boards) -> dict[int, Alone]:
+    """The places of the photographs that see a board on the base, weighed together: where it stands
+    on the base is one unknown, and each of their places tells it.
+
+    A photograph's place is its own where that agrees with the board, which knows the drawing no
+    better, and the board's where none does.
+    """
+    T_camera_board = {
+        k: seen.stood.T_camera_board
+        for k, seen in boards.stations.items()
+        if k in found and seen.stood is not None
+    }
+    if len(T_camera_board) < 2:
+        return {}
+    tell = [inverse(T) @ found[k].T_camera_base for k, T in T_camera_board.items()]
+    T_board_base = np.concatenate(tell)
+    total = np.zeros(len(T_board_base))
+    own: dict[int, Array] = {}
+    for k, T in T_camera_board.items():
+        places, evidence = found[k].T_camera_base, found[k].evidence
+        alike = turn_between((T @ T_board_base)[:, None], places) < ALIKE
+        worth = np.where(alike, np.maximum(evidence, 0.0), 0.0)
+        total += worth.max(axis=1)
+        best = np.argmax(worth, axis=1)
+        agrees = np.take_along_axis(worth, best[:, None], axis=1) > 0
+        own[k] = np.where(agrees[..., None], places[best], T @ T_board_base)
+    order = np.argsort(-total, kind="stable")
+    near = turn_between(T_board_base[order], T_board_base[order[0]]) < ALIKE
+    order = order[~near | (np.arange(len(order)) == 0)]
+    return {k: Alone(T[order], total[order], 1.0) for k, T in own.items()}
 
 
 def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
@@ -172,14 +213,17 @@ def misplaced(
     session: Session, measurements: Measurements, estimate: Estimate, T_camera_base: Array
 ) -> list[int]:
     """Photographs by hand of which the joint estimate has given up most edges, has too few to tell
-    their place, or finds the camera looking another way than where it was placed, T_camera_base.
+    their place, or finds the camera looking another way than where it was placed, T_camera_base. A
+    board that agrees with the others tells the place of its photograph whatever the edges do.
     """
     turn = pose_difference(estimate.state.T_camera_base, T_camera_base)[:, :3]
     astray = np.sqrt(dot(turn, turn)) > ALIKE / 2
     station = measurements.edges.station
     kept = np.bincount(station, estimate.edge_weights, len(session.stations))
     count = np.bincount(station, minlength=len(session.stations))
-    lost = (2 * kept < count) | (kept < FEWEST_EDGES)
+    poses = measurements.poses.station
+    by_board = np.bincount(poses, estimate.pose_weights, len(session.stations)) >= 0.5
+    lost = ((2 * kept < count) | (kept < FEWEST_EDGES)) & ~by_board
     return [k for k, s in enumerate(session.stations) if s.handheld and (lost[k] or astray[k])]
 
 

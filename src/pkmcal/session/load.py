@@ -413,7 +413,9 @@ def _of_little_use(document: Document, schema: SessionDocument) -> list[str]:
         return []
     if not users:
         return [f"{document.where('board')}: no station observes the board."]
-    if schema.board.fixed_to == "base" and len(users) == 1:
+    first = schema.stations[users[0]]
+    by_hand = isinstance(first, StationDocument) and first.handheld
+    if schema.board.fixed_to == "base" and len(users) == 1 and not by_hand:
         return [
             f"{document.where('board')}: only station {users[0]} observes the board on the base;"
             " it takes two for a board to join them."
