@@ -133,6 +133,14 @@ def checked(demo) -> Checked:
     return Checked(found, told)
 
 
+@pytest.fixture
+def one_process(monkeypatch):
+    """Studies in this process: other ones take a second to start."""
+    from pkmcal.studies import workers
+
+    monkeypatch.setattr(workers, "cores", lambda: 1)
+
+
 @pytest.fixture(scope="module")
 def quick_plans():
     """Plans chosen among few candidates, where how good they are is not the question."""

@@ -126,8 +126,8 @@ def test_noise_scale_is_found():
     for robust in (False, True):
         result = solve_batch(problem, truth, robust=robust)
         n_edges = data.weight.sum() * 2
-        assert result.scale.edges.mean() == pytest.approx(3, rel=0.01)
-        assert result.scale.edges.std() == pytest.approx(3 / np.sqrt(2 * n_edges), rel=0.4)
+        assert result.noise_scale.mean() == pytest.approx(3, rel=0.01)
+        assert result.noise_scale.std() == pytest.approx(3 / np.sqrt(2 * n_edges), rel=0.4)
         error = (result.solution.state.z - truth.z) ** 2
         variance = np.einsum("bii->bi", result.info.covariance)[:, : error.shape[1]]
         assert np.mean(error / variance) == pytest.approx(1, abs=0.15)

@@ -18,7 +18,6 @@ from pkmcal.calibration.gather import edges_by_camera
 from pkmcal.calibration.outlines import outlines
 from pkmcal.calibration.saved import load
 from pkmcal.geometry.rigid import perturb
-from pkmcal.identify import score
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.gauge import default_gauge
@@ -32,6 +31,7 @@ from pkmcal.simulation import simulate_edges
 from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.edges import EdgeNoise
 from pkmcal.simulation.placement import draw_configurations
+from pkmcal.solver import elimination
 from pkmcal.wording import ratio
 from test_identify_scene import exact
 
@@ -206,7 +206,7 @@ def test_scores_are_those_of_the_whole_jacobian(monkeypatch):
     scores = tests.scores(freed)
     for k in [2, 3, 5, 40, 70]:
         assert scores[k].chi2 == pytest.approx(oracle(known, k)[0], rel=1e-5, abs=1e-6)
-    monkeypatch.setattr(score, "ROWS", 3 * problem.n_rows)
+    monkeypatch.setattr(elimination, "ROWS", 3 * problem.n_rows)
     pieces = Departures(assembled, state, effects, [0, 1, 2], singles=True)
     for one, other in zip(pieces.scores(freed), scores, strict=True):
         assert one.chi2 == pytest.approx(other.chi2, rel=1e-6, abs=1e-9)

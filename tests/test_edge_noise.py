@@ -106,6 +106,16 @@ def test_what_nothing_shades_keeps_the_least():
     assert off(result, truth) < 1.15
 
 
+def test_a_tube_that_nobody_saw_keeps_what_is_stated():
+    rng = np.random.default_rng(11)
+    scene = shaded(rng, 0.1, runs=1)
+    measurements = scene.measurements(rng)
+    first = replace(measurements, edges=measurements.edges.select(measurements.edges.tube == 0))
+    noise = bundle(scene.machine, first, scene.state()).edge_noise
+    assert noise.scale[0] != 1
+    assert (noise.scale[1], noise.shading[1], noise.tails[1]) == (1, OWN_SHADING, np.inf)
+
+
 def test_a_crowd_is_the_sum_over_its_line():
     rng = np.random.default_rng(8)
     measurements = shaded(rng, 0.1, runs=1).measurements(rng)
@@ -114,10 +124,10 @@ def test_a_crowd_is_the_sum_over_its_line():
     for k in range(len(edges)):
         near = edges.normal[number == number[k]] @ edges.normal[k]
         expected[k] = np.exp(-np.arccos(np.clip(near, -1, 1)) / ALIKE).sum()
-    np.testing.assert_allclose(crowd(measurements), expected, rtol=0.05)
+    np.testing.assert_allclose(crowd(measurements, number), expected, rtol=0.05)
     same = replace(edges, normal=np.broadcast_to(edges.normal[0], edges.normal.shape))
     counted = np.bincount(number)[number]
-    np.testing.assert_allclose(crowd(replace(measurements, edges=same)), counted)
+    np.testing.assert_allclose(crowd(replace(measurements, edges=same), number), counted)
 
 
 numbers = st.floats(-3, 3, allow_nan=False)

@@ -3,6 +3,7 @@
 import re
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,15 +11,16 @@ import pytest
 
 from pkmcal.boards.views import Boards
 from pkmcal.calibration import byhand
-from pkmcal.calibration.byhand import Placed, misplaced, without_misplaced
+from pkmcal.calibration.byhand import misplaced, without_misplaced
 from pkmcal.calibration.calibrate import calibrate
-from pkmcal.calibration.closely import Together, join, look_closer
-from pkmcal.calibration.recognise import KnownScene, platform_poses, read_photographs
+from pkmcal.calibration.closely import join, look_closer
+from pkmcal.calibration.known import KnownScene, SeenSession
+from pkmcal.calibration.recognise import platform_poses, read_photographs
 from pkmcal.calibration.results import document_of
 from pkmcal.check.check import check_session
 from pkmcal.errors import InputError
 from pkmcal.files import Exif, read_exif, with_exif
-from pkmcal.geometry.rigid import apply, perturb, pose_difference
+from pkmcal.geometry.rigid import apply, perturb, pose, pose_difference, rotation
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
@@ -277,12 +279,13 @@ def at_truth(monkeypatch, folder, off=2e-3):
     """Let photographs by hand be placed where they were taken, nearly."""
     rng = np.random.default_rng(1)
 
-    def place(session, photographs, boards, known, _told):
+    def place(session, photographs, boards, _rng, _told):
         truth = load_truth(folder, session.machine).T_camera_base
         near = perturb(truth, off * rng.normal(size=(3, 6)))
-        return Placed(session, photographs, boards, known._replace(T_camera_base=near))
+        known = KnownScene.as_drawn(session.machine, near, session.joints)
+        return SeenSession(session, photographs, boards, known)
 
-    monkeypatch.setattr("pkmcal.calibration.calibrate.place_by_hand", place)
+    monkeypatch.setattr("pkmcal.calibration.calibrate.place", place)
 
 
 @pytest.fixture(scope="module")
@@ -388,6 +391,13 @@ def looked(simulated):
     return session, read_photographs(session), platform_poses(session), truth
 
 
+def view_of(session, p, poses):
+    """What a search looks at in one photograph."""
+    tables = distance_tables(p.images)
+    machine, tubes = session.machine, tubes_of(session.machine)
+    return StationView(machine, p.camera, tubes, p.configuration, session.joints, poses, tables)
+
+
 def found_with(monkeypatch, truth, doubts, textured=False):
     """Photographs are found where they were taken, with doubts; textured: the room tells too."""
 
@@ -407,10 +417,9 @@ def found_with(monkeypatch, truth, doubts, textured=False):
 
 def placed(looked, monkeypatch, doubts, textured=False):
     """Places of photographs that are found where they were taken, with doubts; none: elsewhere."""
-    session, photographs, poses, truth = looked
+    session, photographs, _, truth = looked
     found_with(monkeypatch, truth, doubts, textured)
-    known = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
-    return byhand.place_by_hand(session, photographs, Boards(), known)
+    return byhand.place(session, photographs, Boards(), np.random.default_rng(0))
 
 
 def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
@@ -483,7 +492,7 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
     assert misplaced(session, measurements, estimate, perturb(T, turn)) == [2]
     known = KnownScene(estimate.machine, T, estimate.state.T_base_platform)
-    rest = without_misplaced(session, [], Boards(), known, wrong)
+    rest = without_misplaced(SeenSession(session, [], Boards(), known), wrong)
     assert [s.name for s in rest.session.stations] == ["phone-0000-1", "phone-0002-1"]
     assert "too few of its edges agree" in rest.session.warnings[-1]
 
@@ -505,10 +514,7 @@ def test_one_photograph_is_found_from_nothing(looked):
     session, photographs, poses, truth = looked
     k = EASIEST
     p = photographs[k]
-    view = StationView(
-        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        poses, distance_tables(p.images),
-    )  # fmt: skip
+    view = view_of(session, p, poses)
     found = find_alone(view, p.images[0])
     off = pose_difference(found.T_camera_base[0], truth.T_camera_base[k])
     assert found.doubt < DOUBT
@@ -520,10 +526,7 @@ def test_turns_of_a_machine_onto_itself(looked):
     """A hexapod has equal thirds: two other places from which it looks alike."""
     session, photographs, poses, truth = looked
     p = photographs[0]
-    view = StationView(
-        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        poses, distance_tables(p.images),
-    )  # fmt: skip
+    view = view_of(session, p, poses)
     alike = turned_about(view, truth.T_camera_base[:1])
     assert len(alike) == 2
     base = session.machine.base_centers()
@@ -539,14 +542,11 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     """A search holds the place and those from which the machine is turned onto itself for equal."""
     session, photographs, poses, truth = looked
     p = photographs[1]
-    view = StationView(
-        session.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
-        poses, distance_tables(p.images),
-    )  # fmt: skip
+    view = view_of(session, p, poses)
     true = truth.T_camera_base[1]
     places = np.concatenate([turned_about(view, true[None]), true[None]])
     equal = Alone(places, np.full(len(places), 20.0), 1.0)
-    drawn = Together.as_drawn(session.machine, poses)
+    drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
     found = look_closer(session, p, drawn, equal, NONE)
     assert equal.doubt == 0.5
     assert found.doubt < 1e-3
@@ -570,10 +570,37 @@ def test_photographs_join_what_is_known(looked):
     session, photographs, poses, truth = looked
     at = {p.station: p for p in photographs}
     places = dict(enumerate(truth.T_camera_base[:2]))
-    known = join(session, at, Together.as_drawn(session.machine, poses), places, Boards())
+    drawn = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
+    known = join(session, at, drawn, places, Boards())
     assert sorted(known.edges) == [0, 1]
     right = join(session, at, known, {2: truth.T_camera_base[2]}, Boards())
     assert len(right.edges[2]) > 6
     assert right.paid(but=2) - known.paid(but=2) < 3
     other = {2: replace(at[2], configuration=at[0].configuration, joints=at[0].joints)}
     assert len(join(session, other, known, {2: truth.T_camera_base[2]}, Boards()).edges[2]) < 3
+
+
+def test_a_board_on_the_base_weighs_places_together(looked):
+    """Two photographs prefer look-alikes, each another one; the board stands in one place only."""
+    truth = looked[3].T_camera_base
+    turns = [
+        pose(rotation(np.radians(a) * np.array([0.0, 0.0, 1.0])), np.zeros(3)) for a in (120, 240)
+    ]
+    found = {
+        k: Alone(np.stack([T @ turn, T]), np.array([20.0, 19.0]), 1.0)
+        for k, (T, turn) in enumerate(zip(truth, (*turns, turns[0]), strict=True))
+    }
+    T_base_board = perturb(np.eye(4), np.array([0.1, 0.2, 0.3, 0.05, 0.0, 0.02]))
+    boards = Boards({
+        k: SimpleNamespace(stood=SimpleNamespace(T_camera_board=T @ T_base_board))
+        for k, T in enumerate(truth[:2])
+    })  # fmt: skip
+    told = byhand._on_board(found, boards)
+    assert sorted(told) == [0, 1]  # the third does not show it
+    for k, one in told.items():
+        assert one.doubt < 1e-6
+        assert turn_between(one.T_camera_base[0], truth[k]) < 1e-6
+    # a photograph in which nothing was found gets its place from the board
+    found[1] = Alone(truth[1:2] @ turns[0], np.array([-5.0]), 1.0)
+    assert turn_between(byhand._on_board(found, boards)[1].T_camera_base[1], truth[1]) < 1e-6
+    assert byhand._on_board(found, boards.of(np.array([2]))) == {}

@@ -71,7 +71,7 @@ def test_a_noise_that_is_stated_wrong_is_found(true, stated):
     scale = found.reading_scale * stated / true  # of the noise in use, to the true one
     assert np.all((low * scale < 1) & (high * scale > 1))
     assert np.all(found.reading_scale != 1)
-    np.testing.assert_array_less(found.scale.edges, 1.1)
+    np.testing.assert_array_less(found.noise_scale, 1.1)
     error, least = ((r.solution.state.z - truth.z) ** 2 for r in (found, best))
     assert error.sum() == pytest.approx(least.sum(), rel=0.1)
     promised, honest = (np.einsum("bii->bi", r.info.covariance).sum() for r in (found, best))

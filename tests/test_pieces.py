@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkmcal import solver
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.identify.covariance import Information, identifiability, reduced_rows
 from pkmcal.identify.noise import components
 from pkmcal.papers import linear
+from pkmcal.solver import condensed, elimination
 from test_identify_scene import make_scene
 
 CONFIGURATIONS = 7
@@ -27,7 +27,7 @@ def in_pieces(monkeypatch):
     """Afterwards two configurations, or runs, are worked on at once."""
 
     def begin(problem):
-        monkeypatch.setattr(solver, "ROWS", 2 * problem.n_rows)
+        monkeypatch.setattr(elimination, "ROWS", 2 * problem.n_rows)
 
     return begin
 
@@ -48,7 +48,7 @@ def test_noise_and_estimate_are_the_same(runs, in_pieces):
         np.testing.assert_allclose(getattr(at, name), getattr(at_whole, name), rtol=1e-9)
     np.testing.assert_array_equal(found.info.by_kind.value.shape, whole.info.by_kind.value.shape)
     np.testing.assert_allclose(found.solution.state.z, whole.solution.state.z, atol=1e-8)
-    np.testing.assert_allclose(found.scale.edges, whole.scale.edges, rtol=1e-6)
+    np.testing.assert_allclose(found.noise_scale, whole.noise_scale, rtol=1e-6)
 
 
 def test_the_rows_of_pieces_say_the_same(in_pieces):
@@ -74,7 +74,7 @@ def test_the_rows_of_pieces_say_the_same(in_pieces):
 def test_condensed_rows_say_the_same():
     rng = np.random.default_rng(0)
     rows, value = rng.normal(size=(2, 50, 4)), rng.normal(size=(2, 50))
-    few, rest = solver.condensed(rows, value)
+    few, rest = condensed(rows, value)
     assert few.shape == (2, 5, 4)
     np.testing.assert_allclose(few.mT @ few, rows.mT @ rows, atol=1e-12)
     np.testing.assert_allclose(few.mT @ rest[..., None], rows.mT @ value[..., None], atol=1e-12)

@@ -10,9 +10,7 @@ import pytest
 
 from conftest import run
 from pkmcal.calibration.calibrate import Calibration, calibrate
-from pkmcal.check.check import check_session
-from pkmcal.check.checked import SessionCheck
-from pkmcal.check.repeats import (
+from pkmcal.calibration.repeats import (
     Cylinders,
     RepeatStudy,
     _findings,
@@ -23,6 +21,8 @@ from pkmcal.check.repeats import (
     fit_motions,
     study_repeats,
 )
+from pkmcal.check.check import check_session
+from pkmcal.check.checked import SessionCheck
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
@@ -407,7 +407,7 @@ def looked(repeats):
         return made[0]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pkmcal.check.repeats.calibrate", once)
+        patch.setattr("pkmcal.calibration.repeats.calibrate", once)
         study = study_repeats(repeats)
     (calibration,) = made
     return Looked(check_session(repeats), study, calibration)
@@ -417,7 +417,9 @@ def looked(repeats):
 def once(looked, monkeypatch):
     """Commands tell of one look at the photographs, as it does not depend on what they write."""
     monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: looked.found)
-    monkeypatch.setattr("pkmcal.check.repeats.study_repeats", lambda *_, **_more: looked.study)
+    monkeypatch.setattr(
+        "pkmcal.calibration.repeats.study_repeats", lambda *_, **_more: looked.study
+    )
 
 
 @pytest.mark.usefixtures("once")

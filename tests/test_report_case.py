@@ -9,7 +9,8 @@ import numpy as np
 from pkmcal.cameras.pinhole import Pinhole
 from pkmcal.geometry.cylinders import contour_point, edge_normals, tangent_basis
 from pkmcal.geometry.rigid import look_at, perturb
-from pkmcal.identify.estimate import Estimate, State, Statistics, TubeNoise
+from pkmcal.identify.estimate import Estimate, State, Statistics
+from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.measurements import EdgeSet, Observation, Rejection
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.observe.predict import legs_in_camera
@@ -147,7 +148,7 @@ def make_estimate(machine, poses, T, edges, rng) -> Estimate:
         edge_shift_sigma=np.array([0.012]),
         edge_residuals=rng.normal(size=(count, 2)),
         edge_weights=weights,
-        edge_noise=TubeNoise(np.ones(2), np.full(2, 0.015), np.full(2, 100.0)),
+        edge_noise=EdgeScatter(np.ones(2), np.full(2, 0.015), np.full(2, 100.0)),
         edge_trust=np.ones(count),
         joint_residuals=rng.normal(size=(k, 6)),
         data_share=share,

@@ -29,14 +29,15 @@ def findings_of(scene, *views):
 
 
 def make_estimate_stub():
-    from pkmcal.identify.estimate import Estimate, Statistics, TubeNoise
+    from pkmcal.identify.estimate import Estimate, Statistics
+    from pkmcal.identify.scatter import EdgeScatter
 
     none = np.zeros(0)
     statistics = Statistics(0, 0, 0, 0, 0, 0, 0, 0, 0, "", 1.0)
     empty = load_mechanism("gough-stewart")
     return Estimate(
         empty, make("gough-stewart", n=1).state(), none, none, none, none,
-        TubeNoise(none, none, none), none, none, none, none, statistics, "",
+        EdgeScatter(none, none, none), none, none, none, none, statistics, "",
     )  # fmt: skip
 
 

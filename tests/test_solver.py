@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pkmcal import solver
 from pkmcal.identify.bundle import solve_batch
 from pkmcal.papers.registration import Dense, minimise_dense
 from pkmcal.solver import (
@@ -28,6 +27,7 @@ from pkmcal.solver import (
     put,
     soft_weights,
     stacked,
+    strips,
     take,
 )
 from test_identify_scene import guess, make_scene
@@ -132,7 +132,7 @@ def in_strips(rng, sharp, damping, runs=2, k=11, own=3, na=9):
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
 def test_products_of_strips_are_those_of_their_rows(monkeypatch, damping, sharp, piece):
     """To the last digits, however sharp the rows after them, a few configurations at a time."""
-    monkeypatch.setattr(solver, "PIECE", piece)
+    monkeypatch.setattr(strips, "PIECE", piece)
     rows, damping = in_strips(np.random.default_rng(12), sharp, damping)
     linear = rows.linear()
     assert np.all(linear.by_shared[:, :, :8, [1, 5, 6, 7, 8]] == 0)

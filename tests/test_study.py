@@ -1,16 +1,11 @@
-"""pkmcal study: simulated calibrations, stopped and resumed, on processes and clusters."""
+"""pkmcal study: what can be varied, what is simulated, and the command."""
 
 from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,10 +13,10 @@ import numpy as np
 import pytest
 
 from conftest import run
-from pkmcal.errors import InputError, ResultError
+from pkmcal.errors import InputError
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.report.study import document_of, runs_bytes
-from pkmcal.studies import cluster, engine, tasks, workers
+from pkmcal.report.study import document_of
+from pkmcal.studies import engine
 from pkmcal.studies.calibrations import (
     ESTIMATE,
     SimulatedCalibrations,
@@ -32,21 +27,12 @@ from pkmcal.studies.calibrations import (
 from pkmcal.studies.capture import captured
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.findings import SweepResult, clustered, study
-from pkmcal.studies.paper_a_joint import JointByAxes
 from pkmcal.studies.statistics import Summary
-from pkmcal.studies.store import Store
 from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of
-from pkmcal.studies.tasks import Batch, Job, Population, Sample
 from pkmcal.wording import brief
 
 SMALL = ("--vary", "configurations=6", "--vary", "stations=1,2")
 """Of 3-rpr: two combinations in a second or two."""
-
-
-@pytest.fixture
-def alone(monkeypatch):
-    """This process alone: other ones take a second to start."""
-    monkeypatch.setattr(workers, "cores", lambda: 1)
 
 
 def design_of(name, *vary):
@@ -58,7 +44,7 @@ def batch_of(setting, runs=4, seed=0):
     return engine.batches(setting, runs, seed)[0]
 
 
-# ------------------------------------------------------------------ what is studied
+# what is studied
 
 
 def test_a_grid_has_every_combination():
@@ -97,7 +83,7 @@ def test_what_cannot_be_varied_is_told(words, message):
 @pytest.mark.parametrize(
     "vary", ["legs=3", ["legs=3"], {"legs": [3]}, {"legs": 3}, {"legs": np.array([3])}]
 )
-def test_one_value_may_stand_alone(vary, alone):
+def test_one_value_may_stand_alone(vary, one_process):
     assert study("a", vary, runs=2).varied == {"legs": (3,)}
 
 
@@ -208,7 +194,7 @@ def test_a_folder_called_like_a_machine_is_not_taken_for_a_session(tmp_path, mon
         subject_of("mine")
 
 
-# ------------------------------------------------------------------ what is simulated
+# what is simulated
 
 
 def test_the_tool_of_the_truth_is_not_off():
@@ -243,7 +229,7 @@ def test_the_tool_of_the_truth_is_not_off():
         ("a", []),
     ],
 )
-def test_stated_deviations_hold(subject, vary, alone):
+def test_stated_deviations_hold(subject, vary, one_process):
     """A few runs: errors over stated deviations are about one, for parameters and tool."""
     found = study(subject, vary, runs=10)
     cell, sample = found.found[0], found.results[0].samples[ESTIMATE]
@@ -272,6 +258,25 @@ def test_coverage(subject, vary):
         assert 0.93 <= found.value <= 0.97
 
 
+def test_edges_that_scatter_more_than_stated_are_told():
+    """Ten times as much, which no session's judgement would let pass."""
+    setting = SimulatedCalibrations(design_of("gough-stewart", "configurations=8"))
+    batch = batch_of(setting, 2)
+    data = setting.draw(batch)
+    problem = data.assembled.problem
+    sharp = replace(problem.data, white=10 * problem.data.white)
+    assembled = replace(data.assembled, problem=replace(problem, data=sharp))
+    usual, noisy = (
+        setting.solve(batch, one)[ESTIMATE].told
+        for one in (data, replace(data, assembled=assembled))
+    )
+    np.testing.assert_allclose(usual["scale"], 1, atol=0.25)
+    assert (usual["scale"] != 1).all()
+    assert not usual["failed"].any()
+    assert (noisy["scale"] > 4).all()
+    assert noisy["failed"].all()
+
+
 def test_wrong_deviations_are_told():
     """Half of the true deviations: the study says so, and exit code and page with it."""
     rng = np.random.default_rng(0)
@@ -295,7 +300,7 @@ def test_standard_errors_know_of_batches():
     assert np.mean(np.square(errors)) == pytest.approx(1 / 25, rel=0.05)
 
 
-def test_calibrations_that_all_fail_are_told(tmp_path, alone):
+def test_calibrations_that_all_fail_are_told(tmp_path, one_process):
     """A thousand times the noise of [A] Table 1: no calibration can be used, and that is said."""
     done = run("study", "a", "--vary", "axis_noise=1,1000", "--runs", 4, "-o", tmp_path)
     assert done.code == 1, done.err
@@ -314,7 +319,7 @@ def test_calibrations_that_all_fail_are_told(tmp_path, alone):
     assert all("NaN" not in figure for figure in figures)
 
 
-def test_a_platform_that_does_not_turn_is_told_no_turns(tmp_path, alone):
+def test_a_platform_that_does_not_turn_is_told_no_turns(tmp_path, one_process):
     out = tmp_path / "out"
     done = run("study", "delta", *SMALL[:2], "--vary", "stations=1", "--runs", 4, "-o", out)
     assert done.code == 0, done.err
@@ -328,7 +333,7 @@ def test_one_run_tells_no_standard_error():
     assert np.isnan(one.error)
 
 
-def test_parameters_keep_their_names_where_legs_and_boards_are_compared(alone):
+def test_parameters_keep_their_names_where_legs_and_boards_are_compared(one_process):
     """With legs the tubes' radii are parameters as well, between the others."""
     found = study("h4", ["observe=board,legs", "stations=1", "configurations=6"], runs=2)
     told = [cell["covered_by_parameter"] for cell in document_of(found)["combinations"]]
@@ -361,10 +366,10 @@ def test_what_chance_does_is_no_gain():
     assert calls <= 0.05 * 400
 
 
-# ------------------------------------------------------------------ the command
+# the command
 
 
-def test_the_command_tells_and_writes(tmp_path, alone):
+def test_the_command_tells_and_writes(tmp_path, one_process):
     out = tmp_path / "study"
     done = run("study", "3-rpr", *SMALL, "--runs", 12, "-o", out)
     assert done.code == 0, done.err
@@ -386,7 +391,7 @@ def test_the_command_tells_and_writes(tmp_path, alone):
     assert [gain["name"] for gain in again["gains"]] == ["stations"]
 
 
-def test_more_runs_go_on_from_the_finished_ones(tmp_path, alone):
+def test_more_runs_go_on_from_the_finished_ones(tmp_path, one_process):
     few = study("3-rpr", SMALL[1:2], runs=10, out=tmp_path)
     before = sorted(p.stat().st_mtime_ns for p in tmp_path.glob("batches/*.npz"))
     more = study("3-rpr", SMALL[1:2], runs=20, out=tmp_path)
@@ -396,7 +401,7 @@ def test_more_runs_go_on_from_the_finished_ones(tmp_path, alone):
     np.testing.assert_array_equal(both[:10], first)
 
 
-def test_another_study_in_the_same_folder_is_refused(tmp_path, alone):
+def test_another_study_in_the_same_folder_is_refused(tmp_path, one_process):
     study("a", (), runs=4, out=tmp_path)
     done = run("study", "a", "--vary", "legs=5", "--runs", 4, "-o", tmp_path)
     assert done.code == 2
@@ -408,7 +413,7 @@ def test_another_study_in_the_same_folder_is_refused(tmp_path, alone):
     assert "does not describe a study" in done.err
 
 
-def test_a_file_that_is_spoilt_is_done_again(tmp_path, alone):
+def test_a_file_that_is_spoilt_is_done_again(tmp_path, one_process):
     one = study("a", (), runs=4, out=tmp_path)
     (path,) = tmp_path.glob("batches/*.npz")
     path.write_bytes(path.read_bytes()[:500])
@@ -416,7 +421,7 @@ def test_a_file_that_is_spoilt_is_done_again(tmp_path, alone):
     np.testing.assert_array_equal(*(r.results[0].values("position", *ESTIMATE) for r in (one, two)))
 
 
-def test_parquet(tmp_path, alone, monkeypatch):
+def test_parquet(tmp_path, one_process, monkeypatch):
     words = ("study", "a", "--runs", 4, "-o", tmp_path / "out", "--table", "parquet")
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
     done = run(*words)
@@ -428,274 +433,3 @@ def test_parquet(tmp_path, alone, monkeypatch):
     table = parquet.read_table(tmp_path / "out" / "study.parquet").to_pydict()
     assert table["run"] == [0, 1, 2, 3]
     assert all(np.array(table["position"]) > 0)
-
-
-# ------------------------------------------------------------------ stopped and resumed
-
-COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "300")
-BATCHES = 9
-LONGER = (*COMMAND[:-1], "600")
-
-
-def started(out: Path, command: tuple[str, ...] = COMMAND) -> subprocess.Popen[bytes]:
-    words = [sys.executable, "-m", "pkmcal", "study", *command, "-o", str(out)]
-    quiet = subprocess.DEVNULL
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-
-    def heard() -> None:
-        """What a shell started in the background ignores is heard again."""
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-    return subprocess.Popen(words, stdout=quiet, stderr=quiet, env=environment, preexec_fn=heard)
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The command's study without a stop, by one process."""
-    folder = tmp_path_factory.mktemp("study") / "whole"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers, "cores", lambda: 1)
-        assert run("study", *COMMAND, "-o", folder).code == 0
-    return folder
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no kill -9 here")
-@pytest.mark.parametrize("how", ["SIGKILL", "SIGINT"])
-def test_a_study_that_is_stopped_goes_on(tmp_path, how, whole, alone):
-    """The same numbers to the byte, no finished batch lost and none done twice; begun by one
-    process a core, ended by one.
-    """
-    stopped = tmp_path / "stopped"
-    process = started(stopped)
-    deadline = time.monotonic() + 120
-    while len(list(stopped.glob("batches/*.npz"))) < 2:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    process.send_signal(getattr(signal, how))
-    process.wait()
-    finished = {p.name: p.stat().st_mtime_ns for p in stopped.glob("batches/*.npz")}
-    assert 2 <= len(finished) < BATCHES
-    assert not (stopped / "study.csv").exists()
-    assert run("study", *COMMAND, "-o", stopped).code == 0
-    for name in ("study.csv", "study.json"):
-        assert (stopped / name).read_bytes() == (whole / name).read_bytes()
-    # the page tells to the minute when it was made
-    pages = [(folder / "study.html").read_text() for folder in (stopped, whole)]
-    pages, times = zip(
-        *(re.subn(r"\d+ \w+ \d{4}, \d\d:\d\d", "", page) for page in pages), strict=True
-    )
-    assert pages[0] == pages[1]
-    assert times == (1, 1)
-    kept = {p.name: p.stat().st_mtime_ns for p in stopped.glob("batches/*.npz")}
-    assert len(kept) == BATCHES
-    assert finished.items() <= kept.items()
-    assert not list(stopped.glob("batches/.*"))
-
-
-class Counting:
-    """A setting whose runs are their own random numbers."""
-
-    doing = "Counting"
-    quantities = {"x": tasks.Quantity("mean")}  # noqa: RUF012 - a test's
-
-    def __init__(self, fails: str = "", takes: float = 0.0) -> None:
-        self.fails, self.takes = fails, takes
-
-    def populations(self, runs):
-        return [Population("numbers", runs, 5)]
-
-    def draw(self, batch: Batch):
-        if self.fails == "input":
-            raise InputError("nothing to count")
-        if self.fails == "dies" and os.environ.get("PKMCAL_TEST_PARENT") != str(os.getpid()):
-            os._exit(9)
-        return batch.generator(0).random(batch.runs)
-
-    def solve(self, batch, data):
-        return {ESTIMATE: data}
-
-    def judge(self, batch, data, found):
-        time.sleep(self.takes)
-        return {ESTIMATE: Sample({"x": found[ESTIMATE]})}
-
-
-def test_workers_that_die_are_replaced(monkeypatch):
-    """One is killed in the middle: the same numbers, and no batch twice."""
-    begun: list[subprocess.Popen[bytes]] = []
-    real = subprocess.Popen
-
-    def recorded(*words, **options):
-        begun.append(real(*words, **options))
-        return begun[-1]
-
-    monkeypatch.setattr(workers.subprocess, "Popen", recorded)
-    monkeypatch.setattr(workers, "cores", lambda: 2)
-    done: list[float] = []
-
-    def told(_text, share):
-        done.append(share)
-        if len(done) == 50:
-            begun[0].kill()
-
-    setting = JointByAxes(replace(JointByAxes().axes, poses=4, batch=2))
-    # long enough for the one in its place to begin, too
-    many = engine.run(Counting(takes=0.04), 1500, 1, told)
-    assert len(done) == 300
-    assert len(begun) == 2  # beside this process one, and the one in its place
-    monkeypatch.setattr(workers, "cores", lambda: 1)
-    one = engine.run(Counting(), 1500, 1)
-    np.testing.assert_array_equal(*(r.values("x", *ESTIMATE) for r in (many, one)))
-    assert engine.run(setting, 4, 0).values("position", *ESTIMATE).shape == (4,)
-
-
-def test_a_batch_that_kills_every_worker_ends_the_study(monkeypatch):
-    monkeypatch.setenv("PKMCAL_TEST_PARENT", str(os.getpid()))
-    pool = workers._Pool([Job(Counting("dies"), batch_of(Counting()))], lambda _k, _done: None)
-    pool.elsewhere()
-    assert isinstance(pool.failure, ResultError)
-    assert "killed again and again" in str(pool.failure)
-
-
-def test_an_error_in_another_process_is_told():
-    pool = workers._Pool([Job(Counting("input"), batch_of(Counting()))], lambda _k, _done: None)
-    pool.elsewhere()
-    assert isinstance(pool.failure, InputError)
-    assert str(pool.failure) == "nothing to count."
-
-
-def test_an_error_here_is_told(alone):
-    with pytest.raises(InputError, match="nothing to count"):
-        engine.run(Counting("input"), 10, 0)
-
-
-def test_what_is_kept_is_what_was_done(tmp_path):
-    setting = Counting()
-    task = Job(setting, batch_of(setting, 5))
-    done = tasks.work(task)
-    with Store.opened(tmp_path, "counting", [], 0) as store:
-        store.save(0, 0, done)
-        found = store.load(0, 0, task.batch)
-        assert found.wall == done.wall
-        np.testing.assert_array_equal(
-            found.samples[ESTIMATE].values["x"], done.samples[ESTIMATE].values["x"]
-        )
-        assert store.load(0, 1, task.batch) is None
-        assert store.load(0, 0, replace(task.batch, runs=4)) is None
-
-
-def test_two_studies_do_not_work_in_one_folder_at_once(tmp_path, alone):
-    """Neither another one nor the same again; once the first has ended, its command goes on."""
-    first = started(tmp_path, LONGER)
-    deadline = time.monotonic() + 120
-    while not list(tmp_path.glob("batches/*.npz")):
-        assert first.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    for words in (LONGER, ("a", "--runs", "4")):
-        done = run("study", *words, "-o", tmp_path)
-        assert done.code == 2
-        assert "another study works in this folder. Wait until it has ended" in done.err
-    assert first.poll() is None
-    first.kill()
-    first.wait()
-    with pytest.raises(InputError, match="the batches of another study"):
-        study("a", (), runs=4, out=tmp_path)
-    settings = [cell.setting for cell in cells_of(subject_of("a"), {"configurations": (5, 6)})]
-    with Store.opened(tmp_path, "the same", settings, 0) as store:
-        assert store.load(0, 0, batch_of(settings[0], 1000)) is not None
-
-
-def test_an_impossible_combination_is_named_before_the_others_are_done(tmp_path, alone):
-    vary = [SMALL[1], "stations=1", "focal=900", "distance=2,0.1"]
-    with pytest.raises(InputError, match=r"distance 0.1: a camera does not see the machine"):
-        study("3-rpr", vary, runs=200, out=tmp_path)
-    assert len(list(tmp_path.glob("batches/*.npz"))) == 1
-
-
-def test_a_folder_where_nothing_was_finished_is_free(tmp_path, alone):
-    """After a combination that nobody can photograph, the command is mended, and runs."""
-    with pytest.raises(InputError, match=r"does not see the machine"):
-        study("3-rpr", ["focal=900", "distance=0.1"], runs=2, out=tmp_path)
-    assert study("3-rpr", ["stations=1", SMALL[1]], runs=2, out=tmp_path).runs == 2
-
-
-# ------------------------------------------------------------------ a cluster
-
-
-def test_a_cluster_without_dask_is_told(monkeypatch):
-    monkeypatch.setattr(cluster, "find_spec", lambda _name: None)
-    with pytest.raises(InputError, match=r"dask.distributed.*pip install 'pkmcal\[cluster\]'"):
-        study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
-
-
-@pytest.mark.filterwarnings("default")
-def test_a_scheduler_that_does_not_answer_is_told(monkeypatch):
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "TIMEOUT", 1)
-    with pytest.raises(InputError, match=r"no Dask scheduler answers.*127.0.0.1:1"):
-        study("a", (), runs=4, scheduler="tcp://127.0.0.1:1")
-
-
-@pytest.mark.parametrize("address", ["", "nonsense", "host:port", "ftp://10.0.0.1:21", "tcp://:1"])
-def test_what_is_no_address_is_told_at_once(address):
-    pytest.importorskip("distributed")
-    with pytest.raises(InputError, match=r"no address of a Dask scheduler.*tcp://10.0.0.1:8786"):
-        study("a", (), runs=4, scheduler=address)
-
-
-@pytest.mark.filterwarnings("default")
-def test_a_scheduler_that_goes_away_is_told(tmp_path):
-    """What was finished by then is kept."""
-    distributed, dask = (pytest.importorskip(name) for name in ("distributed", "dask"))
-    local = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None,
-        protocol="tcp",
-    )  # fmt: skip
-    with (
-        local,
-        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
-        pytest.raises(ResultError, match="the scheduler of the cluster is gone"),
-    ):
-        study(
-            "a",
-            ["configurations=5"],
-            runs=2000,
-            scheduler=local.scheduler_address,
-            out=tmp_path,
-            progress=lambda _text, share: share > 0.1 and local.close(),
-        )
-    assert list(tmp_path.glob("batches/*.npz"))
-
-
-@pytest.mark.filterwarnings("default")
-def test_a_cluster_gives_the_same_numbers_though_a_worker_dies(tmp_path, alone):
-    distributed = pytest.importorskip("distributed")
-    killed: list[int] = []
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
-    ) as local:
-
-        def told(_text, share):
-            if share > 0.2 and not killed:
-                killed.append(next(iter(local.workers.values())).pid)
-                os.kill(killed[0], signal.SIGKILL)
-
-        many = study("a", ["configurations=5"], runs=300, scheduler=local.scheduler_address,
-                     out=tmp_path / "cluster", progress=told)  # fmt: skip
-    assert killed
-    one = study("a", ["configurations=5"], runs=300)
-    assert runs_bytes(many, "study.csv") == runs_bytes(one, "study.csv")
-    assert str(document_of(many)) == str(document_of(one))
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
-def test_a_pipe_in_the_place_of_a_batch_is_none(tmp_path):
-    first = study("3-rpr", SMALL[1:2], runs=10, out=tmp_path)
-    batch = next(tmp_path.glob("batches/*.npz"))
-    batch.unlink()
-    os.mkfifo(batch)
-    again = study("3-rpr", SMALL[1:2], runs=10, out=tmp_path)
-    one, two = (r.results[0].values("position", *ESTIMATE) for r in (first, again))
-    np.testing.assert_array_equal(one, two)
-    assert batch.is_file()

@@ -1,7 +1,7 @@
-"""Where photographs by hand were taken from.
+"""Where all stations stand: those on a tripod as recognised, photographs by hand one by one.
 
-Each photograph is searched by itself (:mod:`pkmcal.observe.alone`), for nothing but the machine
-joins it to others, and from the places that it could show it is looked at more closely
+Each photograph by hand is searched by itself (:mod:`pkmcal.observe.alone`), for nothing but the
+machine joins it to others, and from the places that it could show it is looked at more closely
 (:mod:`pkmcal.calibration.closely`). A board on the base places those that see it beside one that is
 placed. Those that are sure tell the machine better than its drawing, and with that the others are
 asked again, until none is added. What stays unsure is left out and told, for one photograph in a
@@ -15,14 +15,14 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
-from pkmcal.calibration.closely import Together, join, look_closer
-from pkmcal.calibration.recognise import WORKERS, KnownScene, Progress
+from pkmcal.calibration.closely import join, look_closer
+from pkmcal.calibration.known import KnownScene, SeenSession
+from pkmcal.calibration.recognise import WORKERS, Progress, station_poses
 from pkmcal.errors import InputError, PkmcalError
 from pkmcal.geometry.rigid import dot, inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
@@ -45,31 +45,28 @@ FEWEST_EDGES = 4
 take seven."""
 
 
-class Placed(NamedTuple):
-    """A session without the photographs by hand that could not be placed, its photographs and
-    boards numbered alike, and what is known of machine, stations and platforms.
-    """
-
-    session: Session
-    photographs: list[legs.Photographs]
-    boards: Boards
-    known: KnownScene
-
-
-def place_by_hand(
+def place(
     session: Session,
     photographs: list[legs.Photographs],
     boards: Boards,
-    known: KnownScene,
+    rng: np.random.Generator,
     told: Progress | None = None,
-) -> Placed:
-    """Find the places of the photographs by hand; those that are not found are left out and told.
+) -> SeenSession:
+    """Where all stations stand; photographs by hand that are not found are left out and told.
 
-    Raises `InputError` where no photograph by hand is placed; see :func:`search_by_hand`.
+    photographs : of all stations that observe legs. told : called with the step in words and the
+    share done. Raises `InputError`, or `ResultError`, where nothing tells where a station stands
+    that is not by hand, and where no photograph by hand is placed.
     """
-    found, known = search_by_hand(session, photographs, boards, known, told)
-    lost = {k: why_lost(one) for k, one in found.items() if np.isnan(known.T_camera_base[k]).any()}
-    return _without(session, photographs, boards, known, lost)
+    fixed = [p for p in photographs if not session.stations[p.station].handheld]
+    stations = station_poses(session, fixed, boards, rng, told)
+    known = KnownScene.as_drawn(session.machine, stations, session.joints)
+    if len(fixed) < len(photographs):
+        found, known = search_by_hand(session, photographs, boards, known, told)
+        nowhere = {k for k in found if np.isnan(known.T_camera_base[k]).any()}
+        lost = {k: why_lost(found[k]) for k in found if k in nowhere}
+        return _without(SeenSession(session, photographs, boards, known), lost)
+    return SeenSession(session, photographs, boards, known)
 
 
 def search_by_hand(
@@ -89,7 +86,7 @@ def search_by_hand(
     at = {p.station: p for p in photographs}
     by_hand = [k for k in at if session.stations[k].handheld]
     room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
-    joined = Together.as_drawn(session.machine, known.T_base_platform)
+    joined = known
     found: dict[int, Alone] = {}
     # with the machine that the first of them tell; later ones change it by little
     looked: dict[int, Alone] = {}
@@ -114,25 +111,25 @@ def search_by_hand(
                 joined = join(session, at, joined, new, boards)
             except PkmcalError:
                 break  # with all that is observed it is told better why
-            placed = {
-                k: Neighbour(at[k].camera, T, _legs(session, at[k], joined, T)[0])
-                for k, T in joined.T_camera_base.items()
-            }
+            placed: dict[int, Neighbour] = {}
+            for k in sorted(joined.edges):
+                T = joined.T_camera_base[k]
+                placed[k] = Neighbour(at[k].camera, T, _legs(session, at[k], joined, T)[0])
             landmarks = room.landmarks(placed)
             again = partial(_search, session, at, room, joined, placed, landmarks, looked)
             for k, (seen, one) in zip(unsure, pool.map(again, unsure), strict=True):
                 looked[k], found[k] = seen, one
     for k in by_hand:
-        if k in joined.T_camera_base:
+        if k in joined.edges:
             believed[k] = joined.T_camera_base[k]
-    return found, KnownScene(joined.machine, believed, joined.T_base_platform)
+    return found, joined._replace(T_camera_base=believed)
 
 
 def _search(
     session: Session,
     photographs: Mapping[int, legs.Photographs],
     room: Surroundings,
-    joined: Together,
+    joined: KnownScene,
     placed: Mapping[int, Neighbour],
     landmarks: Mapping[int, Landmarks],
     looked: Mapping[int, Alone],
@@ -159,7 +156,7 @@ def _search(
 
 
 def _legs(
-    session: Session, photograph: legs.Photographs, joined: Together, T_camera_base: Array
+    session: Session, photograph: legs.Photographs, joined: KnownScene, T_camera_base: Array
 ) -> LegsInCamera:
     """Leg axes (H, L, 3) of a photograph taken from places (H, 4, 4), or (1, L, 3) from one."""
     first = photograph.configuration[:1]
@@ -230,35 +227,10 @@ def misplaced(
     return [k for k, s in enumerate(session.stations) if s.handheld and (lost[k] or astray[k])]
 
 
-def without_misplaced(
-    session: Session,
-    photographs: list[legs.Photographs],
-    boards: Boards,
-    known: KnownScene,
-    wrong: list[int],
-) -> Placed:
-    """The session without these photographs, each told."""
+def without_misplaced(seen: SeenSession, wrong: list[int]) -> SeenSession:
+    """What is seen without these photographs, each told."""
     why = dict.fromkeys(wrong, "too few of its edges agree with the other photographs")
-    return _without(session, photographs, boards, known, why)
-
-
-def _of(
-    session: Session,
-    photographs: list[legs.Photographs],
-    boards: Boards,
-    known: KnownScene,
-    kept: list[int],
-    warnings: tuple[str, ...] = (),
-) -> Placed:
-    """Some of the stations, numbered anew."""
-    number = {k: new for new, k in enumerate(kept)}
-    trackers = range(len(session.stations), len(known.T_camera_base))
-    return Placed(
-        session.of_stations(kept, warnings),
-        [replace(p, station=number[p.station]) for p in photographs if p.station in number],
-        boards.of(np.array(kept, dtype=int)),
-        known._replace(T_camera_base=known.T_camera_base[[*kept, *trackers]]),
-    )
+    return _without(seen, why)
 
 
 def why_lost(found: Alone) -> str:
@@ -269,14 +241,11 @@ def why_lost(found: Alone) -> str:
     )
 
 
-def _without(
-    session: Session,
-    photographs: list[legs.Photographs],
-    boards: Boards,
-    known: KnownScene,
-    lost: dict[int, str],
-) -> Placed:
-    """The session without the photographs that are lost, each told; an error where none is left."""
+def _without(seen: SeenSession, lost: dict[int, str]) -> SeenSession:
+    """What is seen without the photographs that are lost, each told, the other stations numbered
+    anew; an error where none is left.
+    """
+    session, known = seen.session, seen.known
     by_hand = [k for k, station in enumerate(session.stations) if station.handheld]
 
     def label(k: int) -> str:
@@ -294,10 +263,12 @@ def _without(
         )
     warnings = tuple(f"{label(k)}: left out, for {why}." for k, why in lost.items())
     kept = [k for k in range(len(session.stations)) if k not in lost]
-    placed = _of(session, photographs, boards, known, kept, warnings)
-    seen = {photo.configuration for s in placed.session.stations for photo in s.photographs}
-    if len(seen) < 2:
-        names = [session.configurations[k] for k in sorted(seen)]
+    number = {k: new for new, k in enumerate(kept)}
+    trackers = range(len(session.stations), len(known.T_camera_base))
+    left = session.of_stations(kept, warnings)
+    rows = {photo.configuration for s in left.stations for photo in s.photographs}
+    if len(rows) < 2:
+        names = [session.configurations[k] for k in sorted(rows)]
         raise InputError(
             "the photographs that are recognised show one configuration only",
             where=f"session.yaml, stations.{session.stations[by_hand[0]].entry}",
@@ -305,4 +276,10 @@ def _without(
             expected="two at least",
             next_step="Take photographs in which all legs are large and before a plain background",
         )
-    return placed
+    T_camera_base = known.T_camera_base[[*kept, *trackers]]
+    return SeenSession(
+        left,
+        [replace(p, station=number[p.station]) for p in seen.photographs if p.station in number],
+        seen.boards.of(np.array(kept, dtype=int)),
+        KnownScene(known.machine, T_camera_base, known.T_base_platform),
+    )

@@ -13,7 +13,7 @@ import numpy as np
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
-from pkmcal.calibration.byhand import misplaced, place_by_hand, without_misplaced
+from pkmcal.calibration.byhand import misplaced, place, without_misplaced
 from pkmcal.calibration.departures import Departed, departures
 from pkmcal.calibration.doubts import (
     as_stated,
@@ -28,17 +28,16 @@ from pkmcal.calibration.doubts import (
     sizes_told,
 )
 from pkmcal.calibration.gather import CameraRefinement, refinement_of
+from pkmcal.calibration.known import KnownScene, SeenSession
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.outvoted import outvoted
 from pkmcal.calibration.recognise import (
-    KnownScene,
     Progress,
     boards_of,
     check_observable,
     legs_stations,
     platform_poses,
     read_photographs,
-    station_poses,
 )
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, take_turns
@@ -59,7 +58,6 @@ from pkmcal.identify.unidentified import (
 from pkmcal.identify.verdict import RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
-from pkmcal.observe.legs import Photographs
 from pkmcal.outcome import Verdict
 from pkmcal.papers.conditions import conditions
 from pkmcal.papers.methods import Method as PaperMethod
@@ -170,19 +168,16 @@ def calibrate(
     with threadpool_limits(1, "blas"):
         clock = _Clock(progress)
         session = _load(session, refine_camera, clock)
-        session, seen = _observe(session, seed, clock)
-        cameras = refinement_of(session, refine_camera)  # of the stations that are left
-        found = _identify(session, seen, cameras, method, seed, holdout, clock)
+        seen = _observe(session, seed, clock)
+        found = _identify(seen, refine_camera, method, seed, holdout, clock)
         turns = found.turns
-        wrong = misplaced(session, turns.measurements, turns.estimate, seen.known.T_camera_base)
-        if wrong:
+        at = seen.known.T_camera_base
+        if wrong := misplaced(seen.session, turns.measurements, turns.estimate, at):
             state = turns.estimate.state
             known = KnownScene(turns.estimate.machine, state.T_camera_base, state.T_base_platform)
-            rest = without_misplaced(session, seen.photographs, seen.boards, known, wrong)
-            session, seen = rest.session, _Seen(rest.photographs, rest.boards, rest.known)
-            cameras = refinement_of(session, refine_camera)
-            found = _identify(session, seen, cameras, method, seed, holdout, clock)
-        return _judge(session, seen, found, method, seed, clock)
+            seen = without_misplaced(seen._replace(known=known), wrong)
+            found = _identify(seen, refine_camera, method, seed, holdout, clock)
+        return _judge(seen, found, method, seed, clock)
 
 
 def _check_options(method: str, seed: int, holdout: int) -> None:
@@ -200,16 +195,6 @@ def _check_options(method: str, seed: int, holdout: int) -> None:
             raise InputError(
                 "this number is negative", where=name, found=shown(value), expected="0 or more"
             )
-
-
-class _Seen(NamedTuple):
-    """A session's photographs, decoded, the boards in them, and what is known of machine, stations
-    and platforms.
-    """
-
-    photographs: list[Photographs]
-    boards: Boards
-    known: KnownScene
 
 
 class _Identified(NamedTuple):
@@ -235,9 +220,9 @@ def _load(session: Session | Path | str, refine_camera: bool, clock: _Clock) -> 
     return session
 
 
-def _observe(session: Session, seed: int, clock: _Clock) -> tuple[Session, _Seen]:
-    """Where the stations stand, by what their photographs and tables show; and the session without
-    photographs by hand that could not be placed.
+def _observe(session: Session, seed: int, clock: _Clock) -> SeenSession:
+    """Where the stations stand, by what their photographs and tables show; without photographs by
+    hand that could not be placed.
     """
     clock.told("Reading photographs", 0.0)
     photographs = read_photographs(session)
@@ -245,33 +230,23 @@ def _observe(session: Session, seed: int, clock: _Clock) -> tuple[Session, _Seen
     if any("board" in station.observe for station in session.stations):
         clock.told("Looking for the board", 0.1)
     boards = boards_of(session, photographs)
-    rng = np.random.default_rng(seed)
-    if any(station.handheld for station in session.stations):
-        fixed = [p for p in photographs if not session.stations[p.station].handheld]
-        stations = station_poses(session, fixed, boards, rng, by_hand=True, told=clock.told)
-        drawn = KnownScene(session.machine, stations, platform_poses(session))
-        session, photographs, boards, known = place_by_hand(
-            session, photographs, boards, drawn, clock.told
-        )
-    else:
-        stations = station_poses(session, photographs, boards, rng, told=clock.told)
-        known = KnownScene.as_drawn(session.machine, stations, session.joints)
+    seen = place(session, photographs, boards, np.random.default_rng(seed), clock.told)
     clock.lap("observe")
-    return session, _Seen(photographs, boards, known)
+    return seen
 
 
 def _identify(
-    session: Session,
-    seen: _Seen,
-    cameras: CameraRefinement,
+    seen: SeenSession,
+    refine_camera: bool,
     method: Method,
     seed: int,
     holdout: int,
     clock: _Clock,
 ) -> _Identified:
     """The machine, in turns with looks at the edges, and by the paper's method if asked for."""
+    session, cameras = seen.session, refinement_of(seen.session, refine_camera)
     if seen.photographs:
-        turns = take_turns(session, *seen, cameras, clock.told, clock.lap)
+        turns = take_turns(seen, cameras, clock.told, clock.lap)
     else:
         turns = identify_poses(session, seen.boards, seen.known.T_camera_base, cameras, clock.told)
     clock.lap("identify")
@@ -294,9 +269,10 @@ def _identify(
 
 
 def _judge(
-    session: Session, seen: _Seen, found: _Identified, method: Method, seed: int, clock: _Clock
+    seen: SeenSession, found: _Identified, method: Method, seed: int, clock: _Clock
 ) -> Calibration:
     """What the data tell, what they leave open, and whether the result may be used."""
+    session = seen.session
     clock.told("Judging", 0.95)
     if found.turns.cameras.active:  # the edges are where these cameras see them
         cameras = found.turns.cameras

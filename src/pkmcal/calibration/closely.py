@@ -16,19 +16,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
+from pkmcal.calibration.known import KnownScene
 from pkmcal.errors import PkmcalError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
 from pkmcal.identify.start import start_state
-from pkmcal.measurements import EdgeSet, concatenate
-from pkmcal.mechanisms import Machine
+from pkmcal.measurements import concatenate
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turn_between, turned_about
 from pkmcal.observe.predict import tubes_of
@@ -47,45 +46,21 @@ GIVEN_UP = 9.0
 """What an edge costs at least that the estimate gives up: three standard deviations."""
 
 
-class Together(NamedTuple):
-    """Photographs whose places are believed, and what they make of the machine.
-
-    machine, T_base_platform : (K, 4, 4) as they are known. T_camera_base : (4, 4) by station.
-    edges : and what was measured from there. cost : by station, half the squares of its edges.
-    own : half the squares of the drawing's values and of the readings.
-    """
-
-    machine: Machine
-    T_base_platform: Array
-    T_camera_base: Mapping[int, Array]
-    edges: Mapping[int, EdgeSet]
-    cost: Mapping[int, float]
-    own: float
-
-    @classmethod
-    def as_drawn(cls, machine: Machine, T_base_platform: Array) -> Together:
-        """What is known before any photograph is placed."""
-        return cls(machine, T_base_platform, {}, {}, {}, 0.0)
-
-    def paid(self, but: int) -> float:
-        """What is paid for the machine, by all but one station's edges."""
-        return self.own + sum(cost for k, cost in self.cost.items() if k != but)
-
-
 def join(
     session: Session,
     photographs: Mapping[int, legs.Photographs],
-    known: Together,
+    known: KnownScene,
     places: Mapping[int, Array],
     boards: Boards,
-) -> Together:
+) -> KnownScene:
     """What is known together with photographs at places T_camera_base (4, 4).
 
     photographs : by station. boards : what they show of a board. Raises a `PkmcalError` where there
     is nothing to be estimated.
     """
-    at = {**known.T_camera_base, **places}
-    stations = sorted(at)
+    at, stations = known.T_camera_base.copy(), sorted({*known.edges, *places})
+    for k, T in places.items():
+        at[k] = T
     only = replace(session.of_stations(stations), trackers=())
     shown = boards.of(np.array(stations, dtype=int))
     edges = dict(known.edges)
@@ -100,13 +75,13 @@ def join(
             replace(edges[k], station=np.full(len(edges[k]), n)) for n, k in enumerate(stations)
         ]
         measurements = measurements_of(only, shown, concatenate(numbered))
-        T = np.stack([at[k] for k in stations])
-        start = state or start_state(known.machine, measurements, T)
+        start = state or start_state(known.machine, measurements, at[stations])
         estimate = bundle(session.machine, measurements, start)
         state = estimate.state
-        at = dict(zip(stations, state.T_camera_base, strict=True))
-        known = Together(
-            estimate.machine, state.T_base_platform, at, edges,
+        at = at.copy()
+        at[stations] = state.T_camera_base
+        known = KnownScene(
+            estimate.machine, at, state.T_base_platform, edges,
             _costs(estimate, measurements.edges.station, stations),
             (estimate.statistics.chi2_drawing + estimate.statistics.chi2_joints) / 2,
         )  # fmt: skip
@@ -123,7 +98,7 @@ def _costs(estimate: Estimate, station: Integers, stations: Sequence[int]) -> di
 
 
 def look_closer(
-    session: Session, photograph: legs.Photographs, before: Together, found: Alone, others: Array
+    session: Session, photograph: legs.Photographs, before: KnownScene, found: Alone, others: Array
 ) -> Alone:
     """The places of one photograph, weighed with what is known of the machine, the likeliest first;
     evidence is then a log likelihood against chance.
@@ -140,7 +115,7 @@ def look_closer(
     weighed: list[tuple[float, float]] = []  # evidence and what was paid
     places: list[Array] = []
 
-    def weigh(known: Together, T: Array) -> None:
+    def weigh(known: KnownScene, T: Array) -> None:
         seen = replace(view, machine=known.machine, all_poses=known.T_base_platform)
         settled = settle(seen, T[None], one, 16, 6)
         evidence = float(evidence_of(seen, settled, one, 16).sum())

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.boards.views import Boards, find_boards
 from pkmcal.calibration.gather import measurements_of
 from pkmcal.errors import GeometryError, InputError, ResultError
-from pkmcal.mechanisms import Machine
 from pkmcal.observe import legs
 from pkmcal.observe.diagnose import SeenStation, mistake
 from pkmcal.observe.images import KEPT, Pictures, fitting
@@ -43,21 +41,6 @@ NEARLY = 2.0
 MOST = 0.5
 """Share of the configurations that the drawing has to reach for the rest to be believed."""
 ALMOST_ALL = 0.9
-
-
-class KnownScene(NamedTuple):
-    """What is known before the edges are measured: the machine, T_camera_base (S, 4, 4) of the
-    stations, and T_base_platform (K, 4, 4) of the configurations.
-    """
-
-    machine: Machine
-    T_camera_base: Array
-    T_base_platform: Array
-
-    @classmethod
-    def as_drawn(cls, machine: Machine, T_camera_base: Array, joints: Array) -> KnownScene:
-        """A drawing; of platforms the nearest poses, where it does not quite close."""
-        return cls(machine, T_camera_base, machine.forward_result(joints).T_base_platform)
 
 
 def check_observable(session: Session) -> None:
@@ -327,15 +310,15 @@ def station_poses(
     photographs: list[legs.Photographs],
     boards: Boards,
     rng: np.random.Generator,
-    by_hand: bool = False,
     told: Progress | None = None,
 ) -> Array:
     """Poses T_camera_base (S, 4, 4) of all stations, each by the first that tells it: what is known
-    before any leg is looked for, the search for the legs, and what measured poses tell.
+    before any leg is looked for, the search for the legs, and what measured poses tell. NaN of
+    photographs by hand that nothing tells yet.
 
-    by_hand : leave photographs by hand (NaN) where nothing tells them yet. told : called with the
-    step in words and the share done. Raises `InputError`, or
-    `ResultError`, where nothing tells one of the others.
+    photographs : in which the machine is looked for, none by hand. told : called with the step in
+    words and the share done. Raises `InputError`, or `ResultError`, where nothing tells one that is
+    not by hand.
     """
     known = known_stations(session, boards)
     if photographs:
@@ -352,8 +335,8 @@ def station_poses(
         seen = [None if np.isnan(T).any() else T for T in known[: len(session.stations)]]
         for k, T in enumerate(boards.joined(seen)):
             known[k] = known[k] if T is None else T
-    if by_hand and all(s.handheld for s, T in zip(session.stations, known, strict=False)
-                       if np.isnan(T).any()):  # fmt: skip
+    by_hand = [s.handheld for s in session.stations] + [False] * len(session.trackers)
+    if not (np.isnan(known[:, 0, 0]) & ~np.array(by_hand, dtype=bool)).any():
         return known
     return _by_poses(session, boards, known)
 
@@ -379,8 +362,6 @@ def _by_poses(session: Session, boards: Boards, known: Array) -> Array:
 
     Raises `InputError`, or `ResultError`, where they tell too little.
     """
-    if np.isfinite(known).all():
-        return known
     measurements = measurements_of(session, boards)
     try:
         return start_from_poses(session.machine, measurements, known).T_camera_base

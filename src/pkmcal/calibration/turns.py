@@ -19,7 +19,8 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import CameraRefinement, measurements_of
-from pkmcal.calibration.recognise import WORKERS, KnownScene, Progress
+from pkmcal.calibration.known import KnownScene, SeenSession
+from pkmcal.calibration.recognise import WORKERS, Progress
 from pkmcal.errors import InputError, PkmcalError, ResultError
 from pkmcal.identify.bundle import bundle
 from pkmcal.identify.estimate import Estimate, State
@@ -58,26 +59,21 @@ class Turns(NamedTuple):
 
 
 def take_turns(
-    session: Session,
-    photographs: list[legs.Photographs],
-    boards: Boards,
-    known: KnownScene,
-    cameras: CameraRefinement,
-    told: Progress,
-    lap: Callable[[str], None],
+    seen: SeenSession, cameras: CameraRefinement, told: Progress, lap: Callable[[str], None]
 ) -> Turns:
     """Observation and identification in turns, the search narrowing.
 
     lap : called with the name of a step that is done.
     """
+    session, photographs, boards, known = seen
     total = sum(len(p.images) for p in photographs)
     machine = session.machine
     text, searched = "Finding the legs", partial(_whole_legs, session, photographs, boards, lap)
     estimate = searched(known, legs.REACH, _counted(told, text, total, 0.35))
     start = estimate.state
-    seen = KnownScene(estimate.machine, start.T_camera_base, start.T_base_platform)
+    known = KnownScene(estimate.machine, start.T_camera_base, start.T_base_platform)
     text = "Finding the legs again"
-    estimate = searched(seen, legs.AGAIN, _counted(told, text, total, 0.4), start)
+    estimate = searched(known, legs.AGAIN, _counted(told, text, total, 0.4), start)
     blur: dict[int, float | None] = {p.station: None for p in photographs}
     looks: list[legs.StationEdges] = []
     measurements = measurements_of(session, boards)
@@ -189,13 +185,13 @@ def _whole_legs(
     photographs: list[legs.Photographs],
     boards: Boards,
     lap: Callable[[str], None],
-    seen: KnownScene,
+    known: KnownScene,
     reach: float,
     done: legs.Done,
     start: State | None = None,
 ) -> Estimate:
     """The estimate from legs that are looked for within ``reach`` px of where they should be."""
-    machine, stations, poses = seen
+    machine, stations, poses = known[:3]
 
     def search(p: legs.Photographs) -> legs.StationEdges:
         return legs.search(p, machine, stations[p.station], poses[p.configuration], reach, done)

@@ -22,9 +22,9 @@ from pkmcal.calibration.byhand import search_by_hand, why_lost
 from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.doubts import check_poses, richer_models, turning
 from pkmcal.calibration.gather import measurements_of, refinement_of
+from pkmcal.calibration.known import KnownScene
 from pkmcal.calibration.numbering import numbering_told
 from pkmcal.calibration.recognise import (
-    KnownScene,
     board_images,
     check_observable,
     known_stations,

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from pkmcal.calibration.repeats import RepeatStudy, part_of
 from pkmcal.check.advice import forecast_figure, forecast_part
 from pkmcal.check.checked import BoardCheck, JointCheck, SessionCheck, StationCheck, exit_code_of
-from pkmcal.check.repeats import RepeatStudy, part_of
 from pkmcal.outcome import (
     Finding,
     Level,

@@ -47,7 +47,7 @@ def check(
     with console.progress(as_json) as told:
         found = check_session(session, seed=seed, progress=told)
         if repeat and found.exit_code < 2:
-            from pkmcal.check.repeats import study_repeats
+            from pkmcal.calibration.repeats import study_repeats
 
             study = study_repeats(session, seed=seed, progress=told)
         outcome = outcome_of(found, study)

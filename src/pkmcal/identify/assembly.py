@@ -205,14 +205,14 @@ def lines(measurements: Measurements) -> tuple[Integers, Integers]:
     return keys, number
 
 
-def crowd(measurements: Measurements) -> Array:
+def crowd(measurements: Measurements, number: Integers) -> Array:
     """How many edges of its line share an edge's own shading, itself among them, (N,): the sum of
-    exp(-angle / ALIKE) over the angles between the normals.
+    exp(-angle / ALIKE) over the angles between the normals. number : (N,) of each edge's line.
 
     Of n edges with the same normal each counts as one n-th, whatever their number. Normals are
     gathered in cells an eighth of ALIKE wide first, so that thousands cost little.
     """
-    edges, number = measurements.edges, lines(measurements)[1]
+    edges = measurements.edges
     out = np.ones(len(edges))
     cell = np.round(8 * edges.normal / ALIKE).astype(int)
     keys, at = np.unique(np.column_stack([number, cell]), axis=0, return_inverse=True)
@@ -259,7 +259,7 @@ def _edges(
     if len(line):
         # what one edge alone is shaded by is noise of its own: no unknown could tell it from that
         alone = np.where(line < 0, SHADING_SIGMA, 0.0)
-        crowded = 1 + share * (crowd(measurements) - 1)
+        crowded = 1 + share * (crowd(measurements, line) - 1)
         own = np.hypot(edges.shading * np.sqrt(crowded), alone)
     legs = np.unique(edges.leg)
     leg = np.repeat(legs, at.shape[1] // max(len(legs), 1))
@@ -273,8 +273,8 @@ def _edges(
         side=at.filled(edges.side)[..., None],
         present=at.present,
         line=at.filled(line) if len(line) else np.zeros((0, 0), dtype=int),
-        tube=at.filled(edges.tube) if len(line) else np.zeros((0, 0), dtype=int),
-        crowd=at.filled(crowded) if len(line) else np.zeros((0, 0)),
+        tube=at.filled(edges.tube),
+        crowd=at.filled(crowded),
     )
     data = EdgeData(
         basis=at.filled(edges.basis)[None, :, :, None],

@@ -23,14 +23,15 @@ from pkmcal.identify.covariance import (
     information,
     machine_covariance,
 )
-from pkmcal.identify.edge_noise import EdgeScatter, edge_noise
-from pkmcal.identify.estimate import Estimate, State, Statistics, TubeNoise
+from pkmcal.identify.edge_noise import edge_noise
+from pkmcal.identify.estimate import Estimate, State, Statistics
 from pkmcal.identify.gauge import Gauge, apply, default_gauge
 from pkmcal.identify.kinds import EDGES, POSES, READINGS
 from pkmcal.identify.noise import FEWEST, Components, components, counts
 from pkmcal.identify.problem import Problem
 from pkmcal.identify.robust import anneal, settled_weights
 from pkmcal.identify.rows import Kinds
+from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import BatchState, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
@@ -68,21 +69,26 @@ class BatchResult:
     """The joint estimate of B runs.
 
     problem : with the weights in use, noise scale included. solution : states, cost, stops.
-    weight : (B, K, G) robust weights 0..1 of each kind of measurement. scale : (B,) factor on its
-    stated noise; reading_scale : (B,) on the readings'. steps : (B,). info : rows and
-    covariance at the solution. edges : their noise, where it was looked for; trust : (B, K, G) what
-    each counts besides.
+    weight : (B, K, G) robust weights 0..1 of each kind of measurement. pose_scale, reading_scale :
+    (B,) factors on the stated noise of poses and of readings. steps : (B,). info : rows and
+    covariance at the solution. edges : their noise, as stated where it was not looked for; trust :
+    (B, K, G) what each counts besides.
     """
 
     problem: Problem
     solution: Solution
     weight: Kinds[Array]
-    scale: Kinds[Array]
+    pose_scale: Array
     reading_scale: Array
     steps: Integers
     info: Information
     edges: EdgeScatter
     trust: Array
+
+    @property
+    def noise_scale(self) -> Array:
+        """What the edges in use scatter by, in times of what they are stated with, (B,)."""
+        return self.edges.factor(self.problem.blocks, self.problem.data, self.weight.edges)
 
 
 def solve_batch(
@@ -116,7 +122,7 @@ def solve_batch(
         found = anneal(problem, start, LEAST_SCALE if scale_noise else 1.0)
         state, weight, steps = found.state, found.weight, steps + found.steps
         scale = found.scale if scale_noise else ones
-    begin = EdgeScatter.stated(n_runs, problem)
+    begin = EdgeScatter.stated(n_runs, max(map(len, problem.layout.radius), default=0))
     fit = _solved(problem, state, weight, scale, steps, begin, np.ones_like(every.edges))
     if robust or scale_noise:
         settle = partial(_settle, robust=robust, scale_noise=scale_noise, least=least)
@@ -128,14 +134,23 @@ def solve_batch(
     used, steps = fit.info.problem, fit.solution.steps
     readings = np.broadcast_to(used.joint_noise / problem.joint_noise, n_runs)
     return BatchResult(
-        used, fit.solution, fit.weight, fit.scale, readings, steps, fit.info, fit.edges, fit.trust
+        used,
+        fit.solution,
+        fit.weight,
+        fit.scale.poses,
+        readings,
+        steps,
+        fit.info,
+        fit.edges,
+        fit.trust,
     )
 
 
 class _Fit(NamedTuple):
     """A solution with fixed weights (B, K, G) and noise scales (B,), the steps of all solutions
-    before it counted, and what its problem says there. edges : their noise; trust : (B, K, G) by
-    how much more or less each counts for it.
+    before it counted, and what its problem says there. The edges' scale is the annealing's, and one
+    as soon as their noise was looked for. edges : that noise; trust : (B, K, G) by how much more or
+    less each counts for it.
     """
 
     solution: Solution
@@ -161,32 +176,31 @@ def _settle(
     the lines' shading.
     """
     estimates_shading = scale_noise and fit.info.problem.unknowns.n_lines > 0
-    estimates_edges = scale_noise and robust and fit.info.problem.blocks.crowd.size > 0
+    by_tube = scale_noise and robust and bool(fit.info.problem.blocks.crowd.any())
     for number in range(ROUNDS):
         problem, state, weight = fit.info.problem, fit.info.state, fit.weight
         scale, factor = fit.scale, np.ones(len(by_data))
         edges, trust = fit.edges, fit.trust
         if scale_noise:
             found = components(fit.info, weight)
-            scale, factor = _scale(fit, found), np.where(by_data, found.factor(READINGS), 1.0)
-        if scale.poses.min() > hopeless:
-            return fit._replace(scale=scale)
+            scale = Kinds(np.ones_like(scale.edges), _pose_scale(scale.poses, found))
+            if scale.poses.min() > hopeless:
+                return fit._replace(scale=scale)
+            edges = _edges(fit, found, by_tube, late=number >= FREE_ROUNDS)
+            factor = np.where(by_data, found.factor(READINGS), 1.0)
         shading = problem.data.shading
-        if estimates_edges:
-            scale = scale._replace(edges=np.ones_like(scale.edges))
-            late = number >= FREE_ROUNDS
-            edges = edge_noise(fit.info, weight.edges, fit.edges, same_tails=late)
         if estimates_shading:
             shading = _shading_of(fit, least)
         if number > 1:  # these go on as they began, slowly
-            edges = edges.beyond(fit.edges, PACE)
+            edges = edges.beyond(fit.edges, PACE) if by_tube else edges
             shading = np.maximum(
                 problem.data.shading * (shading / problem.data.shading) ** PACE, least
             )
-        if estimates_edges:
-            problem = edges.applied(problem)
+        if scale_noise:
+            problem = replace(problem, data=edges.applied(problem.blocks, problem.data))
+        if by_tube:
             rows = problem.unweighted(state).edges
-            trust = edges.trust(problem, np.sum(rows**2, axis=-1))
+            trust = edges.trust(problem.blocks, np.sum(rows**2, axis=-1))
         if robust:
             weight = settled_weights(problem, state, scale)
         found_shading = np.abs(shading / problem.data.shading - 1).max() < SHADING_CHANGE
@@ -194,7 +208,7 @@ def _settle(
         if by_data.any():
             readings = problem.joint_noise_times(factor, state)
         found_readings = np.abs(readings / problem.joint_noise - 1).max() < SCALE_CHANGE
-        found_edges = edges.close_to(fit.edges, SHADING_CHANGE)
+        found_edges = edges.close_to(fit.edges, SHADING_CHANGE if by_tube else SCALE_CHANGE)
         found_all = found_shading and found_readings and found_edges
         if found_all and _settled(scale, fit.scale, weight, fit.weight):
             break
@@ -246,18 +260,28 @@ def _solved(
     return _Fit(found, weight, scale, info, edges, trust)
 
 
-def _scale(fit: _Fit, found: Components) -> Kinds[Array]:
-    """Factors on the stated noise of each kind that make its chi2 equal its degrees of freedom,
-    (B,) each; kept as they are where too few remain to judge it.
+def _edges(fit: _Fit, found: Components, by_tube: bool, *, late: bool) -> EdgeScatter:
+    """The edges' noise: of each tube where light moves edges; else their errors are normal, as
+    stated but for one factor of all, which makes their chi2 equal its degrees of freedom. That is
+    what the likelihood would say too, but for the edges that it counts as stated; and tails would
+    take for their own what readings stated wrong do to some edges.
     """
-    ratio = np.sqrt(found.chi2 / np.maximum(found.freedom, 1.0))
-    known = found.freedom > FEWEST
-    return Kinds(
-        *(
-            np.where(known[:, k], np.maximum(scale * ratio[:, k], LEAST_SCALE), scale)
-            for k, scale in zip((EDGES, POSES), fit.scale, strict=True)
-        )
-    )
+    if by_tube:
+        return edge_noise(fit.info, fit.weight.edges, fit.edges, same_tails=late)
+    scale = fit.scale.edges[:, None] * fit.edges.scale
+    chi2, freedom = found.chi2[:, EDGES, None], found.freedom[:, EDGES, None]
+    ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
+    scale = np.where(freedom > FEWEST, np.maximum(scale * ratio, LEAST_SCALE), scale)
+    return replace(fit.edges, scale=scale)
+
+
+def _pose_scale(scale: Array, found: Components) -> Array:
+    """The factor on the poses' stated noise that makes their chi2 equal its degrees of freedom,
+    (B,), from the one in use; kept as it is where too few remain to judge it.
+    """
+    chi2, freedom = found.chi2[:, POSES], found.freedom[:, POSES]
+    ratio = np.sqrt(chi2 / np.maximum(freedom, 1.0))
+    return np.where(freedom > FEWEST, np.maximum(scale * ratio, LEAST_SCALE), scale)
 
 
 def common_shading(shift: Array, told: Array, sigma: Array, least: Array | float) -> Array:
@@ -331,10 +355,10 @@ def bundle(
         scale_readings=scale_readings,
         hopeless=hopeless,
     )
-    if result.scale.poses[0] > hopeless:
+    if result.pose_scale[0] > hopeless:
         raise ResultError(
             what="the measured poses do not fit the machine",
-            found=f"{result.scale.poses[0]:.0f} times their noise after a first search",
+            found=f"{result.pose_scale[0]:.0f} times their noise after a first search",
         )
     stop = result.solution.stop[0]
     if stop in (Stop.NOT_FINITE, Stop.STALLED):
@@ -387,8 +411,11 @@ def _estimate(
     problem, u = result.problem, result.problem.unknowns
     optics = own_blocks(result.info.covariance[0], u.optics, u.n_optics)
     factor = measurements.intrinsics_factor
-    measured = zip(assembled.places, problem.unweighted(found), result.scale, strict=True)
-    residuals = Kinds(*(at.taken(rows[0] / scale[0]) for at, rows, scale in measured))
+    edges, poses = problem.unweighted(found)
+    residuals = Kinds(
+        assembled.places.edges.taken(edges[0]),
+        assembled.places.poses.taken(poses[0] / result.pose_scale[0]),
+    )
     weighted = zip(assembled.places, result.weight, strict=True)
     weights = Kinds(*(at.taken(weight[0]) for at, weight in weighted))
     value = result.info.by_kind.value
@@ -402,11 +429,7 @@ def _estimate(
         edge_shift_sigma=np.sqrt(np.diagonal(optics, axis1=-2, axis2=-1)[:, 0]),
         edge_residuals=residuals.edges,
         edge_weights=weights.edges,
-        edge_noise=TubeNoise(
-            result.edges.scale[0] * result.scale.edges[0],
-            result.edges.shading[0],
-            result.edges.tails[0],
-        ),
+        edge_noise=result.edges.of_run(0),
         edge_trust=assembled.places.edges.taken(result.trust[0]),
         joint_residuals=joints,
         data_share=data_share(machine, state.theta, full, gauge),
@@ -444,8 +467,7 @@ def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Stat
     kinds = np.array(assembled.priors)
     rows = problem.kinds.edges.rows, problem.closure_rows, problem.kinds.poses.rows
     chi2 = [float(np.sum(value[0, :, part] ** 2)) for part in rows]
-    if problem.blocks.crowd.size:
-        chi2[0] = float(np.sum(result.edges.squares(problem, value[..., rows[0]])))
+    chi2[0] = float(np.sum(result.edges.squares(problem.blocks, value[..., rows[0]])))
     drawn = ~np.isin(kinds, ("gauge", "mount"))
     prior = problem.prior_values(state)[0] - problem.prior_target
     chi2_drawing = float(np.sum(prior[drawn] ** 2))
@@ -467,18 +489,16 @@ def _statistics(result: BatchResult, assembled: Assembled, value: Array) -> Stat
         n_drawing=n_drawing,
         steps=int(result.steps[0]),
         stopped=result.solution.stop[0].value,
-        noise_scale=float(
-            result.scale.edges[0] * result.edges.factor(problem, result.weight.edges)[0]
-        ),
+        noise_scale=float(result.noise_scale[0]),
         chi2_poses=chi2[2],
         n_poses=n_poses,
-        pose_scale=float(result.scale.poses[0]),
+        pose_scale=float(result.pose_scale[0]),
         dof_edges=freedom[EDGES],
         dof_joints=freedom[READINGS],
         dof_poses=freedom[POSES],
         reading_scale=float(result.reading_scale[0]),
         reading_range=_range(found, READINGS, result.reading_scale),
-        pose_range=_range(found, POSES, result.scale.poses),
+        pose_range=_range(found, POSES, result.pose_scale),
         shading=float(np.median(result.problem.data.shading[0])),
     )
 

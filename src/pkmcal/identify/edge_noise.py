@@ -18,25 +18,23 @@ alike (:func:`pkmcal.identify.assembly.crowd`), so its variance counts times the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.covariance import UNKNOWN, Information
-from pkmcal.identify.problem import Problem
-from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
+from pkmcal.identify.scatter import (
+    LEAST,
+    PAIR,
+    TINY,
+    EdgeScatter,
+    shift_squares,
+    worth,
+)
+from pkmcal.measurements import OWN_SHADING
 from pkmcal.solver import divisions, normal_root
 
-PAIR = 2
-"""Numbers that an edge measures."""
 TAILS = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 100.0])
 """Degrees of freedom that are tried: the last is as good as the normal distribution."""
-LEAST = 0.75
-"""Of the stated deviation at least, whatever the data say: what neighbours have in common beside
-what shades them, the parameters take up in part, and residuals come out smaller than errors are.
-How much is no result of theory: on seventeen path-traced sessions errors were as stated with it,
-and with residuals believed as they are, a tenth larger."""
 STATED = 5.0
 """Edges that the stated noise is worth when their own is found."""
 ROUNDS = 60
@@ -44,83 +42,6 @@ ENOUGH = 1e-4
 """Relative change of a variance below which it counts as found."""
 LARGEST = 4.0
 """Largest factor on a variance in one round."""
-TINY = 1e-12
-
-
-@dataclass(frozen=True)
-class EdgeScatter:
-    """The noise of the edges of T tubes in B runs; see the module.
-
-    scale : (B, T) factor on the stated standard deviations. shading : (B, T) px. tails : (B, T)
-    degrees of freedom. The standard deviations are such that normal errors with them would be worth
-    as much as these are.
-    """
-
-    scale: Array
-    shading: Array
-    tails: Array
-
-    @classmethod
-    def stated(cls, n_runs: int, problem: Problem) -> EdgeScatter:
-        """What edges are given with."""
-        full = (n_runs, max(map(len, problem.layout.radius), default=0))
-        return cls(np.ones(full), np.full(full, OWN_SHADING), np.full(full, TAILS[-1]))
-
-    def trust(self, problem: Problem, square: Array) -> Array:
-        """By how much more or less each edge counts than on average, (B, K, G), where the squares
-        of its whitened residuals are (B, K, G).
-        """
-        tails = self.tails[:, problem.blocks.tube]
-        return (tails + PAIR) / (tails + square * worth(tails))
-
-    def squares(self, problem: Problem, rows: Array) -> Array:
-        """Squares (B, K, G) of the edges' rows (B, K, r) in use, trust included, as large as those
-        of normal errors.
-        """
-        pairs = rows.reshape(*rows.shape[:2], -1, PAIR)
-        return np.sum(pairs**2, axis=-1) * worth(self.tails)[:, problem.blocks.tube]
-
-    def factor(self, problem: Problem, weight: Array) -> Array:
-        """What edges with weights (B, K, G) scatter by on average, in times of what they are stated
-        with, (B,); 1 of none.
-        """
-        if not problem.blocks.crowd.size:
-            return np.ones(len(self.scale))
-        size = np.sum(problem.data.by_shift**2, axis=-1)
-        scale, shading = (part[:, problem.blocks.tube] for part in (self.scale, self.shading))
-        along = (scale**2 + shading**2 * size) / (1 + OWN_SHADING**2 * size)
-        square = np.sum(weight * (along + scale**2) / 2, axis=(1, 2))
-        count = np.sum(weight, axis=(1, 2))
-        return np.sqrt(np.where(count > 0, square / np.maximum(count, TINY), 1.0))
-
-    def close_to(self, other: EdgeScatter, share: float) -> bool:
-        """Whether its deviations are another's up to a share, and its tails the same."""
-        pairs = ((self.scale, other.scale), (self.shading, other.shading))
-        change = [np.abs(new / old - 1).max(initial=0.0) for new, old in pairs]
-        return max(change) < share and bool(np.all(self.tails == other.tails))
-
-    def beyond(self, before: EdgeScatter, pace: float) -> EdgeScatter:
-        """Deviations as many times as far from another's, with these tails."""
-        scale = before.scale * (self.scale / before.scale) ** pace
-        shading = before.shading * (self.shading / before.shading) ** pace
-        least = np.maximum(scale, LEAST), np.maximum(shading, OWN_SHADING)
-        return replace(self, scale=least[0], shading=least[1])
-
-    def applied(self, problem: Problem) -> Problem:
-        """The problem with edges of this noise."""
-        blocks = problem.blocks
-        alone = np.where(blocks.line < 0, SHADING_SIGMA, 0.0)
-        own = np.hypot(self.shading[:, blocks.tube] * np.sqrt(blocks.crowd), alone)
-        return replace(
-            problem, data=replace(problem.data, scale=self.scale[:, blocks.tube], own=own)
-        )
-
-
-def worth(tails: Array) -> Array:
-    """The variance of normal errors that tell as much as those of Student's distribution of pairs,
-    over the square of its scale.
-    """
-    return (tails + PAIR + 2) / (tails + PAIR)
 
 
 def edge_noise(
@@ -129,12 +50,18 @@ def edge_noise(
     """The edges' noise that a solution shows.
 
     weight : (B, K, G) of edges, 0..1, their trust left out; those of 0 do not belong to the machine
-    and tell nothing. before : where the search begins, whose tails are kept where that is asked.
+    and tell nothing. before : where the search begins, whose tails are kept where that is asked; a
+    tube of which no edge was seen keeps all.
     """
     along, rest, size = _squares(info)
     tube, found = info.problem.blocks.tube, []
     for number in range(before.scale.shape[1]):
         own = info.problem.kinds.edges.present & (tube == number)
+        if not own.any():
+            found.append(
+                (before.scale[:, number], before.shading[:, number], before.tails[:, number])
+            )
+            continue
         begin = before.scale[:, number], before.shading[:, number]
         tails = before.tails[None, :, number] if same_tails else TAILS[:, None]
         squares = along[:, own], rest[:, own], size[:, own]
@@ -163,7 +90,7 @@ def _squares(info: Information) -> tuple[Array, Array, Array]:
         for columns in (value, *taken):
             pairs = columns.reshape(*columns.shape[:2], -1, PAIR, columns.shape[-1])
             square += np.sum((unit @ pairs) ** 2, axis=-1)
-        size = np.sum(v**2, axis=-1)
+        size = shift_squares(part.problem.blocks, data)
         weight = np.where(data.weight > 0, data.weight, 1.0)
         along = square[..., 0] * (data.scale**2 + data.own**2 * size) / weight
         rest = square[..., 1] * data.scale**2 / weight

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, short_repr
+from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.identify.unknowns import Unknowns, own_blocks
 from pkmcal.measurements import SHADING_SIGMA, Measurements
 from pkmcal.mechanisms import Machine
@@ -99,21 +100,6 @@ class Statistics:
 
 
 @dataclass(frozen=True)
-class TubeNoise:
-    """What the edges of each of a leg's T tubes scatter by, :mod:`pkmcal.identify.edge_noise`.
-
-    scale : (T,) factor on their stated noise. shading : (T,) px, what they are shaded by one by
-    one. tails : (T,) degrees of freedom of their distribution.
-    """
-
-    scale: Array
-    shading: Array
-    tails: Array
-
-    __repr__ = short_repr
-
-
-@dataclass(frozen=True)
 class Estimate:
     """An identification's result, in the frames that ``gauge`` names.
 
@@ -145,7 +131,7 @@ class Estimate:
     edge_shift_sigma: Array
     edge_residuals: Array
     edge_weights: Array
-    edge_noise: TubeNoise
+    edge_noise: EdgeScatter
     edge_trust: Array
     joint_residuals: Array
     data_share: Array

@@ -430,9 +430,8 @@ class Problem:
         itself: without weights, and without what edges that are shaded alike count for together.
         """
         plain = self.weighted(Kinds(*(kind.present[None].astype(float) for kind in self.kinds)))
-        if self.blocks.crowd.size:
-            crowd = np.where(self.blocks.present, self.blocks.crowd, 1.0)
-            plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
+        crowd = np.where(self.blocks.crowd > 0, self.blocks.crowd, 1.0)
+        plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
         edges = plain._edges(state, plain.closure(state))
         return Kinds(edges.value(state), plain._poses(state).value)
 

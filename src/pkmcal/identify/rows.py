@@ -97,8 +97,8 @@ class EdgeBlocks:
     side : (K, G, g). present : (K, G) False for padding. line : (K, G) number of the tube's side at
     its station, whose edges are shaded alike in all photographs, -1 where there is one edge alone;
     empty where nothing is shaded. tube : (K, G) number of the tube on its leg. crowd : (K, G) how
-    many of its line share an edge's own shading (:func:`~pkmcal.identify.assembly.crowd`); both
-    empty where nothing is shaded.
+    many of its line share an edge's own shading (:func:`~pkmcal.identify.assembly.crowd`), zero
+    where nothing is shaded.
     """
 
     leg: Integers
@@ -107,9 +107,9 @@ class EdgeBlocks:
     radius: Integers
     side: Integers
     present: Booleans
+    tube: Integers
+    crowd: Array
     line: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
-    tube: Integers = field(default_factory=lambda: np.zeros((0, 0), dtype=int))
-    crowd: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def among(self, configurations: slice) -> EdgeBlocks:
         """Those of some configurations."""

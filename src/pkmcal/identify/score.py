@@ -32,7 +32,7 @@ from pkmcal.identify.problem import Problem
 from pkmcal.identify.rows import by_noise
 from pkmcal.identify.unknowns import BatchState
 from pkmcal.measurements import Effect
-from pkmcal.solver import ROWS, Linear, eliminate, inverse_root
+from pkmcal.solver import Linear, divisions, eliminate, inverse_root
 
 SEEN = 1e-10
 """Part of a departure's squared rows that has to be left beside all unknowns for the data to see
@@ -343,10 +343,7 @@ def _products(
 
 def _cuts(problem: Problem, state: BatchState) -> Iterator[tuple[slice, Problem, BatchState]]:
     """Some configurations at a time, with their problem and state."""
-    count = len(problem.blocks.present)
-    each = max(1, ROWS // max(1, problem.n_rows))
-    for first in range(0, count, each):
-        cut = slice(first, min(first + each, count))
+    for cut in divisions(*problem.extent):
         yield cut, problem.among(cut), problem.state_among(state, cut)
 
 

@@ -18,8 +18,9 @@ from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import perturb, pose_difference
 from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.covariance import data_share, told_in_gauge
-from pkmcal.identify.estimate import Estimate, State, Statistics, TubeNoise, told_unknowns
+from pkmcal.identify.estimate import Estimate, State, Statistics, told_unknowns
 from pkmcal.identify.gauge import apply, default_gauge
+from pkmcal.identify.scatter import EdgeScatter
 from pkmcal.measurements import OWN_SHADING, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.papers.four_step import four_step
@@ -162,7 +163,7 @@ def _estimate(
         pose_residuals=poses / pose_scale,
         pose_weights=np.ones(len(poses)),
         edge_weights=weight,
-        edge_noise=TubeNoise(
+        edge_noise=EdgeScatter(
             np.full(n_tubes, scale), np.full(n_tubes, scale * OWN_SHADING), np.full(n_tubes, np.inf)
         ),
         edge_trust=np.ones(len(weight)),

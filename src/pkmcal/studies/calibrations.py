@@ -163,7 +163,7 @@ class SimulatedCalibrations:
         k = int(data.assembled.seen.sum())
         dof = used + k * (problem.layout.n_equations - own) + len(problem.prior)
         dof = dof - problem.unknowns.count
-        scale = np.maximum(found.scale.edges, found.scale.poses)
+        scale = np.maximum(found.noise_scale, found.pose_scale)
         good = np.array([stop is Stop.CONVERGED for stop in found.solution.stop])
         told = [self._told(data, found, run) for run in range(n)]
         return {

@@ -2,36 +2,18 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from typing import final
 
 import numpy as np
 
 from pkmcal.arrays import Array
-from pkmcal.mechanisms.carriers.contract import (
-    BaseCarrier,
-    Chain,
-    Site,
-    vectors,
-)
-from pkmcal.mechanisms.carriers.joint import JointDocument, check_joint, joint_axis_role
-
-CENTER = vectors("center", "m", "center")
+from pkmcal.mechanisms.carriers.contract import BaseCarrier
+from pkmcal.mechanisms.carriers.joint import JointEnd
 
 
 @final
-class FixedPoint(BaseCarrier):
+class FixedPoint(JointEnd, BaseCarrier):
     """Spherical, universal or revolute joint on the base; ``center`` in metres, base frame."""
-
-    joints: ClassVar = ("spherical", "universal", "revolute")
-    schema: ClassVar = JointDocument
-    parameters: ClassVar = CENTER
-    axis_role = staticmethod(joint_axis_role)
-
-    @classmethod
-    def check(cls, node: JointDocument, site: Site) -> None:
-        """An axis where the joint has one, and none where not."""
-        check_joint(node, site)
-        super().check(node, site)
 
     @staticmethod
     def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
@@ -44,9 +26,3 @@ class FixedPoint(BaseCarrier):
         """Identity."""
         shape = np.broadcast_shapes(parameters.shape[:-1], readings.shape)
         return np.broadcast_to(np.eye(3), (*shape, 3, 3))
-
-    @staticmethod
-    def chain(parameters: Array) -> Chain:
-        """The centre, without a joint."""
-        none = np.zeros_like(parameters)
-        return Chain("fixed", parameters, none, none)

@@ -1,0 +1,108 @@
+"""What edges scatter by: a scale, a shading and how heavy the tails are, of each of a leg's tubes.
+
+How these are found is told in :mod:`pkmcal.identify.edge_noise`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pkmcal.arrays import Array, short_repr
+from pkmcal.identify.rows import EdgeBlocks, EdgeData
+from pkmcal.measurements import OWN_SHADING, SHADING_SIGMA
+
+PAIR = 2
+"""Numbers that an edge measures."""
+LEAST = 0.75
+"""Of the stated deviation at least, whatever the data say: what neighbours have in common beside
+what shades them, the parameters take up in part, and residuals come out smaller than errors are.
+How much is no result of theory: on seventeen path-traced sessions errors were as stated with it,
+and with residuals believed as they are, a tenth larger."""
+TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class EdgeScatter:
+    """The noise of the edges of a leg's T tubes (first, second, ... of all legs) in B runs.
+
+    scale : (B, T) factor on the stated standard deviations. shading : (B, T) px, of each edge
+    beside its line's; it counts where something is shaded. tails : (B, T) degrees of freedom of
+    their distribution. The standard deviations are such that normal errors with them would be worth
+    as much as these are. An estimate holds those of its one run, (T,) each (:meth:`of_run`).
+    """
+
+    scale: Array
+    shading: Array
+    tails: Array
+
+    __repr__ = short_repr
+
+    @classmethod
+    def stated(cls, n_runs: int, n_tubes: int) -> EdgeScatter:
+        """What edges are given with."""
+        full = (n_runs, n_tubes)
+        return cls(np.ones(full), np.full(full, OWN_SHADING), np.full(full, np.inf))
+
+    def of_run(self, run: int) -> EdgeScatter:
+        """One run's alone."""
+        return EdgeScatter(self.scale[run], self.shading[run], self.tails[run])
+
+    def trust(self, blocks: EdgeBlocks, square: Array) -> Array:
+        """By how much more or less each edge counts than on average, (B, K, G), where the squares
+        of its whitened residuals are (B, K, G).
+        """
+        tails = self.tails[:, blocks.tube]
+        return (tails + PAIR) / (tails + square * worth(tails))
+
+    def squares(self, blocks: EdgeBlocks, rows: Array) -> Array:
+        """Squares (B, K, G) of the edges' rows (B, K, r) in use, trust included, as large as those
+        of normal errors.
+        """
+        pairs = rows.reshape(*rows.shape[:2], -1, PAIR)
+        return np.sum(pairs**2, axis=-1) * worth(self.tails)[:, blocks.tube]
+
+    def factor(self, blocks: EdgeBlocks, data: EdgeData, weight: Array) -> Array:
+        """What edges with weights (B, K, G) scatter by on average, in times of what they are stated
+        with, (B,); 1 of none.
+        """
+        size = shift_squares(blocks, data)
+        scale, shading = (part[:, blocks.tube] for part in (self.scale, self.shading))
+        along = (scale**2 + shading**2 * size) / (1 + OWN_SHADING**2 * size)
+        square = np.sum(weight * (along + scale**2) / 2, axis=(1, 2))
+        count = np.sum(weight, axis=(1, 2))
+        return np.sqrt(np.where(count > 0, square / np.maximum(count, TINY), 1.0))
+
+    def close_to(self, other: EdgeScatter, share: float) -> bool:
+        """Whether its deviations are another's up to a share, and its tails the same."""
+        pairs = ((self.scale, other.scale), (self.shading, other.shading))
+        change = [np.abs(new / old - 1).max(initial=0.0) for new, old in pairs]
+        return max(change) < share and bool(np.all(self.tails == other.tails))
+
+    def beyond(self, before: EdgeScatter, pace: float) -> EdgeScatter:
+        """Deviations as many times as far from another's, with these tails."""
+        scale = before.scale * (self.scale / before.scale) ** pace
+        shading = before.shading * (self.shading / before.shading) ** pace
+        least = np.maximum(scale, LEAST), np.maximum(shading, OWN_SHADING)
+        return replace(self, scale=least[0], shading=least[1])
+
+    def applied(self, blocks: EdgeBlocks, data: EdgeData) -> EdgeData:
+        """The edges with this noise."""
+        alone = np.where(blocks.line < 0, SHADING_SIGMA, 0.0) if blocks.line.size else 0.0
+        own = np.hypot(self.shading[:, blocks.tube] * np.sqrt(blocks.crowd), alone)
+        return replace(data, scale=self.scale[:, blocks.tube], own=own)
+
+
+def shift_squares(blocks: EdgeBlocks, data: EdgeData) -> Array:
+    """Squares of what a pixel outward does to the edges, in the noise as it was stated, (B or 1,
+    K, G); none where nothing is shaded.
+    """
+    return np.where(blocks.crowd > 0, np.sum(data.by_shift**2, axis=-1), 0.0)
+
+
+def worth(tails: Array) -> Array:
+    """The variance of normal errors that tell as much as those of Student's distribution of pairs,
+    over the square of its scale.
+    """
+    return 1 + 2 / (tails + PAIR)

@@ -1,0 +1,82 @@
+"""Least squares: batched Levenberg-Marquardt, robust weights, scaled ranks and inverses.
+
+A problem has unknowns that all configurations share, x_a (na), and unknowns of each
+configuration alone, x_b (d each). Residual rows are grouped by configuration, so the Jacobian
+is ``by_shared`` (B, K, r, na) and ``by_own`` (B, K, r, d); rows that touch shared unknowns only
+(drawing values, gauge) stand beside them. B counts independent runs: each has its own damping,
+acceptance and stop, and no loop goes over runs or configurations.
+
+Bottom to top: ``ranks`` and inverses of scaled matrices; ``elimination`` of the configurations' own
+unknowns; ``strips`` of rows that depend on few shared unknowns, and the normal equations of all;
+``search``, the damped steps, why they end, and the weights of what does not fit.
+"""
+
+from pkmcal.solver.elimination import (
+    Linear,
+    Memory,
+    Reduced,
+    condensed,
+    divisions,
+    eliminate,
+    own_factors,
+    stacked,
+)
+from pkmcal.solver.ranks import (
+    RANK_TOLERANCE,
+    column_space,
+    directions,
+    inverse_root,
+    normal_inverse,
+    normal_root,
+)
+from pkmcal.solver.search import (
+    FULL,
+    NONE,
+    Divisible,
+    LeastSquares,
+    Solution,
+    Stop,
+    Values,
+    final_weights,
+    minimise,
+    of_runs,
+    put,
+    soft_weights,
+    take,
+)
+from pkmcal.solver.strips import Compact, Eliminated, compact, damped_step, eliminated
+
+__all__ = [
+    "FULL",
+    "NONE",
+    "RANK_TOLERANCE",
+    "Compact",
+    "Divisible",
+    "Eliminated",
+    "LeastSquares",
+    "Linear",
+    "Memory",
+    "Reduced",
+    "Solution",
+    "Stop",
+    "Values",
+    "column_space",
+    "compact",
+    "condensed",
+    "damped_step",
+    "directions",
+    "divisions",
+    "eliminate",
+    "eliminated",
+    "final_weights",
+    "inverse_root",
+    "minimise",
+    "normal_inverse",
+    "normal_root",
+    "of_runs",
+    "own_factors",
+    "put",
+    "soft_weights",
+    "stacked",
+    "take",
+]

@@ -1,0 +1,84 @@
+"""Ranks and inverses of matrices whose columns are scaled to length one first: unknowns in metres,
+radians and pixels are not to be compared otherwise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans
+
+LEAST = 1e-150
+"""Of a singular value or an eigenvalue; where all are zero nothing is known, and that is finite."""
+EPSILON = float(np.finfo(float).eps)
+RANK_TOLERANCE = 1e-9
+"""Singular values below this share of the largest are zero: rounding leaves 1e-12 to 1e-14
+there with exact derivatives, and real directions are many orders above."""
+
+
+def column_space(columns: Array, least: float = RANK_TOLERANCE) -> Array:
+    """An orthonormal basis (n, k) of what columns (n, m) can make together."""
+    norm = np.linalg.norm(columns, axis=0)
+    u, s, _ = np.linalg.svd(columns[:, norm > 0] / norm[norm > 0], full_matrices=False)
+    return u[:, s > least * s.max(initial=0.0)]
+
+
+def directions(rows: Array) -> tuple[Array, Array, Array]:
+    """How well rows (..., n, m) know each direction of their unknowns, columns made of length one.
+
+    Singular values s (..., m), right vectors vt (..., m, m), and the columns' lengths scale
+    (..., m), 1 for those that are zero.
+    """
+    scale = np.sqrt(np.sum(rows**2, axis=-2))
+    scale = np.where(scale > 0, scale, 1.0)
+    _, s, vt = np.linalg.svd(np.linalg.qr(rows / scale[..., None, :], mode="r"))
+    spare = [(0, 0)] * (s.ndim - 1) + [(0, vt.shape[-1] - s.shape[-1])]  # fewer rows than unknowns
+    return np.pad(s, spare), vt, scale
+
+
+def inverse_root(rows: Array, least: float, *, loose: bool) -> Array:
+    """F (..., m, m) with ``F F^T = (rows^T rows)^-1``, columns of rows (..., n, m) scaled.
+
+    Directions below ``least`` of the largest singular value are not known. loose : they get a huge
+    variance; otherwise none, as in a pseudo-inverse.
+    """
+    s, vt, scale = directions(rows)
+    limit = least * s[..., :1]
+    inverse = 1 / np.maximum(s, limit + LEAST) if loose else _of_known(s, limit)
+    return vt.mT * inverse[..., None, :] / scale[..., None]
+
+
+def normal_root(normal: Array, least: float, *, loose: bool) -> Array:
+    """The same of a normal matrix (..., m, m), by its eigenvalues; they hold half of the digits."""
+    scaled, scale = unit_diagonal(normal)
+    values, vectors = np.linalg.eigh(scaled)
+    limit = least * values[..., -1:]
+    inverse = 1 / np.maximum(values, limit + LEAST) if loose else _of_known(values, limit)
+    return vectors * np.sqrt(inverse)[..., None, :] / scale[..., None]
+
+
+def normal_inverse(normal: Array) -> tuple[Array, Booleans]:
+    """Inverses of normal matrices (B, m, m), unknowns scaled, and where they hold half of their
+    digits or more, (B,).
+    """
+    scaled, scale = unit_diagonal(normal)
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        return np.full_like(normal, np.nan), np.zeros(len(normal), dtype=bool)
+    size = np.abs(scaled).sum(axis=-1).max(axis=-1) * np.abs(inverse).sum(axis=-1).max(axis=-1)
+    inverse = 0.5 * (inverse + inverse.mT)
+    return inverse / (scale[:, :, None] * scale[:, None, :]), size < 1 / np.sqrt(EPSILON)
+
+
+def _of_known(values: Array, limit: Array) -> Array:
+    """1 / values where they are above the limit, else 0."""
+    known = values > limit
+    return np.where(known, 1 / np.where(known, values, 1.0), 0.0)
+
+
+def unit_diagonal(normal: Array) -> tuple[Array, Array]:
+    """A normal matrix (..., m, m) with its unknowns scaled (..., m) to a diagonal of ones."""
+    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 0.0))
+    scale = np.where(scale > 0, scale, 1.0)
+    return normal / (scale[..., :, None] * scale[..., None, :]), scale

@@ -1,0 +1,394 @@
+"""The search: damped steps of all runs at once, each of which stops on its own.
+
+**States and data of many runs** are arrays, or frozen dataclasses or named tuples of arrays, whose
+leading axis counts the runs; see :func:`take`, :func:`put` and :func:`of_runs`.
+
+**Robust weights**, one for a search that lets go of what does not fit (:func:`soft_weights`), one
+for its end (:func:`final_weights`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from enum import Enum
+from math import prod
+from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
+
+import numpy as np
+
+from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.solver.elimination import Linear, Memory, divisions
+from pkmcal.solver.strips import (
+    Compact,
+    compact,
+    cost_of,
+    normal_equations,
+    total,
+)
+
+LEAST_DAMPING = 1e-14
+"""Damping that a search begins with, as good as none: near an answer, and starts mostly are, a full
+step is the best, and any damping costs steps along what is known little of."""
+GROWTH = 8.0
+"""Factor on it after a step that was refused, and that factor's after each more in a row: from
+nothing to a hundredth in five."""
+STRONG = 1e-2
+"""Damping from which on a step is small anywhere, so that its size tells nothing."""
+MOST_DAMPING = 1e9
+"""Damping beyond which a step is below rounding: nothing downhill was found."""
+STEP_TOLERANCE = 1e-7
+"""A step that changes all fitted values together by less, in standard deviations, ends the
+search: a ten-millionth of what the noise does, and above the rounding of 1e-9 or so."""
+REFUSED = 1e-3
+"""The same of a step that the residuals refuse, though the linear model promises something: so
+little is their rounding, where a direction is a millionth as well known as the others."""
+ROUNDING = 1e-13
+"""Of the cost, relative."""
+
+FULL, NONE = 4.0, 6.5
+"""Final weights are 1 up to FULL and 0 from NONE standard deviations: of clean pairs of residuals
+3 in 10^4 lose part of their weight and none all of it, so efficiency is above 0.999."""
+
+Runs = TypeVar("Runs")
+"""An array, or a frozen dataclass or named tuple of arrays, with a leading axis of runs."""
+
+
+class Stop(Enum):
+    """Why a search ended; the text is what the user reads."""
+
+    CONVERGED = "converged"
+    STALLED = (
+        "no step downhill was found; check the start, the stations' poses first, and that the "
+        "readings belong to the photographs"
+    )
+    STEPS = "the step limit was reached before convergence; start nearer, or allow more steps"
+    NOT_FINITE = "nothing can be predicted at the start; check the stations' poses and the drawing"
+    RUNNING = "not finished"
+
+
+class Values(NamedTuple):
+    """Residuals alone: value (B, K, r) with NaN where nothing can be predicted, shared (B, c).
+
+    rows : gives the Jacobian there, where it costs less to go on from what these took.
+    """
+
+    value: Array
+    shared_value: Array
+    rows: Callable[[], Compact] | None = None
+
+
+class LeastSquares(Protocol):
+    """What the solver needs of a problem; ``state`` is the problem's own, opaque here."""
+
+    def residuals(self, state: Any) -> Values:
+        """Residuals at a state."""
+        ...
+
+    def linearize(self, state: Any) -> Linear:
+        """Residuals and exact Jacobian; rows that cannot be predicted are zero."""
+        ...
+
+    def moved(self, state: Any, shared: Array, own: Array) -> Any:
+        """The state moved by steps (B, na) and (B, K, d)."""
+        ...
+
+    def select(self, runs: Integers) -> LeastSquares:
+        """The problem of some runs only."""
+        ...
+
+
+@runtime_checkable
+class Divisible(LeastSquares, Protocol):
+    """A problem of which some configurations can be looked at alone, so that the Jacobian of all
+    never stands in memory at once.
+    """
+
+    def among(self, configurations: slice) -> Divisible:
+        """The problem of some configurations, with all that they share."""
+        ...
+
+    def state_among(self, state: Any, configurations: slice) -> Any:
+        """What that problem needs of a state."""
+        ...
+
+    def compact(self, state: Any) -> Compact:
+        """As :meth:`linearize`."""
+        ...
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """Configurations K and rows of each, r."""
+        ...
+
+
+def take(state: Runs, runs: Integers) -> Runs:
+    """The state of some runs."""
+    return _each(lambda array: array[runs], state)
+
+
+def put(state: Runs, runs: Integers, part: Runs) -> Runs:
+    """The state with some runs' values replaced by those of ``part``."""
+
+    def replaced(array: Array, new: Array) -> Array:
+        out = array.copy()
+        out[runs] = new
+        return out
+
+    return _each(replaced, state, part)
+
+
+def of_runs(data: Runs, runs: Integers) -> Runs:
+    """The measured numbers of some runs; what all runs share (a leading axis of 1) stays."""
+    return _each(lambda array: array if len(array) == 1 else array[runs], data)
+
+
+def _count(state: Any) -> int:
+    """Runs of a state."""
+    if isinstance(state, np.ndarray):
+        return len(state)
+    first = state[0] if isinstance(state, tuple) else getattr(state, fields(state)[0].name)
+    return len(cast(Array, first))
+
+
+def _each(function: Callable[..., Array], first: Runs, *others: Runs) -> Runs:
+    """A function of the arrays of states, array by array."""
+    if isinstance(first, np.ndarray):
+        return cast(Runs, function(first, *others))
+    states: tuple[Any, ...] = (first, *others)
+    if not isinstance(first, tuple):
+        names = [field.name for field in fields(states[0])]
+        states = tuple(tuple(getattr(state, name) for name in names) for state in states)
+    return type(first)(*(function(*part) for part in zip(*states, strict=True)))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of a search: state, cost (B,), steps (B,), stop (B,) of Stop.
+
+    normal : (B, na, na) the reduced normal matrix where the last step was made, which is at the end
+    but for that step.
+    """
+
+    state: Any
+    cost: Array
+    steps: Integers
+    stop: tuple[Stop, ...]
+    normal: Array
+
+
+def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solution:
+    """Least squares from ``start``, all runs at once; each stops on its own."""
+    if isinstance(problem, Divisible):
+        values, rows = None, problem.extent
+    else:
+        values = problem.residuals(start)
+        rows = values.value.shape[1:]
+    n_runs = _count(start)
+    cuts = divisions(n_runs, prod(rows))
+    if len(cuts) < 2:
+        return _minimised(_Divided.of(problem, n_runs, *rows), start, values, max_steps)
+    found: list[Solution] = []
+    for cut in cuts:
+        runs = np.arange(cut.start, cut.stop)
+        part = _Divided.of(problem.select(runs), len(runs), *rows)
+        found.append(_minimised(part, take(start, runs), None, max_steps))
+    return Solution(
+        _each(lambda *states: np.concatenate(states), *(one.state for one in found)),
+        np.concatenate([one.cost for one in found]),
+        np.concatenate([one.steps for one in found]),
+        tuple(reason for one in found for reason in one.stop),
+        np.concatenate([one.normal for one in found]),
+    )
+
+
+class _Divided(NamedTuple):
+    """A problem with its parts of some configurations each, small enough for the processor's cache,
+    and the memory that they write to in turn.
+    """
+
+    problem: LeastSquares
+    parts: list[tuple[slice, LeastSquares]]
+    memory: Memory
+
+    @classmethod
+    def of(cls, problem: LeastSquares, n_runs: int, count: int, rows: int) -> _Divided:
+        """A problem of so many runs and configurations of so many rows, divided where it can be."""
+        cuts = divisions(count, n_runs * rows)
+        if not isinstance(problem, Divisible) or len(cuts) < 2:
+            return cls(problem, [(slice(0, count), problem)], Memory())
+        return cls(problem, [(cut, problem.among(cut)) for cut in cuts], Memory())
+
+    def select(self, runs: Integers) -> _Divided:
+        """The same of some runs."""
+        parts = [(cut, part.select(runs)) for cut, part in self.parts]
+        return self._replace(problem=self.problem.select(runs), parts=parts)
+
+    def rows(self, state: Any, values: Values | None) -> Iterator[Compact]:
+        """Residuals and Jacobian of one part after the other; values : the residuals there, where
+        they are known.
+        """
+        if len(self.parts) == 1 and values is not None and values.rows is not None:
+            yield values.rows()
+            return
+        for cut, part in self.parts:
+            if isinstance(part, Divisible):
+                yield part.compact(part.state_among(state, cut))
+            else:
+                yield compact(part.linearize(state))
+
+    def residuals(self, state: Any) -> Iterator[Values]:
+        """Residuals of one part after the other; those of shared unknowns only in the first."""
+        for k, (cut, part) in enumerate(self.parts):
+            if len(self.parts) > 1 and isinstance(part, Divisible):
+                state_of_part = part.state_among(state, cut)
+            else:
+                state_of_part = state
+            values = part.residuals(state_of_part)
+            yield values._replace(shared_value=values.shared_value[:, :0]) if k else values
+
+
+def _minimised(problem: _Divided, start: Any, values: Values | None, max_steps: int) -> Solution:
+    """The same of few runs; values : the residuals at the start, where they are known."""
+    n_runs = _count(start)
+    cost, steps = np.full(n_runs, np.inf), np.zeros(n_runs, dtype=int)
+    stop = [Stop.RUNNING] * n_runs
+    search = _Search.begun(n_runs)
+    state, active = start, np.arange(n_runs)
+    part, here, at = problem, start, values
+    normal: Array | None = None
+    for _ in range(max_steps):
+        new, gain = _try(part, here, at, take(search, active))
+        steps[active] += 1
+        here, at = _kept(here, new, gain)
+        state = put(state, active, here)
+        cost[active], search = gain.cost, put(search, active, gain.search)
+        normal = gain.normal if normal is None else put(normal, active, gain.normal)
+        for run, reason in zip(active, gain.stop, strict=True):
+            stop[run] = reason
+        keep = np.flatnonzero([reason is Stop.RUNNING for reason in gain.stop])
+        if keep.size == 0:
+            break
+        if keep.size < active.size:
+            active = active[keep]
+            part, here, at = problem.select(active), take(state, active), None
+    final = tuple(Stop.STEPS if s is Stop.RUNNING else s for s in stop)
+    return Solution(state, cost, steps, final, cast(Array, normal))
+
+
+def _kept(here: Any, new: Any, gain: _Gain) -> tuple[Any, Values | None]:
+    """The state with the steps that were accepted, and the residuals there where they are known."""
+    if gain.accepted.all():
+        return new, gain.values
+    runs = np.flatnonzero(gain.accepted)
+    return put(here, runs, take(new, runs)), None
+
+
+class _Search(NamedTuple):
+    """Where a search stands, (B,) each.
+
+    damping : of the next step. growth : by how much more of it, should that be refused. size : of
+    the last step's change of all residuals; infinite where it was damped or refused.
+    """
+
+    damping: Array
+    growth: Array
+    size: Array
+
+    @classmethod
+    def begun(cls, n_runs: int) -> _Search:
+        """Before the first step."""
+        return cls(*(np.full(n_runs, x) for x in (LEAST_DAMPING, GROWTH, np.inf)))
+
+    def after(self, accepted: Booleans, ratio: Array, size: Array) -> _Search:
+        """After a step of a size that kept a ratio of what it promised."""
+        less = np.where(ratio > 0.5, 0.05, np.where(ratio > 0.2, 0.5, 2.0))
+        damping = self.damping * np.where(accepted, less, self.growth)
+        return _Search(
+            np.clip(damping, LEAST_DAMPING, MOST_DAMPING),
+            np.where(accepted, GROWTH, GROWTH * self.growth),
+            np.where(accepted & self.undamped, size, np.inf),
+        )
+
+    @property
+    def undamped(self) -> Booleans:
+        """Whether the next step is a full one."""
+        return self.damping <= LEAST_DAMPING
+
+    def left(self, size: Array) -> Array:
+        """How much is left to go after a full step of this size. Steps that shrink by a factor q
+        each leave ``q / (1 - q)`` of the last (Hairer and Wanner, Solving Ordinary Differential
+        Equations II, IV.8).
+        """
+        told = self.undamped & np.isfinite(self.size) & (size < self.size)
+        return np.where(told, size**2 / np.where(told, self.size - size, 1.0), np.inf)
+
+
+class _Gain(NamedTuple):
+    """What came of a step. values : the first part's residuals after it."""
+
+    accepted: Booleans
+    values: Values
+    cost: Array
+    search: _Search
+    normal: Array
+    stop: list[Stop]
+
+
+def _try(
+    problem: _Divided, state: Any, values: Values | None, search: _Search
+) -> tuple[Any, _Gain]:
+    """One damped step of every run; returns the states after it and what came of it.
+
+    values : the residuals at the state, where they are known.
+    """
+    damping = search.damping
+    normal = normal_equations(problem.rows(state, values), damping, problem.memory)
+    shared, own = normal.step(damping)
+    trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
+    usable = [part.usable for part in normal.parts]
+    after = problem.residuals(trial)
+    values = next(after)
+    cost, cost_trial = normal.cost, cost_of(values.value, values.shared_value, usable[0])
+    for part, use in zip(after, usable[1:], strict=True):
+        cost_trial = cost_trial + cost_of(part.value, part.shared_value, use)
+    descent, size2 = normal.promise(shared, own)
+    ratio = (cost - cost_trial) / np.maximum(descent - size2, 1e-300)
+    size, tolerance = np.sqrt(size2), 1 + 1e-3 * np.sqrt(cost)
+    small = size < STEP_TOLERANCE * tolerance
+    # a step near the end changes the cost by less than its rounding, and then it cannot be judged
+    small |= np.abs(descent - size2) < ROUNDING * cost
+    accepted = cost_trial <= cost * (1 + ROUNDING)
+    small |= accepted & (search.left(size) < STEP_TOLERANCE * tolerance)
+    # a step that is refused for its rounding is better taken: all that is known of it is good
+    little = ~accepted & (descent - size2 < (REFUSED * tolerance) ** 2) & (damping < STRONG)
+    small, accepted = small | little, accepted | (little & (cost_trial - cost < REFUSED**2))
+    any_usable = total(np.sum(part, axis=(1, 2)) for part in usable) > 0
+    stop = [_reason(*run) for run in zip(any_usable, small, accepted, damping, strict=True)]
+    cost, search = np.where(accepted, cost_trial, cost), search.after(accepted, ratio, size)
+    return trial, _Gain(accepted, values, cost, search, normal.matrix, stop)
+
+
+def _reason(usable: bool, small: bool, accepted: bool, damping: float) -> Stop:
+    if not usable:
+        return Stop.NOT_FINITE
+    if small and damping < STRONG:
+        return Stop.CONVERGED
+    return Stop.STALLED if not accepted and damping >= MOST_DAMPING else Stop.RUNNING
+
+
+def soft_weights(distance: Array, scale: Array | float) -> Array:
+    """Geman-McClure weights ``(c^2 / (c^2 + d^2))^2`` of distances; 0 where nothing can be
+    predicted. A search begins with a scale so wide that everything counts, and narrows it.
+    """
+    square = scale**2
+    weight = (square / (square + np.nan_to_num(distance) ** 2)) ** 2
+    return np.where(np.isfinite(distance), weight, 0.0)
+
+
+def final_weights(distance: Array) -> Array:
+    """Weights of distances in standard deviations: 1 up to FULL, a cosine's way down to 0 at NONE;
+    0 where nothing can be predicted.
+    """
+    x = np.clip((distance - FULL) / (NONE - FULL), 0, 1)
+    return np.where(np.isfinite(distance), 0.5 * (1 + np.cos(np.pi * x)), 0.0)
