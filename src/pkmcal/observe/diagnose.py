@@ -9,8 +9,9 @@ machine that was recognised is asked too: with two columns exchanged, four legs 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, islice
 from typing import NamedTuple
 
@@ -74,12 +75,14 @@ class SeenStation(NamedTuple):
 
 class Hypothesis(NamedTuple):
     """What the photographs may show instead, the error that names it, and the logarithm of how many
-    of its kind it was chosen from.
+    of its kind it was chosen from. readings : (K, m) that the photographs would have, where nothing
+    else is another.
     """
 
-    view: StationView
+    view: Callable[[], StationView]
     error: InputError
     log_choices: float = 0.0
+    readings: Array | None = None
 
 
 def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError | None:
@@ -155,14 +158,16 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
     if wide and station.by_hand is not None:
         starts.append(station.by_hand)
     begin = np.array(starts).reshape(-1, 4, 4)
-    own = evidence_nearby(view, begin, wide, rng)
-    likely: list[tuple[float, Hypothesis]] = []
-    for other in _hypotheses(station):
-        evidence = evidence_nearby(other.view, begin, wide, rng)
-        # where the machine is as the user says, another word has to be better there at once
-        if evidence > own or station.elsewhere:
-            likely.append((evidence, other))
-    best = [other for _, other in sorted(likely, key=lambda item: -item[0])[:SEARCHED]]
+    hypotheses = list(_hypotheses(station))
+    shown = [h.readings for h in hypotheses if h.readings is not None]
+    own, *evidence = evidence_nearby(view, np.stack([view.joints, *shown]), begin, wide, rng)
+    for h in hypotheses[len(evidence) :]:  # other legs, with the same readings
+        other = h.view()
+        evidence.append(evidence_nearby(other, other.joints[None], begin, wide, rng)[0])
+    # where the machine is as the user says, another word has to be better there at once
+    likely = [k for k, e in enumerate(evidence) if e > own or station.elsewhere]
+    likely.sort(key=lambda k: -evidence[k])
+    best = [hypotheses[k] for k in likely[:SEARCHED]]
     return _likelier(station, [*_other_photographs(station), *best], in_order, rng)
 
 
@@ -172,14 +177,17 @@ def _likelier(
     """The likeliest of hypotheses, searched in full, that explain a station better than the
     session, if any; with it those that it does not exclude.
     """
+    if not others:
+        return None
     view, found = station.view, station.found
-    searched = [(find_station(h.view, station.by_hand, rng), h) for h in others]
-    places = np.stack([found.T_camera_base, *(f.T_camera_base for f, _ in searched)])
+    seen = [h.view() for h in others]
+    searched = [find_station(other, station.by_hand, rng) for other in seen]
+    places = np.stack([found.T_camera_base, *(f.T_camera_base for f in searched)])
     named = evidence_from(view, places)
-    odds = [(evidence_from(h.view, places) - named) / found.grain for _, h in searched]
+    odds = [(evidence_from(other, places) - named) / found.grain for other in seen]
     better = [
         (o, h)
-        for o, (f, h) in zip(odds, searched, strict=True)
+        for o, f, h in zip(odds, searched, others, strict=True)
         if _replaces(f, o - h.log_choices, station, in_order)
     ]
     if not better:
@@ -214,30 +222,35 @@ def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
     view = station.view
     count = view.all_joints.shape[1]
     own = np.arange(count)
-    tried = {tuple(own.tolist())}
+    exchanged: dict[tuple[int, ...], InputError] = {}
     for a, b in combinations(range(count), 2):
         order = own.copy()
         order[[a, b]] = b, a
-        tried.add(tuple(order.tolist()))
-        yield Hypothesis(view.with_joints(view.all_joints[:, order]), _two_legs(a + 1, b + 1))
+        exchanged[tuple(order.tolist())] = _two_legs(a + 1, b + 1)
     turned = [np.roll(own, -r) for r in range(1, count)]
     turned += [np.roll(own[::-1], r) for r in range(count)]
     if station.found.good and station.by_hand is None:
         turned = []  # of a machine with equal thirds, any of its equal numberings would do as well
     for order in turned:
-        if tuple(order.tolist()) not in tried:
-            tried.add(tuple(order.tolist()))
-            yield Hypothesis(view.with_joints(view.all_joints[:, order]), _numbering(order))
+        exchanged.setdefault(tuple(order.tolist()), _numbering(order))
+    exchanged.pop(tuple(own.tolist()), None)
+    for columns, error in exchanged.items():
+        joints = view.all_joints[:, columns]
+        readings = joints[view.configuration]
+        yield Hypothesis(partial(view.with_joints, joints), error, readings=readings)
     names = view.configuration
     if 2 < len(names) == len(np.unique(names)):
         for step in (1, -1):
-            yield Hypothesis(replace(view, configuration=np.roll(names, step)), _shifted(step))
+            shifted = partial(replace, view, configuration=np.roll(names, step))
+            readings = view.all_joints[np.roll(names, step)]
+            yield Hypothesis(shifted, _shifted(step), readings=readings)
     # thin legs of few pixels are as likely to be thinner still, and two photographs of right ones
     # can fit so by chance: only where nothing else explains
     if not station.found.good and len(names) > 2:
         values = view.machine.values.copy()
         values[np.unique(view.tubes.radius)] /= 2
-        yield Hypothesis(replace(view, machine=view.machine.with_values(values)), _diameters())
+        thinner = partial(replace, view, machine=view.machine.with_values(values))
+        yield Hypothesis(thinner, _diameters())
 
 
 def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
@@ -247,7 +260,8 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
     view, T_camera_base = station.view, station.found.T_camera_base
     names = view.configuration
     if not station.found.good:
-        yield Hypothesis(replace(view, tables=view.tables.mirrored()), _mirrored(station.name))
+        mirrored = partial(replace, view, tables=view.tables.mirrored())
+        yield Hypothesis(mirrored, _mirrored(station.name))
     if not 2 < len(names) == len(np.unique(names)):
         return
     columns = np.arange(len(names))
@@ -263,7 +277,7 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
         T_camera_base = settled(replace(view, configuration=names[columns]), T_camera_base)
     moved = np.flatnonzero(columns != np.arange(len(names)))
     if 0 < len(moved) <= len(names) // 2:
-        right = replace(view, configuration=names[columns])
+        right = partial(replace, view, configuration=names[columns])
         error = _misnamed(station, moved, names[columns[moved]])
         yield Hypothesis(right, error, len(moved) * choices)
 
