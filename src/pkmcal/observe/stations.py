@@ -49,10 +49,16 @@ ANYWHERE = 600
 """Poses from all round the machine that are looked at more closely."""
 FIRST_DAMPING = 1e-3
 """Of a step, relative to the normal equations' diagonal."""
-SHAKEN = 48
-"""Poses beside the best ones that are tried before the last descent."""
+SHAKEN, LIKELY = 48, 16
+"""Poses beside the best ones that are tried before the last descent, and of how many two steps have
+shown that they may be the best."""
 FURTHER = 1e4
 """Reduced pixels at which nothing is found: what lies outside the image is nowhere near."""
+SETTLED = 0.1
+"""Evidence that a step has to gain for another one to follow; a measurement is tens of it."""
+AT_ONCE = 40_000
+"""Places on silhouettes that are looked up together, so that what is worked out of them stays in
+the processor's cache."""
 NEARBY = 8
 """Places of each of thirty hypotheses that are settled."""
 NAMES_AT_ONCE = 16
@@ -61,9 +67,9 @@ LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
 FEWEST_RIVALS, MOST_RIVALS = 8, 24
 """Other readings for each photograph, which tell what evidence chance gives."""
-HALVES, THIRDS = 7, 5
+HALVES, THIRDS, HALVES_TOLD = 7, 5, 4
 """Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
-each in its turn."""
+each in its turn. About a known pose two are enough to be searched."""
 DECIDED = 10.0
 """Times less than the probability asked for, by some of the photographs, at which the others need
 not be asked."""
@@ -121,6 +127,12 @@ class StationView:
         if self.guessed is not None:
             return self.guessed[:, photographs]
         return self.all_legs[self.configuration[photographs]]
+
+    def guess(self, which: slice | Integers) -> StationView:
+        """The same for some of the hypotheses that are guessed, if there are as many as places."""
+        if self.guessed is None or len(self.guessed) == 1:
+            return self
+        return replace(self, guessed=self.guessed[which])
 
     def few(self, count: int) -> Integers:
         """Numbers of up to ``count`` photographs, spread over all."""
@@ -204,7 +216,8 @@ def find_station(
     """
     count = len(view.configuration)
     number = np.arange(count)
-    folds = 2 if count >= HALVES else 3 if count >= THIRDS else count
+    halves = HALVES if T_camera_base is None else HALVES_TOLD
+    folds = 2 if count >= halves else 3 if count >= THIRDS else count
     kept: list[Array] = []
     surely = np.zeros(0)
     for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
@@ -217,8 +230,7 @@ def find_station(
             break
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng)
     every = view.few(count)
-    candidates = settle(view, candidates, every, 8, 8)
-    evidence = evidence_of(view, candidates, every, 8).sum(axis=-1)
+    candidates, evidence = settle(view, candidates, every, 8, 8)
     order = np.argsort(-evidence)
     order = order[apart(view, candidates[order], every)]
     candidates, evidence = candidates[order], evidence[order]
@@ -260,8 +272,8 @@ def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Gener
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
     steps = rng.normal(size=(SHAKEN, 6)) * spread
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
-    candidates = settle(view, np.concatenate([candidates, turned]), more, 5, 6)
-    evidence = evidence_of(view, candidates, more, 5).sum(axis=-1)
+    candidates, evidence = settle(view, np.concatenate([candidates, turned]), more, 5, 2)
+    candidates, evidence = settle(view, candidates[np.argsort(-evidence)[:LIKELY]], more, 5, 5)
     candidates = candidates[np.argsort(-evidence)]
     return candidates[apart(view, candidates, more)[:3]]
 
@@ -285,13 +297,19 @@ def _random_search(
         return inverse(T_base_camera @ pose(rotation(steps[:, :3]), steps[:, 3:]))
 
     few = view.few(4)
+
+    def likely(steps: Array, reach: float, keep: int) -> Array:
+        # two photographs and few places tell which of them are not worth a closer look
+        first = np.argsort(score(view, moved(steps), few[::2], reach, 3))
+        steps = steps[first[: max(len(steps) // 4, keep)]]
+        return steps[np.argsort(score(view, moved(steps), few, reach))[:keep]]
+
     steps = rng.normal(size=(tries, 6)) * spread
     steps[0] = 0.0
-    best = steps[np.argsort(score(view, moved(steps), few, reach=12))[:60]]
+    best = likely(steps, 12, 60)
     again = best[rng.integers(0, len(best), tries // 2)]
-    steps = np.concatenate([best, again + rng.normal(size=again.shape) * (0.45 * spread)])
-    order = np.argsort(score(view, moved(steps), few, reach=10))[:16]
-    return moved(steps[order])
+    again = again + rng.normal(size=again.shape) * (0.45 * spread)
+    return moved(likely(np.concatenate([best, again]), 10, 16))
 
 
 def _best(
@@ -321,6 +339,13 @@ def score(
     T_camera_base : (H, 4, 4) hypotheses. reach : reduced pixels. Edges are taken as the chords
     between their ends, which is exact for a pinhole and near enough for this search elsewhere.
     """
+    count = len(photographs) * len(view.tubes) * samples
+    at_once = max(AT_ONCE // max(count, 1), 1)
+    if len(T_camera_base) > at_once:
+        parts = [slice(k, k + at_once) for k in range(0, len(T_camera_base), at_once)]
+        return np.concatenate(
+            [score(view.guess(k), T_camera_base[k], photographs, reach, samples) for k in parts]
+        )
     tubes = view.tubes
     legs = view.legs(photographs).moved(T_camera_base)
     a, b, u = of_edges(legs, tubes)
@@ -364,15 +389,16 @@ class _Look(NamedTuple):
     """The picture under predicted edges, of all photographs in a row, (H, E, n): distance found,
     FURTHER outside the image; its slope, by metres that the edge moves outward; one by the density
     of such distances by chance; reduced pixels of silhouette for which each place stands, none
-    outside the image. turns : (H, E, 2, 6) what a motion of the camera frame does to an edge, in
-    metres outward: at its first place, and how much more at its last.
+    outside the image. begins, grows : (H, E, 6) what a motion of the camera frame does to an edge,
+    in metres outward: at its first place, and how much more at its last.
     """
 
     found: Array
     slope: Array
     rare: Array
     length: Array
-    turns: Array
+    begins: Array
+    grows: Array
 
     def weight(self, reach: float) -> Array:
         """Geman-McClure: what is further than the reach is another edge."""
@@ -444,8 +470,11 @@ def descend(
 
 def settle(
     view: StationView, candidates: Array, photographs: Integers, samples: int, steps: int
-) -> Array:
-    """The same to the most evidence: how far edges scatter is learnt on the way."""
+) -> tuple[Array, Array]:
+    """The same to the most evidence: how far edges scatter is learnt on the way.
+
+    Returns the places (H, 4, 4) and their evidence (H,).
+    """
     look = _look(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
     mixture = _first_mixture(len(candidates))
@@ -453,11 +482,14 @@ def settle(
         mixture = look.mixture(mixture)
         trial = _step(candidates, look, look.length * look.own(mixture), damping)
         seen = _look(view, trial, photographs, samples)
-        better = _summed(seen.evidence(mixture)) > _summed(look.evidence(mixture))
+        gain = _summed(seen.evidence(mixture)) - _summed(look.evidence(mixture))
+        better = gain > 0
         candidates = np.where(better[:, None, None], trial, candidates)
         look = seen.where(better, look)
         damping = np.where(better, 0.3, 10.0) * damping
-    return candidates
+        if gain.max() < SETTLED:
+            break
+    return candidates, _summed(look.evidence(look.mixture(_first_mixture(len(candidates)), 10)))
 
 
 def _first_mixture(count: int) -> _Mixture:
@@ -494,7 +526,7 @@ def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -
 
 def settled(view: StationView, T_camera_base: Array) -> Array:
     """The pose (4, 4) with the most evidence near another."""
-    return settle(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0]
+    return settle(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0][0]
 
 
 def evidence_from(view: StationView, places: Array) -> float:
@@ -504,8 +536,7 @@ def evidence_from(view: StationView, places: Array) -> float:
     photographs are compared from the same places.
     """
     every = view.few(len(view.configuration))
-    places = settle(view, places, every, 8, 8)
-    return float(evidence_of(view, places, every, 8).sum(axis=-1).max())
+    return float(settle(view, places, every, 8, 8)[1].max())
 
 
 def evidence_nearby(
@@ -533,9 +564,8 @@ def evidence_nearby(
     if count > NEARBY:
         order = np.argsort(score(view, ends, few, 5).reshape(-1, count), axis=1)[:, :NEARBY]
         kept = (order + count * np.arange(len(legs))[:, None]).ravel()
-        ends, view = ends[kept], replace(view, guessed=view.guessed and view.guessed[kept])
-    ends = settle(view, ends, few, 4, 3)
-    evidence = evidence_of(view, ends, few, 5).sum(axis=-1)
+        ends, view = ends[kept], view.guess(kept)
+    evidence = settle(view, ends, few, 5, 3)[1]
     return evidence.reshape(len(legs), -1).max(axis=1)
 
 
@@ -624,7 +654,8 @@ def _look(view: StationView, candidates: Array, photographs: Integers, samples: 
         np.where(inside, slope * points.gain, 0.0).reshape(*shape, samples),
         rare.reshape(*shape, samples),
         np.where(inside, length[..., None], 0.0).reshape(*shape, samples),
-        np.stack([np.concatenate(turns[k::2], axis=-1) for k in (0, 1)], axis=-2),
+        np.concatenate(turns[::2], axis=-1),
+        np.concatenate(turns[1::2], axis=-1),
     )
 
 
@@ -635,13 +666,15 @@ def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Arra
     """
     # the places of an edge lie evenly between its first and its last
     at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)
+    powers = np.stack([at**0, at, at**2], axis=-1)
     weighted = weight * look.slope
-    second = (weighted * look.slope) @ np.stack([at**0, at, at**2], axis=-1)
-    first = (weighted * look.found) @ np.stack([at**0, at], axis=-1)
-    turns = look.turns.reshape(len(candidates), -1, 6)
-    inner = second[..., [0, 1, 1, 2]].reshape(*second.shape[:-1], 2, 2) @ look.turns
-    normal = (turns.mT @ inner.reshape(turns.shape)).astype(float)
-    right = (turns.mT @ first.reshape(len(candidates), -1, 1)).astype(float)
+    second = ((weighted * look.slope) @ powers)[..., None, :]
+    first = ((weighted * look.found) @ powers[:, :2])[..., None]
+    begins, grows = look.begins, look.grows
+    normal = begins.mT @ (second[..., 0] * begins + second[..., 1] * grows)
+    normal += grows.mT @ (second[..., 1] * begins + second[..., 2] * grows)
+    right = (begins.mT @ first[..., 0, :] + grows.mT @ first[..., 1, :]).astype(float)
+    normal = normal.astype(float)
     diagonal = np.einsum("hii->hi", normal) + 1e-12
     normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
     step = -np.linalg.solve(normal, right)[..., 0]
