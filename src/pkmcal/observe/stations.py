@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -56,7 +57,7 @@ FURTHER = 1e4
 """Reduced pixels at which nothing is found: what lies outside the image is nowhere near."""
 SETTLED = 0.1
 """Evidence that a step has to gain for another one to follow; a measurement is tens of it."""
-AT_ONCE = 40_000
+AT_ONCE = 30_000
 """Places on silhouettes that are looked up together, so that what is worked out of them stays in
 the processor's cache."""
 NEARBY = 8
@@ -339,10 +340,8 @@ def score(
     T_camera_base : (H, 4, 4) hypotheses. reach : reduced pixels. Edges are taken as the chords
     between their ends, which is exact for a pinhole and near enough for this search elsewhere.
     """
-    count = len(photographs) * len(view.tubes) * samples
-    at_once = max(AT_ONCE // max(count, 1), 1)
-    if len(T_camera_base) > at_once:
-        parts = [slice(k, k + at_once) for k in range(0, len(T_camera_base), at_once)]
+    parts = _parts(view, len(T_camera_base), len(photographs) * samples)
+    if len(parts) > 1:
         return np.concatenate(
             [score(view.guess(k), T_camera_base[k], photographs, reach, samples) for k in parts]
         )
@@ -389,8 +388,8 @@ class _Look(NamedTuple):
     """The picture under predicted edges, of all photographs in a row, (H, E, n): distance found,
     FURTHER outside the image; its slope, by metres that the edge moves outward; one by the density
     of such distances by chance; reduced pixels of silhouette for which each place stands, none
-    outside the image. begins, grows : (H, E, 6) what a motion of the camera frame does to an edge,
-    in metres outward: at its first place, and how much more at its last.
+    outside the image. begins, grows : (H, 6, E) and (H, 3, E) what a motion of the camera frame
+    does to an edge, in metres outward: at its first place, and how much more its turn at the last.
     """
 
     found: Array
@@ -632,8 +631,20 @@ def _by_chance(surely: Array) -> float:
     return 0.5 * math.erfc(float(surely.sum()) / math.sqrt(2 * len(surely)))
 
 
+def _parts(view: StationView, count: int, places: int) -> list[slice]:
+    """Of so many hypotheses those that are looked at together, at so many places of each edge."""
+    each = max(places * len(view.tubes), 1)
+    parts = max(min(round(count * each / AT_ONCE), count), 1)
+    ends = [count * k // parts for k in range(parts + 1)]
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
 def _look(view: StationView, candidates: Array, photographs: Integers, samples: int) -> _Look:
     """Distances under the edges predicted from poses (H, 4, 4)."""
+    parts = _parts(view, len(candidates), len(photographs) * samples)
+    if len(parts) > 1:
+        looks = [_look(view.guess(k), candidates[k], photographs, samples) for k in parts]
+        return _Look(*map(np.concatenate, zip(*looks, strict=True)))
     number = np.arange(len(view.configuration))[photographs][:, None, None]
     legs = view.legs(photographs).moved(candidates)
     points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
@@ -645,18 +656,28 @@ def _look(view: StationView, candidates: Array, photographs: Integers, samples: 
     rare = 1 / view.tables.by_chance(direction, found)
     # an edge moves outward by n . (omega x P + tau), of motions of the camera frame
     first, last = points.point[..., 0, :], points.point[..., -1, :]
-    turn = cross(first, points.normal), cross(last - first, points.normal)
-    motion = [*turn, points.normal, np.zeros_like(turn[1])]
-    shape = (len(candidates), -1)
-    turns = [np.nan_to_num(part).reshape(*shape, 3) for part in motion]
+    seen = inside.any(axis=-1)
+    begins = _stacked((cross(first, points.normal), points.normal), seen)
+    grows = _stacked((cross(last - first, points.normal),), seen)
+    shape = (len(candidates), -1, samples)
     return _Look(
-        np.where(inside, found, FURTHER).reshape(*shape, samples),
-        np.where(inside, slope * points.gain, 0.0).reshape(*shape, samples),
-        rare.reshape(*shape, samples),
-        np.where(inside, length[..., None], 0.0).reshape(*shape, samples),
-        np.concatenate(turns[::2], axis=-1),
-        np.concatenate(turns[1::2], axis=-1),
+        np.where(inside, found, FURTHER).reshape(shape),
+        np.where(inside, slope * points.gain, 0.0).reshape(shape),
+        rare.reshape(shape),
+        np.where(inside, length[..., None], 0.0).reshape(shape),
+        begins,
+        grows,
     )
+
+
+def _stacked(vectors: tuple[Array, ...], seen: Booleans) -> Array:
+    """Components (H, 3 n, E) of n vectors (H, K, E, 3) of all edges in a row, 0 where not seen."""
+    out = np.zeros((len(seen), 3 * len(vectors), seen[0].size), np.float32)
+    for k, vector in enumerate(vectors):
+        for c in range(3):
+            part = out[:, 3 * k + c].reshape(seen.shape)
+            np.copyto(part, vector[..., c], where=seen)
+    return out
 
 
 def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Array:
@@ -668,13 +689,17 @@ def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Arra
     at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)
     powers = np.stack([at**0, at, at**2], axis=-1)
     weighted = weight * look.slope
-    second = ((weighted * look.slope) @ powers)[..., None, :]
-    first = ((weighted * look.found) @ powers[:, :2])[..., None]
+    one, both, two = np.moveaxis((weighted * look.slope) @ powers, -1, 0)[:, :, None]
+    here, there = np.moveaxis((weighted * look.found) @ powers[:, :2], -1, 0)
     begins, grows = look.begins, look.grows
-    normal = begins.mT @ (second[..., 0] * begins + second[..., 1] * grows)
-    normal += grows.mT @ (second[..., 1] * begins + second[..., 2] * grows)
-    right = (begins.mT @ first[..., 0, :] + grows.mT @ first[..., 1, :]).astype(float)
-    normal = normal.astype(float)
+    normal = (begins * one) @ begins.mT
+    mixed = (grows * both) @ begins.mT
+    normal[:, :3] += mixed
+    normal[:, :, :3] += mixed.mT
+    normal[:, :3, :3] += (grows * two) @ grows.mT
+    right = begins @ here[..., None]
+    right[:, :3] += grows @ there[..., None]
+    normal, right = normal.astype(float), right.astype(float)
     diagonal = np.einsum("hii->hi", normal) + 1e-12
     normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
     step = -np.linalg.solve(normal, right)[..., 0]

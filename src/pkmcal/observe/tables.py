@@ -167,10 +167,11 @@ def distances(
     import cv2
 
     tables = np.empty((count, *shape), dtype=np.float32)
+    place = pixel[:, 1] * shape[1] + pixel[:, 0]
     for k in range(count):
-        near = np.isin(number, [(k - 1) % count, k, (k + 1) % count])
+        near = (number - (k - 1)) % count < 3
         mask = np.ones(shape, dtype=np.uint8)
-        mask[pixel[near, 1], pixel[near, 0]] = 0
+        mask.reshape(-1)[place[near]] = 0
         tables[k] = cv2.distanceTransform(mask, cv2.DIST_L2, 3) if near.any() else 1e3
     return tables
 
