@@ -43,6 +43,9 @@ ASSIGNED = 3
 """Rounds of names for photographs, and of the pose that these tell."""
 SEARCHED = 3
 """Hypotheses about the readings, likeliest first, that are searched in full."""
+ENOUGH, USUAL = 5, 15
+"""Photographs below which each has to be asked alone, and one that says little leaves it open
+whether the machine is there; and how many are usual."""
 PAIRS = 15
 """Pairs of stations that are searched for the other's pose: of six stations, all."""
 
@@ -99,17 +102,25 @@ def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError
         return error
     if not bad:  # readings are wrong for all stations, but names for one alone
         rest = (station for station in stations if station is not worst)
-        errors = (_likelier(s, list(_other_photographs(s)), True, rng) for s in rest)
+        named = ((s, list(_other_photographs(s))) for s in rest)
+        errors = (_likelier(s, others, True, rng, len(others)) for s, others in named)
         return next((error for error in errors if error is not None), None)
     others = [station.name for station in bad if station is not worst]
+    at = ", nor in those of " + listed(others) if others else ""
+    few = len(worst.view.configuration) < ENOUGH
     return InputError(
-        f"the machine is not recognised in the photographs of {worst.name}"
-        + (f", nor in those of {listed(others)}" if others else ""),
+        f"the machine is not recognised in the photographs of {worst.name}{at}",
         where=f"session.yaml, stations.{worst.name}",
         found=_little(worst),
         expected="one place where its legs lie on edges of the picture far oftener than any"
         " machine's would",
-        next_step="Check that these photographs show this machine's legs, that each bears the name"
+        next_step=(
+            f"Take more photographs from there, {USUAL} are usual: of so few it cannot be said"
+            " whether anything is mixed up. If there are more, check"
+            if few
+            else "Check"
+        )
+        + " that these photographs show this machine's legs, that each bears the name"
         " of its configuration, and that the drawing is this machine's"
         + ("" if worst.by_hand is not None else "; a pose by hand, right to 10 cm, may help"),
     )
@@ -120,10 +131,12 @@ def _little(station: SeenStation) -> str:
     found = station.found
     if found.by_chance < found.limit:
         return "legs that fit nearly as well at another place"
-    if len(station.view.configuration) < 2:
+    count = len(station.view.configuration)
+    if count < 2:
         return "one photograph alone, and none to confirm what it seems to show"
     often = f"once in {1 / found.by_chance:.0f} times" if found.by_chance < 0.5 else "as a rule"
-    return f"legs that readings of other configurations fit as well {often}"
+    few = f"{count} photographs alone, and " if count < ENOUGH else ""
+    return f"{few}legs that readings of other configurations fit as well {often}"
 
 
 def _swapped_stations(stations: list[SeenStation], rng: np.random.Generator) -> InputError | None:
@@ -168,14 +181,20 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
     likely = [k for k, e in enumerate(evidence) if e > own or station.elsewhere]
     likely.sort(key=lambda k: -evidence[k])
     best = [hypotheses[k] for k in likely[:SEARCHED]]
-    return _likelier(station, [*_other_photographs(station), *best], in_order, rng)
+    others = list(_other_photographs(station))
+    asked = len(hypotheses) + len(others)
+    return _likelier(station, [*others, *best], in_order, rng, asked)
 
 
 def _likelier(
-    station: SeenStation, others: list[Hypothesis], in_order: bool, rng: np.random.Generator
+    station: SeenStation,
+    others: list[Hypothesis],
+    in_order: bool,
+    rng: np.random.Generator,
+    asked: int,
 ) -> InputError | None:
     """The likeliest of hypotheses, searched in full, that explain a station better than the
-    session, if any; with it those that it does not exclude.
+    session, if any; with it those that it does not exclude. asked : of how many they are the best.
     """
     if not others:
         return None
@@ -188,7 +207,7 @@ def _likelier(
     better = [
         (o, h)
         for o, f, h in zip(odds, searched, others, strict=True)
-        if _replaces(f, o - h.log_choices, station, in_order)
+        if _replaces(f, o - h.log_choices, station, in_order, asked)
     ]
     if not better:
         return None
@@ -203,12 +222,18 @@ def _likelier(
     return InputError(error.what, where=error.where, found=said, next_step=error.next_step)
 
 
-def _replaces(found: FoundStation, odds: float, station: SeenStation, in_order: bool) -> bool:
+def _replaces(
+    found: FoundStation, odds: float, station: SeenStation, in_order: bool, asked: int
+) -> bool:
     """Whether a hypothesis, found there, explains a station better than its own readings, by log
     odds against these. Where they put the camera elsewhere than the user, and no other station
-    shows that they are in order, to be recognised where the user says is enough.
+    shows that they are in order, to be recognised where the user says is enough. In any case it has
+    to be recognised more surely by as much as there were others: of thirty that are asked of two
+    photographs of any machine, chance confirms one sooner or later.
     """
-    if not found.good or station._replace(found=found).elsewhere:
+    if not (found.good and found.by_chance * asked < found.limit):
+        return False
+    if station._replace(found=found).elsewhere:
         return False
     if station.elsewhere and station.found.good and not in_order:
         return True

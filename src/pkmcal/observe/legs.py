@@ -123,6 +123,9 @@ def sample(images: Iterable[Any], pixel: Array, cubic: bool = True) -> Array:
         for k in (0, 1)
     )
     out = np.empty(x.shape, dtype=np.float32)
+    columns: Any
+    rows: Any
+    grey: Any
     for image, columns, rows, grey in zip(images, x, y, out, strict=True):
         # floats, because cv2 rounds what it interpolates in bytes to whole grey levels
         levels = image.astype(np.float32, copy=False)

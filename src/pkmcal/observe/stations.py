@@ -656,7 +656,7 @@ def _look(view: StationView, candidates: Array, photographs: Integers, samples: 
     rare = 1 / view.tables.by_chance(direction, found)
     # an edge moves outward by n . (omega x P + tau), of motions of the camera frame
     first, last = points.point[..., 0, :], points.point[..., -1, :]
-    seen = inside.any(axis=-1)
+    seen = np.any(inside, axis=-1, keepdims=True)[..., 0]
     begins = _stacked((cross(first, points.normal), points.normal), seen)
     grows = _stacked((cross(last - first, points.normal),), seen)
     shape = (len(candidates), -1, samples)

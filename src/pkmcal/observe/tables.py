@@ -119,7 +119,8 @@ class DistanceTables:
         if not x.size:
             return np.zeros(x.shape, dtype=np.float32)
         columns, lines = flat.reshape(2, -1, across)
-        return cv2.remap(picture, columns, lines, how).reshape(-1)[: x.size].reshape(x.shape)
+        found: Any = cv2.remap(picture, columns, lines, how)
+        return found.reshape(-1)[: x.size].reshape(x.shape)
 
     def by_chance(self, direction: Integers, found: Array) -> Array:
         """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
