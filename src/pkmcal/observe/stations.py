@@ -477,6 +477,7 @@ def settle(
     look = _look(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
     mixture = _first_mixture(len(candidates))
+    last = np.inf
     for _ in range(steps):
         mixture = look.mixture(mixture)
         trial = _step(candidates, look, look.length * look.own(mixture), damping)
@@ -486,8 +487,8 @@ def settle(
         candidates = np.where(better[:, None, None], trial, candidates)
         look = seen.where(better, look)
         damping = np.where(better, 0.3, 10.0) * damping
-        if gain.max() < SETTLED:
-            break
+        if max(last, last := float(gain.max())) < SETTLED:
+            break  # one step may have been too long
     return candidates, _summed(look.evidence(look.mixture(_first_mixture(len(candidates)), 10)))
 
 
