@@ -471,13 +471,12 @@ def _segment_profiles(
     Returns where there are enough of them, (K, E, SEGMENTS), and the profiles there.
     """
     k, e, n = clear.shape
-    grey = grey.reshape(k, e, SEGMENTS, n // SEGMENTS, -1)
-    weight = clear.reshape(k, e, SEGMENTS, n // SEGMENTS)
-    count = weight.sum(axis=-1)
-    full = count >= FEWEST_SHARE * weight.shape[-1]
-    kept, weight = grey[full], weight[full][..., None]
-    mean = np.sum(kept * weight, axis=-2) / count[full][:, None]
-    saturated = np.any((kept >= profiles.SATURATED) & weight, axis=-2)
+    seen = clear.reshape(k, e, SEGMENTS, n // SEGMENTS)
+    count = seen.sum(axis=-1)
+    full = count >= FEWEST_SHARE * seen.shape[-1]
+    kept = grey.reshape(*seen.shape, -1) * seen[..., None]
+    mean = kept.sum(axis=-2)[full] / count[full][:, None]
+    saturated = kept.max(axis=-2)[full] >= profiles.SATURATED
     cut = profiles.cut_of(saturated, half_width[full])
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
 

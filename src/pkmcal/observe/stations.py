@@ -273,7 +273,7 @@ def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Gener
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
     steps = rng.normal(size=(SHAKEN, 6)) * spread
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
-    candidates, evidence = settle(view, np.concatenate([candidates, turned]), more, 5, 2)
+    candidates, evidence = settle(view, np.concatenate([candidates, turned]), more, 3, 2)
     candidates, evidence = settle(view, candidates[np.argsort(-evidence)[:LIKELY]], more, 5, 5)
     candidates = candidates[np.argsort(-evidence)]
     return candidates[apart(view, candidates, more)[:3]]
