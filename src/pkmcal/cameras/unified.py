@@ -53,7 +53,7 @@ class Unified(Camera):
         return self._pixels(good, distorted)
 
     def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
-        """All from one pass through the lens."""
+        """All from one pass through the lens, if there is one."""
         (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
         depth = np.where(good, depth, np.nan)
         bend = self.xi / distance
@@ -62,14 +62,16 @@ class Unified(Camera):
             # x / w moves by (dx - (x / w) dw) / w with w = z + xi r and dw = xi X / r . dX + dz
             dw = bend * dot(points, d) + d[..., 2]
             own = [(d[..., k] - xy[..., k] * dw) / depth for k in (0, 1)]
-            turned = (by_xy[..., k, 0] * own[0] + by_xy[..., k, 1] * own[1] for k in (0, 1))
-            scaled = zip(self.parameters[:2].tolist(), turned, strict=True)
+            if by_xy is not None:
+                own = [by_xy[..., k, 0] * own[0] + by_xy[..., k, 1] * own[1] for k in (0, 1)]
+            scaled = zip(self.parameters[:2].tolist(), own, strict=True)
             moved.append(of_components(*(focal * part for focal, part in scaled)))
         return self._pixels(good, distorted), *moved
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
         (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
+        by_xy = np.eye(2) if by_xy is None else by_xy
         focal = self.parameters[:2, None]
         # d(x / w) = (dx - (x / w) dw) / w with w = z + xi r and dw = (xi X / r + e_z) . dX
         slope = self.xi * points / distance[..., None]
@@ -115,9 +117,12 @@ class Unified(Camera):
         """Distortion in the pinhole's order, without a third radial term."""
         return np.append(self.parameters[5:], 0.0)
 
-    def _imaged(self, points: Array) -> tuple[tuple[Array, Array], Array, Array, Booleans, Array]:
+    def _imaged(
+        self, points: Array
+    ) -> tuple[tuple[Array, Array], Array, Array, Booleans, Array | None]:
         """Distance r and depth z + xi r (...); x and y over the depth (..., 2); :func:`distort`
-        of these; where they have an image (...); the distortion's derivative by these.
+        of these, which leaves them as they are, without a derivative, where the lens has none;
+        where they have an image (...); the distortion's derivative by these.
         """
         distance = np.sqrt(dot(points, points))
         there = distance > 0
@@ -128,6 +133,8 @@ class Unified(Camera):
         inside = there & (points[..., 2] > (edge + _LEAST) * distance)
         depth = np.where(inside, depth, 1.0)
         xy = of_components(points[..., 0] / depth, points[..., 1] / depth)
+        if not self.parameters[5:].any():
+            return (distance, depth), xy, xy, inside & np.isfinite(xy[..., 0] + xy[..., 1]), None
         with np.errstate(over="ignore", invalid="ignore"):  # of points at the field's border
             distorted, by_xy = distort(xy, self._five())
             good = inside & unfolded(xy, by_xy, self._five())
