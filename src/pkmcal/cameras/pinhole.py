@@ -212,7 +212,7 @@ class Pinhole(Camera):
         xy = of_components(points[..., 0] / z, points[..., 1] / z)
         lens = self.parameters[4:]
         if not lens.any():
-            # what lies infinitely far aside has no image
+            # what is no number, or infinitely far aside, has no image
             return front & np.isfinite(xy[..., 0] + xy[..., 1]), z, xy, xy, None
         with np.errstate(over="ignore", invalid="ignore"):  # of points almost beside the camera
             distorted, by_xy = distort(xy, lens)

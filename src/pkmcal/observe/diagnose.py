@@ -43,9 +43,9 @@ ASSIGNED = 3
 """Rounds of names for photographs, and of the pose that these tell."""
 SEARCHED = 3
 """Hypotheses about the readings, likeliest first, that are searched in full."""
-ENOUGH, USUAL = 5, 15
-"""Photographs below which each has to be asked alone, and one that says little leaves it open
-whether the machine is there; and how many are usual."""
+ENOUGH, USUAL = 4, 15
+"""Photographs below which there are no two halves to search and to ask, and one that says little
+leaves it open whether the machine is there; and how many are usual."""
 PAIRS = 15
 """Pairs of stations that are searched for the other's pose: of six stations, all."""
 

@@ -326,8 +326,9 @@ def apart(view: StationView, candidates: Array, photographs: Integers) -> list[i
     pixel = edge_points(view.machine, view.camera, legs, view.tubes, 2).pixel
     kept: list[int] = []
     for h in range(len(candidates)):
-        off = np.sqrt(np.nansum((pixel[kept] - pixel[h]) ** 2, axis=-1)) / view.tables.scale
-        if all(np.nanmedian(other) > APART for other in off):
+        away = pixel[kept] - pixel[h]
+        off = np.nan_to_num(np.hypot(away[..., 0], away[..., 1])) / view.tables.scale
+        if all(np.median(other) > APART for other in off):
             kept.append(h)
     return kept
 
@@ -663,7 +664,7 @@ def _look(view: StationView, candidates: Array, photographs: Integers, samples: 
     shape = (len(candidates), -1, samples)
     return _Look(
         np.where(inside, found, FURTHER).reshape(shape),
-        np.where(inside, slope * points.gain, 0.0).reshape(shape),
+        (slope * np.where(inside, points.gain, 0.0)).reshape(shape),
         rare.reshape(shape),
         np.where(inside, length[..., None], 0.0).reshape(shape),
         begins,
