@@ -207,7 +207,7 @@ def _likelier(
     better = [
         (o, h)
         for o, f, h in zip(odds, searched, others, strict=True)
-        if _replaces(f, o - h.log_choices, station, in_order, asked)
+        if _replaces(f, o - h.log_choices, station, in_order or h.readings is None, asked)
     ]
     if not better:
         return None
@@ -226,18 +226,16 @@ def _replaces(
     found: FoundStation, odds: float, station: SeenStation, in_order: bool, asked: int
 ) -> bool:
     """Whether a hypothesis, found there, explains a station better than its own readings, by log
-    odds against these. Where they put the camera elsewhere than the user, and no other station
-    shows that they are in order, to be recognised where the user says is enough. In any case it has
-    to be recognised more surely by as much as there were others: of thirty that are asked of two
-    photographs of any machine, chance confirms one sooner or later.
+    odds against these; it has to be recognised more surely by as much as there were others, for of
+    thirty that are asked of two photographs of any machine, chance confirms one sooner or later.
+    Where its own readings put the camera elsewhere than the user, and no other station shows that
+    they are in order, to be recognised where the user says is enough.
     """
-    if not (found.good and found.by_chance * asked < found.limit):
-        return False
-    if station._replace(found=found).elsewhere:
+    if not found.good or station._replace(found=found).elsewhere:
         return False
     if station.elsewhere and station.found.good and not in_order:
         return True
-    return odds > DECIDED
+    return odds > DECIDED and found.by_chance * asked < found.limit
 
 
 def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
@@ -280,11 +278,11 @@ def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
 
 def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
     """Photographs under the names that fit each of them best; where the machine was not recognised,
-    mirrored ones.
+    or elsewhere than the user says, as its mirror image is, mirrored ones.
     """
     view, T_camera_base = station.view, station.found.T_camera_base
     names = view.configuration
-    if not station.found.good:
+    if station.elsewhere:
         mirrored = partial(replace, view, tables=view.tables.mirrored())
         yield Hypothesis(mirrored, _mirrored(station.name))
     if not 2 < len(names) == len(np.unique(names)):
