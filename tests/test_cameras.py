@@ -290,13 +290,30 @@ def test_derivatives_of_project(case, place):
     agrees(by_parameters, found, place.tolerance)
 
 
-def test_the_projection_with_its_derivatives_by_the_point(case, place):
-    """To rounding: a model may have both from one pass through its lens."""
+def test_the_projection_with_its_motion_along_directions(case, place):
+    """To rounding: a model may have all from one pass through its lens."""
     _, camera = case
     points = np.concatenate([rays_at(camera, place), [[0.0, 0.0, 0.0]]])
-    pixels, by_point = camera.project_by_point(points)
+    directions = np.random.default_rng(0).normal(size=(2, *points.shape))
+    pixels, *moved = camera.project_along(points, *directions)
     np.testing.assert_array_equal(pixels, camera.project(points))
-    np.testing.assert_array_equal(by_point, camera.project_jacobians(points)[0])
+    by_point = camera.project_jacobians(points)[0]
+    for found, direction in zip(moved, directions, strict=True):
+        told = (by_point @ direction[..., None])[..., 0]
+        # what is rounded are the terms of sums that may cancel
+        size = np.linalg.norm(by_point, axis=(1, 2)) * np.linalg.norm(direction, axis=1)
+        assert (np.abs(found - told).max(axis=1)[:-1] < 1e-12 * size[:-1]).all()
+        assert np.isnan(found[-1]).all()
+
+
+def test_a_search_may_ask_in_single_precision(case, place):
+    _, camera = case
+    points = rays_at(camera, place)
+    u = np.random.default_rng(1).normal(size=points.shape)
+    single = camera.project_along(points.astype(np.float32), u.astype(np.float32))
+    for found, told in zip(single, camera.project_along(points, u), strict=True):
+        scale = np.nanmax(np.abs(told))
+        np.testing.assert_allclose(found, told, rtol=1e-3, atol=1e-4 * scale)
 
 
 def test_derivatives_of_ray(case, place):

@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pkmcal.observe import diagnose
 from pkmcal.observe.diagnose import SeenStation, _numbering, mistake
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import StationView, find_station
+from pkmcal.observe.stations import FoundStation, StationView, find_station
 from pkmcal.observe.tables import distance_tables
 from test_observe_drawing import camera_of, draw, machine, photographs, poses, redrawn, tubes_at
 from test_observe_search import clouds, rough_pose
@@ -227,3 +228,25 @@ def test_another_machine_is_not_surely_recognised_and_nothing_is_renamed():
     assert not station.found.sure
     error = mistake([station], rng)
     assert error is None or "not recognised" in str(error)
+
+
+@pytest.mark.parametrize(("by_chance", "named"), [(5e-3, False), (1e-5, True)])
+def test_a_mix_up_is_recognised_more_surely_by_as_much_as_there_are_others(
+    monkeypatch, by_chance, named
+):
+    """Of two photographs in which the machine was not recognised, chance confirms one of thirty."""
+    rng, readings = np.random.default_rng(0), machine().inverse(poses())
+    found = FoundStation(rough_pose(4), 0.5, 1.0, 0.02, told=True)
+    two = looked_for(rng, pictures()[:2], readings[:2], by_hand=given(True))._replace(found=found)
+
+    def confirmed(view, _start, _rng):
+        return replace(found, by_chance=by_chance)
+
+    monkeypatch.setattr(diagnose, "find_station", confirmed)
+    monkeypatch.setattr(diagnose, "evidence_from", lambda view, _: 0.0 if view is two.view else 1e3)
+    error = mistake([two], rng)
+    assert error is not None
+    assert ("not recognised" in error.what) != named
+    if not named:
+        assert "2 photographs alone" in error.found
+        assert "of so few it cannot be said whether anything is mixed up" in error.next_step

@@ -289,16 +289,19 @@ def test_tables_hold_the_distance_to_an_edge_of_that_direction():
     # pixel each
     allowed = {"rtol": 0.05, "atol": 2 * tables.scale}
     np.testing.assert_allclose(found * tables.scale, np.abs(x - 319.5), **allowed)
-    smooth, _ = tables.look_smooth(upright, pixel, np.array(0))
+    right = np.array([1.0, 0.0])
+    smooth, slope, _ = tables.look_along(upright, pixel, right, np.array(0))
     np.testing.assert_allclose(smooth * tables.scale, np.abs(x - 319.5), **allowed)
+    np.testing.assert_allclose(slope[[0, 1, 3]] * tables.scale, [-1, -1, 1], rtol=0.05)
     assert tables.look(level, pixel, np.array(0))[0].min() > 100
 
 
 def test_outside_the_picture_and_without_an_image_nothing_is_inside():
     tables = distance_tables([blank(None)])
     pixel = np.array([[-5.0, 10.0], [700.0, 10.0], [10.0, 481.0], [np.nan, np.nan]])
-    for look in (tables.look, tables.look_smooth):
-        assert not look(np.zeros(4, dtype=int), pixel, np.zeros(4, dtype=int))[1].any()
+    zero = np.zeros(4, dtype=int)
+    assert not tables.look(zero, pixel, zero)[-1].any()
+    assert not tables.look_along(zero, pixel, np.zeros((4, 2)), zero)[-1].any()
 
 
 def test_edges_that_never_move_are_left_out_where_photographs_can_be_compared():

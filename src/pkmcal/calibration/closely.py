@@ -31,7 +31,7 @@ from pkmcal.measurements import concatenate
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, FINEST, Alone, distinct, turn_between, turned_about
 from pkmcal.observe.predict import tubes_of
-from pkmcal.observe.stations import StationView, evidence_of, grain, settle
+from pkmcal.observe.stations import StationView, grain, settle
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
 
@@ -117,9 +117,8 @@ def look_closer(
 
     def weigh(known: KnownScene, T: Array) -> None:
         seen = replace(view, machine=known.machine, all_poses=known.T_base_platform)
-        settled = settle(seen, T[None], one, 16, 6)
-        evidence = float(evidence_of(seen, settled, one, 16).sum())
-        weighed.append((evidence, known.paid(but=p.station) - before.paid(but=p.station)))
+        settled, evidence = settle(seen, T[None], one, 16, 6)
+        weighed.append((float(evidence[0]), known.paid(but=p.station) - before.paid(but=p.station)))
         places.append(settled[0])
 
     for T in (*found.T_camera_base[near][:CLOSER], *others):

@@ -21,6 +21,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.files import Schema
+from pkmcal.geometry.rigid import dot, of_components
 
 PositivePair = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
 PositiveSize = tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]
@@ -106,12 +107,16 @@ class Camera(ABC):
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project`: by the point (..., 2, 3), by parameters (..., 2, n)."""
 
-    def project_by_point(self, points: Array) -> tuple[Array, Array]:
-        """:meth:`project` (..., 2) and its derivatives by the point alone (..., 2, 3).
+    def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
+        """:meth:`project` (..., 2), and how it moves (..., 2) as points move along each of some
+        directions (..., 3), px by the unit of the points.
 
-        What a search asks for thousands of times; a model may have it for less.
+        What a search asks for thousands of times; a model may have it for less, in the precision of
+        the points.
         """
-        return self.project(points), self.project_jacobians(points)[0]
+        by_point = self.project_jacobians(points)[0]
+        moved = (of_components(*(dot(by_point[..., k, :], d) for k in (0, 1))) for d in directions)
+        return self.project(points), *moved
 
     @abstractmethod
     def ray(self, pixels: Array) -> Array:

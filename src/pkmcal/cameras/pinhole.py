@@ -25,7 +25,7 @@ def distort(xy: Array, k: Array) -> tuple[Array, Array]:
     Returns the distorted points (..., 2) and their derivatives by xy (..., 2, 2).
     """
     x, y = xy[..., 0], xy[..., 1]
-    k1, k2, p1, p2, k3 = k
+    k1, k2, p1, p2, k3 = k.tolist()
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial = slope * (x dx + y dy)
@@ -33,7 +33,7 @@ def distort(xy: Array, k: Array) -> tuple[Array, Array]:
         x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
         y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
     )
-    by_xy = np.empty((2, 2, *x.shape))
+    by_xy = np.empty((2, 2, *x.shape), dtype=xy.dtype)
     by_xy[0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
     by_xy[0, 1] = by_xy[1, 0] = x * y * slope + 2 * p1 * x + 2 * p2 * y
     by_xy[1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
@@ -145,23 +145,32 @@ class Pinhole(Camera):
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN behind the camera and beyond the fold."""
-        _, good, distorted, _ = self._imaged(points)
+        good, _, _, distorted, _ = self._imaged(points)
         return self._pixels(good, distorted)
 
-    def project_by_point(self, points: Array) -> tuple[Array, Array]:
-        """Both from one pass through the lens, and without the parameters' derivatives."""
-        xy, good, distorted, by_xy = self._imaged(points)
-        return self._pixels(good, distorted), self._by_point(points, xy, good, by_xy)
+    def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
+        """All from one pass through the lens, if there is one."""
+        good, z, xy, distorted, by_xy = self._imaged(points)
+        z = np.where(good, z, np.nan)
+        moved: list[Array] = []
+        for d in directions:
+            # x/z and y/z move by (dx - x/z dz) / z
+            own = [(d[..., k] - xy[..., k] * d[..., 2]) / z for k in (0, 1)]
+            if by_xy is not None:
+                own = [by_xy[..., k, 0] * own[0] + by_xy[..., k, 1] * own[1] for k in (0, 1)]
+            scaled = zip(self.parameters[:2].tolist(), own, strict=True)
+            moved.append(of_components(*(focal * part for focal, part in scaled)))
+        return self._pixels(good, distorted), *moved
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
-        xy, good, distorted, by_xy = self._imaged(points)
+        good, z, xy, distorted, by_xy = self._imaged(points)
         by_parameters = np.zeros((*points.shape[:-1], 2, 9))
         by_parameters[..., 0, 0], by_parameters[..., 1, 1] = distorted[..., 0], distorted[..., 1]
         by_parameters[..., 0, 2] = by_parameters[..., 1, 3] = 1.0
         by_parameters[..., 4:] = self.parameters[:2, None] * distort_by_coefficients(xy)
         return (
-            self._by_point(points, xy, good, by_xy),
+            self._by_point(np.where(good, z, np.nan), xy, by_xy),
             np.where(good[..., None, None], by_parameters, np.nan),
         )
 
@@ -173,17 +182,18 @@ class Pinhole(Camera):
 
     def in_field(self, points: Array) -> Booleans:
         """In front of the camera, and before the lens polynomial folds back; (...)."""
-        return self._imaged(points)[1]
+        return self._imaged(points)[0]
 
     def _pixels(self, good: Booleans, distorted: Array) -> Array:
-        focal, center = self.parameters[:2], self.parameters[2:4]
+        focal, center = self.parameters[:2].tolist(), self.parameters[2:4].tolist()
         return of_components(
             *(np.where(good, focal[i] * distorted[..., i] + center[i], np.nan) for i in (0, 1))
         )
 
-    def _by_point(self, points: Array, xy: Array, good: Booleans, by_xy: Array) -> Array:
+    def _by_point(self, z: Array, xy: Array, by_xy: Array | None) -> Array:
         """Derivatives (..., 2, 3): x/z and y/z have 1/z by x and by y, and -(x/z, y/z)/z by z."""
-        z = np.where(good, points[..., 2], np.nan)
+        if by_xy is None:
+            by_xy = np.broadcast_to(np.eye(2), (*z.shape, 2, 2))
         out = np.empty((2, 3, *z.shape))
         for row, own, focal in zip(out, (0, 1), self.parameters[:2], strict=True):
             scale = focal / z
@@ -192,12 +202,18 @@ class Pinhole(Camera):
             row[2] = scale * -dot(by_xy[..., own, :], xy)
         return np.moveaxis(out, (0, 1), (-2, -1))
 
-    def _imaged(self, points: Array) -> tuple[Array, Booleans, Array, Array]:
-        """x/z and y/z (..., 2), where they have an image (...), and :func:`distort` of them."""
+    def _imaged(self, points: Array) -> tuple[Booleans, Array, Array, Array, Array | None]:
+        """Where points have an image, and z there (...); x/z and y/z (..., 2); :func:`distort` of
+        these, which leaves them as they are, without a derivative, where the lens has none.
+        """
         z = points[..., 2]
         front = z > 1e-9
         z = np.where(front, z, 1.0)
         xy = of_components(points[..., 0] / z, points[..., 1] / z)
-        distorted, by_xy = distort(xy, self.parameters[4:])
-        good = front & unfolded(xy, by_xy, self.parameters[4:])
-        return xy, good, distorted, by_xy
+        lens = self.parameters[4:]
+        if not lens.any():
+            # what is no number, or infinitely far aside, has no image
+            return front & np.isfinite(xy[..., 0] + xy[..., 1]), z, xy, xy, None
+        with np.errstate(over="ignore", invalid="ignore"):  # of points almost beside the camera
+            distorted, by_xy = distort(xy, lens)
+            return front & unfolded(xy, by_xy, lens), z, xy, distorted, by_xy

@@ -16,6 +16,7 @@ from pydantic import Field
 from pkmcal.arrays import Array, Booleans
 from pkmcal.cameras.contract import Camera, CameraSchema
 from pkmcal.cameras.pinhole import distort, distort_by_coefficients, undistort, unfolded
+from pkmcal.geometry.rigid import dot, of_components
 
 _LEAST = 1e-9
 """Cosine by which a ray must lie inside the field's border, where the image runs to infinity."""
@@ -49,12 +50,28 @@ class Unified(Camera):
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of points (..., 3); NaN outside the field."""
         distorted, good = self._imaged(points)[2:4]
-        focal, center = self.parameters[:2], self.parameters[2:4]
-        return np.where(good[..., None], focal * distorted + center, np.nan)
+        return self._pixels(good, distorted)
+
+    def project_along(self, points: Array, *directions: Array) -> tuple[Array, ...]:
+        """All from one pass through the lens, if there is one."""
+        (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
+        depth = np.where(good, depth, np.nan)
+        bend = self.xi / distance
+        moved: list[Array] = []
+        for d in directions:
+            # x / w moves by (dx - (x / w) dw) / w with w = z + xi r and dw = xi X / r . dX + dz
+            dw = bend * dot(points, d) + d[..., 2]
+            own = [(d[..., k] - xy[..., k] * dw) / depth for k in (0, 1)]
+            if by_xy is not None:
+                own = [by_xy[..., k, 0] * own[0] + by_xy[..., k, 1] * own[1] for k in (0, 1)]
+            scaled = zip(self.parameters[:2].tolist(), own, strict=True)
+            moved.append(of_components(*(focal * part for focal, part in scaled)))
+        return self._pixels(good, distorted), *moved
 
     def project_jacobians(self, points: Array) -> tuple[Array, Array]:
         """Derivatives of :meth:`project` by the point (..., 2, 3) and parameters (..., 2, 9)."""
         (distance, depth), xy, distorted, good, by_xy = self._imaged(points)
+        by_xy = np.eye(2) if by_xy is None else by_xy
         focal = self.parameters[:2, None]
         # d(x / w) = (dx - (x / w) dw) / w with w = z + xi r and dw = (xi X / r + e_z) . dX
         slope = self.xi * points / distance[..., None]
@@ -90,15 +107,24 @@ class Unified(Camera):
         """Where one ray, and only one, has the point's image; (...)."""
         return self._imaged(points)[3]
 
+    def _pixels(self, good: Booleans, distorted: Array) -> Array:
+        focal, center = self.parameters[:2].tolist(), self.parameters[2:4].tolist()
+        return of_components(
+            *(np.where(good, focal[i] * distorted[..., i] + center[i], np.nan) for i in (0, 1))
+        )
+
     def _five(self) -> Array:
         """Distortion in the pinhole's order, without a third radial term."""
         return np.append(self.parameters[5:], 0.0)
 
-    def _imaged(self, points: Array) -> tuple[tuple[Array, Array], Array, Array, Booleans, Array]:
+    def _imaged(
+        self, points: Array
+    ) -> tuple[tuple[Array, Array], Array, Array, Booleans, Array | None]:
         """Distance r and depth z + xi r (...); x and y over the depth (..., 2); :func:`distort`
-        of these; where they have an image (...); the distortion's derivative by these.
+        of these, which leaves them as they are, without a derivative, where the lens has none;
+        where they have an image (...); the distortion's derivative by these.
         """
-        distance = np.sqrt(np.sum(points * points, axis=-1))
+        distance = np.sqrt(dot(points, points))
         there = distance > 0
         distance = np.where(there, distance, 1.0)
         depth = points[..., 2] + self.xi * distance
@@ -106,7 +132,10 @@ class Unified(Camera):
         edge = -min(self.xi, 1 / self.xi) if self.xi > 0 else 0.0
         inside = there & (points[..., 2] > (edge + _LEAST) * distance)
         depth = np.where(inside, depth, 1.0)
-        xy = points[..., :2] / depth[..., None]
-        distorted, by_xy = distort(xy, self._five())
-        good = inside & unfolded(xy, by_xy, self._five())
+        xy = of_components(points[..., 0] / depth, points[..., 1] / depth)
+        if not self.parameters[5:].any():
+            return (distance, depth), xy, xy, inside & np.isfinite(xy[..., 0] + xy[..., 1]), None
+        with np.errstate(over="ignore", invalid="ignore"):  # of points at the field's border
+            distorted, by_xy = distort(xy, self._five())
+            good = inside & unfolded(xy, by_xy, self._five())
         return (distance, depth), xy, distorted, good, by_xy

@@ -55,7 +55,8 @@ def of_components(*parts: Array) -> Array:
 
     In memory the components are slowest, so that NumPy runs along many vectors at once.
     """
-    out = np.empty((len(parts), *np.broadcast_shapes(*(part.shape for part in parts))))
+    shape = np.broadcast_shapes(*(part.shape for part in parts))
+    out = np.empty((len(parts), *shape), dtype=np.result_type(*parts))
     for k, part in enumerate(parts):
         out[k] = part
     return out.transpose(*range(1, out.ndim), 0)

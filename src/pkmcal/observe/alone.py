@@ -90,8 +90,8 @@ def find_alone(view: StationView, image: Integers) -> Alone:
     found = _most(coarse, found, 4, FEWER)
     found = descend(coarse, found, one, 4, (8, 7, 6, 5, 5))
     found = _most(coarse, found, 5, FEW)
-    found = settle(fine, found, one, 8, 6)
-    found = _most(fine, found, 8, FEW)
+    found, evidence = settle(fine, found, one, 8, 6)
+    found = found[np.argsort(-evidence)]
     found = found[apart(fine, found, one)][:FEWEST]
     return weighed(view, image, np.concatenate([found, turned_about(view, found[:2])]))
 
@@ -100,8 +100,7 @@ def weighed(view: StationView, image: Integers, found: Array) -> Alone:
     """Places (H, 4, 4) settled on the finest tables, those that are not the same place."""
     one = np.zeros(1, dtype=int)
     view = replace(view, tables=distance_tables([image], *FINEST))
-    found = settle(view, found, one, 16, 6)
-    evidence = evidence_of(view, found, one, 16).sum(axis=-1)
+    found, evidence = settle(view, found, one, 16, 6)
     order = np.argsort(-evidence)
     order = order[evidence[order] > 0]
     if not len(order):

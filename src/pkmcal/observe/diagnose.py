@@ -9,8 +9,9 @@ machine that was recognised is asked too: with two columns exchanged, four legs 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, islice
 from typing import NamedTuple
 
@@ -42,6 +43,9 @@ ASSIGNED = 3
 """Rounds of names for photographs, and of the pose that these tell."""
 SEARCHED = 3
 """Hypotheses about the readings, likeliest first, that are searched in full."""
+ENOUGH, USUAL = 4, 15
+"""Photographs below which there are no two halves to search and to ask, and one that says little
+leaves it open whether the machine is there; and how many are usual."""
 PAIRS = 15
 """Pairs of stations that are searched for the other's pose: of six stations, all."""
 
@@ -74,12 +78,14 @@ class SeenStation(NamedTuple):
 
 class Hypothesis(NamedTuple):
     """What the photographs may show instead, the error that names it, and the logarithm of how many
-    of its kind it was chosen from.
+    of its kind it was chosen from. readings : (K, m) that the photographs would have, where nothing
+    else is another.
     """
 
-    view: StationView
+    view: Callable[[], StationView]
     error: InputError
     log_choices: float = 0.0
+    readings: Array | None = None
 
 
 def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError | None:
@@ -96,17 +102,25 @@ def mistake(stations: list[SeenStation], rng: np.random.Generator) -> InputError
         return error
     if not bad:  # readings are wrong for all stations, but names for one alone
         rest = (station for station in stations if station is not worst)
-        errors = (_likelier(s, list(_other_photographs(s)), True, rng) for s in rest)
+        named = ((s, list(_other_photographs(s))) for s in rest)
+        errors = (_likelier(s, others, True, rng, len(others)) for s, others in named)
         return next((error for error in errors if error is not None), None)
     others = [station.name for station in bad if station is not worst]
+    at = ", nor in those of " + listed(others) if others else ""
+    few = len(worst.view.configuration) < ENOUGH
     return InputError(
-        f"the machine is not recognised in the photographs of {worst.name}"
-        + (f", nor in those of {listed(others)}" if others else ""),
+        f"the machine is not recognised in the photographs of {worst.name}{at}",
         where=f"session.yaml, stations.{worst.name}",
         found=_little(worst),
         expected="one place where its legs lie on edges of the picture far oftener than any"
         " machine's would",
-        next_step="Check that these photographs show this machine's legs, that each bears the name"
+        next_step=(
+            f"Take more photographs from there, {USUAL} are usual: of so few it cannot be said"
+            " whether anything is mixed up. If there are more, check"
+            if few
+            else "Check"
+        )
+        + " that these photographs show this machine's legs, that each bears the name"
         " of its configuration, and that the drawing is this machine's"
         + ("" if worst.by_hand is not None else "; a pose by hand, right to 10 cm, may help"),
     )
@@ -117,10 +131,12 @@ def _little(station: SeenStation) -> str:
     found = station.found
     if found.by_chance < found.limit:
         return "legs that fit nearly as well at another place"
-    if len(station.view.configuration) < 2:
+    count = len(station.view.configuration)
+    if count < 2:
         return "one photograph alone, and none to confirm what it seems to show"
     often = f"once in {1 / found.by_chance:.0f} times" if found.by_chance < 0.5 else "as a rule"
-    return f"legs that readings of other configurations fit as well {often}"
+    few = f"{count} photographs alone, and " if count < ENOUGH else ""
+    return f"{few}legs that readings of other configurations fit as well {often}"
 
 
 def _swapped_stations(stations: list[SeenStation], rng: np.random.Generator) -> InputError | None:
@@ -155,32 +171,43 @@ def _mixed_up(station: SeenStation, in_order: bool, rng: np.random.Generator) ->
     if wide and station.by_hand is not None:
         starts.append(station.by_hand)
     begin = np.array(starts).reshape(-1, 4, 4)
-    own = evidence_nearby(view, begin, wide, rng)
-    likely: list[tuple[float, Hypothesis]] = []
-    for other in _hypotheses(station):
-        evidence = evidence_nearby(other.view, begin, wide, rng)
-        # where the machine is as the user says, another word has to be better there at once
-        if evidence > own or station.elsewhere:
-            likely.append((evidence, other))
-    best = [other for _, other in sorted(likely, key=lambda item: -item[0])[:SEARCHED]]
-    return _likelier(station, [*_other_photographs(station), *best], in_order, rng)
+    hypotheses = list(_hypotheses(station))
+    shown = [h.readings for h in hypotheses if h.readings is not None]
+    own, *evidence = evidence_nearby(view, np.stack([view.joints, *shown]), begin, wide, rng)
+    for h in hypotheses[len(evidence) :]:  # other legs, with the same readings
+        other = h.view()
+        evidence.append(evidence_nearby(other, other.joints[None], begin, wide, rng)[0])
+    # where the machine is as the user says, another word has to be better there at once
+    likely = [k for k, e in enumerate(evidence) if e > own or station.elsewhere]
+    likely.sort(key=lambda k: -evidence[k])
+    best = [hypotheses[k] for k in likely[:SEARCHED]]
+    others = list(_other_photographs(station))
+    asked = len(hypotheses) + len(others)
+    return _likelier(station, [*others, *best], in_order, rng, asked)
 
 
 def _likelier(
-    station: SeenStation, others: list[Hypothesis], in_order: bool, rng: np.random.Generator
+    station: SeenStation,
+    others: list[Hypothesis],
+    in_order: bool,
+    rng: np.random.Generator,
+    asked: int,
 ) -> InputError | None:
     """The likeliest of hypotheses, searched in full, that explain a station better than the
-    session, if any; with it those that it does not exclude.
+    session, if any; with it those that it does not exclude. asked : of how many they are the best.
     """
+    if not others:
+        return None
     view, found = station.view, station.found
-    searched = [(find_station(h.view, station.by_hand, rng), h) for h in others]
-    places = np.stack([found.T_camera_base, *(f.T_camera_base for f, _ in searched)])
+    seen = [h.view() for h in others]
+    searched = [find_station(other, station.by_hand, rng) for other in seen]
+    places = np.stack([found.T_camera_base, *(f.T_camera_base for f in searched)])
     named = evidence_from(view, places)
-    odds = [(evidence_from(h.view, places) - named) / found.grain for _, h in searched]
+    odds = [(evidence_from(other, places) - named) / found.grain for other in seen]
     better = [
         (o, h)
-        for o, (f, h) in zip(odds, searched, strict=True)
-        if _replaces(f, o - h.log_choices, station, in_order)
+        for o, f, h in zip(odds, searched, others, strict=True)
+        if _replaces(f, o - h.log_choices, station, in_order or h.readings is None, asked)
     ]
     if not better:
         return None
@@ -195,16 +222,20 @@ def _likelier(
     return InputError(error.what, where=error.where, found=said, next_step=error.next_step)
 
 
-def _replaces(found: FoundStation, odds: float, station: SeenStation, in_order: bool) -> bool:
+def _replaces(
+    found: FoundStation, odds: float, station: SeenStation, in_order: bool, asked: int
+) -> bool:
     """Whether a hypothesis, found there, explains a station better than its own readings, by log
-    odds against these. Where they put the camera elsewhere than the user, and no other station
-    shows that they are in order, to be recognised where the user says is enough.
+    odds against these; it has to be recognised more surely by as much as there were others, for of
+    thirty that are asked of two photographs of any machine, chance confirms one sooner or later.
+    Where its own readings put the camera elsewhere than the user, and no other station shows that
+    they are in order, to be recognised where the user says is enough.
     """
     if not found.good or station._replace(found=found).elsewhere:
         return False
     if station.elsewhere and station.found.good and not in_order:
         return True
-    return odds > DECIDED
+    return odds > DECIDED and found.by_chance * asked < found.limit
 
 
 def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
@@ -214,40 +245,46 @@ def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
     view = station.view
     count = view.all_joints.shape[1]
     own = np.arange(count)
-    tried = {tuple(own.tolist())}
+    exchanged: dict[tuple[int, ...], InputError] = {}
     for a, b in combinations(range(count), 2):
         order = own.copy()
         order[[a, b]] = b, a
-        tried.add(tuple(order.tolist()))
-        yield Hypothesis(view.with_joints(view.all_joints[:, order]), _two_legs(a + 1, b + 1))
+        exchanged[tuple(order.tolist())] = _two_legs(a + 1, b + 1)
     turned = [np.roll(own, -r) for r in range(1, count)]
     turned += [np.roll(own[::-1], r) for r in range(count)]
     if station.found.good and station.by_hand is None:
         turned = []  # of a machine with equal thirds, any of its equal numberings would do as well
     for order in turned:
-        if tuple(order.tolist()) not in tried:
-            tried.add(tuple(order.tolist()))
-            yield Hypothesis(view.with_joints(view.all_joints[:, order]), _numbering(order))
+        exchanged.setdefault(tuple(order.tolist()), _numbering(order))
+    exchanged.pop(tuple(own.tolist()), None)
+    for columns, error in exchanged.items():
+        joints = view.all_joints[:, columns]
+        readings = joints[view.configuration]
+        yield Hypothesis(partial(view.with_joints, joints), error, readings=readings)
     names = view.configuration
     if 2 < len(names) == len(np.unique(names)):
         for step in (1, -1):
-            yield Hypothesis(replace(view, configuration=np.roll(names, step)), _shifted(step))
+            shifted = partial(replace, view, configuration=np.roll(names, step))
+            readings = view.all_joints[np.roll(names, step)]
+            yield Hypothesis(shifted, _shifted(step), readings=readings)
     # thin legs of few pixels are as likely to be thinner still, and two photographs of right ones
     # can fit so by chance: only where nothing else explains
     if not station.found.good and len(names) > 2:
         values = view.machine.values.copy()
         values[np.unique(view.tubes.radius)] /= 2
-        yield Hypothesis(replace(view, machine=view.machine.with_values(values)), _diameters())
+        thinner = partial(replace, view, machine=view.machine.with_values(values))
+        yield Hypothesis(thinner, _diameters())
 
 
 def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
     """Photographs under the names that fit each of them best; where the machine was not recognised,
-    mirrored ones.
+    or elsewhere than the user says, as its mirror image is, mirrored ones.
     """
     view, T_camera_base = station.view, station.found.T_camera_base
     names = view.configuration
-    if not station.found.good:
-        yield Hypothesis(replace(view, tables=view.tables.mirrored()), _mirrored(station.name))
+    if station.elsewhere:
+        mirrored = partial(replace, view, tables=view.tables.mirrored())
+        yield Hypothesis(mirrored, _mirrored(station.name))
     if not 2 < len(names) == len(np.unique(names)):
         return
     columns = np.arange(len(names))
@@ -263,7 +300,7 @@ def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
         T_camera_base = settled(replace(view, configuration=names[columns]), T_camera_base)
     moved = np.flatnonzero(columns != np.arange(len(names)))
     if 0 < len(moved) <= len(names) // 2:
-        right = replace(view, configuration=names[columns])
+        right = partial(replace, view, configuration=names[columns])
         error = _misnamed(station, moved, names[columns[moved]])
         yield Hypothesis(right, error, len(moved) * choices)
 

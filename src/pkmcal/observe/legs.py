@@ -23,6 +23,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
 from pkmcal.geometry.cylinders import SIDE_SIGNS
+from pkmcal.geometry.rigid import of_components
 from pkmcal.measurements import EdgeSet, Rejection, concatenate
 from pkmcal.mechanisms import Machine
 from pkmcal.observe import profiles
@@ -116,13 +117,19 @@ def sample(images: Iterable[Any], pixel: Array, cubic: bool = True) -> Array:
 
     kind = cv2.INTER_CUBIC if cubic else cv2.INTER_LINEAR
     # one row an edge: cv2.remap takes at most 32767 rows and columns
-    flat = np.nan_to_num(pixel.reshape(*pixel.shape[:2], -1, 2), nan=-9.0).astype(np.float32)
-    out = np.empty(flat.shape[:3], dtype=np.float32)
-    for image, at, grey in zip(images, flat, out, strict=True):
-        x, y = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
+    shape = (*pixel.shape[:2], -1)
+    x, y = (
+        np.nan_to_num(np.asarray(pixel[..., k], np.float32), nan=-9.0).reshape(shape)
+        for k in (0, 1)
+    )
+    out = np.empty(x.shape, dtype=np.float32)
+    columns: Any
+    rows: Any
+    grey: Any
+    for image, columns, rows, grey in zip(images, x, y, out, strict=True):
         # floats, because cv2 rounds what it interpolates in bytes to whole grey levels
-        levels = image.astype(np.float32)
-        cv2.remap(levels, x, y, kind, dst=grey, borderMode=cv2.BORDER_REPLICATE)
+        levels = image.astype(np.float32, copy=False)
+        cv2.remap(levels, columns, rows, kind, dst=grey, borderMode=cv2.BORDER_REPLICATE)
     return out.reshape(pixel.shape[:-1])
 
 
@@ -137,26 +144,42 @@ def search_legs(
 
     images : K arrays (height, width), float32 or uint8. points, clear : predictions (K, E, n).
     """
-    strength, offsets = gradient_strength(images, points, reach + TILTS[-1])
+    strength = gradient_strength(images, points, reach + TILTS[-1])[0]
     weight = clear.astype(np.float32)
-    sign = SIDE_SIGNS[tubes.side]
     steps = np.arange(-reach, reach + 0.5)
-    legs = range(tubes.leg.max() + 1)
     place = place_on_leg(points.along, clear, tubes)
-    scores = np.zeros((len(images), tubes.leg.max() + 1, len(TILTS), len(steps)), np.float32)
-    k, e, n = np.ogrid[: clear.shape[0], : clear.shape[1], : clear.shape[2]]
-    for i, tilt in enumerate(TILTS):
-        at = sign[:, None, None] * (steps + tilt * place[..., None])
-        column = np.rint(at - offsets[0]).astype(np.intp)
-        value = strength[k[..., None], e[..., None], n[..., None], column]
-        # a sum over all edges of a leg, as a matrix product over its edges
-        by_edge = np.einsum("kens,ken->kes", value, weight)
-        for leg in legs:
-            scores[:, leg, i] = by_edge[:, tubes.leg == leg].sum(axis=1)
+    scores = _by_tilt(strength * weight[..., None], place, TILTS, len(steps), tubes)
+    legs = range(tubes.leg.max() + 1)
     total = np.stack([weight[:, tubes.leg == leg].sum(axis=(1, 2)) for leg in legs], axis=1)
     points_of = np.array([max(int((tubes.leg == leg).sum()) * clear.shape[2], 1) for leg in legs])
     scores /= np.maximum(total, 1.0)[..., None, None]
     return _choose(scores, total, total / points_of, steps)
+
+
+def _by_tilt(values: Array, place: Array, tilts: Array, count: int, tubes: TubeList) -> Array:
+    """Sums (K, L, tilts, count) over all points of a leg, of values (K, E, n, steps) at steps
+    outward, for each shift and tilt of the whole leg towards side 0.
+
+    place : (K, E, n) of the points on their legs. tilts : in steps. The shifts, of which there are
+    fewer than steps, lie about the middle; beyond the steps, their last value holds.
+    """
+    towards = np.where((SIDE_SIGNS[tubes.side] > 0)[:, None, None], values, values[..., ::-1])
+    room = (values.shape[-1] - count) // 2
+    beyond = max(int(np.ceil(tilts[-1])) - room, 0)
+    if beyond:
+        ends = towards[..., :1], towards[..., -1:]
+        wide = [np.broadcast_to(end, (*end.shape[:-1], beyond)) for end in ends]
+        towards = np.concatenate([wide[0], towards, wide[1]], axis=-1)
+    step = np.arange(count, dtype=np.int32) + (room + beyond)
+    row = np.arange(place.size, dtype=np.int32).reshape(place.shape) * towards.shape[-1]
+    flat = towards.ravel()
+    out = np.zeros((len(values), tubes.leg.max() + 1, len(tilts), count), values.dtype)
+    for i, tilt in enumerate(tilts):
+        first = row + np.rint(tilt * place).astype(np.int32)
+        by_edge = flat.take(first[..., None] + step).sum(axis=2)
+        for leg in range(out.shape[1]):
+            out[:, leg, i] = by_edge[:, tubes.leg == leg].sum(axis=1)
+    return out
 
 
 def gradient_strength(
@@ -168,10 +191,17 @@ def gradient_strength(
     """
     offsets = np.arange(-np.ceil(reach), np.ceil(reach) + 1)
     wide = np.concatenate([[offsets[0] - 1], offsets, [offsets[-1] + 1]])
-    pixel = points.pixel[..., None, :] + wide[:, None] * points.outward[..., None, :]
+    wide = wide.astype(np.float32)
+    x, y = (
+        points.pixel[..., None, k].astype(np.float32)
+        + wide * points.outward[..., None, k].astype(np.float32)
+        for k in (0, 1)
+    )
+    pixel = of_components(x, y)
     import cv2
 
-    smooth = (cv2.GaussianBlur(im.astype(np.float32), (0, 0), SMOOTH) for im in images)
+    kernel = cv2.getGaussianKernel(2 * round(4 * SMOOTH) + 1, SMOOTH, cv2.CV_32F)
+    smooth = (cv2.sepFilter2D(im, cv2.CV_32F, kernel, kernel) for im in images)
     level = np.sqrt(255.0 * sample(smooth, pixel, cubic=False))
     slope = np.abs(level[..., 2:] - level[..., :-2]) / 2
     about = np.ones((1, 2 * PEAK + 1), np.uint8)
@@ -426,9 +456,11 @@ def _profile_pixels(camera: Camera, points: EdgePoints) -> Array:
     """
     start, step = points.point[..., :1, :], np.diff(points.point[..., :2, :], axis=-2)
     fraction = (np.arange(PLACES * BETWEEN) + 0.5) / BETWEEN - 0.5
-    pixel = camera.project(start + fraction[:, None] * step)
-    outward = np.repeat(points.outward, BETWEEN, axis=-2)
-    return pixel[..., None, :] + profiles.profile_offsets()[:, None] * outward[..., None, :]
+    along = of_components(*(start[..., k] + fraction * step[..., k] for k in range(3)))
+    pixel = camera.project(along).astype(np.float32)
+    outward = np.repeat(points.outward.astype(np.float32), BETWEEN, axis=-2)
+    away = profiles.profile_offsets().astype(np.float32)
+    return of_components(*(pixel[..., None, k] + away * outward[..., None, k] for k in (0, 1)))
 
 
 def _segment_profiles(
@@ -439,13 +471,12 @@ def _segment_profiles(
     Returns where there are enough of them, (K, E, SEGMENTS), and the profiles there.
     """
     k, e, n = clear.shape
-    grey = grey.reshape(k, e, SEGMENTS, n // SEGMENTS, -1)
-    weight = clear.reshape(k, e, SEGMENTS, n // SEGMENTS)
-    count = weight.sum(axis=-1)
-    full = count >= FEWEST_SHARE * weight.shape[-1]
-    kept, weight = grey[full], weight[full][..., None]
-    mean = np.sum(kept * weight, axis=-2) / count[full][:, None]
-    saturated = np.any((kept >= profiles.SATURATED) & weight, axis=-2)
+    seen = clear.reshape(k, e, SEGMENTS, n // SEGMENTS)
+    count = seen.sum(axis=-1)
+    full = count >= FEWEST_SHARE * seen.shape[-1]
+    kept = grey.reshape(*seen.shape, -1) * seen[..., None]
+    mean = kept.sum(axis=-2)[full] / count[full][:, None]
+    saturated = kept.max(axis=-2)[full] >= profiles.SATURATED
     cut = profiles.cut_of(saturated, half_width[full])
     return full, profiles.Profiles(mean, count[full], half_width[full], cut)
 
@@ -456,23 +487,16 @@ def _leg_lines(likelihood: Array, along: Array, full: Booleans, tubes: TubeList)
     likelihood : (N, shifts) of the profiles at ``full`` (K, E, n). A leg is shifted and tilted as a
     whole: a highlight beside one edge is likelier there than the edge, but not for all of them.
     """
-    k, e, n = np.ogrid[: full.shape[0], : full.shape[1], : full.shape[2]]
-    every = np.zeros((*full.shape, likelihood.shape[-1]))
+    every = np.zeros((*full.shape, likelihood.shape[-1]), np.float32)
     every[full] = likelihood
-    sign, place = SIDE_SIGNS[tubes.side], place_on_leg(along, full, tubes)
-    steps, count = profiles.SHIFTS, len(profiles.SHIFTS)
-    pitch = steps[1] - steps[0]
-    score = np.zeros((len(full), tubes.leg.max() + 1, len(LEG_TILTS), count))
-    for i, tilt in enumerate(LEG_TILTS):
-        at = sign[:, None, None] * (steps + tilt * place[..., None])
-        column = np.clip(np.rint((at - steps[0]) / pitch), 0, count - 1).astype(np.intp)
-        by_edge = every[k[..., None], e[..., None], n[..., None], column].sum(axis=2)
-        for leg in range(score.shape[1]):
-            score[:, leg, i] = by_edge[:, tubes.leg == leg].sum(axis=1)
+    place = place_on_leg(along, full, tubes)
+    steps = profiles.SHIFTS
+    tilts = LEG_TILTS / (steps[1] - steps[0])
+    score = _by_tilt(every, place, tilts, len(steps), tubes)
     best = score.reshape(*score.shape[:2], -1).argmax(axis=-1)
     tilt, shift = np.unravel_index(best, score.shape[2:])
     shift, tilt = (v[:, tubes.leg][..., None] for v in (steps[shift], LEG_TILTS[tilt]))
-    return (sign[:, None] * (shift + tilt * place))[full]
+    return (SIDE_SIGNS[tubes.side][:, None] * (shift + tilt * place))[full]
 
 
 def _rejections(

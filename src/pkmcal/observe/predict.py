@@ -65,9 +65,34 @@ class LegsInCamera:
     b: Array
     u: Array
 
-    def __getitem__(self, at: Any) -> LegsInCamera:
-        """Those of some cameras or photographs."""
-        return LegsInCamera(self.a[at], self.b[at], self.u[at])
+    def __getitem__(self, which: Any) -> LegsInCamera:
+        """Some of them, by their leading axes."""
+        return LegsInCamera(self.a[which], self.b[which], self.u[which])
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+    def single(self) -> LegsInCamera:
+        """The same in single precision, which is enough for a search in reduced photographs."""
+        return LegsInCamera(*(v.astype(np.float32) for v in (self.a, self.b, self.u)))
+
+    def joined(self, other: LegsInCamera) -> LegsInCamera:
+        """Both, along their first axis."""
+        pairs = (self.a, other.a), (self.b, other.b), (self.u, other.u)
+        return LegsInCamera(*(np.concatenate(pair) for pair in pairs))
+
+    def moved(self, T_camera_base: Array) -> LegsInCamera:
+        """Legs (K, L) or (H, K, L) of another frame as cameras (H, 4, 4) see them, (H, K, L)."""
+        T = T_camera_base.astype(self.a.dtype)
+        count = len(T)
+
+        def turned(v: Array, shift: Array | float) -> Array:
+            flat = v.reshape(*v.shape[:-3], -1, 3)
+            out = T[:, :3, :3] @ flat.mT + shift  # (H, 3, K L): one component after the other
+            return np.moveaxis(out.reshape(count, 3, *v.shape[-3:-1]), 1, -1)
+
+        return LegsInCamera(turned(self.a, T[:, :3, 3:]), turned(self.b, T[:, :3, 3:]),
+                            turned(self.u, 0.0))  # fmt: skip
 
 
 def legs_in_camera(
@@ -103,9 +128,15 @@ class EdgePoints:
     point: Array
     pixel: Array
     outward: Array
-    across: Array
     gain: Array
     valid: Booleans
+
+    @property
+    def across(self) -> Array:
+        """Outward motion of the pixel (px) by the point's (m), (..., E, n, 3): motions within the
+        edge's plane do not leave the edge.
+        """
+        return self.gain[..., None] * self.normal[..., None, :]
 
     def by_normal(self) -> Array:
         """Outward motion of the edge (px) by a change of its plane's normal, (..., E, n, 3).
@@ -118,27 +149,27 @@ class EdgePoints:
 def edge_points(
     machine: Machine, camera: Camera, legs: LegsInCamera, tubes: TubeList, samples: int
 ) -> EdgePoints:
-    """``samples`` points spaced evenly along every edge; leading axes as ``legs`` has them."""
-    radius = machine.values[tubes.radius]
+    """``samples`` points spaced evenly along every edge; leading axes, and the numbers' precision,
+    as ``legs`` has them.
+    """
+    radius = machine.values[tubes.radius].astype(legs.a.dtype)
     a, b, u = of_edges(legs, tubes)
     normal, ok = plane_normals(a, u, radius, tubes)
     first, last = visible_stretch(a, b, tubes)
-    fraction = (np.arange(samples) + 0.5) / samples
+    fraction = ((np.arange(samples) + 0.5) / samples).astype(a.dtype)
     along = first[:, None] + np.maximum(last - first, 0.0)[..., None] * fraction
     base = a + radius[:, None] * normal
     point = of_components(*(base[..., None, k] + along * u[..., None, k] for k in range(3)))
-    pixel, by_point = camera.project_by_point(point)
-    x, y = (dot(by_point[..., k, :], u[..., None, :]) for k in (0, 1))
-    with np.errstate(invalid="ignore", divide="ignore"):
+    pixel, by_place, by_shift = camera.project_along(point, u[..., None, :], normal[..., None, :])
+    x, y = by_place[..., 0], by_place[..., 1]
+    # beside the camera nothing has an image, and what almost has one lies anywhere
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         length = np.sqrt(y * y + x * x)
         outward = of_components(-y / length, x / length)
-    across = outward[..., :1] * by_point[..., 0, :] + outward[..., 1:] * by_point[..., 1, :]
-    gain = dot(across, normal[..., None, :])
-    sign = np.sign(gain)[..., None]
+        gain = dot(outward, by_shift)
+        outward = outward * np.sign(gain)[..., None]
     valid = (ok & (last > first))[..., None] & np.isfinite(gain)
-    return EdgePoints(
-        normal, along, point, pixel, outward * sign, across * sign, np.abs(gain), valid
-    )
+    return EdgePoints(normal, along, point, pixel, outward, np.abs(gain), valid)
 
 
 def of_edges(legs: LegsInCamera, tubes: TubeList) -> Iterator[Array]:
@@ -154,14 +185,15 @@ def plane_normals(a: Array, u: Array, radius: Array, tubes: TubeList) -> tuple[A
     ok = distance > 1.02 * radius
     sine = np.where(ok, radius / distance, 0.0)[..., None]
     m_unit = m / distance[..., None]
-    sign = SIDE_SIGNS[tubes.side][:, None]
+    sign = SIDE_SIGNS.astype(a.dtype)[tubes.side][:, None]
     return sign * np.sqrt(1 - sine**2) * m_unit - sine * cross(u, m_unit), ok
 
 
 def visible_stretch(a: Array, b: Array, tubes: TubeList) -> tuple[Array, Array]:
     """First and last place of each tube that can be seen, m from A; (E,) and (..., E)."""
     length = np.sqrt(dot(b - a, b - a))
-    return tubes.start + JOINT_MARGIN, np.minimum(tubes.stop, length) - JOINT_MARGIN
+    start, stop = (place.astype(length.dtype) for place in (tubes.start, tubes.stop))
+    return start + JOINT_MARGIN, np.minimum(stop, length) - JOINT_MARGIN
 
 
 def unobstructed(

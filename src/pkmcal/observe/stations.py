@@ -17,16 +17,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.cameras import Camera
-from pkmcal.geometry.rigid import cross, dot, inverse, of_components, perturb, pose, rotation
+from pkmcal.geometry.rigid import cross, inverse, of_components, perturb, pose, rotation
 from pkmcal.mechanisms import Machine
 from pkmcal.observe.places import anywhere
 from pkmcal.observe.predict import (
+    LegsInCamera,
     TubeList,
     edge_points,
     legs_in_camera,
@@ -47,15 +50,27 @@ ANYWHERE = 600
 """Poses from all round the machine that are looked at more closely."""
 FIRST_DAMPING = 1e-3
 """Of a step, relative to the normal equations' diagonal."""
-SHAKEN = 48
-"""Poses beside the best ones that are tried before the last descent."""
+SHAKEN, LIKELY = 48, 16
+"""Poses beside the best ones that are tried before the last descent, and of how many two steps have
+shown that they may be the best."""
+FURTHER = 1e4
+"""Reduced pixels at which nothing is found: what lies outside the image is nowhere near."""
+SETTLED = 0.1
+"""Evidence that a step has to gain for another one to follow; a measurement is tens of it."""
+AT_ONCE = 30_000
+"""Places on silhouettes that are looked up together, so that what is worked out of them stays in
+the processor's cache."""
+NEARBY = 8
+"""Places of each of thirty hypotheses that are settled."""
+NAMES_AT_ONCE = 16
+"""Names under which all photographs are looked at together: some 15 MB of 64 photographs."""
 LAST_REACH = 4.0
 """Reduced pixels at which the final score cuts distances off."""
 FEWEST_RIVALS, MOST_RIVALS = 8, 24
 """Other readings for each photograph, which tell what evidence chance gives."""
-HALVES, THIRDS = 7, 5
+HALVES, THIRDS, HALVES_TOLD = 7, 5, 4
 """Photographs from which half of them, or a third, are kept from the search to be asked; of fewer,
-each in its turn."""
+each in its turn. About a known pose two are enough to be searched."""
 DECIDED = 10.0
 """Times less than the probability asked for, by some of the photographs, at which the others need
 not be asked."""
@@ -75,7 +90,9 @@ class StationView:
     """What the search looks at: one station's photographs and what should be in them.
 
     configuration : (K,) rows of the session's readings. all_joints : (M, m) these readings.
-    all_poses : T_base_platform (M, 4, 4) by the drawing.
+    all_poses : T_base_platform (M, 4, 4) by the drawing. guessed : where the legs would be in the
+    photographs by hypotheses, (H, K, L), one for each place that is asked for; none where they are
+    as the readings say.
     """
 
     machine: Machine
@@ -85,6 +102,7 @@ class StationView:
     all_joints: Array
     all_poses: Array
     tables: DistanceTables
+    guessed: LegsInCamera | None = None
 
     @property
     def joints(self) -> Array:
@@ -95,6 +113,27 @@ class StationView:
     def poses(self) -> Array:
         """Poses (K, 4, 4) of the platform in the photographs."""
         return self.all_poses[self.configuration]
+
+    @cached_property
+    def all_legs(self) -> LegsInCamera:
+        """The legs' axes in the base frame, (M, L), in the search's single precision."""
+        return self.legs_at(self.all_poses, self.all_joints)
+
+    def legs_at(self, poses: Array, joints: Array) -> LegsInCamera:
+        """The same at other poses (..., 4, 4) and readings (..., m)."""
+        return legs_in_camera(self.machine, np.eye(4), poses, joints).single()
+
+    def legs(self, photographs: Integers) -> LegsInCamera:
+        """Of some photographs (n,): (n, L), or (H, n, L) where they are guessed."""
+        if self.guessed is not None:
+            return self.guessed[:, photographs]
+        return self.all_legs[self.configuration[photographs]]
+
+    def guess(self, which: slice | Integers) -> StationView:
+        """The same for some of the hypotheses that are guessed, if there are as many as places."""
+        if self.guessed is None or len(self.guessed) == 1:
+            return self
+        return replace(self, guessed=self.guessed[which])
 
     def few(self, count: int) -> Integers:
         """Numbers of up to ``count`` photographs, spread over all."""
@@ -112,29 +151,24 @@ class StationView:
             self,
             configuration=self.configuration[photographs],
             tables=self.tables.select(photographs),
+            guessed=self.guessed and self.guessed[:, photographs],
         )
 
-    def rivals(self, rng: np.random.Generator) -> list[StationView]:
-        """The same photographs with readings that are not their own: each time those of the
-        configurations that follow by so many; where the session has few, platforms elsewhere too.
+    def rivals(self, rng: np.random.Generator) -> LegsInCamera:
+        """Where legs would be at readings that are not the photographs' own, (R, K, L): each time
+        those of the configurations that follow by so many; where the session has few, on platforms
+        elsewhere too.
         """
         count, own = len(self.all_joints), self.configuration
-        steps = np.unique(np.linspace(1, count - 1, MOST_RIVALS).astype(int)) if count > 1 else []
-        views: list[StationView] = [
-            replace(self, configuration=(own + step) % count) for step in steps
-        ]
-        for _ in range(len(views), FEWEST_RIVALS):
-            away = rng.normal(size=(len(own), 6)) * AWAY
-            away[:, 3:] *= np.linalg.norm(self.poses[:, :3, 3], axis=-1, keepdims=True)
-            views.append(
-                replace(
-                    self,
-                    configuration=np.arange(len(own)),
-                    all_joints=self.joints,
-                    all_poses=perturb(self.poses, away),
-                )
-            )
-        return views
+        steps = np.unique(np.linspace(1, max(count - 1, 1), MOST_RIVALS).astype(int))
+        steps = steps[steps < count]
+        others = self.all_legs[(own + steps[:, None]) % count]
+        rest = max(FEWEST_RIVALS - len(steps), 0)
+        if not rest:
+            return others
+        away = rng.normal(size=(rest, len(own), 6)) * AWAY
+        away[..., 3:] *= np.linalg.norm(self.poses[:, :3, 3], axis=-1, keepdims=True)
+        return others.joined(self.legs_at(perturb(self.poses, away), self.joints))
 
 
 @dataclass(frozen=True)
@@ -183,7 +217,8 @@ def find_station(
     """
     count = len(view.configuration)
     number = np.arange(count)
-    folds = 2 if count >= HALVES else 3 if count >= THIRDS else count
+    halves = HALVES if T_camera_base is None else HALVES_TOLD
+    folds = 2 if count >= halves else 3 if count >= THIRDS else count
     kept: list[Array] = []
     surely = np.zeros(0)
     for fold in range(folds if count > 1 else 0):  # one alone has none to be asked
@@ -196,8 +231,7 @@ def find_station(
             break
     candidates = np.concatenate(kept) if kept else _search(view, T_camera_base, rng)
     every = view.few(count)
-    candidates = settle(view, candidates, every, 8, 8)
-    evidence = evidence_of(view, candidates, every, 8).sum(axis=-1)
+    candidates, evidence = settle(view, candidates, every, 8, 8)
     order = np.argsort(-evidence)
     order = order[apart(view, candidates[order], every)]
     candidates, evidence = candidates[order], evidence[order]
@@ -239,15 +273,16 @@ def _search(view: StationView, T_camera_base: Array | None, rng: np.random.Gener
     spread = np.repeat([SEARCH_ANGLE, SEARCH_DISTANCE], 3) / 3
     steps = rng.normal(size=(SHAKEN, 6)) * spread
     turned = inverse(inverse(beside) @ pose(rotation(steps[:, :3]), steps[:, 3:]))
-    candidates = settle(view, np.concatenate([candidates, turned]), more, 5, 6)
-    evidence = evidence_of(view, candidates, more, 5).sum(axis=-1)
+    candidates, evidence = settle(view, np.concatenate([candidates, turned]), more, 3, 2)
+    candidates, evidence = settle(view, candidates[np.argsort(-evidence)[:LIKELY]], more, 5, 5)
     candidates = candidates[np.argsort(-evidence)]
     return candidates[apart(view, candidates, more)[:3]]
 
 
 def _anywhere(view: StationView, few: Integers, keep: int) -> Array:
     """Candidates (keep, 4, 4) from all round the machine."""
-    legs = legs_in_camera(view.machine, np.eye(4), view.poses, view.joints)
+    legs = view.legs(np.arange(len(view.configuration)))
+    legs = legs if view.guessed is None else legs[0]
     radius = view.machine.values[view.tubes.radius]
     return anywhere(view.camera, view.tubes, radius, legs, view.tables, few, keep)
 
@@ -263,13 +298,19 @@ def _random_search(
         return inverse(T_base_camera @ pose(rotation(steps[:, :3]), steps[:, 3:]))
 
     few = view.few(4)
+
+    def likely(steps: Array, reach: float, keep: int) -> Array:
+        # two photographs and few places tell which of them are not worth a closer look
+        first = np.argsort(score(view, moved(steps), few[::2], reach, 3))
+        steps = steps[first[: max(len(steps) // 4, keep)]]
+        return steps[np.argsort(score(view, moved(steps), few, reach))[:keep]]
+
     steps = rng.normal(size=(tries, 6)) * spread
     steps[0] = 0.0
-    best = steps[np.argsort(score(view, moved(steps), few, reach=12))[:60]]
+    best = likely(steps, 12, 60)
     again = best[rng.integers(0, len(best), tries // 2)]
-    steps = np.concatenate([best, again + rng.normal(size=again.shape) * (0.45 * spread)])
-    order = np.argsort(score(view, moved(steps), few, reach=10))[:16]
-    return moved(steps[order])
+    again = again + rng.normal(size=again.shape) * (0.45 * spread)
+    return moved(likely(np.concatenate([best, again]), 10, 16))
 
 
 def _best(
@@ -281,14 +322,13 @@ def _best(
 
 def apart(view: StationView, candidates: Array, photographs: Integers) -> list[int]:
     """Of candidates (H, 4, 4), best first, those that are not the same place as a better one."""
-    legs = legs_in_camera(
-        view.machine, candidates[:, None], view.poses[photographs], view.joints[photographs]
-    )
+    legs = view.legs(photographs).moved(candidates)
     pixel = edge_points(view.machine, view.camera, legs, view.tubes, 2).pixel
     kept: list[int] = []
     for h in range(len(candidates)):
-        off = np.sqrt(np.nansum((pixel[kept] - pixel[h]) ** 2, axis=-1)) / view.tables.scale
-        if all(np.nanmedian(other) > APART for other in off):
+        away = pixel[kept] - pixel[h]
+        off = np.nan_to_num(np.hypot(away[..., 0], away[..., 1])) / view.tables.scale
+        if all(np.median(other) > APART for other in off):
             kept.append(h)
     return kept
 
@@ -301,26 +341,29 @@ def score(
     T_camera_base : (H, 4, 4) hypotheses. reach : reduced pixels. Edges are taken as the chords
     between their ends, which is exact for a pinhole and near enough for this search elsewhere.
     """
+    parts = _parts(view, len(T_camera_base), len(photographs) * samples)
+    if len(parts) > 1:
+        return np.concatenate(
+            [score(view.guess(k), T_camera_base[k], photographs, reach, samples) for k in parts]
+        )
     tubes = view.tubes
-    legs = legs_in_camera(
-        view.machine, T_camera_base[:, None], view.poses[photographs], view.joints[photographs]
-    )
+    legs = view.legs(photographs).moved(T_camera_base)
     a, b, u = of_edges(legs, tubes)
-    radius = view.machine.values[tubes.radius]
+    radius = view.machine.values[tubes.radius].astype(a.dtype)
     normal, ok = plane_normals(a, u, radius, tubes)
     first, last = visible_stretch(a, b, tubes)
     base = a + radius[:, None] * normal
     begin, end = (view.camera.project(base + at[..., None] * u) for at in (first, last))
     chord = end - begin
     direction = view.tables.direction(of_components(-chord[..., 1], chord[..., 0]))
-    fraction = (np.arange(samples) + 0.5) / samples
+    fraction = ((np.arange(samples) + 0.5) / samples).astype(a.dtype)
     points = of_components(
         *(begin[..., None, k] + fraction * chord[..., None, k] for k in (0, 1))
     )  # (H, K, E, n, 2)
     number = np.arange(len(view.configuration))[photographs][:, None, None]
     found, inside = view.tables.look(direction[..., None], points, number)
     cost = np.where(inside & ok[..., None], np.minimum(found, reach) / reach, 1.0)
-    weight = np.nan_to_num(np.sqrt(dot(chord, chord)))
+    weight = np.nan_to_num(np.hypot(chord[..., 0], chord[..., 1]))
     total = np.maximum(np.sum(weight, axis=(1, 2)), 1e-9)
     return np.sum(cost.mean(axis=-1) * weight, axis=(1, 2)) / total
 
@@ -333,63 +376,73 @@ class _Mixture(NamedTuple):
     share: Array
     sigma: Array
 
-    def ratio(self, found: Array, chance: Array) -> Array:
-        """Density of distances (H, n) on the machine's edges, of those that chance gives."""
-        sigma = self.sigma[:, None]
-        return np.sqrt(2 / np.pi) / sigma * np.exp(-0.5 * (found / sigma) ** 2) / chance
+    def likelier(self, look: _Look) -> Array:
+        """Density (H, E, n) of the distances found on the machine's edges, times the share that is
+        on these, by the density that chance gives.
+        """
+        share, sigma = (v.astype(np.float32)[:, None, None] for v in self)
+        near = np.exp(look.found**2 * (-0.5 / sigma**2))
+        return near * ((1 - share) * np.sqrt(2 / np.pi) / sigma) * look.rare
 
 
 class _Look(NamedTuple):
-    """The picture under predicted edges, (H, n): distance found and whether in the image; the
-    distance's derivatives by the camera frame's motion (H, n, 6); density of such distances by
-    chance; reduced pixels of silhouette for which each place stands.
+    """The picture under predicted edges, of all photographs in a row, (H, E, n): distance found,
+    FURTHER outside the image; its slope, by metres that the edge moves outward; one by the density
+    of such distances by chance; reduced pixels of silhouette for which each place stands, none
+    outside the image. begins, grows : (H, 6, E) and (H, 3, E) what a motion of the camera frame
+    does to an edge, in metres outward: at its first place, and how much more its turn at the last.
     """
 
     found: Array
-    inside: Booleans
-    jac: Array
-    chance: Array
+    slope: Array
+    rare: Array
     length: Array
+    begins: Array
+    grows: Array
 
     def weight(self, reach: float) -> Array:
         """Geman-McClure: what is further than the reach is another edge."""
-        return np.where(self.inside, (1 + (self.found / reach) ** 2) ** -2.0, 0.0)
+        return (1 + (self.found * (1 / reach)) ** 2) ** -2
 
     def cost(self, reach: float) -> Array:
         """What the weights minimise, (H,): 0 to 1 an edge point, and 1 outside the image."""
-        part = (self.found / reach) ** 2
-        return np.where(self.inside, part / (1 + part), 1.0).mean(axis=-1)
+        part = (self.found * (1 / reach)) ** 2
+        return (part / (1 + part)).reshape(len(part), -1).mean(axis=-1)
 
     def mixture(self, mixture: _Mixture, rounds: int = 3) -> _Mixture:
         """The likeliest mixture, from another on (expectation and maximisation)."""
+        total = np.maximum(_summed(self.length), 1e-9)
         for _ in range(rounds):
             own = self.length * self.own(mixture)
-            total = np.maximum(np.sum(self.length * self.inside, axis=-1), 1e-9)
-            share = np.clip(1 - own.sum(axis=-1) / total, 0.01, 0.99)
-            square = np.sum(own * self.found**2, axis=-1) / np.maximum(own.sum(axis=-1), 1e-9)
-            mixture = _Mixture(share, np.clip(np.sqrt(square), BIN, LAST_REACH))
+            mine = _summed(own)
+            square = _summed(own * self.found**2) / np.maximum(mine, 1e-9)
+            sigma = np.clip(np.sqrt(square), BIN, LAST_REACH)
+            mixture = _Mixture(np.clip(1 - mine / total, 0.01, 0.99), sigma)
         return mixture
 
     def own(self, mixture: _Mixture) -> Array:
-        """Probability (H, n) of each place's edge being the machine's."""
-        own = (1 - mixture.share[:, None]) * mixture.ratio(self.found, self.chance)
-        return np.where(self.inside, own / (own + mixture.share[:, None]), 0.0)
+        """Probability (H, E, n) of each place's edge being the machine's."""
+        own = mixture.likelier(self)
+        return own / (own + mixture.share.astype(np.float32)[:, None, None])
 
     def evidence(self, mixture: _Mixture) -> Array:
-        """Log likelihood (H, n) of each place against chance."""
-        share = mixture.share[:, None]
-        gain = np.log((1 - share) * mixture.ratio(self.found, self.chance) + share)
-        return np.where(self.inside, self.length * gain, 0.0)
+        """Log likelihood (H, E, n) of each place against chance."""
+        share = mixture.share.astype(np.float32)[:, None, None]
+        return self.length * np.log(mixture.likelier(self) + share)
 
     def where(self, better: Booleans, other: _Look) -> _Look:
         """Take some of the hypotheses from here, the rest from the other look."""
-        keep = better[:, None]
-        return _Look(
-            *(
-                np.where(keep[..., None] if mine.ndim == 3 else keep, mine, its)
-                for mine, its in zip(self, other, strict=True)
-            )
-        )
+        if better.all():
+            return self
+        out = [mine.copy() for mine in self]
+        for mine, its in zip(out, other, strict=True):
+            mine[~better] = its[~better]
+        return _Look(*out)
+
+
+def _summed(values: Array) -> Array:
+    """Sums (H,) over all places (H, E, n)."""
+    return values.reshape(len(values), -1).sum(axis=-1, dtype=float)
 
 
 def descend(
@@ -417,20 +470,27 @@ def descend(
 
 def settle(
     view: StationView, candidates: Array, photographs: Integers, samples: int, steps: int
-) -> Array:
-    """The same to the most evidence: how far edges scatter is learnt on the way."""
+) -> tuple[Array, Array]:
+    """The same to the most evidence: how far edges scatter is learnt on the way.
+
+    Returns the places (H, 4, 4) and their evidence (H,).
+    """
     look = _look(view, candidates, photographs, samples)
     damping = np.full(len(candidates), FIRST_DAMPING)
     mixture = _first_mixture(len(candidates))
+    last = np.inf
     for _ in range(steps):
         mixture = look.mixture(mixture)
         trial = _step(candidates, look, look.length * look.own(mixture), damping)
         seen = _look(view, trial, photographs, samples)
-        better = seen.evidence(mixture).sum(axis=-1) > look.evidence(mixture).sum(axis=-1)
+        gain = _summed(seen.evidence(mixture)) - _summed(look.evidence(mixture))
+        better = gain > 0
         candidates = np.where(better[:, None, None], trial, candidates)
         look = seen.where(better, look)
         damping = np.where(better, 0.3, 10.0) * damping
-    return candidates
+        if max(last, last := float(gain.max())) < SETTLED:
+            break  # one step may have been too long
+    return candidates, _summed(look.evidence(look.mixture(_first_mixture(len(candidates)), 10)))
 
 
 def _first_mixture(count: int) -> _Mixture:
@@ -441,7 +501,12 @@ def evidence_of(view: StationView, candidates: Array, photographs: Integers, sam
     """Evidence (H, K) of candidates (H, 4, 4) in each photograph."""
     look = _look(view, candidates, photographs, samples)
     mixture = look.mixture(_first_mixture(len(candidates)), rounds=10)
-    return look.evidence(mixture).reshape(len(candidates), len(photographs), -1).sum(axis=-1)
+    return _by_photograph(look.evidence(mixture), len(photographs))
+
+
+def _by_photograph(evidence: Array, count: int) -> Array:
+    """Sums (H, K) over each photograph's places, (H, E, n) of all in a row."""
+    return evidence.reshape(len(evidence), count, -1).sum(axis=-1, dtype=float)
 
 
 def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -> Array:
@@ -449,19 +514,20 @@ def evidence_by_name(view: StationView, T_camera_base: Array, names: Integers) -
     readings; edges scatter as they do under the names that the view has.
     """
     every = view.few(len(view.configuration))
-    look = _look(view, T_camera_base[None], every, 8)
-    mixture = look.mixture(_first_mixture(1), rounds=10)
+    mixture = _look(view, T_camera_base[None], every, 8).mixture(_first_mixture(1), rounds=10)
     fits: list[Array] = []
-    for name in names:
-        other = replace(view, configuration=np.full(len(every), name))
-        look = _look(other, T_camera_base[None], every, 8)
-        fits.append(look.evidence(mixture).reshape(len(every), -1).sum(axis=-1))
-    return np.stack(fits, axis=1)
+    for first in range(0, len(names), NAMES_AT_ONCE):
+        some = names[first : first + NAMES_AT_ONCE]
+        guessed = view.all_legs[np.broadcast_to(some[:, None], (len(some), len(every)))]
+        places = np.broadcast_to(T_camera_base, (len(some), 4, 4))
+        look = _look(replace(view, guessed=guessed), places, every, 8)
+        fits.append(_by_photograph(look.evidence(mixture), len(every)))
+    return np.concatenate(fits).T
 
 
 def settled(view: StationView, T_camera_base: Array) -> Array:
     """The pose (4, 4) with the most evidence near another."""
-    return settle(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0]
+    return settle(view, T_camera_base[None], view.few(len(view.configuration)), 8, 8)[0][0]
 
 
 def evidence_from(view: StationView, places: Array) -> float:
@@ -471,26 +537,46 @@ def evidence_from(view: StationView, places: Array) -> float:
     photographs are compared from the same places.
     """
     every = view.few(len(view.configuration))
-    places = settle(view, places, every, 8, 8)
-    return float(evidence_of(view, places, every, 8).sum(axis=-1).max())
+    return float(settle(view, places, every, 8, 8)[1].max())
 
 
 def evidence_nearby(
-    view: StationView, starts: Array, wide: bool, rng: np.random.Generator
-) -> float:
-    """What a short search from poses (H, 4, 4) finds in a few photographs; from none, anywhere.
+    view: StationView, readings: Array, starts: Array, wide: bool, rng: np.random.Generator
+) -> Array:
+    """What a short search from poses (S, 4, 4) finds in a few photographs with each of several
+    readings (N, K, m) of them, (N,); from none, anywhere.
 
     wide : look about the starts first, as about a pose by hand.
     """
     few = view.few(4)
+    shown = readings if not len(starts) else readings[:, few]
+    found = view.machine.forward_result(shown.reshape(-1, shown.shape[-1])).T_base_platform
+    legs = view.legs_at(found.reshape(*shown.shape[:2], 4, 4), shown)
+    if len(starts):
+        view, few = view.select(few), np.arange(len(few))
+    each = np.broadcast_to(starts, (len(legs), *starts.shape))
+    if wide or not len(starts):
+        near = [_about(replace(view, guessed=legs[k : k + 1]), few, starts, rng)
+                for k in range(len(legs))]  # fmt: skip
+        each = np.stack(near)
+    count = each.shape[1]
+    view = replace(view, guessed=legs[np.repeat(np.arange(len(legs)), count)])
+    ends = descend(view, each.reshape(-1, 4, 4), few, 4, (12, 10, 8, 6, 5))
+    if count > NEARBY:
+        order = np.argsort(score(view, ends, few, 5).reshape(-1, count), axis=1)[:, :NEARBY]
+        kept = (order + count * np.arange(len(legs))[:, None]).ravel()
+        ends, view = ends[kept], view.guess(kept)
+    evidence = settle(view, ends, few, 5, 3)[1]
+    return evidence.reshape(len(legs), -1).max(axis=1)
+
+
+def _about(view: StationView, few: Integers, starts: Array, rng: np.random.Generator) -> Array:
+    """Places (H, 4, 4) that are worth a descent, about poses (S, 4, 4), or anywhere, by one
+    guess.
+    """
     if not len(starts):
-        starts = _best(view, _anywhere(view, few, FEWER_TRIES), few, reach=12, keep=16)
-    elif wide:
-        tried = [_random_search(view, T, rng, FEWER_TRIES)[:8] for T in starts]
-        starts = np.concatenate(tried)
-    starts = descend(view, starts, few, 4, (12, 10, 8, 6, 5))
-    starts = settle(view, _best(view, starts, few, reach=5, keep=8), few, 4, 3)
-    return float(evidence_of(view, starts, few, 5).sum(axis=-1).max())
+        return _best(view, _anywhere(view, few, FEWER_TRIES), few, reach=12, keep=16)
+    return np.concatenate([_random_search(view, T, rng, FEWER_TRIES)[:8] for T in starts])
 
 
 def _surely(
@@ -508,15 +594,15 @@ def _surely(
     """
     from scipy.special import ndtri, stdtr
 
-    def evidence(view: StationView) -> Array:
-        look = _look(view, T_camera_base[None], other, 8)
-        return look.evidence(mixture).reshape(len(other), -1).sum(axis=-1)
-
     mixture = _look(view, T_camera_base[None], searched, 8).mixture(_first_mixture(1), rounds=10)
-    fits = np.stack([evidence(rival) for rival in view.rivals(rng)], axis=1)
-    count = fits.shape[1]
-    scatter = np.maximum(fits.std(axis=1, ddof=1), 1e-9) * np.sqrt(1 + 1 / count)
-    away = (evidence(view) - fits.mean(axis=1)) / scatter
+    every = np.arange(len(view.configuration))
+    guessed = view.legs(every)[None].joined(view.rivals(rng))
+    places = np.broadcast_to(T_camera_base, (len(guessed), 4, 4))
+    look = _look(replace(view, guessed=guessed), places, other, 8)
+    own, *rivals = _by_photograph(look.evidence(mixture), len(other))
+    count, fits = len(rivals), np.stack(rivals)
+    scatter = np.maximum(fits.std(axis=0, ddof=1), 1e-9) * np.sqrt(1 + 1 / count)
+    away = (own - fits.mean(axis=0)) / scatter
     return -ndtri(np.maximum(stdtr(count - 1, -away), 1e-300))
 
 
@@ -547,49 +633,78 @@ def _by_chance(surely: Array) -> float:
     return 0.5 * math.erfc(float(surely.sum()) / math.sqrt(2 * len(surely)))
 
 
+def _parts(view: StationView, count: int, places: int) -> list[slice]:
+    """Of so many hypotheses those that are looked at together, at so many places of each edge."""
+    each = max(places * len(view.tubes), 1)
+    parts = max(min(round(count * each / AT_ONCE), count), 1)
+    ends = [count * k // parts for k in range(parts + 1)]
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
 def _look(view: StationView, candidates: Array, photographs: Integers, samples: int) -> _Look:
     """Distances under the edges predicted from poses (H, 4, 4)."""
+    parts = _parts(view, len(candidates), len(photographs) * samples)
+    if len(parts) > 1:
+        looks = [_look(view.guess(k), candidates[k], photographs, samples) for k in parts]
+        return _Look(*map(np.concatenate, zip(*looks, strict=True)))
     number = np.arange(len(view.configuration))[photographs][:, None, None]
-    legs = legs_in_camera(
-        view.machine, candidates[:, None], view.poses[photographs], view.joints[photographs]
-    )
+    legs = view.legs(photographs).moved(candidates)
     points = edge_points(view.machine, view.camera, legs, view.tubes, samples)
     direction = view.tables.direction(points.outward)
-    step = points.outward * view.tables.scale
-    found, inside = view.tables.look_smooth(direction, points.pixel, number)
-    ahead, _ = view.tables.look_smooth(direction, points.pixel + step, number)
-    behind, _ = view.tables.look_smooth(direction, points.pixel - step, number)
-    slope = np.clip((ahead - behind) / 2, -1, 1)
+    found, slope, inside = view.tables.look_along(direction, points.pixel, points.outward, number)
     inside = inside & points.valid
-    slope = np.where(inside, slope, 0.0) / view.tables.scale
-    # the pixel moves outward by across . (omega x P + tau) for a motion of the camera frame
-    turn = cross(points.point, points.across)
-    motion = [part[..., k] for part in (turn, points.across) for k in range(3)]
-    jac = np.where(inside[..., None], of_components(*(slope * m for m in motion)), 0.0)
-    found = np.where(inside, found, 0.0)
     chord = points.pixel[..., -1, :] - points.pixel[..., 0, :]
-    length = np.nan_to_num(np.sqrt(dot(chord, chord)) / (view.tables.scale * (samples - 1)))
-    length = np.broadcast_to(length[..., None], found.shape)
-    flat = (len(candidates), -1)
+    length = np.hypot(chord[..., 0], chord[..., 1]) / np.float32(view.tables.scale * (samples - 1))
+    rare = 1 / view.tables.by_chance(direction, found)
+    # an edge moves outward by n . (omega x P + tau), of motions of the camera frame
+    first, last = points.point[..., 0, :], points.point[..., -1, :]
+    seen = np.any(inside, axis=-1, keepdims=True)[..., 0]
+    begins = _stacked((cross(first, points.normal), points.normal), seen)
+    grows = _stacked((cross(last - first, points.normal),), seen)
+    shape = (len(candidates), -1, samples)
     return _Look(
-        found.reshape(flat),
-        inside.reshape(flat),
-        jac.reshape(*flat, 6),
-        view.tables.by_chance(direction, found).reshape(flat),
-        length.reshape(flat),
+        np.where(inside, found, FURTHER).reshape(shape),
+        (slope * np.where(inside, points.gain, 0.0)).reshape(shape),
+        rare.reshape(shape),
+        np.where(inside, length[..., None], 0.0).reshape(shape),
+        begins,
+        grows,
     )
+
+
+def _stacked(vectors: tuple[Array, ...], seen: Booleans) -> Array:
+    """Components (H, 3 n, E) of n vectors (H, K, E, 3) of all edges in a row, 0 where not seen."""
+    out = np.zeros((len(seen), 3 * len(vectors), seen[0].size), np.float32)
+    for k, vector in enumerate(vectors):
+        for c in range(3):
+            part = out[:, 3 * k + c].reshape(seen.shape)
+            np.copyto(part, vector[..., c], where=seen)
+    return out
 
 
 def _step(candidates: Array, look: _Look, weight: Array, damping: Array) -> Array:
     """One damped Gauss-Newton step of every candidate's pose, (H, 4, 4).
 
-    weight : (H, n) of the places. damping : (H,).
+    weight : (H, E, n) of the places. damping : (H,).
     """
-    weighted = (look.jac * weight[..., None]).mT
-    normal = weighted @ look.jac
+    # the places of an edge lie evenly between its first and its last
+    at = np.linspace(0, 1, weight.shape[-1], dtype=np.float32)
+    powers = np.stack([at**0, at, at**2], axis=-1)
+    weighted = weight * look.slope
+    one, both, two = np.moveaxis((weighted * look.slope) @ powers, -1, 0)[:, :, None]
+    here, there = np.moveaxis((weighted * look.found) @ powers[:, :2], -1, 0)
+    begins, grows = look.begins, look.grows
+    normal = (begins * one) @ begins.mT
+    mixed = (grows * both) @ begins.mT
+    normal[:, :3] += mixed
+    normal[:, :, :3] += mixed.mT
+    normal[:, :3, :3] += (grows * two) @ grows.mT
+    right = begins @ here[..., None]
+    right[:, :3] += grows @ there[..., None]
+    normal, right = normal.astype(float), right.astype(float)
     diagonal = np.einsum("hii->hi", normal) + 1e-12
     normal = normal + (damping[:, None] * diagonal)[..., None] * np.eye(6)
-    step = -np.linalg.solve(normal, weighted @ look.found[..., None])[..., 0]
+    step = -np.linalg.solve(normal, right)[..., 0]
     step = np.clip(step, -0.1, 0.1)  # further, the tables' slopes say nothing
     # turn about the camera: R <- Exp(omega) R, t <- Exp(omega) t + tau
     turned = pose(rotation(step[:, :3]), np.zeros((len(step), 3))) @ candidates

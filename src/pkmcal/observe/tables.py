@@ -33,6 +33,8 @@ FURTHEST = 32.0
 """Reduced pixels beyond which distances are not told apart."""
 BIN = 0.5
 """Reduced pixels of a bin of the distances that chance gives."""
+MOST_ACROSS = 32_000
+"""Rows and columns of a picture that OpenCV looks things up in, fewer than 2**15."""
 
 
 class PictureEdges(NamedTuple):
@@ -44,12 +46,13 @@ class PictureEdges(NamedTuple):
 
 @dataclass(frozen=True)
 class DistanceTables:
-    """Distances in reduced pixels, (T, DIRECTIONS, h, w), and the reduction factor.
+    """Distances in reduced pixels and the reduction factor.
 
-    row : (K,) each photograph's table. edges : of each photograph. moving : (h, w) share of the
-    photographs in which each place differs from the others; where a single one cannot tell, where
-    it has edges. chance : (DIRECTIONS, bins) of BIN: how often a place taken anywhere has that
-    distance.
+    tables : (rows, h, columns, DIRECTIONS, w), one picture in which the n-th table lies in row
+    n % rows and column n // rows. row : (K,) each photograph's table. edges : of each photograph.
+    moving : (h, w) share of the photographs in which each place differs from the others; where a
+    single one cannot tell, where it has edges. chance : (DIRECTIONS, bins) of BIN: how often a
+    place taken anywhere has that distance.
     """
 
     tables: Array
@@ -61,50 +64,68 @@ class DistanceTables:
 
     def direction(self, normal: Array) -> Integers:
         """Direction number of edges whose image normals are (..., 2)."""
-        return direction_of(normal, self.tables.shape[1])
+        return direction_of(normal, self.tables.shape[3])
 
     def look(
         self, direction: Integers, pixel: Array, photograph: Integers
     ) -> tuple[Array, Booleans]:
         """Distances (reduced px) at full-size pixels (..., 2), and which lie in the photograph.
 
-        direction, photograph : (...) table numbers. Nearest table entry; callers that need a
-        slope look on both sides.
+        direction, photograph : (...) table numbers. Nearest table entry.
         """
-        height, width = self.tables.shape[-2:]
-        x, y = ((pixel[..., i] + 0.5) / self.scale - 0.5 for i in (0, 1))
-        with np.errstate(invalid="ignore"):
-            inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-        x, y = (np.where(inside, np.rint(v), 0).astype(np.intp) for v in (x, y))
-        return self.tables.reshape(-1).take(self._place(direction, x, y, photograph)), inside
+        import cv2
 
-    def look_smooth(
+        x, y, inside = self._place(direction, pixel, photograph)
+        return self._looked_up(x, y, cv2.INTER_NEAREST), inside
+
+    def look_along(
+        self, direction: Integers, pixel: Array, outward: Array, photograph: Integers
+    ) -> tuple[Array, Array, Booleans]:
+        """As :meth:`look`, bilinear between table entries; with it how much the distance grows a
+        pixel along unit vectors (..., 2), from the entries a reduced pixel to both sides.
+        """
+        import cv2
+
+        x, y, inside = self._place(direction, pixel, photograph)
+        right, down = outward[..., 0], outward[..., 1]
+        here = self._looked_up(x, y, cv2.INTER_LINEAR)
+        ahead = self._looked_up(x + right, y + down, cv2.INTER_LINEAR)
+        behind = self._looked_up(x - right, y - down, cv2.INTER_LINEAR)
+        return here, np.clip((ahead - behind) / 2, -1, 1) / np.float32(self.scale), inside
+
+    def _place(
         self, direction: Integers, pixel: Array, photograph: Integers
-    ) -> tuple[Array, Booleans]:
-        """As :meth:`look`, bilinear between table entries."""
-        height, width = self.tables.shape[-2:]
+    ) -> tuple[Array, Array, Booleans]:
+        """Column and row (...) in the picture of all tables, and whether in the photograph."""
+        rows, height, _, count, width = self.tables.shape
         x, y = ((pixel[..., i] + 0.5) / self.scale - 0.5 for i in (0, 1))
         with np.errstate(invalid="ignore"):
             inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
-        x, y = (np.where(inside, v, 0.0) for v in (x, y))
-        left, top = x.astype(np.intp), y.astype(np.intp)
-        fx, fy = x - left, y - top
-        entries, at = self.tables.reshape(-1), self._place(direction, left, top, photograph)
-        upper = (1 - fx) * entries.take(at) + fx * entries.take(at + 1)
-        at += width
-        lower = (1 - fx) * entries.take(at) + fx * entries.take(at + 1)
-        return (1 - fy) * upper + fy * lower, inside
+        number = self.row[photograph]
+        column = (number // rows * count + direction) * width
+        out = x + column, y + number % rows * height
+        x, y = (np.where(inside, v, 0.0).astype(np.float32) for v in out)
+        return x, y, inside
 
-    def _place(self, direction: Integers, x: Integers, y: Integers, photograph: Integers) -> Any:
-        """Of entries, in one row: one index is looked up several times as fast as four."""
-        count, height, width = self.tables.shape[1:]
-        table = self.row[photograph] * count + direction
-        return table * (height * width) + (y * width + x)
+    def _looked_up(self, x: Array, y: Array, how: int) -> Array:
+        """The picture of all tables at columns and rows (...)."""
+        import cv2
+
+        picture: Any = self.tables.reshape(self.tables.shape[0] * self.tables.shape[1], -1)
+        # cv2.remap takes at most MOST_ACROSS rows and columns
+        across = min(x.size, MOST_ACROSS)
+        flat = np.zeros((2, -(-x.size // max(across, 1)) * across), dtype=np.float32)
+        flat[0, : x.size], flat[1, : x.size] = x.ravel(), y.ravel()
+        if not x.size:
+            return np.zeros(x.shape, dtype=np.float32)
+        columns, lines = flat.reshape(2, -1, across)
+        found: Any = cv2.remap(picture, columns, lines, how)
+        return found.reshape(-1)[: x.size].reshape(x.shape)
 
     def by_chance(self, direction: Integers, found: Array) -> Array:
         """How often (a share a reduced pixel) places taken anywhere have distances (...)."""
         bins = self.chance.shape[1]
-        number = np.minimum(found / BIN, bins - 1).astype(np.intp)
+        number = np.minimum(found / np.float32(BIN), bins - 1).astype(np.int32)
         return self.chance.take(direction * bins + number)
 
     def select(self, photographs: Integers) -> DistanceTables:
@@ -120,7 +141,7 @@ class DistanceTables:
             PictureEdges(e.pixel * (-1, 1) + (width - 1, 0), e.normal * (-1, 1)) for e in self.edges
         )
         return DistanceTables(
-            np.ascontiguousarray(self.tables[:, ::-1, :, ::-1]),
+            np.ascontiguousarray(self.tables[..., ::-1, ::-1]),
             self.row,
             self.scale,
             tuple(edges),
@@ -133,9 +154,8 @@ def direction_of(normal: Array, count: int = DIRECTIONS) -> Integers:
     """Direction number, of ``count``, of edges whose image normals are (..., 2); the sign does not
     matter.
     """
-    angle = np.nan_to_num(np.arctan2(normal[..., 1], normal[..., 0]))
-    number = (np.where(angle < 0, angle + np.pi, angle) * (count / np.pi)).astype(np.intp)
-    return np.where(number < count, number, 0)
+    turn = np.arctan2(normal[..., 1], normal[..., 0]) * (count / np.pi)
+    return np.floor(np.nan_to_num(turn)).astype(np.int32) % count
 
 
 def distances(
@@ -148,10 +168,11 @@ def distances(
     import cv2
 
     tables = np.empty((count, *shape), dtype=np.float32)
+    place = pixel[:, 1] * shape[1] + pixel[:, 0]
     for k in range(count):
-        near = np.isin(number, [(k - 1) % count, k, (k + 1) % count])
+        near = (number - (k - 1)) % count < 3
         mask = np.ones(shape, dtype=np.uint8)
-        mask[pixel[near, 1], pixel[near, 0]] = 0
+        mask.reshape(-1)[place[near]] = 0
         tables[k] = cv2.distanceTransform(mask, cv2.DIST_L2, 3) if near.any() else 1e3
     return tables
 
@@ -170,15 +191,58 @@ def distance_tables(
         scale = max(image.shape[1] / width, 1.0)
         size = (round(image.shape[1] / scale), round(image.shape[0] / scale))
         small.append(_levels(cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
-    still = np.median(np.stack(small), axis=0) if len(small) >= ENOUGH_TO_COMPARE else None
-    edges = tuple(_edges_of(image, still) for image in small)
-    shape = small[0].shape
-    tables = np.empty((len(small), directions, *shape), dtype=np.float32)
-    for table, e in zip(tables, edges, strict=True):
+    height, across = small[0].shape
+    differs = _differs(np.stack(small)) if len(small) >= ENOUGH_TO_COMPARE else None
+    edges = tuple(map(_edges_of, small, [None] * len(small) if differs is None else differs))
+    moving = _moving(np.stack(small), edges[0]) if differs is None else differs.mean(axis=0)
+    rows = min(len(small), MOST_ACROSS // height)
+    columns = -(-len(small) // rows)
+    tables = np.zeros((rows, height, columns, directions, across), dtype=np.float32)
+    count = np.ones((directions, round(FURTHEST / BIN)))  # what no place has is not impossible
+    for k, e in enumerate(edges):
         number = direction_of(e.normal, directions)
-        table[:] = distances(e.pixel.astype(int), number, shape, directions)
-    row = np.arange(len(small))
-    return DistanceTables(tables, row, scale, edges, _moving(small, still, edges), _chance(tables))
+        table = distances(e.pixel.astype(int), number, (height, across), directions)
+        tables[k % rows, :, k // rows] = table.transpose(1, 0, 2)
+        count += _counted(table)
+    chance = (count / count.sum(axis=1, keepdims=True) / BIN).astype(np.float32)
+    return DistanceTables(tables, np.arange(len(small)), scale, edges, moving, chance)
+
+
+def _differs(small: Integers) -> Booleans:
+    """Where photographs (K, h, w) differ from the median of all."""
+    # neighbours exchanged until all are in order: over pictures, thirty times as fast as sorting
+    # the levels of one place after the other
+    order = small.copy()
+    for turn in range(len(order)):
+        low, high = order[turn % 2 : -1 : 2], order[turn % 2 + 1 :: 2]
+        less = np.minimum(low, high)
+        np.maximum(low, high, out=high)
+        low[...] = less
+    n = len(order)
+    # twice the median, in whole levels
+    twice = order[(n - 1) // 2].astype(np.int16) + order[n // 2]
+    return np.abs(2 * small.astype(np.int16) - twice) > 2 * STILL
+
+
+def _moving(small: Integers, edges: PictureEdges) -> Array:
+    """Share (h, w) of photographs too few for a median in which each place differs from the others;
+    of one alone, where it has edges.
+    """
+    if len(small) > 1:
+        return (np.ptp(small.astype(float), axis=0) > STILL).astype(float)
+    out = np.zeros(small.shape[1:])
+    x, y = edges.pixel.astype(int).T
+    out[y, x] = 1.0
+    return out
+
+
+def _counted(table: Array) -> Integers:
+    """How often each distance occurs in tables (DIRECTIONS, h, w), (DIRECTIONS, bins); at every
+    other place of every other row.
+    """
+    bins = round(FURTHEST / BIN)
+    number = np.minimum(table[:, ::2, ::2] * np.float32(1 / BIN), bins - 1).astype(np.intp)
+    return np.stack([np.bincount(one.ravel(), minlength=bins) for one in number])
 
 
 def _levels(image: Any) -> Integers:
@@ -188,44 +252,18 @@ def _levels(image: Any) -> Integers:
     return np.rint(np.sqrt(255.0 * image.astype(np.float32))).astype(np.uint8)
 
 
-def _edges_of(image: Any, still: Array | None) -> PictureEdges:
-    """Edge points of one reduced photograph."""
+def _edges_of(image: Any, moving: Booleans | None) -> PictureEdges:
+    """Edge points of one reduced photograph, where it differs from the others (h, w)."""
     import cv2
 
     dx = cv2.Sobel(image, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(image, cv2.CV_16S, 0, 1)
     edges = cv2.Canny(dx, dy, *CANNY) > 0
-    if still is not None:
-        moving = (np.abs(image - still) > STILL).astype(np.uint8)
-        edges &= cv2.dilate(moving, np.ones((3, 3), np.uint8)) > 0
+    if moving is not None:
+        edges &= cv2.dilate(moving.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     y, x = np.nonzero(edges)
     normal = np.stack([dx[y, x], dy[y, x]], axis=-1).astype(float)
     return PictureEdges(
         np.stack([x, y], axis=-1).astype(float),
         normal / np.hypot(normal[:, 0], normal[:, 1])[:, None],
     )
-
-
-def _moving(small: list[Integers], still: Array | None, edges: tuple[PictureEdges, ...]) -> Array:
-    """Share (h, w) of the photographs in which each place differs from the others."""
-    if still is not None:
-        return np.mean([np.abs(image - still) > STILL for image in small], axis=0)
-    if len(small) > 1:
-        return (np.ptp(np.stack(small).astype(float), axis=0) > STILL).astype(float)
-    out = np.zeros(small[0].shape)
-    x, y = edges[0].pixel.astype(int).T
-    out[y, x] = 1.0
-    return out
-
-
-def _chance(tables: Array) -> Array:
-    """How often each distance occurs, (DIRECTIONS, bins), a share a reduced pixel."""
-    bins = np.arange(0.0, FURTHEST + BIN, BIN)
-    count = np.stack(
-        [
-            np.histogram(np.minimum(tables[:, k], FURTHEST - BIN / 2), bins)[0]
-            for k in range(tables.shape[1])
-        ]
-    )
-    count = count + 1.0  # a distance that no place has is not impossible
-    return count / count.sum(axis=1, keepdims=True) / BIN
