@@ -132,7 +132,7 @@ def edge_noise(
     and tell nothing. before : where the search begins, whose tails are kept where that is asked.
     """
     along, rest, size = _squares(info)
-    tube, found = info.problem.blocks.tube, []
+    tube, found = info.problem.blocks.tube, list[tuple[Array, ...]]()
     for number in range(before.scale.shape[1]):
         own = info.problem.kinds.edges.present & (tube == number)
         begin = before.scale[:, number], before.shading[:, number]

@@ -119,7 +119,7 @@ class StationView:
         configurations that follow by so many; where the session has few, platforms elsewhere too.
         """
         count, own = len(self.all_joints), self.configuration
-        steps = np.unique(np.linspace(1, count - 1, MOST_RIVALS).astype(int)) if count > 1 else []
+        steps = np.unique(np.linspace(1, count - 1, MOST_RIVALS).astype(int)) if count > 1 else ()
         views: list[StationView] = [
             replace(self, configuration=(own + step) % count) for step in steps
         ]
