@@ -432,8 +432,8 @@ def test_parquet(tmp_path, alone, monkeypatch):
 
 # ------------------------------------------------------------------ stopped and resumed
 
-COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "300")
-BATCHES = 9
+COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "225")
+BATCHES = 7
 LONGER = (*COMMAND[:-1], "600")
 
 
