@@ -23,11 +23,12 @@ from pkmcal.identify.assembly import assemble, batch_of
 from pkmcal.identify.gauge import default_gauge
 from pkmcal.measurements import BREATHING_SIGMA, OWN_SHADING, SHADING_SIGMA
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.observe import legs
+from pkmcal.observe import legs, surroundings
 from pkmcal.observe.alone import Alone, find_alone, turn_between, turned_about
 from pkmcal.observe.images import decode
 from pkmcal.observe.predict import tubes_of
 from pkmcal.observe.stations import DOUBT, StationView
+from pkmcal.observe.surroundings import Texture
 from pkmcal.observe.tables import distance_tables
 from pkmcal.observe.tubes import DIRECTIONS, WORTH, tube_chart
 from pkmcal.session.exif import camera_by_exif
@@ -57,6 +58,7 @@ configuration,leg1,leg2,leg3,leg4,leg5,leg6
 """
 EASIEST = 0
 """The simulated photograph that shows its legs best."""
+NONE = np.zeros((0, 4, 4))
 PICTURE = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
 
 
@@ -386,25 +388,49 @@ def looked(simulated):
     return session, read_photographs(session), platform_poses(session), truth
 
 
-def found_with(monkeypatch, truth, doubts):
-    """Photographs are found where they were taken, with doubts."""
+def found_with(monkeypatch, truth, doubts, textured=False):
+    """Photographs are found where they were taken, with doubts; textured: the room tells too."""
 
-    def look(_session, photograph, _before, _found):
+    def look(_session, photograph, _before, _found, _others):
         T, doubt = truth.T_camera_base[photograph.station], doubts[photograph.station]
         lead = np.log(1 / doubt - 1)
         return Alone(np.stack([T, np.eye(4)]), np.array([9 + lead, 9.0]), 1.0)
 
-    monkeypatch.setattr(byhand, "find_alone", lambda _view, _image: None)
+    nowhere = Alone(np.zeros((0, 4, 4)), np.zeros(0), 1.0)
+    monkeypatch.setattr(byhand, "find_alone", lambda _view, _image: nowhere)
     monkeypatch.setattr(byhand, "look_closer", look)
     monkeypatch.setattr(byhand, "WORKERS", 1)
+    if not textured:
+        empty = Texture(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
+        monkeypatch.setattr(surroundings, "texture_of", lambda _image, _camera: empty)
 
 
-def placed(looked, monkeypatch, doubts):
+def placed(looked, monkeypatch, doubts, textured=False):
     """Places of photographs that are found where they were taken, with doubts; none: elsewhere."""
     session, photographs, poses, truth = looked
-    found_with(monkeypatch, truth, doubts)
+    found_with(monkeypatch, truth, doubts, textured)
     known = KnownScene(session.machine, np.full((3, 4, 4), np.nan), poses)
     return byhand.place_by_hand(session, photographs, Boards(), known)
+
+
+def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
+    """All photographs show some of the same points about the machine."""
+    _, photographs, _, truth = looked
+    rng = np.random.default_rng(2)
+    world = rng.uniform(-1.2, 1.2, (6000, 3))
+    names = rng.standard_normal((len(world), 128)).astype(np.float32)
+
+    def texture(image, camera):
+        k = next(k for k, p in enumerate(photographs) if p.images[0] is image)
+        seen = apply(truth.T_camera_base[k], world)
+        pixel = camera.project(np.where(seen[:, 2:] > 0.1, seen, np.nan))
+        with np.errstate(invalid="ignore"):
+            inside = ((pixel > 0) & (pixel < camera.image_size)).all(axis=1)
+        return Texture(camera.ray(pixel[inside]), pixel[inside], names[inside])
+
+    monkeypatch.setattr(surroundings, "texture_of", texture)
+    found = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4], textured=True)
+    assert [s.name for s in found.session.stations] == [s.name for s in looked[0].stations]
 
 
 def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
@@ -521,12 +547,21 @@ def test_a_look_alike_is_told_apart_by_the_machine_there(looked):
     places = np.concatenate([turned_about(view, true[None]), true[None]])
     equal = Alone(places, np.full(len(places), 20.0), 1.0)
     drawn = Together.as_drawn(session.machine, poses)
-    found = look_closer(session, p, drawn, equal)
+    found = look_closer(session, p, drawn, equal, NONE)
     assert equal.doubt == 0.5
     assert found.doubt < 1e-3
     assert np.degrees(turn_between(found.T_camera_base[0], true)) < 4
     # one place alone is weighed against chance
-    alone = look_closer(session, p, drawn, Alone(true[None], np.array([20.0]), equal.unit))
+    alone = look_closer(session, p, drawn, Alone(true[None], np.array([20.0]), equal.unit), NONE)
+    # a place that others tell of is asked about as well
+    told = look_closer(
+        session,
+        p,
+        drawn,
+        Alone(equal.T_camera_base[1:], equal.evidence[1:], equal.unit),
+        true[None],
+    )
+    assert np.degrees(turn_between(told.T_camera_base[0], true)) < 2
     assert alone.doubt < 1e-3
 
 

@@ -11,6 +11,7 @@ was in a wrong place.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -28,16 +29,17 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.measurements import Measurements
 from pkmcal.observe import legs
 from pkmcal.observe.alone import ALIKE, Alone, find_alone
-from pkmcal.observe.predict import tubes_of
+from pkmcal.observe.predict import LegsInCamera, legs_in_camera, tubes_of
 from pkmcal.observe.stations import StationView
+from pkmcal.observe.surroundings import Landmarks, Neighbour, Surroundings
 from pkmcal.observe.tables import distance_tables
 from pkmcal.session.load import Session
 from pkmcal.session.photographs import label_of
 from pkmcal.wording import listed
 
-SURE = 1e-2
-"""Probability that a photograph shows the machine from another place, below which it is believed:
-of a hundred one may be wrong, and the joint estimate finds that one out."""
+SURE = 0.05
+"""Probability that any photograph of a session is believed to be where it is not; each has an equal
+share of it."""
 FEWEST_EDGES = 4
 """Edges of a photograph that tell its place: two numbers each, of which a pose and a focal length
 take seven."""
@@ -86,20 +88,12 @@ def search_by_hand(
     """
     at = {p.station: p for p in photographs}
     by_hand = [k for k in at if session.stations[k].handheld]
-    tubes = tubes_of(session.machine)
-
-    def search(joined: Together, k: int) -> Alone:
-        p, image = at[k], at[k].images[0]
-        view = StationView(
-            joined.machine, p.camera, tubes, p.configuration, session.joints,
-            joined.T_base_platform, distance_tables([image]),
-        )  # fmt: skip
-        return look_closer(session, p, joined, find_alone(view, image))
-
+    room = Surroundings(lambda k: (at[k].images[0], at[k].camera))
     joined = Together.as_drawn(session.machine, known.T_base_platform)
     found: dict[int, Alone] = {}
     with ThreadPoolExecutor(WORKERS) as pool:
-        for k, one in zip(by_hand, pool.map(partial(search, joined), by_hand), strict=True):
+        alone = partial(_search, session, at, room, joined, {}, {})
+        for k, one in zip(by_hand, pool.map(alone, by_hand), strict=True):
             found[k] = one
             if told is not None:
                 told(f"Placing photographs by hand: {len(found)} of {len(by_hand)}", 0.25)
@@ -111,17 +105,57 @@ def search_by_hand(
             if not new:
                 break
             if told is not None:
-                placed = len(by_hand) - len(unsure)
-                told(f"Asking again, with {placed} of {len(by_hand)} photographs placed", 0.3)
+                count = len(by_hand) - len(unsure)
+                told(f"Asking again, with {count} of {len(by_hand)} photographs placed", 0.3)
             try:
                 joined = join(session, at, joined, new)
             except PkmcalError:
                 break  # with all that is observed it is told better why
-            found |= zip(unsure, pool.map(partial(search, joined), unsure), strict=True)
+            placed = {
+                k: Neighbour(at[k].camera, T, _legs(session, at[k], joined, T)[0])
+                for k, T in joined.T_camera_base.items()
+            }
+            again = partial(_search, session, at, room, joined, placed, room.landmarks(placed))
+            found |= zip(unsure, pool.map(again, unsure), strict=True)
     for k in by_hand:
         if k in joined.T_camera_base:
             believed[k] = joined.T_camera_base[k]
     return found, KnownScene(joined.machine, believed, joined.T_base_platform)
+
+
+def _search(
+    session: Session,
+    photographs: Mapping[int, legs.Photographs],
+    room: Surroundings,
+    joined: Together,
+    placed: Mapping[int, Neighbour],
+    landmarks: Mapping[int, Landmarks],
+    k: int,
+) -> Alone:
+    """The places that photograph k could show: by its legs, and by what it shares of the room with
+    those that are placed.
+    """
+    p = photographs[k]
+    view = StationView(
+        joined.machine, p.camera, tubes_of(session.machine), p.configuration, session.joints,
+        joined.T_base_platform, distance_tables([p.images[0]]),
+    )  # fmt: skip
+    found, others = find_alone(view, p.images[0]), room.place(k, landmarks)
+    if placed:
+        axes = _legs(session, p, joined, found.T_camera_base)
+        others = np.concatenate([others, room.about(found, k, p.camera, axes, placed)])
+    found = look_closer(session, p, joined, found, others)
+    axes = _legs(session, p, joined, found.T_camera_base)
+    return room.weighed(found, k, p.camera, axes, placed)
+
+
+def _legs(
+    session: Session, photograph: legs.Photographs, joined: Together, T_camera_base: Array
+) -> LegsInCamera:
+    """Leg axes (H, L, 3) of a photograph taken from places (H, 4, 4), or (1, L, 3) from one."""
+    first = photograph.configuration[:1]
+    pose, readings = joined.T_base_platform[first], session.joints[first]
+    return legs_in_camera(joined.machine, T_camera_base, pose, readings)
 
 
 def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
@@ -130,7 +164,7 @@ def _believed(found: dict[int, Alone], boards: Boards, known: Array) -> Array:
     """
     out = known.copy()
     for k, one in found.items():
-        if one.doubt < SURE:
+        if one.doubt * len(found) < SURE:
             out[k] = one.T_camera_base[0]
     seen = [None if np.isnan(T).any() else T for T in out]
     joined = boards.joined(seen)

@@ -121,10 +121,12 @@ def _costs(estimate: Estimate, station: Integers, stations: Sequence[int]) -> di
 
 
 def look_closer(
-    session: Session, photograph: legs.Photographs, before: Together, found: Alone
+    session: Session, photograph: legs.Photographs, before: Together, found: Alone, others: Array
 ) -> Alone:
     """The places of one photograph, weighed with what is known of the machine, the likeliest first;
     evidence is then a log likelihood against chance.
+
+    others : (n, 4, 4) places that are asked about beside those found in the picture.
     """
     p = photograph.decoded()
     one = np.zeros(1, dtype=int)
@@ -143,7 +145,7 @@ def look_closer(
         weighed.append((evidence, known.paid(but=p.station) - before.paid(but=p.station)))
         places.append(settled[0])
 
-    for T in found.T_camera_base[near][:CLOSER]:
+    for T in (*found.T_camera_base[near][:CLOSER], *others):
         weigh(before, T)  # the machine as it is known; where it fits better changed, that is taken
         try:
             known = join(session, {p.station: p}, before, {p.station: T})

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -63,6 +64,10 @@ class LegsInCamera:
     a: Array
     b: Array
     u: Array
+
+    def __getitem__(self, at: Any) -> LegsInCamera:
+        """Those of some cameras or photographs."""
+        return LegsInCamera(self.a[at], self.b[at], self.u[at])
 
 
 def legs_in_camera(
