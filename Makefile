@@ -9,7 +9,6 @@
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
 .PHONY: install demo docs test clean
 
@@ -25,6 +24,7 @@ test: $(VENV)/.test-tools
 	@./.ci/chromium $(VENV)/.chromium-tried
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/pyrefly check --progress-bar no
 	./.ci/checks $(BIN)
 
 clean:

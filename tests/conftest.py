@@ -6,11 +6,13 @@ import gc
 import io
 import json
 import os
+import pickle
 import shutil
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -45,6 +47,21 @@ def run(*words) -> Run:
     return Run(code, out.getvalue(), err.getvalue())
 
 
+LONG = (
+    "test_study", "test_board_session", "test_calibration", "test_fuzz", "test_cli",
+    "test_camera_calibration", "test_bad_input", "test_diagnose", "test_repeats", "test_check",
+    "test_departures", "test_boards", "test_pose_sessions", "test_watch_command", "test_validate",
+    "test_writing",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    """The files that take longest first: a worker that is left alone with one of them at the end
+    leaves the other without work.
+    """
+    items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
+
+
 def pytest_collection_finish():
     """What was imported stays to the end, so that nobody looks through it for what may go: that
     took one second in thirty.
@@ -76,19 +93,28 @@ class Demo:
 
 
 @pytest.fixture(scope="session")
-def demo(tmp_path_factory) -> Demo:
-    """One demonstration a run of the tests: all workers share the first one's."""
+def common(tmp_path_factory) -> Path:
+    """A folder that all workers of a run of the tests share."""
     root = tmp_path_factory.getbasetemp()
-    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+    return (root.parent if "PYTEST_XDIST_WORKER" in os.environ else root) / "common"
 
-    def make(part: Path) -> None:
-        # where it will stand is what it says of itself
-        done = run("demo", "-o", root / "demo" / "out", "--fast", "--no-open", "--json")
+
+def made_once(folder: Path, make: Callable[[], Any]) -> Any:
+    """What ``make`` gives, by the worker that asks first; the others read it from the folder."""
+
+    def write(part: Path) -> None:
         part.mkdir()
-        (part / "run.json").write_text(json.dumps(vars(done)))
+        (part / "made.pickle").write_bytes(pickle.dumps(make()))
 
-    said = once(root / "demo" / "said", make)
-    return Demo(root / "demo" / "out", Run(**json.loads((said / "run.json").read_text())))
+    return pickle.loads((once(folder, write) / "made.pickle").read_bytes())
+
+
+@pytest.fixture(scope="session")
+def demo(common) -> Demo:
+    """One demonstration a run of the tests."""
+    out = common / "demo"
+    words = ("demo", "-o", out, "--fast", "--no-open", "--json")
+    return Demo(out, made_once(common / "said", lambda: run(*words)))
 
 
 @dataclass(frozen=True)
@@ -100,13 +126,16 @@ class Calibrated:
 
 
 @pytest.fixture(scope="session")
-def calibrating(demo) -> Calibrated:
+def calibrating(demo, common) -> Calibrated:
     """The demonstration's session, calibrated from Python."""
     from pkmcal.calibration.calibrate import calibrate
 
-    told: list[tuple[str, float]] = []
-    found = calibrate(demo.session, progress=lambda text, share: told.append((text, share)))
-    return Calibrated(found, told)
+    def make() -> Calibrated:
+        told: list[tuple[str, float]] = []
+        found = calibrate(demo.session, progress=lambda text, share: told.append((text, share)))
+        return Calibrated(found, told)
+
+    return made_once(common / "calibrated", make)
 
 
 @pytest.fixture(scope="session")
@@ -124,13 +153,16 @@ class Checked:
 
 
 @pytest.fixture(scope="session")
-def checked(demo) -> Checked:
+def checked(demo, common) -> Checked:
     """The demonstration's session, checked from Python."""
     from pkmcal.check.check import check_session
 
-    told: list[tuple[float, str]] = []
-    found = check_session(demo.session, progress=lambda text, share: told.append((share, text)))
-    return Checked(found, told)
+    def make() -> Checked:
+        told: list[tuple[float, str]] = []
+        found = check_session(demo.session, progress=lambda text, share: told.append((share, text)))
+        return Checked(found, told)
+
+    return made_once(common / "checked", make)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from pkmcal.simulation.board import board_from_fields
 
 POINT = 25.4 / 72
 """mm."""
-DPI = 300
+DPI = 150
 BOARDS = {
     "charuco": {"type": "charuco", "squares": [9, 7], "square": 0.03, "marker": 0.022,
                 "dictionary": "DICT_5X5_100"},

@@ -116,8 +116,8 @@ def errors_at_the_tool(name, runs, tolerance, assumed):
     return np.array(out)
 
 
-def test_sigma_contains_the_size_where_nothing_tells_it():
-    runs = 24
+@pytest.mark.parametrize("runs", [12, pytest.param(48, marks=pytest.mark.slow)])
+def test_sigma_contains_the_size_where_nothing_tells_it(runs):
     errors = errors_at_the_tool("delta", runs, TOLERANCE, (TOLERANCE, 0.0))
     z, blind = np.mean(errors**2, axis=0)
     # the size is one direction, and most of the tool's error: squares scatter as of one normal

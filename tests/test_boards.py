@@ -278,7 +278,7 @@ def test_two_boards_mixed(pictures):
 def test_no_board_anywhere(tmp_path, pictures):
     paths = [tmp_path / f"{k}.png" for k in range(2)]
     for k, path in enumerate(paths):
-        noise = np.random.default_rng(k).normal(90, 5, (360, 480))
+        noise = np.random.default_rng(k).normal(90, 5, (180, 240))
         cv2.imwrite(str(path), noise.astype(np.uint8))
     with pytest.raises(InputError, match="in none of the photographs") as caught:
         detect_boards(paths, pictures["charuco"][0])

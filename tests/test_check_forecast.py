@@ -110,12 +110,16 @@ def test_no_forecast_of_photographs_without_edges(found):
     assert forecast(replace(look, stations=tuple(stations))) is None
 
 
-def test_a_leg_that_tells_little_is_named_with_its_reason():
+@pytest.mark.parametrize(
+    ("seen", "found", "why"),
+    [(0.3, 0.9, "70% hidden from front"), (0.9, 0.4, "60% of its edges lost at front")],
+)
+def test_a_leg_that_tells_little_is_named_with_its_reason(seen, found, why):
     legs = [LegForecast("front", j, 0.9, 0.95, 0.1, 0.19, 0.1) for j in range(1, 6)]
-    legs.append(LegForecast("front", 6, 0.3, 0.9, 0.2, 0.02, 0.4))
+    legs.append(LegForecast("front", 6, seen, found, 0.2, 0.02, 0.4))
     told = Forecast(15, 2e-4, 1e-3, 0.0, 0.03, float("nan"), tuple(legs))
     part = words.forecast_part(told)
-    assert part.said[1] == "Leg 6 tells little, 2% of what all edges tell: 70% hidden from front."
+    assert part.said[1] == f"Leg 6 tells little, 2% of what all edges tell: {why}."
     marks = [row.mark for row in part.tables[0].rows]
     assert marks == ["good"] * 5 + [Level.NOTE]
 
@@ -247,7 +251,15 @@ def test_a_page_with_pictures(found):
     assert "best pose found, not recognised" in html
 
 
-def test_the_command_writes_page_and_pictures(alone, tmp_path):
+def test_the_command_writes_page_and_pictures(alone, tmp_path, monkeypatch):
+    """The second and third time of what was found the first time."""
+    kept = []
+
+    def once(*words, **more):
+        kept[:] = kept or [check_session(*words, **more)]
+        return kept[0]
+
+    monkeypatch.setattr("pkmcal.check.check.check_session", once)
     done = run("check", alone, "-o", tmp_path / "out", "--pictures", tmp_path / "drawn", "--json")
     assert done.json["exit_code"] == done.code
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [

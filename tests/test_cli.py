@@ -137,16 +137,18 @@ def test_an_answer_that_cannot_be_given_is_told_once(words, end, reason, tmp_pat
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device here that is always full")
 @pytest.mark.parametrize("end", [">/dev/full", ">&-"])
 def test_a_mistake_is_told_where_an_answer_cannot_be_given(end):
-    for words in (["calibrate", "nowhere"], ["calibrate", "nowhere", "--json"]):
+    for words in (["board", "nowhere"], ["board", "nowhere", "--json"]):
         done = shell(words, end)
         assert done.returncode == 2
-        assert done.stderr == "Error: nowhere: there is no such session folder.\n"
+        assert done.stderr == (
+            "Error: nowhere: the file does not exist; expected a file nowhere.\n"
+        )
 
 
 @pytest.mark.skipif(os.name == "nt", reason="closing by the shell's own words")
 def test_nobody_needs_to_hear_of_a_mistake():
-    assert shell(["calibrate", "nowhere"], "2>&-").returncode == 2
-    assert shell(["calibrate", "nowhere"], "<&- >&- 2>&-").returncode == 2
+    assert shell(["board", "nowhere"], "2>&-").returncode == 2
+    assert shell(["board", "nowhere"], "<&- >&- 2>&-").returncode == 2
 
 
 def shell(words, end):

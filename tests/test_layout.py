@@ -82,3 +82,25 @@ def test_a_public_class_name_exists_once():
     ]
     assert len(names) > 100
     assert {name for name in names if names.count(name) > 1} == set()
+
+
+def is_private(name: str) -> bool:
+    return name.startswith("_") and not name.startswith("__")
+
+
+def test_private_names_are_used_in_their_own_file_and_nowhere_else():
+    """Neither the type checker nor ruff looks for these two: a function that nobody calls any more,
+    and one of another file's inside.
+    """
+    wrong: list[str] = []
+    for path in SOURCE.rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        tree, where = ast.parse(text), path.relative_to(SOURCE)
+        made = (n for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef))
+        names = (node.name for node in made if not node.decorator_list and is_private(node.name))
+        alone = (name for name in names if len(re.findall(rf"\b{name}\b", text)) == 1)
+        wrong += (f"{where}: nobody uses {name}" for name in alone)
+        taken = (n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom))
+        names = (alias.name for node in taken for alias in node.names)
+        wrong += (f"{where} imports {name}" for name in names if is_private(name))
+    assert wrong == []

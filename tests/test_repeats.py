@@ -21,8 +21,6 @@ from pkmcal.calibration.repeats import (
     fit_motions,
     study_repeats,
 )
-from pkmcal.check.check import check_session
-from pkmcal.check.checked import SessionCheck
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import tangent_basis
 from pkmcal.geometry.rigid import dot, look_at, perturb
@@ -391,9 +389,8 @@ def test_repeats_do_not_promise_more_than_they_hold(repeats, looked, tmp_path):
 
 @dataclass(frozen=True)
 class Looked:
-    """What the check finds in them, the study of the repeats, and the calibration it is made of."""
+    """The study of the repeats, and the calibration it is made of."""
 
-    found: SessionCheck
     study: RepeatStudy
     calibration: Calibration
 
@@ -410,13 +407,15 @@ def looked(repeats):
         patch.setattr("pkmcal.calibration.repeats.calibrate", once)
         study = study_repeats(repeats)
     (calibration,) = made
-    return Looked(check_session(repeats), study, calibration)
+    return Looked(study, calibration)
 
 
 @pytest.fixture
-def once(looked, monkeypatch):
-    """Commands tell of one look at the photographs, as it does not depend on what they write."""
-    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: looked.found)
+def once(looked, checked, monkeypatch):
+    """Commands tell of one look at the repeats, as it does not depend on what they write; what else
+    a check finds is the demonstration's, as nobody asks for it here.
+    """
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     monkeypatch.setattr(
         "pkmcal.calibration.repeats.study_repeats", lambda *_, **_more: looked.study
     )
@@ -453,7 +452,8 @@ def test_check_repeat_as_json(repeats):
     assert [s["cause"] for s in found["stations"]] == ["noise", "noise"]
 
 
-def test_a_shaken_camera_is_told(tmp_path):
+def test_a_shaken_camera_is_told(tmp_path, checked, monkeypatch):
+    monkeypatch.setattr("pkmcal.check.check.check_session", lambda *_, **_more: checked.found)
     shaken = {"shake": (3e-5, 5e-4), "stations": 1, "configurations": 3}
     folder = simulated(tmp_path / "session", 3, **shaken)
     told = run("check", folder, "--repeat", "--json")

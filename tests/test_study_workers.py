@@ -28,8 +28,8 @@ from pkmcal.studies.sweep import cells_of, subject_of
 from pkmcal.studies.tasks import Batch, Job, Population, Sample
 from test_study import SMALL, batch_of
 
-COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "300")
-BATCHES = 9
+COMMAND = ("a", "--vary", "configurations=5,6", "--runs", "225")
+BATCHES = 7
 LONGER = (*COMMAND[:-1], "600")
 
 

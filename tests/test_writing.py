@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import pickle
 import shutil
 import stat
 import subprocess
@@ -128,12 +129,15 @@ def test_a_clash_is_noticed_before_anything_is_moved(tmp_path):
 
 
 KILLED = """
-import itertools, os, shutil, signal, sys
+import itertools, os, pickle, shutil, signal, sys
 from pathlib import Path
+import pkmcal.calibration.calibrate
 from pkmcal.commands import calibrate, cli
 from pkmcal.commands import finish as end
 
-session, new, keep = map(Path, sys.argv[1:])
+session, new, keep, made = map(Path, sys.argv[1:])
+found = pickle.loads(made.read_bytes())
+pkmcal.calibration.calibrate.calibrate = lambda *_, **_more: found
 finish, out = calibrate.finish, session / "calibration"
 old = keep / "old"
 shutil.copytree(out, old)
@@ -178,15 +182,19 @@ sys.exit(cli.main(["calibrate", str(session), "--quiet"]))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and SIGKILL")
-def test_a_result_is_the_old_or_the_new_wherever_calibrate_is_killed(demo, session, tmp_path):
+def test_a_result_is_the_old_or_the_new_wherever_calibrate_is_killed(
+    demo, calibrated, session, tmp_path
+):
+    made = tmp_path / "calibrated.pickle"
+    made.write_bytes(pickle.dumps(calibrated))
     out, keep, new = session / "calibration", tmp_path / "killed", tmp_path / "new"
     shutil.copytree(demo.calibration, out)
     for path in out.iterdir():  # an old result that differs in every file, and has one more
         text = path.read_text()[: 10_000 if path.suffix == ".html" else None]
-        path.write_text(text.replace("hexapod", "hexapod-before").replace("0.1", "0.2"))
+        path.write_text(text.replace("<title>", "<title>Before: ").replace("0.1", "0.2"))
     (out / "camera-front.yaml").write_text("model: pinhole\n")
     done = subprocess.run(
-        [sys.executable, "-c", KILLED, session, new, keep],
+        [sys.executable, "-c", KILLED, session, new, keep, made],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -221,7 +221,7 @@ def _document(size: Array, content: str) -> bytes:
         + b"\nendstream",
         b"<< /Producer (pkmcal) >>",
     ]
-    out, places = b"%PDF-1.7\n", []
+    out, places = b"%PDF-1.7\n", list[int]()
     for number, body in enumerate(objects, 1):
         places.append(len(out))
         out += f"{number} 0 obj\n".encode() + body + b"\nendobj\n"

@@ -94,14 +94,14 @@ def texts_of(
     holdout: dict[str, Any] | None = None,
     over: ToolMap | str | None = None,
     photographs: Mapping[str, Sequence[str]] | None = None,
-) -> dict[str, str]:
+) -> dict[str, str | bytes]:
     """What a calibration leaves on disk besides its page: texts by their files' names.
 
     not_identified, holdout, over, photographs : as for :func:`document_of`.
     """
     from pkmcal.cameras.files import camera_text
 
-    texts = {
+    texts: dict[str, str | bytes] = {
         MECHANISM: calibrated_mechanism_text(calibration),
         EVERYTHING: json_text(document_of(calibration, not_identified, holdout, over, photographs)),
     }

@@ -5,7 +5,7 @@ The same for one that was just made and for one read back from its file.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING
@@ -50,7 +50,7 @@ class Overview:
     warnings: tuple[str, ...]
 
 
-class ShownCalibration:
+class ShownCalibration(ABC):
     """What a calibration shows of itself."""
 
     @abstractmethod

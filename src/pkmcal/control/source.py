@@ -172,7 +172,7 @@ def legs_of(text: str) -> tuple[int, ...]:
     try:
         numbers = [int(part) for part in text.split(",")]
     except ValueError:
-        numbers = []
+        numbers = list[int]()
     if not numbers or min(numbers) < 1 or len(set(numbers)) < len(numbers):
         raise InputError(
             "no list of legs",

@@ -83,7 +83,7 @@ def _fading(found: Study) -> tuple[str, ...]:
 
 def _others(found: Study) -> tuple[str, ...]:
     """Other equilibria."""
-    found_, text = found.equilibria, []
+    found_, text = found.equilibria, list[str]()
     legs = named(found.own, found)
     for flag, part, what in (
         (True, found_.alike, f"{legs} look exactly as at the goal"),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -81,7 +81,8 @@ def exporters() -> dict[str, Exporter]:
     package = __name__.rpartition(".")[0]
     for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
         importlib.import_module(f"{package}.{module.name}")
-    return {cls.name: cls() for cls in sorted(Exporter.__subclasses__(), key=lambda c: c.name)}
+    made: list[Callable[[], Exporter]] = [*Exporter.__subclasses__()]
+    return {one.name: one for one in sorted((make() for make in made), key=lambda one: one.name)}
 
 
 def exporter_of(name: str) -> Exporter:

@@ -266,7 +266,7 @@ def _checked(document: Document) -> Document:
             todo += [
                 ((*keys, k), item)
                 for k, item in enumerate(value)
-                if isinstance(item, str | dict | list)
+                if isinstance(item, (str, dict, list))
             ]
     return document
 
@@ -447,7 +447,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         known = value.dtype.kind != "f" or bool(np.isfinite(value).all())
         return value.tolist() if known and value.dtype.kind in "fiub" else plain(value.tolist())
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
     return str(value) if isinstance(value, Path) else value
 
@@ -458,9 +458,9 @@ def json_text(value: Any) -> str:
 
 
 def _text(value: Any, indent: str) -> str:
-    if not isinstance(value, dict | list) or _is_row(value):
+    if not isinstance(value, (dict, list)) or _is_row(value):
         return _line(value)
-    if not any(isinstance(item, dict | list) for item in _items(value)):
+    if not any(isinstance(item, (dict, list)) for item in _items(value)):
         line = _line(value)
         if len(line) <= _WIDEST:
             return line

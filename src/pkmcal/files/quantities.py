@@ -68,7 +68,7 @@ def with_unit(value: object) -> Unit | None:
 
 def any_unit(data: object) -> bool:
     """Whether any value of a file's content is written with its unit."""
-    if isinstance(data, dict | list):
+    if isinstance(data, (dict, list)):
         return any(map(any_unit, data.values() if isinstance(data, dict) else data))
     return with_unit(data) is not None
 

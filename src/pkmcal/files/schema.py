@@ -74,7 +74,7 @@ def _check_numbers(document: Document, fields: dict[str, Any]) -> None:
         keys, value = todo.pop()
         if isinstance(value, Mapping):
             todo += [((*keys, str(key)), item) for key, item in value.items()]
-        elif isinstance(value, list | tuple):
+        elif isinstance(value, (list, tuple)):
             todo += [((*keys, k), item) for k, item in enumerate(value)]
         elif isinstance(value, int | float) and abs(value) > LARGEST:
             raise InputError(

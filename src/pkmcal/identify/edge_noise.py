@@ -54,7 +54,7 @@ def edge_noise(
     tube of which no edge was seen keeps all.
     """
     along, rest, size = _squares(info)
-    tube, found = info.problem.blocks.tube, []
+    tube, found = info.problem.blocks.tube, list[tuple[Array, ...]]()
     for number in range(before.scale.shape[1]):
         own = info.problem.kinds.edges.present & (tube == number)
         if not own.any():

@@ -122,7 +122,9 @@ class FoundParameters(Sequence[FoundParameter]):
 
     def _cells(self) -> list[tuple[str, ...]]:
         """The heading and all rows as text, with digits that mean something."""
-        out = [("parameter", "drawing", "calibrated", "sigma", "unit", "decided by")]
+        out: list[tuple[str, ...]] = [
+            ("parameter", "drawing", "calibrated", "sigma", "unit", "decided by")
+        ]
         for row in self.rows:
             places = decimals(row.sigma) if row.sigma else LARGEST_DECIMALS
             out.append(

@@ -45,7 +45,8 @@ def kind_sums(problem: Problem, state: BatchState) -> KindSums:
     n_runs, na, memory = len(state.z), problem.unknowns.count, Memory()
     own, trace = np.zeros((n_runs, 3, 3)), np.zeros((n_runs, 3))
     cross, normal = np.zeros((n_runs, 3, 3, na, na)), np.zeros((n_runs, 3, na, na))
-    every, chi2, values = np.zeros((n_runs, na, na)), np.zeros((n_runs, 3)), []
+    every, chi2 = np.zeros((n_runs, na, na)), np.zeros((n_runs, 3))
+    values: list[Array] = []
     for cut in divisions(*problem.extent):
         part, at = problem.among(cut), problem.state_among(state, cut)
         rows, by_reading = part.compact(at), part.closure(at).by_reading

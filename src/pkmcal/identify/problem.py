@@ -432,8 +432,8 @@ class Problem:
         plain = self.weighted(Kinds(*(kind.present[None].astype(float) for kind in self.kinds)))
         crowd = np.where(self.blocks.crowd > 0, self.blocks.crowd, 1.0)
         plain = replace(plain, data=replace(plain.data, own=plain.data.own / np.sqrt(crowd)))
-        edges = plain._edges(state, plain.closure(state))
-        return Kinds(edges.value(state), plain._poses(state).value)
+        edges = plain._edges(state, plain.closure(state))  # noqa: SLF001 - one of its own kind
+        return Kinds(edges.value(state), plain._poses(state).value)  # noqa: SLF001
 
     def joint_rows(self, c_rows: Array, state: BatchState) -> Array:
         """Whitened closure rows (B, K, E) as one a reading, (B, K, m)."""

@@ -373,7 +373,7 @@ def made_tests(
         told = chi_square(found, cause)
         return replace(told, adjusted=level.adjusted(told.chance))
 
-    return tuple(map(test, causes)), tuple(cause and test(cause) for cause in zero), level
+    return tuple(map(test, causes)), tuple(test(cause) if cause else None for cause in zero), level
 
 
 def look_for_changes(found: Evidence, machine: Machine, alpha: float) -> ChangeTests:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from functools import cache
-from typing import Annotated, Any, Literal, Union
+from functools import cache, reduce
+from operator import or_
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, GetJsonSchemaHandler, Tag, TypeAdapter
@@ -126,9 +127,9 @@ class _OneOfTheCarriers:
 
 @cache
 def _union(schemas: tuple[type[Schema], ...]) -> TypeAdapter[Any]:
-    one: Any = schemas[0]
+    one: Any = reduce(or_, schemas)
     if len(schemas) > 1:
-        one = Annotated[Union[schemas], Field(discriminator="joint")]  # noqa: UP007 - at run time
+        one = Annotated[one, Field(discriminator="joint")]
     return TypeAdapter(one)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -13,6 +13,7 @@ from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import GeometryError, InputError
 from pkmcal.geometry.rigid import pose, rotation
 from pkmcal.mechanisms import assembly_modes, kinematics, velocities, workspace
+from pkmcal.mechanisms.assembly_modes import AssemblyModes
 from pkmcal.mechanisms.carriers.contract import (
     ParameterKind,
     base_carriers,
@@ -41,6 +42,9 @@ from pkmcal.mechanisms.motors import (
 )
 from pkmcal.mechanisms.parameters import ParameterTable
 from pkmcal.wording import count, split_name
+
+_Row = tuple[str, str, str, float, str, str]
+"""Name, unit, tolerance's name, drawing value, label, part of a parameter."""
 
 
 @dataclass(frozen=True)
@@ -308,7 +312,7 @@ class Machine:
 
     def assembly_modes_result(
         self, joints: Array, rng: np.random.Generator, most: int = 100_000
-    ) -> assembly_modes.AssemblyModes:
+    ) -> AssemblyModes:
         """As :meth:`assembly_modes`, with signs, counts and what may be missing; most : starts."""
         readings = _checked(joints, (self.n_joints,), "joints")
         return assembly_modes.assembly_modes(
@@ -375,7 +379,7 @@ def with_exact_scales(document: MechanismDocument) -> MechanismDocument:
     return document.model_copy(update={"tolerance": tolerance})
 
 
-def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator of plain rows
+def _parameter_rows(document: MechanismDocument) -> Iterator[_Row]:
     """Rows (name, unit, tolerance's name, drawing value, label, part), leg by leg."""
     axes, unsure = axes_in_use(document), scale_tolerances(document) > 0
     for j, leg in enumerate(document.legs):
@@ -393,7 +397,7 @@ def _parameter_rows(document: MechanismDocument):  # noqa: ANN202 - a generator 
             yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius, f"tube {t} radius", ""
 
 
-def _tolerances(document: MechanismDocument, rows: list[Any]) -> list[float]:
+def _tolerances(document: MechanismDocument, rows: list[_Row]) -> list[float]:
     """Each row's standard deviation; of a scale the one that its reading has."""
     scale = scale_tolerances(document)
     return [
@@ -404,7 +408,7 @@ def _tolerances(document: MechanismDocument, rows: list[Any]) -> list[float]:
     ]
 
 
-def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]):  # noqa: ANN202 - as above
+def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]) -> Iterator[_Row]:
     """Rows of one part: what its file gives, and not what is a constant."""
     for kind in kinds:
         value = of_part(node, kind)

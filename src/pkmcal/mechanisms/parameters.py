@@ -242,7 +242,7 @@ class ParameterTable:
 
     def free_names(self) -> tuple[str, ...]:
         """A name for each free unknown; an axis' turns are numbered."""
-        names, seen = [], dict[str, int]()
+        names, seen = list[str](), dict[str, int]()
         for k in self.first_of_free():
             name = self.names[k]
             if self.kinds[k] == "axis":

@@ -68,7 +68,7 @@ class _Ear:
                 self._changed.notify_all()
 
     def _begin(self) -> None:
-        if sys.stderr is not None:  # pyright: ignore[reportUnnecessaryComparison]
+        if sys.stderr is not None:
             sys.stderr.flush()
         try:
             own = os.dup(STANDARD_ERROR)

@@ -253,7 +253,7 @@ def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
     turned = [np.roll(own, -r) for r in range(1, count)]
     turned += [np.roll(own[::-1], r) for r in range(count)]
     if station.found.good and station.by_hand is None:
-        turned = []  # of a machine with equal thirds, any of its equal numberings would do as well
+        turned.clear()  # of a machine with equal thirds, any of its equal numberings would do
     for order in turned:
         exchanged.setdefault(tuple(order.tolist()), _numbering(order))
     exchanged.pop(tuple(own.tolist()), None)

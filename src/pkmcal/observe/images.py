@@ -78,10 +78,10 @@ def decode(path: Path, image_size: tuple[int, int], label: str) -> Integers:
         if clockwise is None:
             clockwise = image.shape[1] > image.shape[0]
         way = cv2.ROTATE_90_CLOCKWISE if clockwise else cv2.ROTATE_90_COUNTERCLOCKWISE
-        return np.ascontiguousarray(cv2.rotate(image, way))
+        return np.ascontiguousarray(cv2.rotate(image, way), np.uint8)
     if (image.shape[1], image.shape[0]) != tuple(image_size):
         raise _other_size(label, (image.shape[1], image.shape[0]), image_size)
-    return image
+    return image.astype(np.uint8, copy=False)  # as it was decoded
 
 
 def _check_depth(data: bytes, label: str) -> None:

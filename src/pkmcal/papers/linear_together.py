@@ -93,7 +93,7 @@ def base_together(machine: Machine, measurements: Measurements) -> BaseSolution:
             lines = system.unknowns.shading
             told = np.sum(half[lines] ** 2, axis=1) / shading**2
             shift = now.shifts[system.unknowns.n_cameras :]
-            shading = common_shading(*(x[None] for x in (shift, told, shading)), SHADING_SIGMA)[0]
+            shading = common_shading(shift[None], told[None], shading[None], SHADING_SIGMA)[0]
         weight = final_weights(np.abs(residual) / scale * ONE) * system.used
         change = np.abs(shading / before[2] - 1).max(initial=0.0) / SHADING_CHANGE
         change = max(change, np.abs(weight - before[0]).max() / 1e-2)

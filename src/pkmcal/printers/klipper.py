@@ -243,7 +243,7 @@ def _three(entries: dict[str, tuple[str, str]], label: str, name: str) -> list[f
     try:
         values = [float(x) for x in text.split(",")]
     except ValueError:
-        values = []
+        values = list[float]()
     if len(values) != 3 or not all(abs(x) <= MOST_STEPS for x in values):
         raise InputError(
             f"{name} does not tell where the three motors were",

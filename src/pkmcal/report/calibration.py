@@ -72,7 +72,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
     )
     groups = parameters.parameter_groups(c.session.machine, c.estimate)
     open_ = parameters.unidentified(groups, c.estimate, c.findings)
-    predicted = held_out and held_out.document(c.session.configurations)
+    predicted = held_out.document(c.session.configurations) if held_out else None
     return replace(
         told,
         closing="" if c.verdict.usable else "Written all the same, to find out why:",
@@ -142,11 +142,11 @@ def report_of(
         provenance.stations(session, observation, estimate, camera, space),
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
-        findings and identifiability.section(findings, estimate.machine.parameters),
+        identifiability.section(findings, estimate.machine.parameters) if findings else None,
         correlations.section(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
-        holdout and validation.held_out(holdout, session),
+        validation.held_out(holdout, session) if holdout else None,
         residuals.section(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),
@@ -161,7 +161,9 @@ def report_of(
         kicker=session.called,
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
-        figures=cards(session, observation, estimate, centres, tool, findings and findings.bed),
+        figures=cards(
+            session, observation, estimate, centres, tool, findings.bed if findings else None
+        ),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
         summary={"figures": numbers(observation, estimate, centres, tool)},
@@ -199,7 +201,7 @@ def cards(
         f"{brief(float(change[farthest]))} mm ({_centre_name(centres, farthest)})",
     )
     found = (
-        bed and _flat(bed, tool),
+        _flat(bed, tool) if bed else None,
         joints if len(observation.edges) else None,
         _tool_sigma(session, estimate, tool),
         moved,

@@ -146,7 +146,7 @@ def _machine(c: Calibration, centres: tuple[Centres, ...], k: int) -> Iterator[L
     if len(c.observation.poses):
         points, configuration = poses.places(c.observation, c.estimate)
         points = points[configuration == k]
-        told = {"points": points, "labels": [], "colour": LEGS[0]}
+        told = {"points": points, "labels": list[str](), "colour": LEGS[0]}
         yield Logged(("machine", "measured"), "points3d", told, at)
 
 

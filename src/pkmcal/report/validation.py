@@ -40,7 +40,7 @@ def outcome_of(v: Validation) -> Outcome:
     )
     notes = tuple(f"{what}: {', '.join(names)}." for what, names in told if names)
     parts = (
-        v.judged and _readings(v.judged, v.session),
+        _readings(v.judged, v.session) if v.judged else None,
         Part("paths", "Paths", tables=(paths_table(v.paths),)) if v.paths else None,
         Part("regions", "Regions", tables=(regions_table(v.regions, v.session),))
         if v.regions

@@ -210,7 +210,7 @@ def load_session(folder: Path | str, model: str | None = None, *, measured: bool
             warnings += repeated
     else:
         none, columns = np.zeros((0, machine.n_joints)), machine.joint_names
-        table, warnings = CsvTable(schema.joints.file, columns, (), none, ()), []
+        table, warnings = CsvTable(schema.joints.file, columns, (), none, ()), list[str]()
     board = _board(folder, document, schema)
     warnings += _of_little_use(document, schema)
     stations = tuple(

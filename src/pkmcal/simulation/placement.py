@@ -275,7 +275,7 @@ def places_by_hand(
     space = legs_space(machine)
     centre = (space.min(axis=0) + space.max(axis=0)) / 2
     radius = float(np.linalg.norm(space - centre, axis=1).max())
-    start, out = rng.uniform(0, 2 * np.pi), []
+    start, out = rng.uniform(0, 2 * np.pi), list[StationPlace]()
     # three turns about the machine, so that photographs of one configuration are not side by side
     turn = 2 * np.pi * 3 / len(cameras) * (1 + 1 / (3 * len(cameras)))
     for k, camera in enumerate(cameras):

@@ -12,7 +12,7 @@ and 8 bits, linear in the light.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -119,7 +119,7 @@ def lamp_seen(
     """
     rays = points - lamp.place[:, None, None]
     distance = np.sqrt(np.einsum("ibr,ibr->br", rays, rays))
-    rays = rays / distance
+    rays /= distance
     seen = np.ones(distance.shape)
     reached = bounds.reached(lamp.place, rays, lamp.radius)
     for k, part in enumerate(parts):
@@ -145,36 +145,48 @@ class RayHits(NamedTuple):
     seen: Array
 
 
-def look(
-    scene: Scene, bounds: Bounds, origin: Array, rays: Array, seen: Array | None = None
-) -> RayHits:
-    """What rays (3, bundles, rays) meet; seen : (bundles, rays) of the lamp, where it is known."""
-    shapes = [part.shape for part in scene.parts]
-    distance, owner = first_hits(shapes, bounds, origin, rays)
+def look(scene: Scene, bounds: Bounds, origin: Array, rays: Array) -> RayHits:
+    """What rays (3, bundles, rays) meet."""
+    distance, owner = first_hits([part.shape for part in scene.parts], bounds, origin, rays)
     lost = owner < 0
     points = origin[:, None, None] + np.where(lost, 1.0, distance) * rays
-    if seen is None:
-        seen = np.ones(distance.shape)
-        for lamp in scene.lighting.lamps:
-            if lamp.shadows:
-                seen = lamp_seen(scene.parts, bounds, lamp, points, owner)
-    flat, toward, lit = points.reshape(3, -1), -rays.reshape(3, -1), seen.ravel()
+    seen = np.ones(distance.shape)
+    for lamp in scene.lighting.lamps:
+        if lamp.shadows:
+            seen = lamp_seen(scene.parts, bounds, lamp, points, owner)
+    flat, face = points.reshape(3, -1), np.zeros(owner.size, dtype=np.int16)
+    for k, at in _by_owner(owner):
+        face[at] = scene.parts[k].shape.face(flat[:, at])
+    light = light_of(scene, origin, rays, distance, owner, seen)
+    label = 6 * owner + 2 * face.reshape(owner.shape) + (seen < 0.5)
+    return RayHits(light, np.where(lost, -1, label).astype(np.int16), seen)
+
+
+def light_of(
+    scene: Scene, origin: Array, rays: Array, distance: Array, owner: Integers, seen: Array
+) -> Array:
+    """Light (bundles, rays) along rays (3, bundles, rays) from what each meets first; seen : of the
+    lamp.
+    """
+    flat, far, lit = rays.reshape(3, -1), distance.ravel(), seen.ravel()
+    light = np.zeros(owner.size)
+    for k, at in _by_owner(owner):
+        part, along = scene.parts[k], flat[:, at]
+        points = origin[:, None] + far[at] * along
+        light[at] = radiance(part.shape, part.material, points, -along, lit[at], scene.lighting)
+        if part.material.polish > 0:
+            light[at] += part.material.polish * _mirrored(scene, k, points, -along)
+    return light.reshape(owner.shape)
+
+
+def _by_owner(owner: Integers) -> Iterator[tuple[int, Integers]]:
+    """Each shape that any ray meets, and those rays, by their numbers in a row."""
     numbers = owner.ravel()
     order = np.argsort(numbers, kind="stable")
-    starts = np.searchsorted(numbers[order], np.arange(len(shapes) + 1))
-    light = np.zeros(numbers.size)
-    face = np.zeros(numbers.size, dtype=np.int16)
-    for k, part in enumerate(scene.parts):
-        at = order[starts[k] : starts[k + 1]]
-        if at.size:
-            face[at] = part.shape.face(flat[:, at])
-            light[at] = radiance(
-                part.shape, part.material, flat[:, at], toward[:, at], lit[at], scene.lighting
-            )
-            if part.material.polish > 0:
-                light[at] += part.material.polish * _mirrored(scene, k, flat[:, at], toward[:, at])
-    label = 6 * owner + 2 * face.reshape(owner.shape) + (seen < 0.5)
-    return RayHits(light.reshape(distance.shape), np.where(lost, -1, label).astype(np.int16), seen)
+    found, starts = np.unique(numbers[order], return_index=True)
+    for k, at in zip(found.tolist(), np.split(order, starts[1:]), strict=True):
+        if k >= 0:
+            yield k, at
 
 
 def _mirrored(scene: Scene, number: int, points: Array, to_camera: Array) -> Array:
@@ -299,7 +311,7 @@ def _over_area(
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    width = border.shape[1]
+    width, shapes = border.shape[1], [part.shape for part in scene.parts]
     wanted = np.flatnonzero(border)
     # neighbours together, for narrow bundles
     order = np.lexsort((wanted % width // TILE, wanted // width // TILE))
@@ -317,12 +329,16 @@ def _over_area(
             c = [corner[:, first[rows] + s][..., None] for s in (0, 1, width + 1, width + 2)]
             d = (c[0] * (1 - fx) + c[1] * fx) * (1 - fy) + (c[2] * (1 - fx) + c[3] * fx) * fy
             # at the rim of the field a corner may see nothing where the centre still does
-            centre = view.centre.reshape(3, -1)[:, at[rows]][..., None]
-            d = np.where(np.isfinite(d).all(axis=0), d, centre)
-            d = d / np.sqrt(np.einsum("i...,i...->...", d, d))
+            if not all(np.isfinite(one).all() for one in c):
+                centre = view.centre.reshape(3, -1)[:, at[rows]][..., None]
+                d = np.where(np.isfinite(d).all(axis=0), d, centre)
+            d /= np.sqrt(np.einsum("i...,i...->...", d, d))
             d = turned(rot, d.reshape(3, rows.shape[0], -1))
-            lit = np.repeat(seen.ravel()[at[rows]], SAMPLES, axis=1) if known else None
-            light = look(scene, bounds, origin, d, lit).light
+            if known:
+                lit = np.repeat(seen.ravel()[at[rows]], SAMPLES, axis=1)
+                light = light_of(scene, origin, d, *first_hits(shapes, bounds, origin, d), lit)
+            else:
+                light = look(scene, bounds, origin, d).light
             out[rows] = light.reshape(*rows.shape, SAMPLES).mean(axis=-1)
     result = np.empty(at.size)
     result[order] = out

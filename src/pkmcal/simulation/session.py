@@ -106,7 +106,7 @@ class Studio:
         lit_from = float(np.arctan2(way[1], way[0])) if read else None
         rng = np.random.default_rng(seeds[1])
         room = room_of(discs, reach, noise, rng, lit_from, settings.light)
-        views = {}
+        views: dict[int, PixelRays] = {}
         if truth.focal_scale is None:
             views = {key: PixelRays.of(c) for key, c in {id(c): c for c in cameras}.items()}
         fixed: tuple[ScenePart, ...] = ()

@@ -56,7 +56,10 @@ class Shape(ABC):
 
 def inner(d: Array, v: Array) -> Array:
     """Inner products (n,) of vectors (3, n) with one vector (3,), or one each (3, n)."""
-    return d[0] * v[0] + d[1] * v[1] + d[2] * v[2]
+    out = d[0] * v[0]
+    out += d[1] * v[1]
+    out += d[2] * v[2]
+    return out
 
 
 def turned(rot: Array, v: Array) -> Array:
@@ -65,13 +68,20 @@ def turned(rot: Array, v: Array) -> Array:
     Not by BLAS: its own threads, for so small a matrix, wait more than they work, and photographs
     are rendered in threads already.
     """
-    return np.stack([sum(rot[i, j] * v[j] for j in range(3)) for i in range(3)])
+    return np.stack([inner(v, row) for row in rot])
 
 
-def _soft(clearance: Array, width: Array, where: Booleans) -> Array:
-    """Hidden part of a lamp whose image at the shape is ``width`` in radius, by clearance (m)."""
-    x = np.clip(0.5 - clearance / (2 * width), 0, 1)
-    return np.where(where, x * x * (3 - 2 * x), 0.0)
+def _soft(clearance: Array, t: Array, distance: Array, spread: float, where: Booleans) -> Array:
+    """Hidden part (n,) of a lamp of radius ``spread`` by a shape that rays miss by ``clearance``
+    (m) at t, on their way to what lies at ``distance``; 0 but where the shape may hide something.
+    """
+    hidden = np.zeros(clearance.shape)
+    # most rays pass by: none of the lamp's image at the shape is larger than the lamp
+    near = np.flatnonzero(where & (t > 0) & (t < distance) & (clearance < spread + 1e-6))
+    width = spread * np.maximum(1 - t[near] / distance[near], 0.0) + 1e-6
+    x = np.clip(0.5 - clearance[near] / (2 * width), 0, 1)
+    hidden[near] = x * x * (3 - 2 * x)
+    return hidden
 
 
 @final
@@ -138,8 +148,7 @@ class Cylinder(Shape):
             t = (self.length / 2 - along) / np.where(np.abs(du) < 1e-9, 1e-9, du)
             between = np.ones(t.shape, dtype=bool)
         miss = np.sqrt(np.maximum(across2 + t * (2 * b + a * t), 0.0)) - self.radius
-        width = spread * np.maximum(1 - t / distance, 0.0) + 1e-6
-        return _soft(miss, width, between & (t > 0) & (t < distance))
+        return _soft(miss, t, distance, spread, between)
 
     def _place(self, points: Array) -> tuple[Array, Array, Array]:
         """Places along the axis (n,), vectors from the axis (3, n) and their lengths (n,)."""
@@ -193,8 +202,7 @@ class Ball(Shape):
         o = light - self.centre
         t = -inner(d, o)
         miss = np.sqrt(np.maximum(o @ o - t * t, 0.0)) - self.radius
-        width = spread * np.maximum(1 - t / distance, 0.0) + 1e-6
-        return _soft(miss, width, (t > 0) & (t < distance))
+        return _soft(miss, t, distance, spread, np.ones(t.shape, dtype=bool))
 
 
 @final

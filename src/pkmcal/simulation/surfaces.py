@@ -235,7 +235,7 @@ def radiance(
     for lamp in light.lamps:
         to_lamp = lamp.place[:, None] - points
         dist2 = np.einsum("in,in->n", to_lamp, to_lamp)
-        to_lamp = to_lamp / np.sqrt(dist2)
+        to_lamp /= np.sqrt(dist2)
         power = lamp.power * lamp.reach**2 / dist2 * (lit if lamp.shadows else 1.0)
         facing = np.maximum(np.einsum("in,in->n", n, to_lamp), 0.0)
         diffuse = diffuse + power * facing
@@ -252,7 +252,7 @@ def _highlight(
 ) -> Array:
     """Blinn-Phong's lobe (n,), or Ward's without its constant factor where brushed."""
     h = to_lamp + to_camera
-    h = h / np.sqrt(np.maximum(np.einsum("in,in->n", h, h), 1e-12))
+    h /= np.sqrt(np.maximum(np.einsum("in,in->n", h, h), 1e-12))
     hn = np.maximum(np.einsum("in,in->n", h, n), 1e-3)
     if axis is None:
         return hn**material.sharpness

@@ -65,7 +65,7 @@ def on_cluster(address: str) -> Runner:
 
         try:
             client: Any = Client(address, timeout=TIMEOUT, set_as_default=False)
-        except (OSError, ValueError, TimeoutError) as error:
+        except (OSError, ValueError) as error:
             raise InputError(
                 "no Dask scheduler answers",
                 where="--scheduler",

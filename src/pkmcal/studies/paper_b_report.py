@@ -273,7 +273,7 @@ def _geometry_part(words: Words, s: Found) -> Part:
         ]
         layout = plane("xyz"[axes[0]] + ", m", "xyz"[axes[1]] + ", m")
         layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
-        figure = {"data": data, "layout": layout, "config": {}}
+        figure = {"data": data, "layout": layout, "config": dict[str, Any]()}
         plots[name] = {"figure": figure, "height": 300 if name == "lateral" else 420}
     return words.part("figure-7", plots=plots)
 

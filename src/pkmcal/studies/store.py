@@ -126,7 +126,7 @@ def plainly(value: Any) -> Any:
         return {"kind": type(value).__name__, **own}
     if isinstance(value, Mapping):
         return {str(key): plainly(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, (list, tuple)):
         return [plainly(item) for item in value]
     return plain(value)
 

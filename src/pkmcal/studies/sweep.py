@@ -262,7 +262,7 @@ def cells_of(subject: StudySubject, varied: Mapping[str, Sequence[Value]]) -> li
 
 def _paper(setting: HexapodByAxes, values: Mapping[str, Value]) -> HexapodByAxes:
     """[A] 4.3 with other values."""
-    own = {
+    own: dict[str, Any] = {
         {"configurations": "poses", "legs": "legs_seen", "reading_noise": "joint_noise"}.get(
             name, name
         ): value

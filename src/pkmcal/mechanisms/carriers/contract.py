@@ -255,7 +255,7 @@ class Carrier(ABC):
         return None
 
 
-class BaseCarrier(Carrier):
+class BaseCarrier(Carrier, ABC):
     """Gives A, the limb's end on the base side, as a function of the joint reading.
 
     driven : the reading moves A; the rod then has a length of its own. unit : of the reading, m or
@@ -325,7 +325,7 @@ class BaseCarrier(Carrier):
         return np.stack(np.broadcast_arrays(*points), axis=-2)
 
 
-class PlatformCarrier(Carrier):
+class PlatformCarrier(Carrier, ABC):
     """Gives B, the limb's end on the platform side, as a function of the platform's pose.
 
     body : the field whose number says on which body of an articulated platform the leg ends.
