@@ -442,6 +442,15 @@ def test_what_legs_leave_unsure_the_room_may_tell(looked, monkeypatch):
     assert [s.name for s in found.session.stations] == [s.name for s in looked[0].stations]
 
 
+def test_a_board_on_the_base_serves_photographs_by_hand(folder):
+    """Each is from a place of its own, so one entry is many stations."""
+    board = SESSION.replace("observe: legs", "observe: [legs, board]")
+    text = board + "board: {file: board.yaml, fixed_to: base}\n"
+    (folder / "session.yaml").write_text(text)
+    (folder / "board.yaml").write_text("type: charuco\n")
+    assert not any("board" in told for told in load_session(folder).warnings)
+
+
 def test_unsure_photographs_are_left_out_and_told(looked, monkeypatch):
     found = placed(looked, monkeypatch, [1e-4, 0.3, 1e-4])
     assert [s.name for s in found.session.stations] == ["phone-0000-1", "phone-0002-1"]
@@ -489,6 +498,10 @@ def test_a_photograph_in_a_wrong_place_is_found_out(breathed):
     given_up = replace(estimate, edge_weights=weights)
     wrong = misplaced(session, measurements, given_up, T)
     assert wrong == [1]
+    # a board that agrees tells its place
+    shown = SimpleNamespace(edges=measurements.edges, poses=SimpleNamespace(station=np.array([1])))
+    with_board = replace(given_up, pose_weights=np.ones(1))
+    assert misplaced(session, shown, with_board, T) == []
     turn = np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [0.2, 0, 0, 0, 0, 0]])
     assert misplaced(session, measurements, estimate, perturb(T, turn)) == [2]
     known = KnownScene(estimate.machine, T, estimate.state.T_base_platform)
