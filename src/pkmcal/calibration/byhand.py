@@ -40,8 +40,6 @@ from pkmcal.wording import listed
 SURE = 0.05
 """Probability that any photograph of a session is believed to be where it is not; each has an equal
 share of it."""
-LIKELIEST = 4
-"""Places of a photograph that are asked about again, as others tell more of the machine."""
 FEWEST_EDGES = 4
 """Edges of a photograph that tell its place: two numbers each, of which a pose and a focal length
 take seven."""
@@ -93,7 +91,7 @@ def search_by_hand(
     # with the machine that the first of them tell; later ones change it by little
     looked: dict[int, Alone] = {}
     with ThreadPoolExecutor(WORKERS) as pool:
-        alone = partial(_search, session, at, room, joined, {}, {}, {}, {})
+        alone = partial(_search, session, at, room, joined, {}, {}, {})
         for k, (_, one) in zip(by_hand, pool.map(alone, by_hand), strict=True):
             found[k] = one
             if told is not None:
@@ -118,7 +116,7 @@ def search_by_hand(
                 T = joined.T_camera_base[k]
                 placed[k] = Neighbour(at[k].camera, T, _legs(session, at[k], joined, T)[0])
             landmarks = room.landmarks(placed)
-            again = partial(_search, session, at, room, joined, placed, landmarks, looked, found)
+            again = partial(_search, session, at, room, joined, placed, landmarks, looked)
             for k, (seen, one) in zip(unsure, pool.map(again, unsure), strict=True):
                 looked[k], found[k] = seen, one
     for k in by_hand:
@@ -135,12 +133,10 @@ def _search(
     placed: Mapping[int, Neighbour],
     landmarks: Mapping[int, Landmarks],
     looked: Mapping[int, Alone],
-    before: Mapping[int, Alone],
     k: int,
 ) -> tuple[Alone, Alone]:
     """The places that photograph k could show: by the search in it alone, unless it was looked at,
-    and weighed by its legs and by what it shares of the room with those that are placed. The
-    likeliest that were weighed before are asked about as well.
+    and weighed by its legs and by what it shares of the room with those that are placed.
     """
     p = photographs[k]
     alone = looked.get(k)
@@ -151,8 +147,6 @@ def _search(
         )  # fmt: skip
         alone = find_alone(view, p.images[0])
     others = room.place(k, landmarks)
-    if k in before:
-        others = np.concatenate([others, before[k].T_camera_base[:LIKELIEST]])
     if placed:
         axes = _legs(session, p, joined, alone.T_camera_base)
         others = np.concatenate([others, room.about(alone, k, p.camera, axes, placed)])

@@ -270,7 +270,7 @@ class Surroundings:
             near = T @ pose(turn, middle - turn @ middle)
             gain = self._gain(near, one, camera, [legs[h]] * len(near), placed)
             best = int(np.argmax(gain))
-            if gain[best] > gain[len(near) // 2]:
+            if gain[best] > 0 and best != len(near) // 2:
                 out.append(near[best : best + 1])
         return np.concatenate(out)
 
@@ -318,7 +318,9 @@ class Surroundings:
                 ok = beside & beside_machine(texture.pixel[j], camera, legs[h])
                 rays = texture.ray[j[ok]], self.texture(other).ray[k[ok]]
                 gain[h, n] = agreement(*rays, seen.T_camera_base @ inverse(T))
-        return np.logaddexp.reduce(gain, axis=1) - np.log(len(placed))
+        # any turn of a place may be what agrees best, of any neighbour: tries are paid for
+        tries = len(placed) * len(TURN_GRID)
+        return np.maximum(np.logaddexp.reduce(gain, axis=1) - np.log(tries), 0.0)
 
 
 def _crossing(eye: Array, ray: Array, eye_b: Array, ray_b: Array) -> tuple[Array, Booleans]:
