@@ -232,7 +232,7 @@ class _Work:
 
     def best(self, group: int, taken: list[int]) -> int:
         """The candidate of a group, none of those taken nor the same as one of them, whose coming
-        makes the index smallest.
+        makes the index smallest; of those with which it is equal, the one of the least variance.
         """
         now = self.machine
         to_slope = self._covariance @ (self._way.T @ self._index.slope(now))
@@ -252,4 +252,8 @@ class _Work:
         inner = np.eye(rows.shape[1]) + across @ rows.mT
         moved = across @ self._way.T
         after = now - moved.mT @ np.linalg.solve(inner, moved)
-        return int(begin + top[np.argmin(self._index.value(after))])
+        value = self._index.value(after)
+        # while some direction is told nothing, the largest eigenvalue is the same whatever comes
+        alike = value <= value.min() + GAIN * np.abs(value.min())
+        spread = np.where(alike, after.trace(axis1=1, axis2=2), np.inf)
+        return int(begin + top[np.argmin(spread)])
