@@ -46,11 +46,12 @@ class Outcome(NamedTuple):
 
 class Mistake(NamedTuple):
     """A usual mistake: how a session's folder gets it, and words by which it is named; none where
-    the session is as good as before.
+    the session is as good as before. late : it is the joint estimate that shows it.
     """
 
     make: Callable[[Path, np.random.Generator], None]
     named: tuple[str, ...]
+    late: bool = False
 
 
 def simulated(machine: str, seed: int, stations: int, count: int, keep: Path) -> Path:
@@ -103,6 +104,20 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
     right = bool((place < NEAR).all() and (turn < TURNED).all())
     said = f"{100 * place.max():.1f} % of the distance, {np.degrees(turn.max()):.1f} degrees off"
     return Outcome("right" if right else "wrong", said, seconds / len(session.stations))
+
+
+def calibrated(folder: Path, seed: int) -> Outcome:
+    """Whether a session with a mistake is refused when the whole of it is calibrated."""
+    from pkmcal.calibration.calibrate import calibrate
+    from pkmcal.errors import PkmcalError
+
+    begin = time.process_time()
+    try:
+        verdict = calibrate(folder, seed=seed).verdict
+    except PkmcalError as error:
+        return Outcome("refused", str(error), time.process_time() - begin)
+    what = "wrong" if verdict.usable else "refused"
+    return Outcome(what, verdict.headline, time.process_time() - begin)
 
 
 # ------------------------------------------------------------------ mistakes
@@ -226,7 +241,7 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), ("are mirrored",)),
     "upside down": Mistake(lambda f, _: pictures(f, lambda p: p[::-1, ::-1]), ()),
-    "diameters": Mistake(_radii, ("look like diameters",)),
+    "diameters": Mistake(_radii, ("look like diameters",), late=True),
     "millimetres": Mistake(_millimetres, ("range",)),
     "another machine": Mistake(_another, ("not recognised",)),
     "stations exchanged": Mistake(_stations, ("are mixed up",)),
@@ -243,6 +258,8 @@ def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
             without_poses(copy)
         mistake.make(copy, np.random.default_rng(seed))
         found = recognised(copy, seed, upside_down=name == "upside down")
+        if mistake.late and found.what != "refused":
+            found = calibrated(copy, seed)
     if not mistake.named:
         return found._replace(what="named" if found.what == "right" else found.what)
     if found.what != "refused":

@@ -11,9 +11,11 @@ import pytest
 import pkmcal
 from pkmcal.cameras import camera_models
 from pkmcal.commands.comparison import compare
+from pkmcal.errors import InputError
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import ThreeCentres, apply
+from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.session.load import load_session
 from pkmcal.simulation import Settings, load_truth
 from rendered import rendered
@@ -119,6 +121,23 @@ def test_start_from_a_bad_drawing(demo, calibrated):
     found = pkmcal.calibrate(replace(session, machine=machine))
     errors = compare(found, demo.session).calibrated
     assert errors.centre < 1.5 * compare(calibrated, demo.session).calibrated.centre + 0.05e-3
+
+
+@pytest.mark.parametrize("stations", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_diameters_for_radii_are_named_where_the_machine_was_recognised(demo, stations):
+    """Thick legs are found in the photographs, with the camera elsewhere; the estimate tells, or
+    that from one place there is none.
+    """
+    session = load_session(demo.session)
+    drawing = session.machine.document
+    legs = []
+    for leg in drawing.legs:
+        tubes = [t.model_copy(update={"radius": 2 * t.radius}) for t in leg.tubes]
+        legs.append(leg.model_copy(update={"tubes": tuple(tubes)}))
+    thick = machine_from_document(drawing.model_copy(update={"legs": tuple(legs)}))
+    session = replace(session.of_stations(range(stations)), machine=thick)
+    with pytest.raises(InputError, match="radii look like diameters"):
+        pkmcal.calibrate(session)
 
 
 def test_one_station_alone(demo, calibrated):

@@ -15,6 +15,7 @@ from pkmcal.boards.views import Boards
 from pkmcal.calibration.aside import LeftOut, chosen, set_aside
 from pkmcal.calibration.byhand import misplaced, place, without_misplaced
 from pkmcal.calibration.departures import Departed, departures
+from pkmcal.calibration.diameters import check_radii
 from pkmcal.calibration.doubts import (
     as_stated,
     check_poses,
@@ -41,7 +42,7 @@ from pkmcal.calibration.recognise import (
 )
 from pkmcal.calibration.shown import Overview, ShownCalibration
 from pkmcal.calibration.turns import Turns, identify_poses, take_turns
-from pkmcal.errors import InputError
+from pkmcal.errors import InputError, ResultError
 from pkmcal.files import closest, shown
 from pkmcal.identify.bed import bed_of
 from pkmcal.identify.bundle import what_data_tell
@@ -55,7 +56,7 @@ from pkmcal.identify.unidentified import (
     only_heights,
     seen_legs,
 )
-from pkmcal.identify.verdict import RicherModel, judge
+from pkmcal.identify.verdict import TOO_NOISY, RicherModel, judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
@@ -169,7 +170,11 @@ def calibrate(
         clock = _Clock(progress)
         session = _load(session, refine_camera, clock)
         seen = _observe(session, seed, clock)
-        found = _identify(seen, refine_camera, method, seed, holdout, clock)
+        try:
+            found = _identify(seen, refine_camera, method, seed, holdout, clock)
+        except ResultError:
+            check_radii(seen, refinement_of(seen.session, refine_camera), seed)
+            raise
         turns = found.turns
         at = seen.known.T_camera_base
         if wrong := misplaced(seen.session, turns.measurements, turns.estimate, at):
@@ -177,6 +182,8 @@ def calibrate(
             known = KnownScene(turns.estimate.machine, state.T_camera_base, state.T_base_platform)
             seen = without_misplaced(seen._replace(known=known), wrong)
             found = _identify(seen, refine_camera, method, seed, holdout, clock)
+        if found.turns.estimate.statistics.noise_scale > TOO_NOISY:
+            check_radii(seen, refinement_of(seen.session, refine_camera), seed)
         return _judge(seen, found, method, seed, clock)
 
 

@@ -273,7 +273,7 @@ def _hypotheses(station: SeenStation) -> Iterator[Hypothesis]:
         values = view.machine.values.copy()
         values[np.unique(view.tubes.radius)] /= 2
         thinner = partial(replace, view, machine=view.machine.with_values(values))
-        yield Hypothesis(thinner, _diameters())
+        yield Hypothesis(thinner, diameters("mechanism.yaml"))
 
 
 def _other_photographs(station: SeenStation) -> Iterator[Hypothesis]:
@@ -370,10 +370,11 @@ def _mirrored(name: str) -> InputError:
     )
 
 
-def _diameters() -> InputError:
+def diameters(mechanism: str) -> InputError:
+    """The error about radii that are twice too large; mechanism : the drawing's file."""
     return InputError(
         "the tubes' radii look like diameters",
-        where="mechanism.yaml, tubes",
+        where=f"{mechanism}, tubes",
         found="the photographs fit with radii half as large",
         next_step="Divide the radii by 2",
     )

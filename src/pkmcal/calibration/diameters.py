@@ -1,0 +1,52 @@
+"""Diameters that were taken for radii.
+
+Thick tubes of half the width are found in the photographs all the same: their edges lie on what is
+seen inside of the right ones, and the camera at another distance. A search in the picture does not
+tell them apart, for a tube's highlights, too, are edges at less than its width. What tells is the
+joint estimate: with the drawing's radii its edges disagree with the machine beyond what is accepted
+of any result, and with half of them they agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pkmcal.calibration.byhand import place
+from pkmcal.calibration.gather import CameraRefinement
+from pkmcal.calibration.known import SeenSession
+from pkmcal.calibration.turns import take_turns
+from pkmcal.errors import PkmcalError
+from pkmcal.identify.verdict import TOO_NOISY
+from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.document import Leg
+from pkmcal.mechanisms.machine import machine_from_document
+from pkmcal.observe.diagnose import diameters
+
+
+def check_radii(seen: SeenSession, cameras: CameraRefinement, seed: int) -> None:
+    """Raise `InputError` where the edges agree with a machine of half the radii.
+
+    Asked where with the drawing's radii nothing comes of them that may be used. cameras : as they
+    were before the estimate. seed : of the search for the stations.
+    """
+    if not seen.photographs:
+        return
+    thinner = replace(seen.session, machine=_of_half_the_radii(seen.session.machine))
+    try:
+        rng = np.random.default_rng(seed)
+        again = place(thinner, seen.photographs, seen.boards, rng)
+        turns = take_turns(again, cameras, lambda _text, _share: None, lambda _step: None)
+    except PkmcalError:  # it is not found in these photographs, or not known by them
+        return
+    if turns.estimate.statistics.noise_scale <= TOO_NOISY:
+        raise diameters(seen.session.document["mechanism"])
+
+
+def _of_half_the_radii(machine: Machine) -> Machine:
+    legs: list[Leg] = []
+    for leg in machine.document.legs:
+        tubes = [tube.model_copy(update={"radius": tube.radius / 2}) for tube in leg.tubes]
+        legs.append(leg.model_copy(update={"tubes": tuple(tubes)}))
+    return machine_from_document(machine.document.model_copy(update={"legs": tuple(legs)}))
