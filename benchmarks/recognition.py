@@ -195,7 +195,8 @@ def _radii(folder: Path, _: np.random.Generator) -> None:
 def _millimetres(folder: Path, _: np.random.Generator) -> None:
     def larger(value: Any) -> Any:
         if isinstance(value, dict):
-            return {key: larger(part) for key, part in value.items()}
+            # a reading's scale has no unit
+            return {k: part if k == "scale" else larger(part) for k, part in value.items()}
         if isinstance(value, list):
             return [larger(part) for part in value]
         return 1e3 * value if isinstance(value, float) else value
