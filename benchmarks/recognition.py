@@ -46,12 +46,11 @@ class Outcome(NamedTuple):
 
 class Mistake(NamedTuple):
     """A usual mistake: how a session's folder gets it, and words by which it is named; none where
-    the session is as good as before. late : it is the joint estimate that shows it.
+    the session is as good as before.
     """
 
     make: Callable[[Path, np.random.Generator], None]
     named: tuple[str, ...]
-    late: bool = False
 
 
 def simulated(machine: str, seed: int, stations: int, count: int, keep: Path) -> Path:
@@ -107,7 +106,7 @@ def recognised(folder: Path, seed: int, upside_down: bool = False) -> Outcome:
 
 
 def calibrated(folder: Path, seed: int) -> Outcome:
-    """Whether a session with a mistake is refused when the whole of it is calibrated."""
+    """Whether a session in whose photographs the machine was recognised is refused in the end."""
     from pkmcal.calibration.calibrate import calibrate
     from pkmcal.errors import PkmcalError
 
@@ -242,7 +241,7 @@ MISTAKES: dict[str, Mistake] = {
     ),
     "mirrored": Mistake(lambda f, _: pictures(f, lambda p: p[:, ::-1]), ("are mirrored",)),
     "upside down": Mistake(lambda f, _: pictures(f, lambda p: p[::-1, ::-1]), ()),
-    "diameters": Mistake(_radii, ("look like diameters",), late=True),
+    "diameters": Mistake(_radii, ("look like diameters",)),
     "millimetres": Mistake(_millimetres, ("range",)),
     "another machine": Mistake(_another, ("not recognised",)),
     "stations exchanged": Mistake(_stations, ("are mixed up",)),
@@ -259,7 +258,7 @@ def mistaken(name: str, folder: Path, seed: int, no_pose: bool) -> Outcome:
             without_poses(copy)
         mistake.make(copy, np.random.default_rng(seed))
         found = recognised(copy, seed, upside_down=name == "upside down")
-        if mistake.late and found.what != "refused":
+        if mistake.named and found.what != "refused":
             found = calibrated(copy, seed)
     if not mistake.named:
         return found._replace(what="named" if found.what == "right" else found.what)
