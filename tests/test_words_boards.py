@@ -198,10 +198,10 @@ def test_a_search_that_has_not_settled_is_refused():
     nothing = Observation(
         EdgeSet.empty(), (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
     )
-    assert judge(nothing, estimate, findings=findings).usable
+    assert judge(nothing, estimate, findings).usable
     statistics = replace(estimate.statistics, stopped=Stop.STEPS.value, steps=100)
     unsettled = replace(estimate, statistics=statistics)
-    (reason,) = judge(nothing, unsettled, findings=findings).reasons
+    (reason,) = judge(nothing, unsettled, findings).reasons
     assert "had not settled after 100 steps" in reason
 
 

@@ -86,12 +86,12 @@ class Calibration(ShownCalibration):
     measurements: Measurements
     estimate: Estimate
     verdict: Verdict
+    findings: Findings
     cameras: CameraRefinement
     method: str
     seed: int
     timings: dict[str, float] = field(default_factory=dict)
     boards: Boards = field(default_factory=Boards)
-    findings: Findings | None = None
     holdout: LeftOut | None = None
     departures: tuple[Departed, ...] = ()
     photographs: Mapping[int, Sequence[Integers]] = field(
@@ -289,8 +289,8 @@ def _judge(
     verdict = judge(
         found.turns.observation,
         found.estimate,
+        findings,
         method,
-        findings=findings,
         richer=found.richer,
         held_out=len(found.out.region.rows) if found.out else 0,
         doubts=(
@@ -317,12 +317,12 @@ def _judge(
         measurements=found.turns.measurements,
         estimate=found.estimate,
         verdict=verdict,
+        findings=findings,
         cameras=found.turns.cameras,
         method=method,
         seed=seed,
         timings=clock.laps,
         boards=seen.boards,
-        findings=findings,
         holdout=found.out,
         departures=departed,
         photographs={one.station: one.images for one in seen.photographs},

@@ -62,7 +62,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
         c.observation,
         c.estimate,
         c.verdict,
-        findings=c.findings,
+        c.findings,
         timings=c.timings,
         holdout=held_out,
         over=over,
@@ -70,8 +70,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
         boards=c.boards,
         photographs=c.photographs,
     )
-    groups = parameters.parameter_groups(c.session.machine, c.estimate)
-    open_ = parameters.unidentified(groups, c.estimate, c.findings)
+    open_ = parameters.unidentified(c.estimate, c.findings)
     predicted = held_out.document(c.session.configurations) if held_out else None
     return replace(
         told,
@@ -113,8 +112,8 @@ def report_of(
     observation: Observation,
     estimate: Estimate,
     verdict: Verdict,
+    findings: Findings,
     *,
-    findings: Findings | None = None,
     timings: Mapping[str, float] | None = None,
     holdout: HoldOut | None = None,
     over: ToolMap | str | None = None,
@@ -124,7 +123,6 @@ def report_of(
 ) -> Outcome:
     """The verdict, cards and parts.
 
-    findings : what the data tell of the machine; without them their section is left out.
     timings : seconds by step. holdout : what the estimate predicts of configurations that it did
     not see. over : the tool over the workspace, or why there is no map of it. digest : of the
     session. boards : the board as it was seen, to draw its corners.
@@ -142,7 +140,7 @@ def report_of(
         provenance.stations(session, observation, estimate, camera, space),
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
-        identifiability.section(findings, estimate.machine.parameters) if findings else None,
+        identifiability.section(findings, estimate.machine.parameters),
         correlations.section(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
@@ -151,7 +149,7 @@ def report_of(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),
         field.section(session, observation, estimate, album.corners, links),
-        provenance.left_out(session, observation.rejected, estimate, findings),
+        provenance.left_out(session, observation.rejected, estimate),
         provenance.how(session, estimate, timings or {}),
     )
     return Outcome(
@@ -161,9 +159,7 @@ def report_of(
         kicker=session.called,
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
-        figures=cards(
-            session, observation, estimate, centres, tool, findings.bed if findings else None
-        ),
+        figures=cards(session, observation, estimate, centres, tool, findings.bed),
         parts=tuple(part for part in parts if part),
         findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
         summary={"figures": numbers(observation, estimate, centres, tool)},

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import csv
 import io
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,7 +23,6 @@ from pkmcal.wording import (
     SCALES,
     decimals,
     joined,
-    legs_named,
     named,
     number,
     percent,
@@ -180,21 +178,9 @@ def _row(
     )
 
 
-def unidentified(
-    groups: tuple[ParameterGroup, ...], estimate: Estimate, findings: Findings | None = None
-) -> tuple[str, ...]:
-    """Sentences: what the data leave open, then pairs that can hardly be told apart.
-
-    findings : what is open, in words; without them, the values that stayed the drawing's.
-    """
-    if findings is None:
-        kinds: dict[str, list[ParameterRow]] = {}
-        for row in (row for group in groups for row in group.rows if row.source == "drawing"):
-            kinds.setdefault(re.sub(r"tube \d+", "tube", row.label), []).append(row)
-        n_legs = estimate.machine.n_legs
-        out = [_kind_text(kind, rows, n_legs) for kind, rows in kinds.items()]
-    else:
-        out = [f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak)]
+def unidentified(estimate: Estimate, findings: Findings) -> tuple[str, ...]:
+    """Sentences: what the data leave open, then pairs that can hardly be told apart."""
+    out = (f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak))
     return (*out, *bound_together(estimate, findings))
 
 
@@ -216,19 +202,6 @@ def _whole_axis(name: str) -> str:
     """The axis that a parameter is a component of, elsewhere the parameter itself."""
     whole = name.rpartition(".")[0]
     return whole if whole.endswith("axis") else name
-
-
-def _kind_text(kind: str, rows: list[ParameterRow], all_legs: int) -> str:
-    """A sentence on values of one kind that stayed the drawing's."""
-    legs = [row.leg for row in rows if row.leg is not None]
-    where = f" of {legs_named(legs, all_legs)}" if legs else ""
-    shares = sorted(row.share for row in rows)
-    low, high = percent(shares[0]), percent(shares[-1])
-    said = low if low == high else f"{low.removesuffix(' %')} to {high}"
-    return (
-        f"{kind.capitalize()}{where}: the photographs give {said} of what is known, so the drawing "
-        "and its tolerance decide."
-    )
 
 
 def _pair_text(table: ParameterTable, first: str, second: str, rho: float) -> str:
