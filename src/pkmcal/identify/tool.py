@@ -4,7 +4,7 @@ the drawing was. A calibration is for this; joints and lengths are the way to it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -101,6 +101,15 @@ class ToolError:
     off: Array
 
     __repr__ = short_repr
+
+    def first(self, n: int) -> ToolError:
+        """Of the first n poses alone."""
+        return replace(
+            self,
+            T_base_platform=self.T_base_platform[:n],
+            by_parameters=self.by_parameters[:n],
+            off=self.off[:n],
+        )
 
     @cached_property
     def covariance(self) -> Array:

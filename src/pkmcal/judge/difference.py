@@ -355,9 +355,8 @@ def _of_tool(d: MachineDifference) -> str:
     """What it does to the tool, as the end of a sentence."""
     if isinstance(d.tool, str):
         return ""
-    even = slice(0, d.tool.spread)
-    off, sigma = d.tool.after.off_position[even], d.tool.after.position[even]
-    off, sigma = off[np.isfinite(off)], sigma[np.isfinite(sigma)]
+    _, after = d.tool.evenly
+    off, sigma = (x[np.isfinite(x)] for x in (after.off_position, after.position))
     if not off.size:
         return ""
     one_sigma = brief(float(np.median(sigma)) * 1e3)
