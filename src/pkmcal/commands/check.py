@@ -16,7 +16,7 @@ DRAWN = "the drawing over each photograph"
 
 
 def check(
-    session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")],
+    session: console.SessionFolder,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Write a page with photographs there."),

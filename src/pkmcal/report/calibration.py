@@ -25,7 +25,6 @@ from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
 from pkmcal.outcome import Figure, Finding, Level, Outcome, Verdict
 from pkmcal.report import (
-    correlations,
     field,
     identifiability,
     page,
@@ -141,7 +140,7 @@ def report_of(
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
         identifiability.section(findings, estimate.machine.parameters),
-        correlations.section(estimate),
+        parameters.together(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
         validation.held_out(holdout, session) if holdout else None,
