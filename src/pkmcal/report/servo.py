@@ -389,8 +389,9 @@ def _over(values: Any, o: Trials, of: Callable[[Any], Any]) -> float | None:
     return float(of(good)) if good.size else None
 
 
-def _percent(values: Any, o: Trials, of: Callable[[Any], Any] = np.max) -> str:
-    value = _over(values, o, of)
+def _percent(values: Any, o: Trials) -> str:
+    """Parts of a way, the largest of the runs that reached the goal."""
+    value = _over(values, o, np.max)
     return "–" if value is None else brief(100 * value) if value > 5e-4 else "0"
 
 
