@@ -27,6 +27,8 @@ AS_REGULAR = 0.7
 """Part of the session's own distance from a singular pose that the others keep: near one, any
 error counts manifold, and nobody works there."""
 SEED = 4
+NO_TURN = 1e-9
+"""rad; what rounding leaves of a turn."""
 
 
 def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:

@@ -20,10 +20,10 @@ from pkmcal.files import write_folder
 from pkmcal.identify.bed import Bed
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import ToolError, centres_and_tool
+from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
 from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
-from pkmcal.outcome import Figure, Finding, Level, Outcome, Verdict
+from pkmcal.outcome import Figure, Outcome, Verdict, doubtful
 from pkmcal.report import (
     field,
     identifiability,
@@ -47,9 +47,6 @@ if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
     from pkmcal.identify.unidentified import Findings
     from pkmcal.judge.holdouts import HoldOut
-
-NO_TURN = 1e-9
-"""rad; what rounding leaves."""
 
 
 def outcome_of(calibration: Calibration) -> Outcome:
@@ -160,7 +157,7 @@ def report_of(
         notes=(session.document.get("notes") or "").strip(),
         figures=cards(session, observation, estimate, centres, tool, findings.bed),
         parts=tuple(part for part in parts if part),
-        findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
+        findings=tuple(doubtful(text) for text in session.warnings),
         summary={"figures": numbers(observation, estimate, centres, tool)},
     )
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.toolmap import ToolMap
+from pkmcal.identify.tool import NO_TURN
 from pkmcal.judge.difference import MachineDifference
 from pkmcal.outcome import AXIS, LOOKS, Figure, Level, Outcome, Part, Plot, Row, Table
 from pkmcal.report.scene import coloured, space_layout
@@ -16,8 +17,6 @@ from pkmcal.report.workspace import middle_and_worst
 from pkmcal.wording import SCALES, brief, count, decimals, number
 
 NONE = "–"
-NO_TURN = 1e-9
-"""rad; what rounding leaves."""
 BRIEF = 8
 """Changes that a terminal shows."""
 

@@ -22,6 +22,7 @@ from pkmcal.outcome import AXIS, LOOKS, Part, Plot
 from pkmcal.report import page
 from pkmcal.wording import (
     SCALES,
+    capital,
     decimals,
     joined,
     named,
@@ -216,9 +217,8 @@ def _whole_axis(name: str) -> str:
 
 def _pair_text(table: ParameterTable, first: str, second: str, rho: float) -> str:
     what = "difference" if rho > 0 else "sum"
-    start = table.in_words(first)
     return (
-        f"{start[0].upper()}{start[1:]} and {table.in_words(second)} move together (correlation "
+        f"{capital(table.in_words(first))} and {table.in_words(second)} move together (correlation "
         f"{number(rho, 3)}): their {what} is known far better than each alone."
     )
 

@@ -17,14 +17,13 @@ from pkmcal.outcome import (
     AXIS,
     LOOKS,
     Figure,
-    Finding,
-    Level,
     Outcome,
     Part,
     Plot,
     Row,
     Table,
     Verdict,
+    note,
 )
 from pkmcal.planning.plan import PAYS, Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
@@ -106,7 +105,7 @@ def outcome_of(found: MeasurementPlan) -> Outcome:
             ),
         ),
         parts=tuple(parts),
-        findings=tuple(Finding(Level.NOTE, text) for text in found.subject.words),
+        findings=tuple(note(text) for text in found.subject.words),
         document=document_of(found),
         texts=texts,
     )

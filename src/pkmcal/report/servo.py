@@ -16,14 +16,13 @@ from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
 from pkmcal.outcome import (
     Figure,
-    Finding,
-    Level,
     Outcome,
     Part,
     Plot,
     Row,
     Table,
     Verdict,
+    doubtful,
     plane,
 )
 from pkmcal.report.scene import coordinates, line, markers, ring, space_layout
@@ -124,7 +123,7 @@ def outcome_of(subject: Controlled, found: Study) -> Outcome:
             Part("legs", "Legs", tables=(choices_table(found),)),
             Part("how", "How it was computed", HOW, tables=(settings_table(found),)),
         ),
-        findings=tuple(Finding(Level.DOUBTFUL, text) for text in subject.warnings),
+        findings=tuple(doubtful(text) for text in subject.warnings),
         document=document,
         summary={name: value for name, value in document.items() if name != "curves"},
     )

@@ -10,14 +10,13 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.toolmap import NO_EXTENT, Slice, ToolMap
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.estimate import Estimate
+from pkmcal.identify.tool import NO_TURN
 from pkmcal.outcome import AXIS, LOOKS, Part, Plot, Row, Table
 from pkmcal.report.links import Links
 from pkmcal.report.scene import COLOURS, coloured, markers, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, number
 
-NO_TURN = 1e-9
-"""rad; what rounding leaves."""
 PANEL = 170
 """Height of a row of slices, px."""
 LEFT, RIGHT, TOP, BOTTOM = 92, 74, 26, 40
