@@ -20,7 +20,7 @@ from pkmcal.identify.verdict import judge
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.report import correlations
+from pkmcal.report import parameters
 from pkmcal.report.identifiability import held as held_in_words
 from pkmcal.report.identifiability import tied as tied_in_words
 from pkmcal.report.parameters import TIGHT, bound_together, grouped, tight_pairs
@@ -240,7 +240,7 @@ def test_pairs_that_a_finding_names_are_not_said_again():
 def test_what_the_picture_of_correlations_says_fits_the_sentences_on_pairs(name):
     _, _, estimate = told_of(name)
     table, said = estimate.machine.parameters, bound_together(estimate)
-    part = correlations.section(estimate)
+    part = parameters.together(estimate)
     (heat,) = part.plots[0].figure["data"]
     closest = float(re.search(r", ([+−]\d\.\d\d)\.", part.text[0])[1].replace("−", "-"))
     assert bool(said) == (abs(closest) > TIGHT)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, short_repr
+from pkmcal.arrays import Array, numbered, short_repr
 from pkmcal.boards.board import Board, load_board
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
@@ -115,7 +115,7 @@ def of_machine(
         machine,
         tuple(f"station{k + 1}" for k in range(len(cameras))),
         T_camera_base,
-        np.array([list(dict.fromkeys(map(id, cameras))).index(id(c)) for c in cameras]),
+        numbered(map(id, cameras)),
         joint_noise,
         instruments,
         mounts,
@@ -195,13 +195,12 @@ def of_session(
     seen = _Photographed.of(session, saved, np.random.default_rng(seed))
     T_camera_base = _places(session, saved, seen, anywhere, seed)
     found = _instruments(session, saved, seen, T_camera_base, edge, corner, seed)
-    files = [station.camera_file for station in session.stations]
-    numbers = [list(dict.fromkeys(files)).index(f) for f in files] + [0] * len(session.trackers)
+    cameras = numbered(station.camera_file for station in session.stations)
     rig = Rig(
         session.machine,
         session.station_names,
         T_camera_base,
-        np.array(numbers, dtype=int),
+        np.pad(cameras, (0, len(session.trackers))),  # of a tracker no camera's number matters
         session.joint_noise,
         found.instruments,
         found.mounts,

@@ -19,11 +19,10 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
 from pkmcal.report import poses
-from pkmcal.report.drawn import edge_name, laid_over
+from pkmcal.report.drawn import edge_name, laid_over, residual_words
 from pkmcal.report.pictures import edge_curves
 from pkmcal.report.residuals import KEPT, rms
 from pkmcal.session.photographs import label_of
-from pkmcal.wording import number
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
@@ -227,9 +226,6 @@ def _coded(grey: Any) -> dict[str, Any]:
 def _tip(c: Calibration, n: int) -> str:
     """An edge in words."""
     edges, estimate = c.observation.edges, c.estimate
-    across, tilt = estimate.edge_residuals[n].tolist()
-    return (
-        f"{edge_name(int(edges.leg[n]), int(edges.tube[n]), int(edges.side[n]))}: residual"
-        f" {number(across, 1, signed=True)} σ across, {number(tilt, 1, signed=True)} σ tilt;"
-        f" weight {number(float(estimate.edge_weights[n]), 2)}"
-    )
+    name = edge_name(int(edges.leg[n]), int(edges.tube[n]), int(edges.side[n]))
+    shift, tilt = estimate.edge_residuals[n].tolist()
+    return f"{name}: {residual_words(shift, tilt, float(estimate.edge_weights[n]))}"
