@@ -25,6 +25,7 @@ from pkmcal.outcome import (
     doubtful,
     plane,
 )
+from pkmcal.report.page import N_COLOURS
 from pkmcal.report.scene import coordinates, line, markers, ring, space_layout
 from pkmcal.wording import brief, number
 
@@ -513,7 +514,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
     data = [
         line(
             f"leg {j + 1}" + ("" if j in seen else ", not seen"),
-            f"--leg{j % 8 + 1}" if j in seen else "--quiet",
+            f"--leg{j % N_COLOURS + 1}" if j in seen else "--quiet",
             8 if j in seen else 4,
             (),
             **leg,
@@ -624,7 +625,7 @@ def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[di
             f"edges {name}",
             _pixel_list(pixels[e, :, 0]),
             _pixel_list(pixels[e, :, 1]),
-            {"color": f"--leg{int(leg) % 8 + 1}", "width": width, "dash": dash},
+            {"color": f"--leg{int(leg) % N_COLOURS + 1}", "width": width, "dash": dash},
             legendgroup=name,
             showlegend=e == 0,
         )
