@@ -35,7 +35,7 @@ def main() -> None:
     """Print the ratio, the parts of a calibration, and the memory used."""
     begin = time.perf_counter()
     from pkmcal.calibration.calibrate import calibrate
-    from pkmcal.report.calibration import report_of
+    from pkmcal.report.calibration import outcome_of
     from pkmcal.report.page import page_html
     from pkmcal.session.load import load_session
 
@@ -47,7 +47,7 @@ def main() -> None:
         runs = [calibrate(session).timings for _ in range(3)]
         parts = {name: min(run[name] for run in runs) for name in runs[0]}
         begin = time.perf_counter()
-        page_html(report_of(session, first.observation, first.estimate, first.verdict))
+        page_html(outcome_of(first))
         parts["report"] = time.perf_counter() - begin
         paths = [p.path for s in session.stations for p in s.photographs]
         plain = best_of(lambda: decode_and_canny(paths))

@@ -17,12 +17,19 @@ from conftest import run
 from pkmcal.check import advice as words
 from pkmcal.check.check import check_session
 from pkmcal.check.forecast import Forecast, LegForecast, forecast
+from pkmcal.check.pictures import (
+    BAR,
+    GAP,
+    leg_colours,
+    picture_names,
+    with_pictures,
+    write_pictures,
+)
 from pkmcal.check.words import outcome_of
 from pkmcal.geometry.rigid import inverse, pose, rotation
 from pkmcal.identify.tool import centres_and_tool
 from pkmcal.outcome import Level
 from pkmcal.planning.first import EdgesOf
-from pkmcal.report.check import BAR, GAP, leg_colours, picture_names, with_pictures, write_pictures
 
 
 @pytest.fixture
@@ -208,7 +215,7 @@ def test_pictures_of_all_photographs(found, tmp_path):
 
 def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
     """Under its lines the photograph changes; under those by hand, that are off, it does less."""
-    from pkmcal.report.check import overlay, poses_of
+    from pkmcal.check.pictures import overlay, poses_of
 
     def strength(laid, k):
         image = station.photographs.images[k].astype(np.float32)
@@ -225,7 +232,7 @@ def test_the_drawing_lies_on_the_legs_by_the_pose_found(found, calibrated):
 
 
 def test_each_number_stands_once_and_apart(found):
-    from pkmcal.report.check import overlay, poses_of
+    from pkmcal.check.pictures import overlay, poses_of
 
     station = found.look.stations[0]
     _, spots = overlay(found.look, station, poses_of(station)[-1], 0)
@@ -283,14 +290,14 @@ def test_without_these_options_nothing_is_drawn(alone, monkeypatch):
     def never(*_):
         raise AssertionError
 
-    monkeypatch.setattr("pkmcal.report.check.overlay", never)
+    monkeypatch.setattr("pkmcal.check.pictures.overlay", never)
     before = sorted(alone.rglob("*"))
     assert run("check", alone).code < 2
     assert sorted(alone.rglob("*")) == before
 
 
 def test_pictures_whole_or_not_at_all(found, tmp_path, monkeypatch):
-    monkeypatch.setattr("pkmcal.report.check.BAR", -1)  # fails in the first picture
+    monkeypatch.setattr("pkmcal.check.pictures.BAR", -1)  # fails in the first picture
     with pytest.raises(ValueError, match="negative"):
         write_pictures(found.look, tmp_path / "pictures")
     assert list(tmp_path.iterdir()) == []

@@ -444,7 +444,7 @@ def test_the_four_steps_on_four_configurations_a_station(session, monkeypatch):
 def test_an_unusable_result_is_told_and_written(session, calibrated, monkeypatch):
     found = calibrated
     doubts = ("Somebody ran into the machine.",)
-    verdict = judge(found.observation, found.estimate, findings=found.findings, doubts=doubts)
+    verdict = judge(found.observation, found.estimate, found.findings, doubts=doubts)
     found = replace(found, verdict=verdict)
     monkeypatch.setattr("pkmcal.calibration.calibrate.calibrate", lambda *_, **_more: found)
     done = run("calibrate", session)

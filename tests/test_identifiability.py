@@ -19,6 +19,7 @@ from pkmcal.identify.covariance import identifiability
 from pkmcal.identify.estimate import State
 from pkmcal.identify.gauge import apply, default_gauge, freedoms, generators
 from pkmcal.identify.start import start_state
+from pkmcal.identify.unidentified import explain, seen_legs
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.mechanisms import load_mechanism
@@ -72,7 +73,10 @@ def surprise(machine, found, state):
 def verdict(measurements, found):
     nothing = np.zeros((0, 2)), np.zeros(0, dtype=int)
     observation = Observation(measurements.edges, (), *nothing, found.state.T_camera_base)
-    return judge(observation, found, told=what_data_tell(measurements, found))
+    seen = seen_legs(
+        measurements.edges, found.edge_weights, measurements.n_stations, found.machine.n_legs
+    )
+    return judge(observation, found, explain(what_data_tell(measurements, found), found, seen))
 
 
 def test_six_turns_of_a_3_upus_axes_are_unknown_and_nothing_else():

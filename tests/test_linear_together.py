@@ -12,7 +12,9 @@ import pkmcal
 from pkmcal.cameras import camera_models
 from pkmcal.errors import ResultError
 from pkmcal.geometry.rigid import apply, look_at, perturb, register
+from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.gauge import BestFit, centre_index, generators, transformation
+from pkmcal.identify.unidentified import Findings
 from pkmcal.identify.verdict import judge
 from pkmcal.measurements import Measurements, Observation
 from pkmcal.papers import linear
@@ -200,7 +202,8 @@ def test_verdict_says_how_far_the_method_goes(scenes):
         np.zeros(0, dtype=int),
         estimate.state.T_camera_base,
     )
-    verdict = judge(observation, estimate, "linear")
+    told = Identifiability(0, 0, 0, (), (), np.zeros(0))
+    verdict = judge(observation, estimate, Findings(told, (), (), 1.0), "linear")
     assert not verdict.usable
     told = verdict.reasons[0]
     assert "tells of the base alone" in told

@@ -22,7 +22,7 @@ from pkmcal.report import drawn, parameters, pictures, provenance, residuals
 from pkmcal.report.calibration import report_of
 from pkmcal.report.charts import enlargement, ticks_between
 from pkmcal.report.drawn import CURVE, STRAIGHT
-from test_report_case import OUTWARD, RADIUS, Case, edges_of, make_case
+from test_report_case import OUTWARD, RADIUS, TOLD, Case, edges_of, make_case
 
 
 @pytest.fixture(scope="module")
@@ -86,13 +86,14 @@ def test_the_row_of_chi2_is_of_the_noise_as_stated(case):
     )  # fmt: skip
     refused = Verdict(False, "Not to be used.", ("The edges disagree with the machine.",))
     estimate = replace(case.estimate, statistics=noisy)
-    found = report_of(case.session, case.observation, estimate, refused)
+    found = report_of(case.session, case.observation, estimate, refused, TOLD)
     (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
     assert card.values == (("46.16", "χ² per degree of freedom"),)  # 0.94 * 49 + 0.1
     assert "1.04 after the edges' stated noise was multiplied by 7.00" in card.note
     assert found.summary["figures"]["chi2_per_freedom"] == pytest.approx(46.16)
     plain = replace(noisy, noise_scale=1.0)
-    found = report_of(case.session, case.observation, replace(estimate, statistics=plain), refused)
+    estimate = replace(estimate, statistics=plain)
+    found = report_of(case.session, case.observation, estimate, refused, TOLD)
     (card,) = (card for card in found.figures if card.question.startswith("Does the model"))
     assert card.values == (("1.04", "χ² per degree of freedom"),)
     assert "multiplied" not in card.note
@@ -104,18 +105,15 @@ def test_groups_follow_the_legs(case):
     assert sum(len(g.rows) for g in groups) == len(case.session.machine.parameters)
 
 
-def test_what_stays_the_drawings_is_said_in_words(case):
+def test_what_can_hardly_be_told_apart_is_said_in_words(case):
     covariance = case.estimate.covariance.copy()
     i, j = (case.session.machine.parameters.index(f"legs[6].{p}")
             for p in ("platform.center.z", "length.offset"))  # fmt: skip
     covariance[i, j] = covariance[j, i] = -0.98 * covariance[i, i]
     estimate = with_covariance(case.estimate, covariance)
-    groups = parameters.parameter_groups(case.session.machine, estimate)
-    said = parameters.unidentified(groups, estimate)
-    assert said[0].startswith("Tube radius of all legs: the photographs give 20 %")
-    assert said[1].startswith("Leg 6 platform centre z and leg 6 length offset move together")
-    assert "their sum is known far better" in said[1]
-    assert len(said) == 2
+    (said,) = parameters.bound_together(estimate)
+    assert said.startswith("Leg 6 platform centre z and leg 6 length offset move together")
+    assert "their sum is known far better" in said
 
 
 # ------------------------------------------------------------------ uncertainty

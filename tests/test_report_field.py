@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pkmcal.report import correlations, field
+from pkmcal.report import field, parameters
 from pkmcal.report.corners import BoardCorners
 from pkmcal.report.field import Offsets
 from pkmcal.report.links import Links
@@ -83,7 +83,7 @@ def test_edges_are_off_by_what_they_were_shifted(case):
 
 
 def test_correlations_are_those_of_the_covariance(case):
-    part = correlations.section(case.estimate)
+    part = parameters.together(case.estimate)
     assert part is not None
     (heat,) = part.plots[0].figure["data"]
     rho = np.asarray(heat["z"])

@@ -69,12 +69,6 @@ def test_the_section_stands_on_the_page(case, apart):
     assert "nan" not in re.sub(r'<script type="text/plain".*?</script>', "", page, flags=re.S)
 
 
-def test_without_findings_there_is_no_section(case):
-    page = report_html(case.session, case.observation, case.estimate, Verdict(True, "Fine."))
-    assert "identifiability" not in page
-    assert "What the photographs could not decide" in page
-
-
 def test_a_whole_session_has_nothing_to_list():
     findings = findings_of(make("gough-stewart"))
     table = load_mechanism("gough-stewart").parameters

@@ -17,7 +17,7 @@ from pkmcal.outcome import Level, Outcome, Part, Row, Table, Verdict
 from pkmcal.report.calibration import report_of
 from pkmcal.report.charts import UprightBar, bar_chart
 from pkmcal.report.page import page_html
-from test_report_case import Case, make_case, report_html
+from test_report_case import TOLD, Case, make_case, report_html
 
 HOSTILE = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
 CHROMIUM = next(
@@ -72,7 +72,8 @@ def test_page_tells_verdict_numbers_and_model_error(page):
 
 def test_page_tells_when_and_from_what_it_was_made(case):
     noted = replace(case.session, document={"notes": "Machine 2.\nLeg 4 <b>exchanged</b>."})
-    found = report_of(noted, case.observation, case.estimate, Verdict(True, "Fine."), digest="3f2a")
+    fine = Verdict(True, "Fine.")
+    found = report_of(noted, case.observation, case.estimate, fine, TOLD, digest="3f2a")
     html = page_html(found, datetime(2026, 3, 4, 15, 2))
     text = Found(html).text
     assert "4 March 2026, 15:02" in text
@@ -80,8 +81,7 @@ def test_page_tells_when_and_from_what_it_was_made(case):
     assert "digest of the session 3f2a" in text
     assert "Leg 4 <b>exchanged</b>." in text
     assert "<h3>Notes</h3>" in html
-    assert "<h3>Notes</h3>" not in report_html(case.session, case.observation, case.estimate,
-                                               Verdict(True, "Fine."))  # fmt: skip
+    assert "<h3>Notes</h3>" not in report_html(case.session, case.observation, case.estimate, fine)
 
 
 def test_charts_lead_to_photographs_that_are_there(page, case):

@@ -15,7 +15,6 @@ import pytest
 from conftest import run
 from pkmcal.errors import InputError
 from pkmcal.mechanisms import load_mechanism
-from pkmcal.report.study import document_of
 from pkmcal.studies import engine
 from pkmcal.studies.calibrations import (
     ESTIMATE,
@@ -28,6 +27,7 @@ from pkmcal.studies.capture import captured
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.findings import SweepResult, clustered, study
 from pkmcal.studies.statistics import Summary
+from pkmcal.studies.study_report import document_of
 from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of
 from pkmcal.wording import brief
 

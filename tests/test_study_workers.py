@@ -16,7 +16,6 @@ import pytest
 
 from conftest import run
 from pkmcal.errors import InputError, ResultError
-from pkmcal.report.study import document_of, runs_bytes
 from pkmcal.studies import cluster, engine, tasks, workers
 from pkmcal.studies.calibrations import (
     ESTIMATE,
@@ -24,6 +23,7 @@ from pkmcal.studies.calibrations import (
 from pkmcal.studies.findings import study
 from pkmcal.studies.paper_a_joint import JointByAxes
 from pkmcal.studies.store import Store
+from pkmcal.studies.study_report import document_of, runs_bytes
 from pkmcal.studies.sweep import cells_of, subject_of
 from pkmcal.studies.tasks import Batch, Job, Population, Sample
 from test_study import SMALL, batch_of

@@ -20,7 +20,7 @@ from pkmcal.identify.verdict import judge
 from pkmcal.measurements import EdgeSet, Observation
 from pkmcal.mechanisms import load_mechanism
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.report import correlations
+from pkmcal.report import parameters
 from pkmcal.report.identifiability import held as held_in_words
 from pkmcal.report.identifiability import tied as tied_in_words
 from pkmcal.report.parameters import TIGHT, bound_together, grouped, tight_pairs
@@ -198,10 +198,10 @@ def test_a_search_that_has_not_settled_is_refused():
     nothing = Observation(
         EdgeSet.empty(), (), np.zeros((0, 2)), np.zeros(0, int), estimate.state.T_camera_base
     )
-    assert judge(nothing, estimate, findings=findings).usable
+    assert judge(nothing, estimate, findings).usable
     statistics = replace(estimate.statistics, stopped=Stop.STEPS.value, steps=100)
     unsettled = replace(estimate, statistics=statistics)
-    (reason,) = judge(nothing, unsettled, findings=findings).reasons
+    (reason,) = judge(nothing, unsettled, findings).reasons
     assert "had not settled after 100 steps" in reason
 
 
@@ -240,7 +240,7 @@ def test_pairs_that_a_finding_names_are_not_said_again():
 def test_what_the_picture_of_correlations_says_fits_the_sentences_on_pairs(name):
     _, _, estimate = told_of(name)
     table, said = estimate.machine.parameters, bound_together(estimate)
-    part = correlations.section(estimate)
+    part = parameters.together(estimate)
     (heat,) = part.plots[0].figure["data"]
     closest = float(re.search(r", ([+−]\d\.\d\d)\.", part.text[0])[1].replace("−", "-"))
     assert bool(said) == (abs(closest) > TIGHT)

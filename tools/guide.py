@@ -20,10 +20,11 @@ import numpy as np
 
 import pkmcal
 from pkmcal.calibration.calibrate import Calibration
+from pkmcal.check import pictures
 from pkmcal.check.check import check_session
 from pkmcal.judge.validate import validate
 from pkmcal.outcome import Outcome
-from pkmcal.report import calibration, check, page, validation
+from pkmcal.report import calibration, page, validation
 
 HERE = Path(__file__).resolve().parents[1]
 HELD_OUT = 6
@@ -89,7 +90,7 @@ def laid_over(folder: Path) -> str:
         sys.exit(f"{folder}: nothing to look at")
     few = replace(found.look, stations=found.look.stations[:1])
     # the section shows up to three photographs of a station, each twice; one is enough
-    figures = str(check.with_pictures(few).html).split("<figure")[1:3]
+    figures = str(pictures.with_pictures(few).html).split("<figure")[1:3]
     style = "<style>.row { display: flex; gap: 10px; padding: 6px } .row figure { flex: 1 }</style>"
     return style + "<div class='row'>" + "".join("<figure" + one for one in figures) + "</div>"
 

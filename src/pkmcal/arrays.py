@@ -1,10 +1,10 @@
 """The one array type of the project, so that signatures stay readable, what it is told as, and its
-plain figure.
+plain figures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Hashable, Iterable
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -19,6 +19,12 @@ Booleans = NDArray[np.bool_]
 def rms(values: Array) -> float:
     """Root mean square of all values; NaN of none."""
     return float(np.sqrt(np.mean(values**2))) if values.size else float("nan")
+
+
+def numbered(names: Iterable[Hashable]) -> Integers:
+    """Numbers (n,) of things that may be alike, in the order in which each is first named."""
+    number: dict[Hashable, int] = {}
+    return np.array([number.setdefault(name, len(number)) for name in names], dtype=int)
 
 
 LONGEST_VALUE = 40

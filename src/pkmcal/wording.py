@@ -104,6 +104,11 @@ def listed(names: Sequence[str], longest: int = 6) -> str:
     return f"{', '.join(names[: longest - 1])} and {len(names) - longest + 1} more"
 
 
+def capital(text: str) -> str:
+    """The beginning of a sentence."""
+    return text[:1].upper() + text[1:]
+
+
 def percent(share: float) -> str:
     """A share as whole percent, never rounded up to a certainty it has not."""
     return f"{math.floor(100 * min(max(share, 0.0), 1.0))} %"

@@ -87,12 +87,12 @@ class Calibration(ShownCalibration):
     measurements: Measurements
     estimate: Estimate
     verdict: Verdict
+    findings: Findings
     cameras: CameraRefinement
     method: str
     seed: int
     timings: dict[str, float] = field(default_factory=dict)
     boards: Boards = field(default_factory=Boards)
-    findings: Findings | None = None
     holdout: LeftOut | None = None
     departures: tuple[Departed, ...] = ()
     photographs: Mapping[int, Sequence[Integers]] = field(
@@ -173,7 +173,7 @@ def calibrate(
         try:
             found = _identify(seen, refine_camera, method, seed, holdout, clock)
         except ResultError:
-            check_radii(seen, refinement_of(seen.session, refine_camera), seed)
+            check_radii(seen, 0, refinement_of(seen.session, refine_camera), seed)
             raise
         turns = found.turns
         at = seen.known.T_camera_base
@@ -182,8 +182,10 @@ def calibrate(
             known = KnownScene(turns.estimate.machine, state.T_camera_base, state.T_base_platform)
             seen = without_misplaced(seen._replace(known=known), wrong)
             found = _identify(seen, refine_camera, method, seed, holdout, clock)
-        if found.turns.estimate.statistics.noise_scale > TOO_NOISY:
-            check_radii(seen, refinement_of(seen.session, refine_camera), seed)
+        estimate = found.turns.estimate
+        if estimate.statistics.noise_scale > TOO_NOISY:
+            kept = float(estimate.edge_weights.sum())
+            check_radii(seen, kept, refinement_of(seen.session, refine_camera), seed)
         return _judge(seen, found, method, seed, clock)
 
 
@@ -296,8 +298,8 @@ def _judge(
     verdict = judge(
         found.turns.observation,
         found.estimate,
+        findings,
         method,
-        findings=findings,
         richer=found.richer,
         held_out=len(found.out.region.rows) if found.out else 0,
         doubts=(
@@ -324,12 +326,12 @@ def _judge(
         measurements=found.turns.measurements,
         estimate=found.estimate,
         verdict=verdict,
+        findings=findings,
         cameras=found.turns.cameras,
         method=method,
         seed=seed,
         timings=clock.laps,
         boards=seen.boards,
-        findings=findings,
         holdout=found.out,
         departures=departed,
         photographs={one.station: one.images for one in seen.photographs},

@@ -3,8 +3,8 @@
 Thick tubes of half the width are found in the photographs all the same: their edges lie on what is
 seen inside of the right ones, and the camera at another distance. A search in the picture does not
 tell them apart, for a tube's highlights, too, are edges at less than its width. What tells is the
-joint estimate: with the drawing's radii its edges disagree with the machine beyond what is accepted
-of any result, and with half of them they agree.
+joint estimate: with the drawing's radii few edges are found, which disagree with the machine beyond
+what is accepted of any result; with half of them there are more, and they agree.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from pkmcal.calibration.byhand import place
+from pkmcal.calibration.doubts import CURED
 from pkmcal.calibration.gather import CameraRefinement
 from pkmcal.calibration.known import SeenSession
 from pkmcal.calibration.turns import take_turns
@@ -25,11 +26,11 @@ from pkmcal.mechanisms.machine import machine_from_document
 from pkmcal.observe.diagnose import diameters
 
 
-def check_radii(seen: SeenSession, cameras: CameraRefinement, seed: int) -> None:
-    """Raise `InputError` where the edges agree with a machine of half the radii.
+def check_radii(seen: SeenSession, kept: float, cameras: CameraRefinement, seed: int) -> None:
+    """Raise `InputError` where more edges agree with a machine of half the radii.
 
-    Asked where with the drawing's radii nothing comes of them that may be used. cameras : as they
-    were before the estimate. seed : of the search for the stations.
+    Asked where with the drawing's radii nothing comes of them that may be used. kept : edges that
+    fitted then. cameras : as they were before the estimate. seed : of the search for the stations.
     """
     if not seen.photographs:
         return
@@ -40,7 +41,9 @@ def check_radii(seen: SeenSession, cameras: CameraRefinement, seed: int) -> None
         turns = take_turns(again, cameras, lambda _text, _share: None, lambda _step: None)
     except PkmcalError:  # it is not found in these photographs, or not known by them
         return
-    if turns.estimate.statistics.noise_scale <= TOO_NOISY:
+    found = turns.estimate
+    cured = found.statistics.noise_scale <= CURED * TOO_NOISY
+    if cured and found.edge_weights.sum() > kept:
         raise diameters(seen.session.document["mechanism"])
 
 

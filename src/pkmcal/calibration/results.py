@@ -151,7 +151,7 @@ def document_of(
     given.
     """
     session, estimate = calibration.session, calibration.estimate
-    bed = calibration.findings and calibration.findings.bed
+    bed = calibration.findings.bed
     seen = digests(session) if photographs is None else photographs
     document = {
         FORMAT_KEY: FORMAT,
@@ -219,13 +219,11 @@ def _parameters(calibration: Calibration) -> list[dict[str, Any]]:
     return [asdict(row) for row in calibration.parameters]
 
 
-def identifiability_of(findings: Findings | None) -> dict[str, Any] | None:
-    """The rank, what is open in words, and the paper's conditions; null where not looked at.
+def identifiability_of(findings: Findings) -> dict[str, Any]:
+    """The rank, what is open in words, and the paper's conditions.
 
     moves_platform : m, root mean square over the platform's joints and poses.
     """
-    if findings is None:
-        return None
     told = findings.told
     return {
         "rank": told.rank,

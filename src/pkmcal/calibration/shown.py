@@ -14,16 +14,13 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.identify.found import FoundParameters, found_parameters
-from pkmcal.identify.tool import ToolError
+from pkmcal.identify.tool import NO_TURN, ToolError
 from pkmcal.mechanisms import Machine
 from pkmcal.outcome import Verdict
 from pkmcal.wording import brief, count, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-NO_TURN = 1e-9
-"""rad; what rounding leaves."""
 
 
 @dataclass(frozen=True)

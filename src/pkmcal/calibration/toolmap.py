@@ -5,6 +5,7 @@ would be by the drawing's tolerances, and how wrong the drawing was.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -79,21 +80,25 @@ class ToolMap:
 
     __repr__ = short_repr
 
+    @cached_property
+    def evenly(self) -> tuple[ToolError, ToolError]:
+        """``before`` and ``after`` at the evenly spread poses alone."""
+        return self.before.first(self.spread), self.after.first(self.spread)
+
     def document(self) -> dict[str, Any]:
         """For programs, of the evenly spread poses: m and rad."""
-        even = slice(0, self.spread)
-        after, before = self.after, self.before
-        worst = int(np.nanargmax(after.position[even]))
+        before, after = self.evenly
+        worst = int(np.nanargmax(after.position))
         return {
             "region": {
                 **dict(zip("xyz", self.region.sides, strict=True)),
                 "turn": self.region.turn,
             },
             "poses": self.spread,
-            "sigma": _summary(self.after.position[even], self.after.orientation[even]),
-            "drawing_off": _summary(after.off_position[even], after.off_orientation[even]),
-            "sigma_of_drawing": _summary(before.position[even], before.orientation[even]),
-            "worst_at": self.after.T_base_platform[worst, :3, 3],
+            "sigma": _summary(after.position, after.orientation),
+            "drawing_off": _summary(after.off_position, after.off_orientation),
+            "sigma_of_drawing": _summary(before.position, before.orientation),
+            "worst_at": after.T_base_platform[worst, :3, 3],
         }
 
 

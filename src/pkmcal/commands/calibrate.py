@@ -34,7 +34,7 @@ FILES = {
 
 
 def calibrate(
-    session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")],
+    session: console.SessionFolder,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="SESSION/calibration unless given."),

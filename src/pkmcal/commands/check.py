@@ -16,7 +16,7 @@ DRAWN = "the drawing over each photograph"
 
 
 def check(
-    session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")],
+    session: console.SessionFolder,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="Write a page with photographs there."),
@@ -56,7 +56,7 @@ def check(
             outcome = replace(outcome, document={**outcome.document, "repeats": repeats})
         files: dict[str, str] = {}
         if pictures is not None and found.look:
-            from pkmcal.report.check import picture_names, write_pictures
+            from pkmcal.check.pictures import picture_names, write_pictures
 
             told("Drawing", 0.95)
             names = picture_names(found.look).values()
@@ -65,7 +65,7 @@ def check(
             files[str(pictures)] = DRAWN
         if out is not None:
             if found.look:
-                from pkmcal.report.check import with_pictures
+                from pkmcal.check.pictures import with_pictures
 
                 told("Writing the page", 0.97)
                 outcome = replace(outcome, parts=(*outcome.parts, with_pictures(found.look)))

@@ -16,7 +16,6 @@ from typing import Annotated, cast
 
 import typer
 
-from pkmcal import __version__
 from pkmcal.commands import (
     board,
     calibrate,
@@ -81,7 +80,9 @@ for _name, _command in COMMANDS.items():
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"pkmcal {__version__}")
+        from importlib.metadata import version
+
+        typer.echo(f"pkmcal {version('pkmcal')}")
         raise typer.Exit
 
 

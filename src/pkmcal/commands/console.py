@@ -1,4 +1,6 @@
-"""What commands say: results to stdout, progress and errors to stderr, each kind in one way."""
+"""What commands take alike, and how they say things: results to stdout, progress and errors to
+stderr, each kind in one way.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +11,12 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,6 +27,15 @@ Progress = Callable[[str, float], None]
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Of all random draws.")]
+
+SessionFolder = Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")]
+CalibrationFolder = Annotated[
+    Path, typer.Argument(metavar="CALIBRATION", help="The folder that calibrate wrote.")
+]
+CamerasOf = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="The session, for its cameras, where it is not found."),
+]
 
 MARKS = {
     "good": "[green]✓[/]",
@@ -35,6 +49,17 @@ EVERY = 10.0
 """Seconds from one line about the progress to the next, where there is no terminal."""
 WIDEST_NAME = 32
 """Letters of a row's name up to which it stays on one line."""
+
+
+def check_positive(option: str, value: float, most: float) -> None:
+    """Raise `InputError` where an option's number is not above zero, or above ``most``."""
+    if not 0 < value <= most:
+        raise InputError(
+            "this number cannot be used",
+            where=option,
+            found=f"{value:g}",
+            expected=f"more than 0 and at most {most:g}",
+        )
 
 
 def out() -> Console:

@@ -37,10 +37,7 @@ def export(
         Path | None,
         typer.Option("-o", "--out", metavar="DIR", help="export-FORMAT unless given."),
     ] = None,
-    session: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="The session, for its cameras, where it is not found."),
-    ] = None,
+    session: console.CamerasOf = None,
     force: Annotated[
         bool, typer.Option("--force", help="Export a calibration that was refused.")
     ] = False,

@@ -11,7 +11,6 @@ import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS, PAGE, finish
-from pkmcal.commands.numbers import check_positive
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -114,9 +113,9 @@ def plan(
     from pkmcal.report.plan import outcome_of
     from pkmcal.session.load import load_session, session_folder
 
-    check_positive("--edge-noise", edge_noise, 100)
-    check_positive("--corner-noise", corner_noise, 100)
-    check_positive("--joint-noise", joint_noise, 1)
+    console.check_positive("--edge-noise", edge_noise, 100)
+    console.check_positive("--corner-noise", corner_noise, 100)
+    console.check_positive("--joint-noise", joint_noise, 1)
     session = session_folder(subject)
     folder = out or (Path("plan") if session is None else session / "plan")
     files = {**FILES, **(STATIONS if places or best_of else {})}

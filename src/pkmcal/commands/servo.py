@@ -9,7 +9,6 @@ import typer
 
 from pkmcal.commands import console
 from pkmcal.commands.finish import NUMBERS, PAGE, finish
-from pkmcal.commands.numbers import check_positive
 from pkmcal.errors import InputError
 
 FILES = {"servo.html": PAGE, "servo.json": NUMBERS}
@@ -25,10 +24,7 @@ def servo(
             help="The folder that calibrate wrote; or a mechanism file, or a built-in machine.",
         ),
     ],
-    session: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="The session, for its cameras, where it is not found."),
-    ] = None,
+    session: console.CamerasOf = None,
     station: Annotated[
         str | None, typer.Option(metavar="NAME", help="The camera that controls; the first.")
     ] = None,
@@ -93,10 +89,10 @@ def servo(
     from pkmcal.simulation.edges import EdgeNoise
 
     law_named(law)
-    check_positive("--gain", gain, 1000)
-    check_positive("--rate", rate, 10000)
-    check_positive("--speed", 1.0 if speed is None else speed, 1e6)
-    check_positive("--duration", 1.0 if duration is None else duration, 3600)
+    console.check_positive("--gain", gain, 1000)
+    console.check_positive("--rate", rate, 10000)
+    console.check_positive("--speed", 1.0 if speed is None else speed, 1e6)
+    console.check_positive("--duration", 1.0 if duration is None else duration, 3600)
     loop = LoopSettings(
         law=law,
         gain=gain,

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pkmcal.commands import console
-from pkmcal.commands.numbers import check_positive
 from pkmcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -106,7 +105,7 @@ def simulate(
     from pkmcal.simulation.demo import camera_of_size
     from pkmcal.simulation.rehearsal import rehearsal_of
 
-    check_positive("--joint-noise", joint_noise, 1)
+    console.check_positive("--joint-noise", joint_noise, 1)
     eye = load_camera(camera) if camera else camera_of_size(parsed_size(size))
     planned = rehearsal_of(plan) if plan else None
     drawing = planned.machine if planned else load_mechanism(mechanism, label=None)

@@ -54,9 +54,9 @@ def study(
     from importlib.util import find_spec
 
     from pkmcal.files import check_own_folder
-    from pkmcal.report.study import outcome_of
     from pkmcal.studies.findings import study as simulated
     from pkmcal.studies.store import FOLDER
+    from pkmcal.studies.study_report import outcome_of
 
     if table is TableFormat.parquet and find_spec("pyarrow") is None:
         raise InputError(

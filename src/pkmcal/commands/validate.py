@@ -14,9 +14,7 @@ FILES = {"validation.html": PAGE, "validation.json": NUMBERS}
 
 
 def validate(
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION", help="The folder that calibrate wrote.")
-    ],
+    calibration: console.CalibrationFolder,
     session: Annotated[
         Path,
         typer.Argument(metavar="SESSION", help="A session with photographs that it never saw."),

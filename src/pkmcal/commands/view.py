@@ -12,7 +12,7 @@ from pkmcal.commands import console
 
 
 def view(
-    session: Annotated[Path, typer.Argument(metavar="SESSION", help="The session's folder.")],
+    session: console.SessionFolder,
     calibration: Annotated[
         Path | None,
         typer.Option(

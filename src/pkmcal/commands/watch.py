@@ -14,9 +14,7 @@ FILES = {"watch.html": PAGE, "watch.json": NUMBERS}
 
 
 def watch(
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION", help="The folder that calibrate wrote.")
-    ],
+    calibration: console.CalibrationFolder,
     session: Annotated[
         Path,
         typer.Argument(metavar="SESSION", help="New photographs with readings, a few are enough."),

@@ -1,6 +1,5 @@
 """Files in and out: YAML with line numbers, schemas, CSV tables, outputs whole or not at all."""
 
-from pkmcal.files.alone import alone_in
 from pkmcal.files.cache import remember, remembered
 from pkmcal.files.documents import (
     Document,
@@ -34,6 +33,7 @@ from pkmcal.files.regular import check_regular
 from pkmcal.files.schema import Schema, field_path, validate
 from pkmcal.files.tables import CsvTable, csv_text, read_csv
 from pkmcal.files.writing import (
+    alone_in,
     check_own_folder,
     check_writable,
     entries,
@@ -45,7 +45,6 @@ from pkmcal.files.writing import (
     write_folder,
     write_text,
 )
-from pkmcal.wording import listed
 
 __all__ = [
     "ENDINGS",
@@ -70,7 +69,6 @@ __all__ = [
     "entries",
     "field_path",
     "json_text",
-    "listed",
     "no_such",
     "parse_yaml",
     "plain",

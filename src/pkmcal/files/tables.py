@@ -19,6 +19,8 @@ from pkmcal.files.documents import LARGEST, closest, shown, text_blocks
 from pkmcal.files.quantities import Unit, split_head
 from pkmcal.wording import listed
 
+KEY = "configuration"
+"""The first column's name."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _PLAIN = re.compile(r"[-+.0-9eE]*", re.ASCII)
 _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)|#.*", re.IGNORECASE)
@@ -67,11 +69,10 @@ class CsvTable:
 
 def read_csv(
     path: Path | str,
-    key: str = "configuration",
     columns: Sequence[str] | None = None,
     label: str | None = None,
 ) -> CsvTable:
-    """Read a table whose header is `key` and then one name a number column.
+    """Read a table whose header is KEY and then one name a number column.
 
     columns : the only names allowed, all of them needed, in any order; None takes what is there.
     Values come back in the file's own order of columns. A byte-order mark, any line ends, empty
@@ -82,10 +83,10 @@ def read_csv(
     rows = _rows(_lines(path, label), label)
     header_line, header = next(rows, (0, None))
     if header is None:
-        raise InputError("the file is empty", where=label, expected=f"a header: {key},…")
+        raise InputError("the file is empty", where=label, expected=f"a header: {KEY},…")
     heads = [split_head(head) for head in header[1:]]
     header[1:] = [name for name, _ in heads]
-    _check_header(header, key, columns, f"{label}, line {header_line}")
+    _check_header(header, columns, f"{label}, line {header_line}")
     lines: dict[str, int] = {}
     values = array("d")
     for line, cells in rows:
@@ -98,7 +99,7 @@ def read_csv(
             _check_length([name], f"{label}, line {line}")
         if (first := lines.setdefault(name, line)) != line:
             raise InputError(
-                f"the {key} {name} stands twice, on lines {first} and {line}",
+                f"the {KEY} {name} stands twice, on lines {first} and {line}",
                 where=f"{label}, line {line}",
                 next_step="Give each row its own name, or remove one of the two",
             )
@@ -110,13 +111,11 @@ def read_csv(
     return CsvTable(label, tuple(header[1:]), tuple(lines), each, tuple(lines.values()), units)
 
 
-def csv_text(
-    columns: Sequence[str], names: Sequence[str], values: Array, key: str = "configuration"
-) -> str:
+def csv_text(columns: Sequence[str], names: Sequence[str], values: Array) -> str:
     """Write a table (names K, values (K, m)) as text that `read_csv` reads back exactly."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([key, *columns])
+    writer.writerow([KEY, *columns])
     rows = np.asarray(values, dtype=float).reshape(len(names), len(columns)).tolist()
     writer.writerows([name, *map(repr, row)] for name, row in zip(names, rows, strict=True))
     return stream.getvalue()
@@ -146,7 +145,7 @@ def _rows(lines: Iterable[str], label: str) -> Iterator[tuple[int, list[str]]]:
         ) from None
 
 
-def _check_header(header: list[str], key: str, columns: Sequence[str] | None, where: str) -> None:
+def _check_header(header: list[str], columns: Sequence[str] | None, where: str) -> None:
     for separator, name in ((";", "semicolons"), ("\t", "tabs")):
         if len(header) == 1 and separator in header[0]:
             raise InputError(
@@ -157,13 +156,13 @@ def _check_header(header: list[str], key: str, columns: Sequence[str] | None, wh
                 next_step="Save it as CSV (comma delimited); a spreadsheet with English settings"
                 " does so",
             )
-    if header[0] != key:
+    if header[0] != KEY:
         raise InputError(
             "the header's first column has another name" if len(header) > 1 else "no header",
             where=where,
             found=shown(header[0]),
-            expected=key,
-            next_step=f"Begin the file with the line {key},<one column a number>",
+            expected=KEY,
+            next_step=f"Begin the file with the line {KEY},<one column a number>",
         )
     _check_length(header, where)
     if "" in header:
@@ -173,7 +172,7 @@ def _check_header(header: list[str], key: str, columns: Sequence[str] | None, wh
     if twice:
         raise InputError(f"the header names {listed(twice)} twice", where=where)
     if len(header) == 1:
-        raise InputError("there is no column of numbers", where=where, found=key)
+        raise InputError("there is no column of numbers", where=where, found=KEY)
     if columns is not None:
         _check_columns(header[1:], columns, where)
 

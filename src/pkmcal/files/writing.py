@@ -1,19 +1,22 @@
-"""Outputs appear whole or not at all: written beside their place, then moved there."""
+"""Outputs appear whole or not at all: written beside their place, then moved there. Of processes
+that work in one folder, one at a time may where that is asked for.
+"""
 
 from __future__ import annotations
 
+import errno
 import os
 import platform
 import re
 import secrets
 import shutil
+import sys
 from collections.abc import Collection, Generator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from pkmcal.errors import InputError
-from pkmcal.files.lock import lock
 from pkmcal.wording import listed
 
 COMMITTED = ".pkmcal-replacing"
@@ -23,6 +26,8 @@ _NEW, _GONE = "new", "gone"
 """In a stage: the files as they will stand, and empty ones that name those which go."""
 _HELD = "held"
 """In a stage, beside them: a file that its process has locked for as long as it lives."""
+LOCK = "lock"
+"""An empty file in a folder in which one process at a time works; it stays there."""
 _LEFT_OVER = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{12}\.part")
 """Names of `_beside`."""
 
@@ -172,6 +177,24 @@ def staged_folder(folder: Path | str, over: Collection[str] = ()) -> Generator[P
         shutil.rmtree(stage, ignore_errors=True)
 
 
+@contextmanager
+def alone_in(folder: Path, what: str) -> Generator[None]:
+    """Work in a folder, made where missing, while no other process that asks for it may.
+
+    what : what works there, such as "study". Raises InputError where another one does.
+    """
+    check_writable(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK).open("ab") as stream:
+        if _lock(stream.fileno()) is False:
+            raise InputError(
+                f"another {what} works in this folder",
+                where=str(folder),
+                next_step="Wait until it has ended, or name another folder with -o",
+            )
+        yield
+
+
 def remove_folder(folder: Path) -> None:
     """Remove a folder in one step, so that no part of it is ever taken for the whole."""
     left = _beside(folder)
@@ -248,9 +271,30 @@ def _sweep(folder: Path) -> None:
 def _hold(stage: Path) -> BinaryIO:
     """A stage's file, locked, and the computer's name written into it when it is."""
     held = (stage / _HELD).open("wb", buffering=0)
-    lock(held.fileno())
+    _lock(held.fileno())
     held.write(_computer())
     return held
+
+
+def _lock(file: int) -> bool | None:
+    """Lock an open file, by its descriptor, for as long as this process lives, however it ends;
+    False where another process has it.
+
+    None where the file system has no locks at all, as some of a network have none.
+    """
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        held = error.errno in (errno.EAGAIN, errno.EACCES, errno.EWOULDBLOCK)
+        return False if held else None
+    return True
 
 
 def _computer() -> bytes:
@@ -268,7 +312,8 @@ def _clear_abandoned(place: Path) -> None:
     for stage in stages:
         with suppress(OSError):  # no stage, or one that another process removes
             with (stage / _HELD).open("r+b") as held:  # empty: not locked yet
-                abandoned = held.read() == _computer() and held.seek(0) == 0 and lock(held.fileno())
+                ours = held.read() == _computer() and held.seek(0) == 0
+                abandoned = ours and _lock(held.fileno())
             if abandoned:
                 shutil.rmtree(stage, ignore_errors=True)
 

@@ -11,7 +11,7 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import rotation_vector
 from pkmcal.identify.motions import AXES, Motion, Situation, changes
 from pkmcal.mechanisms.parameters import EVERY
-from pkmcal.wording import in_full, joined, listed, named, split_name, ways
+from pkmcal.wording import capital, in_full, joined, listed, named, split_name, ways
 
 MOVES = 0.01
 """Share of a joint centre's tolerance below which a platform counts as not moved: a hundredth
@@ -117,7 +117,7 @@ def sentence(around: Situation, found: Found, unit: Array, moved: float, weak: b
             " frames do, is not counted)."
         )
     return Sentence(
-        f"{text[0].upper()}{text[1:]}. {how_far}",
+        f"{capital(text)}. {how_far}",
         advice_on(around, found, names, matters, weak),
         names,
         found.new,

@@ -4,7 +4,7 @@ the drawing was. A calibration is for this; joints and lengths are the way to it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,6 +27,8 @@ AS_REGULAR = 0.7
 """Part of the session's own distance from a singular pose that the others keep: near one, any
 error counts manifold, and nobody works there."""
 SEED = 4
+NO_TURN = 1e-9
+"""rad; what rounding leaves of a turn."""
 
 
 def pose_by_parameters(machine: Machine, joints: Array, poses: Array) -> Array:
@@ -101,6 +103,15 @@ class ToolError:
     off: Array
 
     __repr__ = short_repr
+
+    def first(self, n: int) -> ToolError:
+        """Of the first n poses alone."""
+        return replace(
+            self,
+            T_base_platform=self.T_base_platform[:n],
+            by_parameters=self.by_parameters[:n],
+            off=self.off[:n],
+        )
 
     @cached_property
     def covariance(self) -> Array:

@@ -10,13 +10,12 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.identify.bed import Bed
 from pkmcal.identify.centres import free_of_gauge, joint_centres
-from pkmcal.identify.covariance import Identifiability
 from pkmcal.identify.decided import decided_by
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, generators
 from pkmcal.identify.sentences import Sentence
 from pkmcal.identify.tool import platform_by_parameters
-from pkmcal.identify.unidentified import Findings, explain, only_heights, seen_legs
+from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.measurements import Observation
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, on_manifold
@@ -65,10 +64,9 @@ class RicherModel:
 def judge(
     observation: Observation,
     estimate: Estimate,
+    findings: Findings,
     method: str = "bundle",
-    told: Identifiability | None = None,
     *,
-    findings: Findings | None = None,
     richer: tuple[RicherModel, ...] = (),
     doubts: tuple[str, ...] = (),
     cautions: tuple[str, ...] = (),
@@ -77,28 +75,18 @@ def judge(
 ) -> Verdict:
     """The verdict on an estimate of a session by a method.
 
-    told : what the data tell of the machine; findings : the same in words, made from ``told`` and
-    the edges where absent. Without both, values that the data do not decide speak for themselves.
+    findings : what the data tell of the machine.
     richer : models of the machine that were tried because this one is too poor for the poses.
     doubts : further reasons against it, cautions : further warnings, hints : further advice, found
     in the session.
     held_out : configurations that were left out on purpose.
     """
-    if findings is None and told is not None:
-        stations, legs = len(estimate.state.T_camera_base), estimate.machine.n_legs
-        seen = seen_legs(observation.edges, estimate.edge_weights, stations, legs)
-        findings = explain(told, estimate, seen)
-    bed = findings.bed if findings else None
-    large, small = _left_open(estimate, findings) if findings and not bed else ((), ())
+    bed = findings.bed
+    large, small = ((), ()) if bed else _left_open(estimate, findings)
     left = [f"{s.text} {s.advice}" for s in large]
-    if findings and bed:
+    if bed:
         left = _bed_unknown(bed)
         hints = (*_not_by_heights(bed, findings), *hints)
-    elif findings is None and (undecided := _undecided(estimate)):
-        left = [
-            f"The data hardly say more than the drawing about {listed(undecided, 4)}: more"
-            " configurations, with legs that point elsewhere, are needed."
-        ]
     reasons = tuple(_reasons(estimate, method, left) + _poses_against(estimate, richer)) + doubts
     # what is a small part of the deviation that was reached is in that, and in the report
     least = WORTH_SAYING * _platform_sigma(estimate) if small else 0.0

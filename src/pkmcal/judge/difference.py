@@ -19,7 +19,7 @@ from pkmcal.identify.change import MachineChange, machine_change
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.region import AXES, Region
 from pkmcal.outcome import Verdict
-from pkmcal.wording import amount, brief, count, listed, number
+from pkmcal.wording import amount, brief, capital, count, listed, number
 
 FORMAT = 1
 ALPHA = 0.01
@@ -355,9 +355,8 @@ def _of_tool(d: MachineDifference) -> str:
     """What it does to the tool, as the end of a sentence."""
     if isinstance(d.tool, str):
         return ""
-    even = slice(0, d.tool.spread)
-    off, sigma = d.tool.after.off_position[even], d.tool.after.position[even]
-    off, sigma = off[np.isfinite(off)], sigma[np.isfinite(sigma)]
+    _, after = d.tool.evenly
+    off, sigma = (x[np.isfinite(x)] for x in (after.off_position, after.position))
     if not off.size:
         return ""
     one_sigma = brief(float(np.median(sigma)) * 1e3)
@@ -371,8 +370,7 @@ def _of_tool(d: MachineDifference) -> str:
 def _named(d: MachineDifference, k: int) -> str:
     """A parameter's change in a sentence."""
     table = d.a.machine.parameters
-    words = table.in_words(table.names[k])
-    return f"{words[0].upper()}{words[1:]} by {change_text(d, k)}."
+    return f"{capital(table.in_words(table.names[k]))} by {change_text(d, k)}."
 
 
 def change_text(d: MachineDifference, k: int) -> str:

@@ -63,6 +63,18 @@ def repeated_rows(saved: SavedCalibration, session: Session) -> Booleans:
     return owner[len(used) :] < len(used)
 
 
+def check_new(known: Booleans, seen: Booleans, what: str, expected: str, next_step: str) -> None:
+    """Raise `InputError`, in these words, where nothing that was seen is new to the calibration."""
+    if not np.any(seen & ~known):
+        used = int(np.sum(seen & known))
+        raise InputError(
+            what,
+            found=f"{used} configurations, all of them used",
+            expected=expected,
+            next_step=next_step,
+        )
+
+
 def look(
     saved: SavedCalibration, session: Session, seed: int, told: Progress, share: float
 ) -> Calibration:

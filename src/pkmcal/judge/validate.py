@@ -16,11 +16,11 @@ import numpy as np
 from pkmcal.arrays import Booleans, short_repr
 from pkmcal.calibration.calibrate import Progress
 from pkmcal.calibration.saved import SavedCalibration
-from pkmcal.errors import InputError, ResultError
+from pkmcal.errors import ResultError
 from pkmcal.files import plain
 from pkmcal.judge.comparison import BesideDrawing, compare
 from pkmcal.judge.holdouts import HoldOut, by_regions
-from pkmcal.judge.new_data import known_rows, look, read, repeated_rows
+from pkmcal.judge.new_data import check_new, known_rows, look, read, repeated_rows
 from pkmcal.judge.paths import LinePath, line_path, paths_of
 from pkmcal.judge.prediction import predict
 from pkmcal.judge.words import validation_verdict
@@ -29,6 +29,12 @@ from pkmcal.outcome import Verdict
 from pkmcal.session.load import Session
 
 FORMAT = 1
+NOT_INDEPENDENT = (
+    "the session is not independent: the calibration was made from these photographs",
+    "photographs that the calibration did not see",
+    "Take new photographs, calibrate with --holdout N, or hold out regions of this session with"
+    " --regions N",
+)
 
 
 @dataclass(frozen=True)
@@ -98,7 +104,7 @@ def validate(
         saved, session = read(calibration, session)
         lines, known = paths_of(session), known_rows(saved, session)
         if not regions:
-            _check_independent(known, _photographed(session))
+            check_new(known, _photographed(session), *NOT_INDEPENDENT)
         looked = look(saved, session, seed, told, 0.8)
         estimate = looked.estimate
         data = estimate.as_found(looked.measurements)
@@ -107,7 +113,7 @@ def validate(
         drawing = drawing_of(saved)
         found = predict(saved.machine, data, estimate.state)
         if not regions:
-            _check_independent(known, found.seen)
+            check_new(known, found.seen, *NOT_INDEPENDENT)
         judged = None
         repeated = ~known & repeated_rows(saved, session)
         new = np.flatnonzero(found.seen & ~known)
@@ -151,16 +157,3 @@ def _photographed(session: Session) -> Booleans:
     for station in session.stations:
         out[[photo.configuration for photo in station.photographs]] = True
     return out
-
-
-def _check_independent(known: Booleans, seen: Booleans) -> None:
-    """Raise `InputError` where nothing that was seen is new to the calibration."""
-    if np.any(seen & ~known):
-        return
-    raise InputError(
-        "the session is not independent: the calibration was made from these photographs",
-        found=f"{int(np.sum(seen & known))} configurations, all of them used",
-        expected="photographs that the calibration did not see",
-        next_step="Take new photographs, calibrate with --holdout N, or hold out regions of this"
-        " session with --regions N",
-    )

@@ -27,7 +27,7 @@ from pkmcal.identify.rows import Kinds
 from pkmcal.judge.causes import magnified
 from pkmcal.judge.changes import ChangeTests, StationTest, look_for_changes
 from pkmcal.judge.held import Held, KeptStations, Trust, evidence, hold
-from pkmcal.judge.new_data import known_rows, look, read
+from pkmcal.judge.new_data import check_new, known_rows, look, read
 from pkmcal.judge.words import LookedAt, Names, watch_verdict
 from pkmcal.outcome import Verdict
 from pkmcal.session.load import Session
@@ -37,6 +37,11 @@ FORMAT = 1
 ALPHA = 0.01
 """Share of machines that did not change that are flagged all the same."""
 LEAST_ALPHA, MOST_ALPHA = 1e-6, 0.2
+NOTHING_NEW = (
+    "there is nothing new in this session: the calibration was made from it",
+    "photographs, or poses, that were taken after the calibration",
+    "Take three to five new photographs with their readings",
+)
 
 
 @dataclass(frozen=True)
@@ -122,10 +127,10 @@ def watch(
         _check_usable(saved)
         session = _placed(saved, session, same_place)
         known = known_rows(saved, session)
-        _check_new(known, np.ones_like(known))
+        check_new(known, np.ones_like(known), *NOTHING_NEW)
         looked = look(saved, session, seed, told, 0.9)
         seen = seen_configurations(looked.measurements)
-        _check_new(known, seen)
+        check_new(known, seen, *NOTHING_NEW)
 
         told("Testing for changes", 0.9)
         old = saved.document.get("statistics") or {}
@@ -265,16 +270,4 @@ def _check_usable(saved: SavedCalibration) -> None:
         found=saved.verdict.reasons[0] if saved.verdict.reasons else saved.verdict.headline,
         expected="a calibration that was not refused",
         next_step="Calibrate the machine first",
-    )
-
-
-def _check_new(known: Booleans, seen: Booleans) -> None:
-    """Raise `InputError` where nothing that was seen is new."""
-    if np.any(seen & ~known):
-        return
-    raise InputError(
-        "there is nothing new in this session: the calibration was made from it",
-        found=f"{int(np.sum(seen & known))} configurations, all of them used",
-        expected="photographs, or poses, that were taken after the calibration",
-        next_step="Take three to five new photographs with their readings",
     )

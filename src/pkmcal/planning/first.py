@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, numbered
 from pkmcal.calibration.gather import refinement_of
 from pkmcal.errors import ResultError
 from pkmcal.identify.bundle import bundle
@@ -113,8 +113,7 @@ def spread_over(configuration: Integers, n_stations: int = 1, most: int = FIRST)
 
 def camera_numbers(session: Session, stations: Sequence[int]) -> Integers:
     """Number of each station's camera file among theirs, (S,)."""
-    files = [session.stations[s].camera_file for s in stations]
-    return np.array([list(dict.fromkeys(files)).index(file) for file in files], dtype=int)
+    return numbered(session.stations[s].camera_file for s in stations)
 
 
 def first_edges(

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, short_repr
+from pkmcal.arrays import Array, numbered, short_repr
 from pkmcal.boards.board import Board, load_board
 from pkmcal.boards.views import Boards
 from pkmcal.calibration.gather import measurements_of
@@ -70,13 +70,6 @@ class Subject:
     __repr__ = short_repr
 
 
-class _Noise(NamedTuple):
-    """px, as assumed."""
-
-    edge: float
-    corner: float
-
-
 def of_machine(
     machine: Machine,
     cameras: Sequence[Camera],
@@ -96,38 +89,42 @@ def of_machine(
     cameras. edge, corner : px, how far edges and corners are off.
     """
     rng = np.random.default_rng(seed)
-    noise = f"Readings are taken to be good to {_length(joint_noise)}"
+    noise = f"Readings are taken to be good to {brief(joint_noise * 1e6)} µm (or µrad)"
     if tracker is not None:
         rig = _tracked(machine, tracker, joint_noise)
         return Subject(rig, None, tuple(columns), (), (noise + ", as told.",))
     cameras = tuple(cameras)
     stations = default_stations(machine, cameras, rng, "platform" if board else None)
     T_camera_base = np.stack([place.T_camera_base() for place in stations])
-    names = tuple(f"station{k + 1}" for k in range(len(cameras)))
-    T_platform_board = None
-    if board is not None:
-        T_platform_board = _bracket(machine, board, cameras, T_camera_base, rng)
-    rig = _seen(
-        machine, names, cameras, T_camera_base, joint_noise, _Noise(edge, corner), board,
-        T_platform_board,
-    )  # fmt: skip
-    what = (
-        f"corners of the board to {corner:g} px, and its size to be exact"
-        if board
-        else f"edges of legs to {edge:g} px"
+    placed = [*enumerate(zip(cameras, T_camera_base, strict=True))]
+    instruments: tuple[Instrument, ...]
+    if board is None:
+        check_tubes(machine, "legs")
+        pools = nominal_pools(machine, edge)
+        instruments = tuple(LegsFrom(s, camera, T, pools) for s, (camera, T) in placed)
+        mounts, T_mount = (), None
+        what = f"edges of legs to {edge:g} px"
+    else:
+        place = _bracket(machine, board, cameras, T_camera_base, rng)
+        instruments = tuple(
+            BoardFrom(s, camera, T, board.points, place, corner) for s, (camera, T) in placed
+        )
+        mounts, T_mount = (Mount(BOARD, "platform", board.tolerance),), place[None]
+        what = f"corners of the board to {corner:g} px, and its size to be exact"
+    rig = Rig(
+        machine,
+        tuple(f"station{k + 1}" for k in range(len(cameras))),
+        T_camera_base,
+        numbered(map(id, cameras)),
+        joint_noise,
+        instruments,
+        mounts,
+        T_mount,
+        where=None,
     )
-    return Subject(
-        rig,
-        None,
-        tuple(columns),
-        (),
-        (f"{noise}, {what}: an assumption.",),
-        board.document if board else None,
-    )
-
-
-def _length(sigma: float) -> str:
-    return f"{brief(sigma * 1e6)} µm (or µrad)"
+    fields = board.document if board else None
+    words = (f"{noise}, {what}: an assumption.",)
+    return Subject(rig, None, tuple(columns), (), words, fields)
 
 
 def _bracket(
@@ -136,37 +133,6 @@ def _bracket(
     """Where a board on the platform is seen best."""
     poses, joints = draw_configurations(machine, 12, 0.5, rng)
     return place_board(machine, board, "platform", cameras, T, poses, joints, rng)
-
-
-def _seen(
-    machine: Machine,
-    names: tuple[str, ...],
-    cameras: tuple[Camera, ...],
-    T_camera_base: Array,
-    joint_noise: float,
-    noise: _Noise,
-    board: Board | None,
-    T_platform_board: Array | None,
-) -> Rig:
-    """Cameras that all see the legs, or all a board."""
-    pools = nominal_pools(machine, noise.edge)
-    instruments: list[Instrument] = []
-    for s, (camera, T) in enumerate(zip(cameras, T_camera_base, strict=True)):
-        if board is not None and T_platform_board is not None:
-            instruments.append(
-                BoardFrom(s, camera, T, board.points, T_platform_board, noise.corner)
-            )
-        else:
-            instruments.append(LegsFrom(s, camera, T, pools))
-    mounts = (Mount(BOARD, "platform", board.tolerance),) if board is not None else ()
-    if board is None:
-        check_tubes(machine, "legs")
-    numbers = np.array([list(dict.fromkeys(map(id, cameras))).index(id(c)) for c in cameras])
-    T_mount = None if T_platform_board is None else T_platform_board[None]
-    return Rig(
-        machine, names, T_camera_base, numbers, joint_noise, tuple(instruments), mounts, T_mount,
-        where=None,
-    )  # fmt: skip
 
 
 def check_tubes(machine: Machine, where: str) -> None:
@@ -229,13 +195,12 @@ def of_session(
     seen = _Photographed.of(session, saved, np.random.default_rng(seed))
     T_camera_base = _places(session, saved, seen, anywhere, seed)
     found = _instruments(session, saved, seen, T_camera_base, edge, corner, seed)
-    files = [station.camera_file for station in session.stations]
-    numbers = [list(dict.fromkeys(files)).index(f) for f in files] + [0] * len(session.trackers)
+    cameras = numbered(station.camera_file for station in session.stations)
     rig = Rig(
         session.machine,
         session.station_names,
         T_camera_base,
-        np.array(numbers, dtype=int),
+        np.pad(cameras, (0, len(session.trackers))),  # of a tracker no camera's number matters
         session.joint_noise,
         found.instruments,
         found.mounts,

@@ -17,8 +17,9 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.files import listed, read_csv, read_text
+from pkmcal.files import read_csv, read_text
 from pkmcal.printers.printer import LARGEST, Printer, Touches
+from pkmcal.wording import listed
 
 FEWEST = 7
 """Points that leave something to be known besides the bed's own height and tilt; DELTA_CALIBRATE

@@ -20,12 +20,11 @@ from pkmcal.files import write_folder
 from pkmcal.identify.bed import Bed
 from pkmcal.identify.centres import Centres
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import ToolError, centres_and_tool
+from pkmcal.identify.tool import NO_TURN, ToolError, centres_and_tool
 from pkmcal.judge.holdouts import holdout_of
 from pkmcal.measurements import Observation
-from pkmcal.outcome import Figure, Finding, Level, Outcome, Verdict
+from pkmcal.outcome import Figure, Outcome, Verdict, doubtful
 from pkmcal.report import (
-    correlations,
     field,
     identifiability,
     page,
@@ -49,9 +48,6 @@ if TYPE_CHECKING:
     from pkmcal.identify.unidentified import Findings
     from pkmcal.judge.holdouts import HoldOut
 
-NO_TURN = 1e-9
-"""rad; what rounding leaves."""
-
 
 def outcome_of(calibration: Calibration) -> Outcome:
     """Everything that `pkmcal calibrate` tells and writes."""
@@ -62,7 +58,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
         c.observation,
         c.estimate,
         c.verdict,
-        findings=c.findings,
+        c.findings,
         timings=c.timings,
         holdout=held_out,
         over=over,
@@ -70,8 +66,7 @@ def outcome_of(calibration: Calibration) -> Outcome:
         boards=c.boards,
         photographs=c.photographs,
     )
-    groups = parameters.parameter_groups(c.session.machine, c.estimate)
-    open_ = parameters.unidentified(groups, c.estimate, c.findings)
+    open_ = parameters.unidentified(c.estimate, c.findings)
     predicted = held_out.document(c.session.configurations) if held_out else None
     return replace(
         told,
@@ -113,8 +108,8 @@ def report_of(
     observation: Observation,
     estimate: Estimate,
     verdict: Verdict,
+    findings: Findings,
     *,
-    findings: Findings | None = None,
     timings: Mapping[str, float] | None = None,
     holdout: HoldOut | None = None,
     over: ToolMap | str | None = None,
@@ -124,7 +119,6 @@ def report_of(
 ) -> Outcome:
     """The verdict, cards and parts.
 
-    findings : what the data tell of the machine; without them their section is left out.
     timings : seconds by step. holdout : what the estimate predicts of configurations that it did
     not see. over : the tool over the workspace, or why there is no map of it. digest : of the
     session. boards : the board as it was seen, to draw its corners.
@@ -142,8 +136,8 @@ def report_of(
         provenance.stations(session, observation, estimate, camera, space),
         workspace.section(session, estimate, over, links) if over else None,
         parameters.section(session.machine, estimate),
-        identifiability.section(findings, estimate.machine.parameters) if findings else None,
-        correlations.section(estimate),
+        identifiability.section(findings, estimate.machine.parameters),
+        parameters.together(estimate),
         pictures.section(session, album) if session.stations else None,
         poses.section(session, observation, estimate, links),
         validation.held_out(holdout, session) if holdout else None,
@@ -151,7 +145,7 @@ def report_of(
             session, edges, estimate, shifts, links, poses.axes(observation.poses, estimate)
         ),
         field.section(session, observation, estimate, album.corners, links),
-        provenance.left_out(session, observation.rejected, estimate, findings),
+        provenance.left_out(session, observation.rejected, estimate),
         provenance.how(session, estimate, timings or {}),
     )
     return Outcome(
@@ -161,11 +155,9 @@ def report_of(
         kicker=session.called,
         origin=(f"digest of the session {digest}",) if digest else (),
         notes=(session.document.get("notes") or "").strip(),
-        figures=cards(
-            session, observation, estimate, centres, tool, findings.bed if findings else None
-        ),
+        figures=cards(session, observation, estimate, centres, tool, findings.bed),
         parts=tuple(part for part in parts if part),
-        findings=tuple(Finding(Level.DOUBTFUL, text) for text in session.warnings),
+        findings=tuple(doubtful(text) for text in session.warnings),
         summary={"figures": numbers(observation, estimate, centres, tool)},
     )
 

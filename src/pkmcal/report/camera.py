@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from pkmcal.report import charts, page
 from pkmcal.report.charts import enlargement
 from pkmcal.report.field import CellShift, ImageField
 from pkmcal.report.jpegs import THREADS, jpeg
-from pkmcal.report.pictures import Corner
+from pkmcal.report.pictures import Corner, Picture
 from pkmcal.wording import brief, count, decimals, number
 
 ARROW = 0.05
@@ -44,18 +44,6 @@ SIGMA = (
     " file says leaves the intrinsics alone and scales every distance; a focus that moves"
     " afterwards makes it another camera."
 )
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One photograph with the corners found in it."""
-
-    name: str
-    width: int
-    height: int
-    jpeg: str
-    corners: tuple[Corner, ...]
-    caption: str
 
 
 def outcome_of(
@@ -98,7 +86,7 @@ def outcome_of(
                 "Photographs",
                 html=page.render(
                     "corners.html.j2",
-                    shots=_shots(c, [Path(path) for path in paths], factor),
+                    pictures=_photographs(c, [Path(path) for path in paths], factor),
                     factor=factor,
                     missed=[d for d in c.detections if not d.found],
                 ),
@@ -205,15 +193,17 @@ def _cards(c: CameraCalibration) -> tuple[Figure, ...]:
     )
 
 
-def _shots(c: CameraCalibration, paths: list[Path], factor: float) -> tuple[Shot, ...]:
+def _photographs(c: CameraCalibration, paths: list[Path], factor: float) -> tuple[Picture, ...]:
+    """All views, each by its file's name."""
     by_name = {path.name: path for path in paths}
     size = c.camera.image_size
     with ThreadPoolExecutor(THREADS) as pool:
         jpegs = pool.map(lambda name: jpeg(by_name.get(name), size), c.views)
-        return tuple(_shot(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
+        return tuple(_photograph(c, v, jpeg, factor) for v, jpeg in enumerate(jpegs))
 
 
-def _shot(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Shot:
+def _photograph(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Picture:
+    """One view with the corners found in it."""
     seen = np.flatnonzero(np.isfinite(c.residuals[v]).all(axis=-1))
     corners: list[Corner] = []
     for i in seen.tolist():
@@ -228,8 +218,19 @@ def _shot(c: CameraCalibration, v: int, jpeg: str, factor: float) -> Shot:
     aside = sum(corner.quiet for corner in corners)
     caption = f"{count(len(seen), 'corner')}" + (f", {aside} put aside" if aside else "")
     caption += f"; held-out error {brief(float(c.held_out.by_view[v]))} px"
+    caption += "" if jpeg else "; the photograph is not at hand"
     width, height = c.camera.image_size
-    return Shot(c.views[v], width, height, jpeg, tuple(corners), caption)
+    return Picture(
+        station="",
+        configuration=c.views[v],
+        width=width,
+        height=height,
+        jpeg=jpeg,
+        edges=(),
+        spots=(),
+        caption=caption,
+        corners=tuple(corners),
+    )
 
 
 def _field(c: CameraCalibration) -> Markup:

@@ -8,16 +8,15 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.calibration.toolmap import ToolMap
+from pkmcal.identify.tool import NO_TURN
 from pkmcal.judge.difference import MachineDifference
 from pkmcal.outcome import AXIS, LOOKS, Figure, Level, Outcome, Part, Plot, Row, Table
-from pkmcal.report.scene import markers, space_layout
+from pkmcal.report.scene import coloured, space_layout
 from pkmcal.report.watch import chance_text
-from pkmcal.report.workspace import COLOURS
+from pkmcal.report.workspace import middle_and_worst
 from pkmcal.wording import SCALES, brief, count, decimals, number
 
 NONE = "–"
-NO_TURN = 1e-9
-"""rad; what rounding leaves."""
 BRIEF = 8
 """Changes that a terminal shows."""
 
@@ -56,15 +55,16 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
     """The main numbers."""
     out: list[Figure] = []
     if not isinstance(d.tool, str):
-        off, sigma = _even(d.tool)
+        off, sigma = _changes(d.tool)
         if off.size:
-            one_sigma = brief(float(np.median(sigma)))
-            spread = f"; chance alone makes {one_sigma} mm" if d.found.dof else ""
+            middle, worst = middle_and_worst(off)
+            by_chance = middle_and_worst(sigma)[0]
+            spread = f"; chance alone makes {by_chance} mm" if d.found.dof else ""
             out.append(
                 Figure(
                     "How much does the tool differ?",
-                    ((brief(float(np.median(off))), "mm"),),
-                    f"median over {d.tool.region}; at worst {brief(float(off.max()))} mm{spread}",
+                    ((middle, "mm"),),
+                    f"median over {d.tool.region}; at worst {worst} mm{spread}",
                 )
             )
     moved = np.concatenate([np.linalg.norm(side.change, axis=-1) for side in d.centres]) * 1e3
@@ -87,32 +87,28 @@ def _cards(d: MachineDifference) -> tuple[Figure, ...]:
     return tuple(out)
 
 
-def _even(found: ToolMap) -> tuple[Array, Array]:
+def _changes(found: ToolMap) -> tuple[Array, Array]:
     """Changes and standard deviations of the tool at the evenly spread poses, mm."""
-    even = slice(0, found.spread)
-    known = np.isfinite(found.after.off_position[even])
-    return (
-        found.after.off_position[even][known] * 1e3,
-        found.after.position[even][known] * 1e3,
-    )
+    _, after = found.evenly
+    known = np.isfinite(after.off_position)
+    return after.off_position[known] * 1e3, after.position[known] * 1e3
 
 
 def _tool_tables(d: MachineDifference) -> tuple[Table, ...]:
     """Medians and largest of the tool's change."""
     if isinstance(d.tool, str):
         return ()
-    even, after = slice(0, d.tool.spread), d.tool.after
-    kinds = [("Position, mm", after.off_position[even] * 1e3, after.position[even] * 1e3)]
-    turn = np.rad2deg(after.off_orientation[even])
+    _, after = d.tool.evenly
+    kinds = [("Position, mm", after.off_position * 1e3, after.position * 1e3)]
+    turn = np.rad2deg(after.off_orientation)
     if np.nanmax(turn, initial=0.0) > np.rad2deg(NO_TURN):
-        kinds.append(("Turn, °", turn, np.rad2deg(after.orientation[even])))
+        kinds.append(("Turn, °", turn, np.rad2deg(after.orientation)))
     rows: list[Row] = []
     for name, off, sigma in kinds:
         known = np.isfinite(off)
         if known.any():
-            by_chance = brief(float(np.median(sigma[known]))) if d.found.dof else NONE
-            middle, worst = float(np.median(off[known])), float(off[known].max())
-            rows.append(Row(name, (brief(middle), brief(worst), by_chance)))
+            by_chance = middle_and_worst(sigma[known])[0] if d.found.dof else NONE
+            rows.append(Row(name, (*middle_and_worst(off), by_chance)))
     columns = ("At the same readings", "median", "worst", "by chance, 1σ")
     note = (
         f"At {count(d.tool.spread, 'pose')} spread evenly over {d.tool.region}: the platform's pose"
@@ -234,29 +230,19 @@ def _joints(d: MachineDifference) -> Plot:
 
 def _space(found: ToolMap) -> Plot:
     """The evenly spread poses, coloured by how far the tool moved there."""
-    even = slice(0, found.spread)
-    known = np.flatnonzero(np.isfinite(found.after.off_position[even]))
-    off = found.after.off_position[known] * 1e3
-    sigma = found.after.position[known] * 1e3
-    look = {
-        "size": 4,
-        "color": [float(f"{x:.3g}") for x in off.tolist()],
-        "colorscale": COLOURS,
-        "showscale": True,
-        "colorbar": {
-            "title": {"text": "mm", "side": "top"}, "thickness": 12, "outlinewidth": 0, "len": 0.8,
-        },
-    }  # fmt: skip
+    _, after = found.evenly
+    off, sigma = _changes(found)
     told = [[float(f"{a:.3g}"), float(f"{b:.3g}")] for a, b in zip(off, sigma, strict=True)]
-    points = markers(
+    points = coloured(
         "tool",
-        found.after.T_base_platform[known, :3, 3],
-        look,
+        after.T_base_platform[np.isfinite(after.off_position), :3, 3],
+        off,
+        "mm",
         customdata=told,
         hovertemplate="x: %{x:.3g}<br>y: %{y:.3g}<br>z: %{z:.3g}<br>differs by %{customdata[0]:.3g}"
         " mm<br>σ %{customdata[1]:.3g} mm<extra></extra>",
     )
-    layout = space_layout({"x": 1.45, "y": -1.45, "z": 0.8})
+    layout = space_layout()
     layout["showlegend"] = False
     return Plot(
         "reach",

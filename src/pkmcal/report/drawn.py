@@ -148,6 +148,22 @@ def own_edges(
     return replace(edges, normal=own)
 
 
+def across(expected: Array, measured: Array) -> tuple[Array, Array]:
+    """Unit normals (n, m, 2) of curves (n, m, 2), px, and how far (n, m) others lie along them."""
+    tangent = np.gradient(expected, axis=1)
+    normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    return normal, dot(normal, measured - expected)
+
+
+def residual_words(shift: float, tilt: float, weight: float) -> str:
+    """An edge's residual, in standard deviations, and its robust weight."""
+    return (
+        f"residual {number(shift, 1, signed=True)} σ across, {number(tilt, 1, signed=True)} σ tilt;"
+        f" weight {number(weight, 2)}"
+    )
+
+
 def radius_positions(machine: Machine, edges: EdgeSet) -> Integers:
     """Where each edge's radius stands among the machine's parameters, (N,)."""
     pairs = zip(edges.leg.tolist(), edges.tube.tolist(), strict=True)

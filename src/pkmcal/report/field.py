@@ -22,7 +22,7 @@ from pkmcal.outcome import Part
 from pkmcal.report import page
 from pkmcal.report.charts import enlargement
 from pkmcal.report.corners import BoardCorners
-from pkmcal.report.drawn import measured_curves, own_edges
+from pkmcal.report.drawn import across, measured_curves, own_edges
 from pkmcal.report.links import Links
 from pkmcal.report.residuals import KEPT, camera_numbers
 from pkmcal.session.load import Session
@@ -153,17 +153,14 @@ def _of_edges(session: Session, edges: EdgeSet, estimate: Estimate, s: int) -> O
     measured, expected = (
         measured_curves(machine, camera, legs, photograph, part, ALONG) for part in (some, shifted)
     )
-    tangent = np.gradient(expected, axis=1)
-    across = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1)
-    across /= np.linalg.norm(across, axis=-1, keepdims=True)
-    value = np.sum(across * (measured - expected), axis=-1)
+    direction, value = across(expected, measured)
     n = len(ALONG)
     return Offsets(
         np.full(len(mine) * n, s),
         np.repeat(some.configuration, n),
         np.repeat(mine, n),
         expected.reshape(-1, 2),
-        across.reshape(-1, 2),
+        direction.reshape(-1, 2),
         value.ravel(),
     )
 

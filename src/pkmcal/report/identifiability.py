@@ -12,7 +12,7 @@ from pkmcal.outcome import Part
 from pkmcal.report import page
 from pkmcal.report.charts import BarChart, UprightBar
 from pkmcal.report.parameters import grouped
-from pkmcal.wording import brief, count, joined
+from pkmcal.wording import brief, capital, count, joined
 
 FLOOR = 1e-3
 """Information below which a bar is a stub only: the drawing knows a thousand times more."""
@@ -48,7 +48,7 @@ def headline(findings: Findings) -> str:
         parts.append(f"{count(lost, 'direction')} no amount of such data would fix")
     if told.weak:
         parts.append(f"{count(len(told.weak), 'direction')} the drawing knows better")
-    return f"{start} {joined(parts)[0].upper()}{joined(parts)[1:]}."
+    return f"{start} {capital(joined(parts))}."
 
 
 def spectrum(findings: Findings) -> BarChart | None:
@@ -163,5 +163,4 @@ def _listed(table: ParameterTable, names: tuple[str, ...]) -> str:
     words = groups[:MOST_NAMES]
     if len(groups) > MOST_NAMES:
         words.append(f"{len(groups) - MOST_NAMES} more")
-    text = joined(words)
-    return text[0].upper() + text[1:]
+    return capital(joined(words))

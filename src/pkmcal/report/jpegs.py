@@ -1,4 +1,4 @@
-"""Photographs as small JPEG files in a page: base64, in grey, within a number of bytes."""
+"""Photographs as small JPEG files: in a page base64, in grey, within a number of bytes."""
 
 from __future__ import annotations
 
@@ -48,17 +48,29 @@ def small_and_large(
 
 def _packed(images: Sequence[Integers], number: int, widths: Sequence[int]) -> list[str]:
     """A photograph in several widths, none more than its own."""
-    import cv2
-
     try:
-        image: Any = images[number]
+        image = images[number]
     except InputError:
         return [""] * len(widths)
     out: dict[int, str] = {}
     for width in sorted(widths, reverse=True):
-        if image.shape[1] > width:
-            height = max(1, round(image.shape[0] * width / image.shape[1]))
-            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-        out[width] = base64.b64encode(packed.tobytes()).decode("ascii")
+        image = narrowed(image, width)
+        out[width] = base64.b64encode(coded(image, QUALITY)).decode("ascii")
     return [out[width] for width in widths]
+
+
+def narrowed(image: Any, width: int) -> Any:
+    """A picture (h, w), no wider than ``width`` px."""
+    import cv2
+
+    if image.shape[1] <= width:
+        return image
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def coded(image: Any, quality: int) -> bytes:
+    """A picture as a JPEG file."""
+    import cv2
+
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

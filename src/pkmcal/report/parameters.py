@@ -1,13 +1,13 @@
-"""The table of parameters, and in words what the data could not decide."""
+"""The parameters: their table, what is known of them together, and in words what is open."""
 
 from __future__ import annotations
 
 import base64
 import csv
 import io
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +18,13 @@ from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.found import FoundParameters, found_parameters
 from pkmcal.identify.unidentified import Findings, only_heights
 from pkmcal.mechanisms import Machine, ParameterTable
-from pkmcal.outcome import Part
+from pkmcal.outcome import AXIS, LOOKS, Part, Plot
 from pkmcal.report import page
 from pkmcal.wording import (
     SCALES,
+    capital,
     decimals,
     joined,
-    legs_named,
     named,
     number,
     percent,
@@ -34,6 +34,15 @@ from pkmcal.wording import (
 TIGHT = 0.95
 """Correlation beyond which two parameters are worth a sentence; 3.2 times better known jointly."""
 MOST_PAIRS = 6
+MOST_SHOWN = 250
+"""Parameters up to which they are shown: of more, a cell would be less than three pixels."""
+RHO_COLOURS = [[0.0, "--drawing"], [0.5, "--card"], [1.0, "--calibrated"]]
+HOW_TOGETHER = (
+    "Orange: when one is larger than told, so is the other; blue: the other is smaller. Only their"
+    " sum, or difference, is as sure as the small deviations of other values suggest. In the"
+    " frames that the parameters are told in; what a frame or the file holds is left out, and of"
+    " values that are tied one stands for all."
+)
 TEX = {
     "%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "−": "$-$", "–": "--", "µ": r"\textmu ",
     "°": r"$^\circ$", "σ": r"$\sigma$", "\N{NARROW NO-BREAK SPACE}": r"\,",
@@ -180,21 +189,9 @@ def _row(
     )
 
 
-def unidentified(
-    groups: tuple[ParameterGroup, ...], estimate: Estimate, findings: Findings | None = None
-) -> tuple[str, ...]:
-    """Sentences: what the data leave open, then pairs that can hardly be told apart.
-
-    findings : what is open, in words; without them, the values that stayed the drawing's.
-    """
-    if findings is None:
-        kinds: dict[str, list[ParameterRow]] = {}
-        for row in (row for group in groups for row in group.rows if row.source == "drawing"):
-            kinds.setdefault(re.sub(r"tube \d+", "tube", row.label), []).append(row)
-        n_legs = estimate.machine.n_legs
-        out = [_kind_text(kind, rows, n_legs) for kind, rows in kinds.items()]
-    else:
-        out = [f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak)]
+def unidentified(estimate: Estimate, findings: Findings) -> tuple[str, ...]:
+    """Sentences: what the data leave open, then pairs that can hardly be told apart."""
+    out = (f"{s.text} {s.advice}" for s in (*findings.unidentified, *findings.weak))
     return (*out, *bound_together(estimate, findings))
 
 
@@ -218,24 +215,10 @@ def _whole_axis(name: str) -> str:
     return whole if whole.endswith("axis") else name
 
 
-def _kind_text(kind: str, rows: list[ParameterRow], all_legs: int) -> str:
-    """A sentence on values of one kind that stayed the drawing's."""
-    legs = [row.leg for row in rows if row.leg is not None]
-    where = f" of {legs_named(legs, all_legs)}" if legs else ""
-    shares = sorted(row.share for row in rows)
-    low, high = percent(shares[0]), percent(shares[-1])
-    said = low if low == high else f"{low.removesuffix(' %')} to {high}"
-    return (
-        f"{kind.capitalize()}{where}: the photographs give {said} of what is known, so the drawing "
-        "and its tolerance decide."
-    )
-
-
 def _pair_text(table: ParameterTable, first: str, second: str, rho: float) -> str:
     what = "difference" if rho > 0 else "sum"
-    start = table.in_words(first)
     return (
-        f"{start[0].upper()}{start[1:]} and {table.in_words(second)} move together (correlation "
+        f"{capital(table.in_words(first))} and {table.in_words(second)} move together (correlation "
         f"{number(rho, 3)}): their {what} is known far better than each alone."
     )
 
@@ -280,3 +263,69 @@ def tight_pairs(estimate: Estimate) -> list[tuple[int, int, float]]:
     i, j = np.nonzero(pairs & (np.abs(rho) > TIGHT))
     order = np.argsort(-np.abs(rho[i, j]), kind="stable")
     return [(int(free[i[n]]), int(free[j[n]]), float(rho[i[n], j[n]])) for n in order]
+
+
+def together(estimate: Estimate) -> Part | None:
+    """What is known together; None where nothing was estimated, or too much to be drawn."""
+    table = estimate.machine.parameters
+    shown, rho, pairs = correlations(estimate)
+    if not 1 < len(shown) <= MOST_SHOWN:
+        return None
+    names = [table.in_words(table.names[k]) for k in shown]
+    off = np.abs(rho) * pairs
+    a, b = np.unravel_index(np.argmax(off), off.shape)
+    said = (
+        f"Of {np.count_nonzero(pairs)} pairs, {np.count_nonzero(off > 0.8)} have a correlation of"
+        f" more than 0.8; the closest are {names[a]} and {names[b]}, {rho[a, b]:+.2f}."
+    ).replace("-", "−")
+    if np.count_nonzero(pairs) < len(shown) * (len(shown) - 1) // 2:
+        said += " Components of one axis, which its length binds, are not counted."
+    plot = Plot(
+        "correlations",
+        "Correlations of the parameters",
+        "Point at a cell for its two parameters.",
+        f"A square of {len(shown)} by {len(shown)} cells, coloured by the correlation of two"
+        " parameters each.",
+        _heat_map(rho, names),
+        height=600,
+        width=600,
+    )
+    return Part(
+        "correlations",
+        "What is known together",
+        (f"{said} {HOW_TOGETHER}",),
+        plots=(plot,),
+        menu="Correlations",
+    )
+
+
+def _heat_map(rho: Any, names: list[str]) -> dict[str, Any]:
+    """The heat map."""
+    # where the first of a leg's, or of a kind, stands
+    common = {
+        **AXIS, "showgrid": False, "zeroline": False, "ticks": "", "tickfont": {"size": 9},
+        "automargin": True, "constrain": "domain",
+    }  # fmt: skip
+    data = [
+        {
+            "type": "heatmap",
+            "x": names,
+            "y": names,
+            "z": np.round(rho, 2),
+            "zmin": -1,
+            "zmax": 1,
+            "colorscale": RHO_COLOURS,
+            "xgap": 0.5,
+            "ygap": 0.5,
+            "hovertemplate": "%{y}<br>%{x}<br>ρ = %{z:.2f}<extra></extra>",
+            "colorbar": {"thickness": 12, "outlinewidth": 0, "len": 0.6, "title": {"text": "ρ"},
+                         "tickvals": [-1, -0.5, 0, 0.5, 1]},
+        }
+    ]  # fmt: skip
+    layout = {
+        **LOOKS,
+        "margin": {"l": 20, "r": 10, "t": 8, "b": 20},
+        "xaxis": {**common, "tickangle": -90},
+        "yaxis": {**common, "autorange": "reversed", "scaleanchor": "x"},
+    }
+    return {"data": data, "layout": layout, "config": {}}

@@ -11,23 +11,23 @@ import numpy as np
 from pkmcal.arrays import Array
 from pkmcal.cameras import Camera
 from pkmcal.files import csv_text, plain, yaml_text
-from pkmcal.geometry.rigid import apply, inverse
+from pkmcal.geometry.rigid import inverse
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.outcome import (
     AXIS,
     LOOKS,
     Figure,
-    Finding,
-    Level,
     Outcome,
     Part,
     Plot,
     Row,
     Table,
     Verdict,
+    note,
 )
 from pkmcal.planning.plan import PAYS, Accuracy, MeasurementPlan, TriedPlace
 from pkmcal.planning.rig import BoardFrom, LegsFrom
+from pkmcal.report.photographed import frustum
 from pkmcal.report.scene import beside, line, markers, seen_whole
 from pkmcal.simulation.placement import StationPlace
 from pkmcal.wording import SCALES, amount, brief, count, listed, number
@@ -105,7 +105,7 @@ def outcome_of(found: MeasurementPlan) -> Outcome:
             ),
         ),
         parts=tuple(parts),
-        findings=tuple(Finding(Level.NOTE, text) for text in found.subject.words),
+        findings=tuple(note(text) for text in found.subject.words),
         document=document_of(found),
         texts=texts,
     )
@@ -324,11 +324,13 @@ def _where(found: MeasurementPlan) -> Part:
     ]  # fmt: skip
     eyes: list[Array] = []
     for name, camera, T_camera_base in _cameras(found):
-        eye, frame = _frustum(camera, T_camera_base, middle)
+        T = inverse(T_camera_base)
+        eye = T[:3, 3]
+        view = frustum(camera, T, FRUSTUM * float(np.linalg.norm(middle - eye)))
         eyes.append(eye)
         look = {"size": 4, "color": "--ink", "symbol": "square"}
         data += [
-            line(name, "--ink", 3, frame, showlegend=False),
+            line(name, "--ink", 3, view, showlegend=False),
             markers(
                 name, eye[None], look, mode="markers+text", text=[name],
                 textposition="top center", textfont={"color": "--ink"}, showlegend=False,
@@ -349,21 +351,6 @@ def _where(found: MeasurementPlan) -> Part:
         height=520,
     )
     return Part("where", "In space", plots=(plot,))
-
-
-def _frustum(camera: Camera, T_camera_base: Array, middle: Array) -> tuple[Array, list[Array]]:
-    """A camera's place (3,), and the lines of its view towards the machine, base frame, m."""
-    T = inverse(T_camera_base)
-    eye = T[:3, 3]
-    width, height = camera.image_size
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
-    rays = camera.ray(corners)
-    size = FRUSTUM * float(np.linalg.norm(middle - eye))
-    if not np.isfinite(rays).all() or np.any(rays[:, 2] < 0.2):  # it looks all round
-        ahead = apply(T, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, size]]))
-        return eye, [ahead]
-    rim = apply(T, rays / rays[:, 2:] * size)
-    return eye, [rim, *(np.stack([eye, point]) for point in rim[:-1])]
 
 
 def _tried(tried: tuple[TriedPlace, ...]) -> dict[str, Any]:

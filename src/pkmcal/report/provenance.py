@@ -13,7 +13,6 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.results import base_camera_covariance, versions
 from pkmcal.geometry.rigid import inverse, pose_difference
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.unidentified import Findings
 from pkmcal.measurements import Observation, Rejection
 from pkmcal.outcome import Part, Plot, Row, Table
 from pkmcal.report import page, parameters
@@ -213,22 +212,13 @@ class Reason:
         return self.count - len(self.cases)
 
 
-def left_out(
-    session: Session,
-    rejected: tuple[Rejection, ...],
-    estimate: Estimate,
-    findings: Findings | None = None,
-) -> Part:
-    """What was rejected, and, unless the findings tell it, what the data leave open."""
-    groups = parameters.parameter_groups(session.machine, estimate)
+def left_out(session: Session, rejected: tuple[Rejection, ...], estimate: Estimate) -> Part:
+    """What was rejected, and which values can hardly be told apart."""
     html = page.render(
         "rejected.html.j2",
         reasons=reasons(session, rejected),
-        told=bool(findings),
         tight=parameters.TIGHT,
-        unidentified=parameters.bound_together(estimate)
-        if findings
-        else parameters.unidentified(groups, estimate),
+        together=parameters.bound_together(estimate),
     )
     return Part("rejected", "What was left out, and what stays open", html=html, menu="Left out")
 

@@ -19,11 +19,11 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.observe.images import decode
 from pkmcal.report import poses
-from pkmcal.report.drawn import edge_name, laid_over
+from pkmcal.report.drawn import edge_name, laid_over, residual_words
+from pkmcal.report.jpegs import coded
 from pkmcal.report.pictures import edge_curves
 from pkmcal.report.residuals import KEPT, rms
 from pkmcal.session.photographs import label_of
-from pkmcal.wording import number
 
 if TYPE_CHECKING:
     from pkmcal.calibration.calibrate import Calibration
@@ -180,13 +180,14 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
     if photo is None:
         # black: rerun's viewer goes on showing a coded picture that was cleared (its issue 12793)
         width, height = station.camera.image_size
-        yield Logged((*path, "photograph"), "photograph", _coded(np.zeros((height, width))), at)
+        black = coded(np.zeros((height, width)), QUALITY)
+        yield Logged((*path, "photograph"), "photograph", {"jpeg": black}, at)
         for part in ("edges", "aside", "contour"):
             yield Logged((*path, part), "clear", {}, at)
         return
     label = label_of(session.folder, photo.path)
-    grey: Any = decode(photo.path, station.camera.image_size, label)
-    yield Logged((*path, "photograph"), "photograph", _coded(grey), at)
+    grey = decode(photo.path, station.camera.image_size, label)
+    yield Logged((*path, "photograph"), "photograph", {"jpeg": coded(grey, QUALITY)}, at)
     edges = c.observation.edges
     mine = np.flatnonzero((edges.station == s) & (edges.configuration == k))
     curves = edge_curves(session, c.observation, estimate, mine, s)
@@ -218,18 +219,9 @@ def _photograph(c: Calibration, s: int, k: int) -> Iterator[Logged]:
         yield Logged(("residuals", "edges", station.name), "numbers", {"value": level}, at)
 
 
-def _coded(grey: Any) -> dict[str, Any]:
-    import cv2
-
-    return {"jpeg": cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()}
-
-
 def _tip(c: Calibration, n: int) -> str:
     """An edge in words."""
     edges, estimate = c.observation.edges, c.estimate
-    across, tilt = estimate.edge_residuals[n].tolist()
-    return (
-        f"{edge_name(int(edges.leg[n]), int(edges.tube[n]), int(edges.side[n]))}: residual"
-        f" {number(across, 1, signed=True)} σ across, {number(tilt, 1, signed=True)} σ tilt;"
-        f" weight {number(float(estimate.edge_weights[n]), 2)}"
-    )
+    name = edge_name(int(edges.leg[n]), int(edges.tube[n]), int(edges.side[n]))
+    shift, tilt = estimate.edge_residuals[n].tolist()
+    return f"{name}: {residual_words(shift, tilt, float(estimate.edge_weights[n]))}"

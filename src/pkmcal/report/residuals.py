@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers
+from pkmcal.arrays import Array, Booleans, Integers, numbered
 from pkmcal.geometry.cylinders import edge_normal_jacobians
 from pkmcal.geometry.rigid import dot
 from pkmcal.identify.estimate import Estimate
@@ -73,9 +73,7 @@ def section(
 
 def camera_numbers(session: Session) -> Integers:
     """Number of each station's camera file, in order of first use, (S,)."""
-    files = [station.camera_file for station in session.stations]
-    order = list(dict.fromkeys(files))
-    return np.array([order.index(name) for name in files], dtype=int)
+    return numbered(station.camera_file for station in session.stations)
 
 
 def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Integers) -> Array:

@@ -36,8 +36,11 @@ RING = 25
 """Points of an ellipsoid's ring."""
 BESIDE = 1.2
 """rad that the eye stands beside a camera at most, so that a single one looks across."""
+CORNER = {"x": 1.45, "y": -1.45, "z": 0.8}
 VIEW = np.pi / 4
 """From below to above in a picture in space, rad: Plotly's."""
+COLOURS = [[0.0, "--band"], [0.6, "--drawing"], [1.0, "--ink"]]
+"""Of magnitudes, the least first."""
 WIDE, NARROW = (1.5, 0.76), (1.0, 0.66)
 """Widths of pictures in space, in heights, and the part of each that what is drawn may take: names
 and numbers stand beside it, of the same size in a small picture."""
@@ -297,7 +300,7 @@ def figure_of(scene: BeforeAfter) -> dict[str, Any]:
         _ellipsoids(scene),
         _centres(base, platform),
     ]
-    layout = space_layout({"x": 1.45, "y": -1.45, "z": 0.8})
+    layout = space_layout()
     layout["scene"]["camera"]["center"] = {"x": 0, "y": 0, "z": -0.14}
     layout["legend"] = {"orientation": "h", "y": 0, "x": 0, "bgcolor": "rgba(0,0,0,0)"}
     return {"data": data, "layout": layout, "config": {"scrollZoom": True}}
@@ -341,6 +344,24 @@ def markers(name: str, points: Array, marker: dict[str, Any], **more: Any) -> di
     }
 
 
+def coloured(name: str, points: Array, values: Array, unit: str, **more: Any) -> dict[str, Any]:
+    """A trace of marks at points (n, 3), m, in the colours of values (n,), with their scale."""
+    look = {
+        "size": 4,
+        "color": [float(f"{x:.3g}") for x in values.tolist()],
+        "colorscale": COLOURS,
+        "showscale": True,
+        "colorbar": {
+            "title": {"text": unit, "side": "top"},
+            "thickness": 12,
+            "outlinewidth": 0,
+            "x": 1.0,
+            "len": 0.8,
+        },
+    }
+    return markers(name, points, look, **more)
+
+
 def ring(points: Array) -> Array:
     """A body's joints (L, 3) in the order that goes around their middle, closed (L + 1, 3)."""
     centred = points - points.mean(axis=0)
@@ -349,8 +370,8 @@ def ring(points: Array) -> Array:
     return points[[*around, around[0]]]
 
 
-def space_layout(eye: dict[str, float]) -> dict[str, Any]:
-    """The layout of a figure in space, seen from ``eye``."""
+def space_layout(eye: dict[str, float] = CORNER) -> dict[str, Any]:
+    """The layout of a figure in space, seen from ``eye``, a corner unless told."""
     axis = {**AXIS, "showbackground": False, "tickfont": {"size": 10}, "nticks": 6}
     return {
         **LOOKS,

@@ -16,16 +16,16 @@ from pkmcal.mechanisms.closure import limb_ends
 from pkmcal.mechanisms.kinematics import inverse_result
 from pkmcal.outcome import (
     Figure,
-    Finding,
-    Level,
     Outcome,
     Part,
     Plot,
     Row,
     Table,
     Verdict,
+    doubtful,
     plane,
 )
+from pkmcal.report.page import N_COLOURS
 from pkmcal.report.scene import coordinates, line, markers, ring, space_layout
 from pkmcal.wording import brief, number
 
@@ -124,7 +124,7 @@ def outcome_of(subject: Controlled, found: Study) -> Outcome:
             Part("legs", "Legs", tables=(choices_table(found),)),
             Part("how", "How it was computed", HOW, tables=(settings_table(found),)),
         ),
-        findings=tuple(Finding(Level.DOUBTFUL, text) for text in subject.warnings),
+        findings=tuple(doubtful(text) for text in subject.warnings),
         document=document,
         summary={name: value for name, value in document.items() if name != "curves"},
     )
@@ -389,8 +389,9 @@ def _over(values: Any, o: Trials, of: Callable[[Any], Any]) -> float | None:
     return float(of(good)) if good.size else None
 
 
-def _percent(values: Any, o: Trials, of: Callable[[Any], Any] = np.max) -> str:
-    value = _over(values, o, of)
+def _percent(values: Any, o: Trials) -> str:
+    """Parts of a way, the largest of the runs that reached the goal."""
+    value = _over(values, o, np.max)
     return "–" if value is None else brief(100 * value) if value > 5e-4 else "0"
 
 
@@ -513,7 +514,7 @@ def space(s: Study, run: int) -> dict[str, Any]:
     data = [
         line(
             f"leg {j + 1}" + ("" if j in seen else ", not seen"),
-            f"--leg{j % 8 + 1}" if j in seen else "--quiet",
+            f"--leg{j % N_COLOURS + 1}" if j in seen else "--quiet",
             8 if j in seen else 4,
             (),
             **leg,
@@ -624,7 +625,7 @@ def _edges(s: Study, pose: Array, width: float, name: str, dash: str) -> list[di
             f"edges {name}",
             _pixel_list(pixels[e, :, 0]),
             _pixel_list(pixels[e, :, 1]),
-            {"color": f"--leg{int(leg) % 8 + 1}", "width": width, "dash": dash},
+            {"color": f"--leg{int(leg) % N_COLOURS + 1}", "width": width, "dash": dash},
             legendgroup=name,
             showlegend=e == 0,
         )

@@ -7,7 +7,7 @@ import numpy as np
 from pkmcal.judge.changes import POWER, ChiSquare, LegTest
 from pkmcal.judge.watch import Watch, names_of
 from pkmcal.judge.words import found_from, said, signed
-from pkmcal.outcome import Figure, Finding, Level, Outcome, Part, Row, Table
+from pkmcal.outcome import Figure, Level, Outcome, Part, Row, Table, doubtful
 from pkmcal.report import charts
 from pkmcal.wording import SCALES, amount, brief, count, listed, named, number
 
@@ -58,7 +58,7 @@ def outcome_of(w: Watch) -> Outcome:
         level=Level.WRONG if w.judged.changed else Level.DOUBTFUL,
         figures=_cards(w),
         parts=tuple(part for part in parts if part),
-        findings=tuple(Finding(Level.DOUBTFUL, text) for text in w.session.warnings),
+        findings=tuple(doubtful(text) for text in w.session.warnings),
         document=w.document(),
     )
 

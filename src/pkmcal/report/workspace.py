@@ -10,16 +10,13 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.calibration.toolmap import NO_EXTENT, Slice, ToolMap
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.identify.estimate import Estimate
-from pkmcal.identify.tool import ToolError
+from pkmcal.identify.tool import NO_TURN
 from pkmcal.outcome import AXIS, LOOKS, Part, Plot, Row, Table
 from pkmcal.report.links import Links
-from pkmcal.report.scene import markers, space_layout
+from pkmcal.report.scene import COLOURS, coloured, markers, space_layout
 from pkmcal.session.load import Session
 from pkmcal.wording import brief, count, number
 
-COLOURS = [[0.0, "--band"], [0.6, "--drawing"], [1.0, "--ink"]]
-NO_TURN = 1e-9
-"""rad; what rounding leaves."""
 PANEL = 170
 """Height of a row of slices, px."""
 LEFT, RIGHT, TOP, BOTTOM = 92, 74, 26, 40
@@ -65,7 +62,7 @@ def section(session: Session, estimate: Estimate, found: ToolMap | str, links: L
 def _narrow(found: ToolMap) -> bool:
     """Whether the region itself, and not the machine, leaves no plane to cut."""
     named = any(side is not None and side[0] == side[1] for side in found.region.sides)
-    wide = np.ptp(found.after.T_base_platform[: found.spread, :3, 3], axis=0)
+    wide = np.ptp(found.evenly[1].T_base_platform[:, :3, 3], axis=0)
     return named and int(np.count_nonzero(wide > NO_EXTENT * wide.max())) < 2
 
 
@@ -80,11 +77,8 @@ def _quantities(found: ToolMap) -> tuple[tuple[str, Array], ...]:
 
 def _said(found: ToolMap) -> str:
     """The main figures in a sentence."""
-    even = slice(0, found.spread)
-    sigma, off = (
-        values[np.isfinite(values)] * 1e3
-        for values in (found.after.position[even], found.after.off_position[even])
-    )
+    _, after = found.evenly
+    sigma, off = (x[np.isfinite(x)] * 1e3 for x in (after.position, after.off_position))
     text = (
         f"Over {found.region}, {count(found.spread, 'pose')} spread evenly, the calibrated"
         f" platform's place is known to {brief(float(np.median(sigma)))} mm (1σ, median), at worst"
@@ -100,23 +94,24 @@ def _said(found: ToolMap) -> str:
 
 def _table(found: ToolMap) -> Table:
     """Medians and largest over the evenly spread poses."""
-    even = slice(0, found.spread)
+    before, after = found.evenly
     rows: list[Row] = []
-    turns = float(np.nanmax(found.before.orientation[even])) > NO_TURN
+    turns = float(np.nanmax(before.orientation)) > NO_TURN
     kinds = (
-        ("By the drawing's tolerances, σ", found.before.position, found.before.orientation),
-        ("Drawing's error", found.after.off_position, found.after.off_orientation),
-        ("Calibrated, σ", found.after.position, found.after.orientation),
+        ("By the drawing's tolerances, σ", before.position, before.orientation),
+        ("Drawing's error", after.off_position, after.off_orientation),
+        ("Calibrated, σ", after.position, after.orientation),
     )
     for name, place, turn in kinds:
-        cells = _pair(place[even] * 1e3)
-        rows.append(Row(name, (*cells, *(_pair(np.rad2deg(turn[even])) if turns else ()))))
+        turned = middle_and_worst(np.rad2deg(turn)) if turns else ()
+        rows.append(Row(name, (*middle_and_worst(place * 1e3), *turned)))
     columns = ("Over the region", "place, median, mm", "worst, mm")
     columns += ("turn, median, °", "worst, °") if turns else ()
     return Table("", columns, tuple(rows), brief=False)
 
 
-def _pair(values: Array) -> tuple[str, str]:
+def middle_and_worst(values: Array) -> tuple[str, str]:
+    """Median and largest of what is known."""
     known = values[np.isfinite(values)]
     if not known.size:
         return "–", "–"
@@ -221,7 +216,7 @@ def _crosses(
     """Measured poses near a slice, each of which leads to its photograph."""
     used = np.flatnonzero(estimate.configurations)
     place = estimate.state.T_base_platform[used, :3, 3]
-    even = found.after.T_base_platform[: found.spread, cut.normal, 3]
+    even = found.evenly[1].T_base_platform[:, cut.normal, 3]
     near = np.abs(place[:, cut.normal] - cut.level) <= DEEP * np.ptp(even) + 1e-6
     used, place = used[near], place[near]
     return {
@@ -348,41 +343,27 @@ def _space(session: Session, estimate: Estimate, found: ToolMap) -> Plot | None:
     """The evenly spread poses, coloured by what is left, and the measured ones; None of a machine
     that moves in a plane.
     """
-    poses = found.after.T_base_platform[: found.spread]
+    _, after = found.evenly
+    poses = after.T_base_platform
     axes = _axes(poses)
     if axes is None:
         return None
     which, names = axes
-    even = slice(0, found.spread)
-    after: ToolError = found.after
-    sigma = after.position[even] * 1e3
-    turn = np.rad2deg(after.orientation[even])
+    sigma, turn = after.position * 1e3, np.rad2deg(after.orientation)
     turns = bool(np.nanmax(turn) > np.rad2deg(NO_TURN))
-    columns = [sigma, after.off_position[even] * 1e3, turn if turns else np.zeros_like(turn)]
+    columns = [sigma, after.off_position * 1e3, turn if turns else np.zeros_like(turn)]
     hover = "<br>".join(f"{name}: %{{{k}:.3g}}" for k, name in zip("xyz", names, strict=True))
     hover += "<br>σ %{customdata[0]:.3g} mm"
     hover += ", %{customdata[2]:.2g}°" if turns else ""
     hover += "<br>drawing's error %{customdata[1]:.3g} mm<extra></extra>"
-    look = {
-        "size": 4,
-        "color": [float(f"{x:.3g}") for x in sigma.tolist()],
-        "colorscale": COLOURS,
-        "showscale": True,
-        "colorbar": {
-            "title": {"text": "σ, mm", "side": "top"},
-            "thickness": 12,
-            "outlinewidth": 0,
-            "x": 1.0,
-            "len": 0.8,
-        },
-    }
     home = poses[0] if which.min() >= 3 else session.machine.home()
     used = np.flatnonzero(estimate.configurations)
     data = [
-        markers(
+        coloured(
             "Calibrated, σ",
             _drawn(poses, home, which) * 1e-3,
-            look,
+            sigma,
+            "σ, mm",
             customdata=_significant(np.column_stack(columns), 3),
             hovertemplate=hover,
         ),
@@ -394,7 +375,7 @@ def _space(session: Session, estimate: Estimate, found: ToolMap) -> Plot | None:
             hoverinfo="text",
         ),
     ]
-    layout = space_layout({"x": 1.45, "y": -1.45, "z": 0.8})
+    layout = space_layout()
     layout["showlegend"] = False
     for axis, name in zip("xyz", names, strict=True):
         layout["scene"][f"{axis}axis"]["title"] = {"text": name}

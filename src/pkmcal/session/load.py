@@ -40,7 +40,7 @@ from pkmcal.geometry.rigid import pose
 from pkmcal.mechanisms import Machine, catalogue, load_mechanism
 from pkmcal.mechanisms.region import Region
 from pkmcal.session.exif import EXIF, camera_by_exif
-from pkmcal.session.photographs import Photograph, find_photographs, photograph_header
+from pkmcal.session.photographs import Photograph, find_photographs, label_of, photograph_header
 from pkmcal.session.poses import PoseTable, read_poses
 from pkmcal.session.readings import check_readings, without_repeats
 from pkmcal.session.schema import (
@@ -438,7 +438,7 @@ def _stations(
     from_exif = station.camera == EXIF
     if from_exif:
         label = document.where(*keys, "camera")
-        camera = camera_by_exif([(p.path, _inside(folder, p.path)) for p in photographs], label)
+        camera = camera_by_exif([(p.path, label_of(folder, p.path)) for p in photographs], label)
         camera_file = f"exif/{name}.yaml"
     else:
         camera_file = station.camera
@@ -502,7 +502,7 @@ def _check_handheld(document: Document, name: str, station: StationDocument) -> 
 
 
 def _check_size(folder: Path, photo: Photograph, camera: Camera, camera_file: str) -> None:
-    label = _inside(folder, photo.path)
+    label = label_of(folder, photo.path)
     width, height = size = photograph_header(photo.path, label)
     if tuple(camera.image_size) in (size, (height, width)):
         return
@@ -518,7 +518,7 @@ def _check_size(folder: Path, photo: Photograph, camera: Camera, camera_file: st
 def _turned(folder: Path, stations: tuple[Station, ...]) -> list[str]:
     """Photographs that were turned by a quarter after they were taken."""
     turned = [
-        _inside(folder, photo.path)
+        label_of(folder, photo.path)
         for station in stations
         for photo in station.photographs
         if photograph_header(photo.path) != tuple(station.camera.image_size)
@@ -616,14 +616,9 @@ def _resolved(
     for station in stations:
         entry = document["stations"][station.entry]
         entry["observe"] = station.observe[0] if len(station.observe) == 1 else station.observe
-        files = [_inside(folder, photo.path) for photo in station.photographs]
+        files = [label_of(folder, photo.path) for photo in station.photographs]
         entry["photographs"] = entry.get("photographs", []) + files
     return document
-
-
-def _inside(folder: Path, path: Path) -> str:
-    """A path as session.yaml would write it."""
-    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
 def digests(session: Session) -> dict[str, list[str]]:

@@ -105,8 +105,8 @@ def photograph_header(path: Path | str, label: str | None = None) -> tuple[int, 
 
 
 def label_of(folder: Path, path: Path) -> str:
-    """A photograph's name in messages: its path inside the session."""
-    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
+    """A photograph's name in messages: its path inside the session, as session.yaml writes it."""
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
 def _parts(pattern: str, where: str) -> list[tuple[str, str | None]]:

@@ -37,17 +37,14 @@ _UNITS = {
 }
 
 
-def check_readings(
-    table: CsvTable, ranges: Array, noise: float, units: Sequence[str] = ()
-) -> list[str]:
+def check_readings(table: CsvTable, ranges: Array, noise: float, units: Sequence[str]) -> list[str]:
     """Raise `InputError` for readings that cannot be this machine's; return warnings.
 
     ranges : (m, 2) smallest and largest reading of each joint, m or rad; NaN where not known.
-    noise : standard deviation of a reading, m or rad. units : ``m`` or ``rad`` of each joint, m
-    unless told.
+    noise : standard deviation of a reading, m or rad. units : ``m`` or ``rad`` of each joint.
     """
     _check_columns(table, len(ranges))
-    table.check_kinds(units or ["m"] * len(ranges))
+    table.check_kinds(units)
     if len(table.names) < 2:
         raise InputError(
             "there is only one configuration",
@@ -56,9 +53,9 @@ def check_readings(
             expected="two at least; one cannot tell a joint's place from its offset",
             next_step="Move the machine and take more photographs; 15 configurations are usual",
         )
-    _check_units(table, ranges, units or ["m"] * len(ranges))
+    _check_units(table, ranges, units)
     _check_signs(table, ranges)
-    _check_shift(table, ranges, units or ["m"] * len(ranges))
+    _check_shift(table, ranges, units)
     return _check_ranges(table, ranges) + _check_movement(table, noise)
 
 

@@ -12,10 +12,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pkmcal.arrays import Array
+from pkmcal.geometry.rigid import dot
 from pkmcal.measurements import EdgeSet, Rejection
 from pkmcal.observe import legs
 from pkmcal.observe.predict import edge_points, legs_in_camera, tubes_of
-from pkmcal.report.drawn import CURVE, edge_name, measured_curves, own_edges, polyline
+from pkmcal.report.drawn import (
+    CURVE,
+    across,
+    edge_name,
+    measured_curves,
+    own_edges,
+    polyline,
+    residual_words,
+)
 from pkmcal.report.residuals import KEPT
 from pkmcal.view.overlay import moved, pane_of
 from pkmcal.view.requests import LookRequest
@@ -74,10 +83,7 @@ def _legs(viewed: Viewed, look: LookRequest, pane: Pane, out: dict[str, Any]) ->
         quiet = False
         if (of := judged.get(place)) is not None:
             quiet = of.weight < KEPT
-            tip += (
-                f"; residual {number(of.shift, 1, signed=True)} σ across,"
-                f" {number(of.tilt, 1, signed=True)} σ tilt; weight {number(of.weight, 2)}"
-            )
+            tip += f"; {residual_words(of.shift, of.tilt, of.weight)}"
         if place in reasons:
             quiet, tip = True, f"{tip}; {reasons[place]}"
         drawn = polyline(place[0], curve, quiet, tip)
@@ -131,11 +137,9 @@ def _off(pane: Pane, T_camera_base: Array, edges: EdgeSet) -> tuple[Array, Array
     a, u = axes.a[0, edges.leg], axes.u[0, edges.leg]
     axis = pane.camera.project(a + (edges.span.mean(axis=1))[:, None] * u)
     middle = CURVE // 2
-    tangent = drawn[:, middle + 1] - drawn[:, middle - 1]
-    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    normal *= np.sign(np.sum(normal * (drawn[:, middle] - axis), axis=-1, keepdims=True))
-    return measured, np.sum(normal * (measured[:, middle] - drawn[:, middle]), axis=-1)
+    normal, off = across(drawn, measured)
+    outward = np.sign(dot(normal[:, middle], drawn[:, middle] - axis))
+    return measured, outward * off[:, middle]
 
 
 def _missed(

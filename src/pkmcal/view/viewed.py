@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -89,14 +89,9 @@ class Viewed:
 
     def jpeg(self, s: int, k: int) -> bytes:
         """A photograph at a size for the screen."""
-        import cv2
+        from pkmcal.report.jpegs import coded, narrowed
 
-        image: Any = self.image(s, k)
-        height, width = image.shape
-        if width > WIDEST:
-            size = (WIDEST, max(1, round(height * WIDEST / width)))
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+        return coded(narrowed(self.image(s, k), WIDEST), QUALITY)
 
     def drawn(self, s: int, k: int) -> Pane:
         """The drawing's machine before a station's camera."""
