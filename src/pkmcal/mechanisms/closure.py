@@ -1,10 +1,9 @@
 """The closure of every machine, |B_j - A_j| = length_j and what its joints' axes add.
 
-First the rows and how they change with the pose, which is all that kinematics needs
-(:func:`rows_between`); then their derivatives by the parameters (:func:`closure`). What moves with
-the readings only, :func:`base_ends`, is apart, so that a search for the pose finds it once. Where
-each limb finds its carriers, its parameters and its reading says its
-:class:`~pkmcal.mechanisms.layout.LimbLayout`.
+:func:`closure` gives the rows, how they change with the pose, and, where somebody asks, with the
+readings and the parameters. What moves with the readings only, :func:`base_ends`, is apart, so that
+a search for the pose finds it once. Where each limb finds its carriers, its parameters and its
+reading says its :class:`~pkmcal.mechanisms.layout.LimbLayout`.
 
 All functions take the parameter vector as an array (..., P), so that a whole Monte-Carlo batch of
 machines is one call: leading axes of parameters, readings and poses broadcast.
@@ -63,14 +62,6 @@ class Rows(NamedTuple):
     u: Array
     distance: Array
     w: Array
-
-
-def pose_rows(
-    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array | None = None
-) -> Rows:
-    """The rows at readings (..., m) and poses (..., 4, 4); theta (..., P), internal (..., n)."""
-    base = base_ends(layout, theta, readings)
-    return rows_between(layout, theta, base, platform_ends(layout, theta, poses, internal), poses)
 
 
 def base_ends(layout: LimbLayout, theta: Array, readings: Array) -> BaseEnds:
@@ -166,16 +157,6 @@ def _with_angles(
         by_internal=stacked(rows.by_internal, by_internal),
         w=angles.by_line,
     )
-
-
-def by_readings(layout: LimbLayout, theta: Array, base: BaseEnds, rows: Rows) -> Array:
-    """Derivatives (..., E) of the rows by their legs' own readings, zero where there is none."""
-    by = -dot(rows.u, base.by_reading) - rod_rates(layout, theta)
-    by = by if layout.all_close else by[..., layout.closing]
-    if not len(layout.angles):
-        return by
-    angles = -dot(rows.w, base.by_reading[..., layout.angles.leg, :])
-    return stacked(by[..., None], angles[..., None])[..., 0]
 
 
 def _by_pose(arm: Array, w: Array) -> Array:
@@ -302,7 +283,8 @@ class Closure:
 
     Made from the machine (layout, theta), readings, poses and internal coordinates: what the
     readings decide (base), what the pose decides (platform), and the rows between them. Derivatives
-    by the parameters are found when they are asked for: a search that only tries a step does not.
+    by readings and by parameters are found when they are asked for: a search that only tries a step
+    does not.
     """
 
     layout: LimbLayout
@@ -342,7 +324,13 @@ class Closure:
     @cached_property
     def by_reading(self) -> Array:
         """(..., E) by the leg's own reading, zero where it has none."""
-        return by_readings(self.layout, self.theta, self.base, self.rows)
+        layout, moved = self.layout, self.base.by_reading
+        by = -dot(self.rows.u, moved) - rod_rates(layout, self.theta)
+        by = by if layout.all_close else by[..., layout.closing]
+        if not len(layout.angles):
+            return by
+        angles = -dot(self.rows.w, moved[..., layout.angles.leg, :])
+        return stacked(by[..., None], angles[..., None])[..., 0]
 
     @cached_property
     def ends(self) -> LimbEnds:
@@ -454,6 +442,11 @@ def closure(
     platform = platform_ends(layout, theta, poses, internal)
     rows = rows_between(layout, theta, base, platform, poses)
     return Closure(layout, theta, readings, poses, internal, base, platform, rows)
+
+
+def by_motors(layout: LimbLayout, by_reading: Array) -> Array:
+    """Derivatives (..., E) by the legs' own readings as those by all, (..., E, m)."""
+    return np.where(layout.of_motor, by_reading[..., None], 0.0)
 
 
 def by_own(layout: LimbLayout, rows: Closure | Rows) -> Array:
