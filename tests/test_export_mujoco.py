@@ -20,7 +20,7 @@ from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import catalogue
 from pkmcal.mechanisms.carriers.crank import Crank
-from pkmcal.mechanisms.carriers.rigid import RigidPlatform
+from pkmcal.mechanisms.carriers.joint import RigidPlatform
 from pkmcal.mechanisms.kinematics import forward
 
 PLACE, TURN = 1e-12, 1e-11

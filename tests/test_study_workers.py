@@ -22,7 +22,7 @@ from pkmcal.studies.calibrations import (
     ESTIMATE,
 )
 from pkmcal.studies.findings import study
-from pkmcal.studies.paper_a_joint import JointByAxes
+from pkmcal.studies.paper_a import JointByAxes
 from pkmcal.studies.store import Store
 from pkmcal.studies.sweep import cells_of, subject_of
 from pkmcal.studies.tasks import Batch, Job, Population, Sample
