@@ -26,6 +26,7 @@ from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import by_pose
 from pkmcal.mechanisms.closure import (
     Closure,
+    LimbEnds,
     along,
     base_ends,
     by_motors,
@@ -234,25 +235,25 @@ def _of_closure(seen: SeenMachine, c: Closure, u: Array, pivot: Array) -> Legs:
     """The limbs of a closed machine, with the directions (..., L, 3) given: the lengths' rows are
     by these, and the axes' rows stay.
     """
-    layout, a_by_reading = seen.machine.layout, np.broadcast_to(c.base.by_reading, u.shape)
-    b_by_pose, b_by_internal = by_pose(c.platform.arm), c.platform.by_internal
+    layout, a_by_reading = c.layout, np.broadcast_to(c.a_by_reading, u.shape)
+    b_by_internal = c.platform.by_internal
     rows, hinges, by_reading = c.by_pose, c.by_internal, c.by_reading
     if u is not c.u:
         rows, hinges, by_reading = (np.array(x) for x in (rows, hinges, by_reading))
         keep, n = layout.closing, int(layout.closing.sum())
         own = u[..., keep, :]
-        rows[..., :n, :] = along(own, b_by_pose[..., keep, :, :])
+        rows[..., :n, :] = along(own, c.b_by_pose[..., keep, :, :])
         hinges[..., :n, :] = along(own, b_by_internal[..., keep, :, :])
         moved = dot(own, a_by_reading[..., keep, :])
         by_reading[..., :n] = -moved - rod_rates(layout, seen.theta)[..., keep]
     return Legs(
-        a=np.broadcast_to(c.base.a, u.shape),
-        b=np.broadcast_to(c.platform.b, u.shape),
+        a=np.broadcast_to(c.a, u.shape),
+        b=np.broadcast_to(c.b, u.shape),
         u=u,
         length=np.broadcast_to(c.distance, u.shape[:-1]),
         pivot=pivot,
         a_by_reading=a_by_reading,
-        b_by_pose=np.broadcast_to(b_by_pose, (*u.shape, 6)),
+        b_by_pose=np.broadcast_to(c.b_by_pose, (*u.shape, 6)),
         b_by_internal=np.broadcast_to(b_by_internal, (*u.shape, layout.n_internal)),
         rows=rows,
         hinges=hinges,
@@ -276,12 +277,11 @@ def seen_ends(
 ) -> tuple[Array, Array]:
     """Ends a and b (..., s, 3) of the seen legs, camera frame, m."""
     layout, theta = seen.machine.layout, seen.theta
-    c = closure_at(layout, theta, T_base_platform)
-    base = c.base if readings is None else base_ends(layout, theta, readings)
-    b = c.platform.b
+    ends: LimbEnds = closure_at(layout, theta, T_base_platform)
+    if readings is not None:
+        ends = limb_ends(layout, theta, readings, T_base_platform, ends.internal)
     T = seen.T_camera_base[..., None, :, :]
-    a = np.broadcast_to(base.a, b.shape)
-    return apply(T, a[..., seen.legs, :]), apply(T, b[..., seen.legs, :])
+    return apply(T, ends.a[..., seen.legs, :]), apply(T, ends.b[..., seen.legs, :])
 
 
 def directions_of(normals: Array) -> Array:

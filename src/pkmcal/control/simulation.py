@@ -348,7 +348,7 @@ def outside(machine: Machine, readings: Array) -> Booleans:
 
 def platform_joints(machine: Machine, poses: Array) -> Array:
     """The platform's joint centres (R, L, 3) at poses (R, 4, 4), m, base frame."""
-    return closure_at(machine.layout, machine.values, poses).platform.b
+    return closure_at(machine.layout, machine.values, poses).b
 
 
 @dataclass(frozen=True)
