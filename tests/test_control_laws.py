@@ -113,7 +113,7 @@ def paper_twist(seen: SeenMachine, pivot):
     the project's at a pivot.
     """
     rot = seen.T_camera_base[:3, :3]
-    at_camera = twist_change(seen.camera_centre() - pivot)
+    at_camera = twist_change(inverse(seen.T_camera_base)[:3, 3] - pivot)
     turned = np.zeros((6, 6))
     turned[:3, 3:], turned[3:, :3] = rot, rot
     return turned @ at_camera

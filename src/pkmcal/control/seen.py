@@ -21,7 +21,7 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import SIDE_SIGNS, edge_normal, line_through
-from pkmcal.geometry.rigid import apply, cross, dot, inverse, register, skew
+from pkmcal.geometry.rigid import apply, cross, dot, register, skew
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.carriers.contract import by_pose
 from pkmcal.mechanisms.closure import (
@@ -78,10 +78,6 @@ class SeenMachine:
         """The drawing's home pose (4, 4)."""
         return self.machine.with_values(self.machine.parameters.drawing).home()
 
-    def camera_centre(self) -> Array:
-        """The camera's centre of projection, (..., 3) m, base frame."""
-        return inverse(self.T_camera_base)[..., :3, 3]
-
 
 def seen_machine(
     machine: Machine, T_camera_base: Array, legs: Integers | None = None
@@ -101,9 +97,7 @@ def seen_machine(
             expected=f"some of {', '.join(str(j + 1) for j in tubed)}" if tubed else "tubes",
             next_step="give the visible cylinders under tubes in the mechanism file, or other legs",
         )
-    tubes = visible_tubes(machine, wanted)
-    radii = machine.radii()
-    radius = np.array([radii[j][t] for j, t in zip(wanted, tubes, strict=True)])
+    radius = machine.radii_of(wanted, visible_tubes(machine, wanted))
     return SeenMachine(machine, T_camera_base, wanted, radius)
 
 

@@ -116,10 +116,7 @@ def edge_misfits(
     own = edges.leg[:, None] == seen.legs
     edges = edges.select(own.any(axis=1))
     leg = own[own.any(axis=1)].argmax(axis=1)
-    radii = machine.radii()
-    radius = np.array(
-        [radii[j][k] for j, k in zip(edges.leg, edges.tube, strict=True)], dtype=float
-    )
+    radius = machine.radii_of(edges.leg, edges.tube)
     at = edge_normal_jacobians(a[leg], b[leg], radius, edges.side)
     to_tangent = edges.basis.mT
     off = SHADING * edges.shift

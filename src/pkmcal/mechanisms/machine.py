@@ -150,6 +150,10 @@ class Machine:
         """Each leg's tube radii, m."""
         return tuple(self.values[index] for index in self.layout.radius)
 
+    def radii_of(self, legs: Integers, tubes: Integers) -> Array:
+        """Radii (n,) m of legs' tubes, by the numbers of both, (n,) each, from 0."""
+        return self.values[self.layout.radius_of(legs, tubes)]
+
     def home(self) -> Array:
         """A start for forward kinematics: the file's home, or the platform above the base."""
         return self._home.copy()

@@ -17,7 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot
-from pkmcal.measurements import EdgeSet, Measurements
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 Method = Literal["plain", "huber", "tukey", "least-median", "robust", "errors-in-variables"]
@@ -213,9 +213,8 @@ def centres(
         out[group, place] = values
         return out
 
-    n, present, radius = (
-        padded(values) for values in (edges.normal, np.ones(len(edges)), edge_radii(machine, edges))
-    )
+    radii = machine.radii_of(edges.leg, edges.tube)
+    n, present, radius = (padded(x) for x in (edges.normal, np.ones(len(edges)), radii))
     noise = padded(edges.basis @ edges.covariance @ edges.basis.mT)
     rng = np.random.default_rng(0) if rng is None else rng
     a, weight, covariance = solve(n, radius, present, noise, method, rng)
@@ -283,9 +282,3 @@ def procrustes_scale(points: Array, drawing: Array) -> float:
     u, s, vt = np.linalg.svd(p.T @ d)
     s[-1] *= np.sign(np.linalg.det(u @ vt))
     return float(s.sum() / np.sum(d**2))
-
-
-def edge_radii(machine: Machine, edges: EdgeSet) -> Array:
-    """The machine's present radius of the tube that each edge bounds, (N,) m."""
-    radii = machine.radii()
-    return np.array([radii[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)])
