@@ -317,46 +317,24 @@ class LimbEnds:
 
 @dataclass(frozen=True)
 class Closure(LimbEnds):
-    """The closure's rows, (..., E): lengths of the legs that close, then the axes' equations; with
-    the limbs' ends that they are between.
-    """
+    """The closure's rows as in :class:`Rows`, with the limbs' ends that they are between."""
 
-    rows: Rows
-
-    @property
-    def value(self) -> Array:
-        """(..., E) m."""
-        return self.rows.value
-
-    @property
-    def u(self) -> Array:
-        """(..., L, 3) unit directions from A to B of all legs."""
-        return self.rows.u
-
-    @property
-    def distance(self) -> Array:
-        """(..., L) m."""
-        return self.rows.distance
-
-    @property
-    def by_pose(self) -> Array:
-        """(..., E, 6)."""
-        return self.rows.by_pose
-
-    @property
-    def by_internal(self) -> Array:
-        """(..., E, n), n = 0 for a rigid platform."""
-        return self.rows.by_internal
+    value: Array
+    by_pose: Array
+    by_internal: Array
+    u: Array
+    distance: Array
+    w: Array
 
     @cached_property
     def by_reading(self) -> Array:
         """(..., E) by the leg's own reading, zero where it has none."""
         layout, moved = self.layout, self.base.by_reading
-        by = -dot(self.rows.u, moved) - rod_rates(layout, self.theta)
+        by = -dot(self.u, moved) - rod_rates(layout, self.theta)
         by = by if layout.all_close else by[..., layout.closing]
         if not len(layout.angles):
             return by
-        angles = -dot(self.rows.w, moved[..., layout.angles.leg, :])
+        angles = -dot(self.w, moved[..., layout.angles.leg, :])
         return stacked(by[..., None], angles[..., None])[..., 0]
 
     @property
@@ -438,7 +416,7 @@ def closure(
     base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
     rows = rows_between(layout, theta, base, platform, poses)
-    return Closure(layout, theta, readings, poses, internal, base, platform, rows)
+    return Closure(layout, theta, readings, poses, internal, base, platform, *rows)
 
 
 def by_motors(layout: LimbLayout, by_reading: Array) -> Array:
