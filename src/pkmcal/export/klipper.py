@@ -78,9 +78,8 @@ class Klipper(Exporter):
         zero = homed(found) - fit.rate * fit.delta.ends[fit.order]
         return [tool_difference(text, fit, lambda points: move(found, points), zero)]
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
-        del files
         return (follows(_fit(source)), Finding(Level.NOTE, MARK), *redo(source))
 
 

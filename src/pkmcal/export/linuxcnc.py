@@ -91,9 +91,8 @@ class LinuxCnc(Exporter):
             Difference(f"readings at {len(poses)} poses by genhexkins' formulas", off, ROUNDING)
         ]
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """Where offsets went, or how well the pins follow the machine."""
-        del files
         if source.machine.document.motion == "translation":
             return (follows(_fit(source)),)
         return (

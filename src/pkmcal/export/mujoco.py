@@ -55,9 +55,9 @@ class MujocoExporter(Exporter):
         """By the text's own bodies, joints and loops."""
         return differences(read(next(iter(files.values()))), source.machine)
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """What the model does not know."""
-        del files, source
+        del source
         text = (
             "Masses, inertias, damping and gains in the model are placeholders: it is for "
             "kinematics. Gravity and contacts are off."

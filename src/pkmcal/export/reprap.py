@@ -71,9 +71,8 @@ class RepRap(Exporter):
         move = linear_motors if linear else rotary_motors
         return [tool_difference(text, fit, lambda points: move(words, points), homed - ends)]
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
-        del files
         return (follows(_fit(source)), *redo(source))
 
 
