@@ -169,21 +169,16 @@ def _singular_values(jac: Array) -> Array:
     return np.where(known[..., None], values, np.nan)
 
 
-def determinant_of(scaled: Array) -> Array:
-    """Determinant (...) of scaled rows (..., E, d), see
-    :func:`pkmcal.mechanisms.kinematics.scaled_rows`. NaN where they are not known, and for machines
+def sign_of(scaled: Array) -> Array:
+    """Sign (...) of the determinant of scaled rows (..., E, d), 1 or -1; see
+    :func:`pkmcal.mechanisms.kinematics.scaled_rows`. 0 where they are not known, and for machines
     with more or fewer rows than freedoms, which have none.
     """
     if scaled.shape[-1] != scaled.shape[-2]:
-        return np.full(scaled.shape[:-2], np.nan)
+        return np.zeros(scaled.shape[:-2])
     known = np.asarray(np.isfinite(scaled).all(axis=(-1, -2)))
     square = np.where(known[..., None, None], scaled, np.eye(scaled.shape[-1]))
-    return np.where(known, np.linalg.det(square), np.nan)
-
-
-def sign_of(scaled: Array) -> Array:
-    """Sign (...) of :func:`determinant_of`: 1 or -1; 0 where there is none."""
-    return np.nan_to_num(np.sign(determinant_of(scaled)))
+    return np.where(known, np.sign(np.linalg.det(square)), 0.0)
 
 
 def same_assembly(layout: LimbLayout, theta: Array, poses: Array, reference: Array) -> Booleans:
