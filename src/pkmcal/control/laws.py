@@ -288,7 +288,6 @@ def joint_velocities(
     readings: Array,
     gain: float,
     *,
-    near: Array | None = None,
     at: Where = "measured",
     goal_readings: Array | None = None,
 ) -> Array:
@@ -296,14 +295,13 @@ def joint_velocities(
 
     law : "directions" or "edges". measured, goal : (..., s, 2, 3) unit normals of the seen legs'
     edges, camera frame, sides as in :mod:`pkmcal.geometry.cylinders`. readings : (..., m).
-    gain : 1/s. near : (..., 4, 4) see :func:`pkmcal.control.seen.legs_from_image`.
-    at : where N is taken; "goal" and "mean" need the goal_readings (..., m).
+    gain : 1/s. at : where N is taken; "goal" and "mean" need the goal_readings (..., m).
     NaN where an edge has no place, or a limb cannot be where the readings put it.
     """
-    legs = legs_from_image(seen, directions_of(measured), readings, near)
+    legs = legs_from_image(seen, directions_of(measured), readings)
     goal_legs = None
     if at != "measured" and goal_readings is not None:
-        goal_legs = legs_from_image(seen, directions_of(goal), goal_readings, near)
+        goal_legs = legs_from_image(seen, directions_of(goal), goal_readings)
     task = task_of(law, seen, measured, goal, legs, goal_legs, at)
     return -gain * (task.readings @ solution(task)[..., None])[..., 0]
 

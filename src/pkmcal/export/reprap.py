@@ -9,6 +9,7 @@ larger angle of A plus its own.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import ClassVar, final
 
 import numpy as np
@@ -116,8 +117,7 @@ def _three(values: Array) -> str:
     return ":".join(mm(v) for v in values)
 
 
-def _letters(values: Array, number: object) -> str:
-    write = mm if number is mm else degrees
+def _letters(values: Array, write: Callable[[float], str]) -> str:
     return " ".join(f"{letter}{write(float(v))}" for letter, v in zip("XYZ", values, strict=True))
 
 

@@ -436,25 +436,25 @@ class PathCheck:
         )
 
 
-def check_path(limits: Limits, poses: Array, between: int = BETWEEN) -> PathCheck:
+def check_path(limits: Limits, poses: Array) -> PathCheck:
     """Look along a path T_base_platform (n, 4, 4), n >= 2, straight from each pose to the next.
 
-    between : poses looked at from one to the next; a singular pose that is crossed twice within
-    one of them, or a corner left so, is not seen.
+    A singular pose that is crossed twice within one of the steps looked at, or a corner left so, is
+    not seen.
     Raises InputError for a path that is none.
     """
-    if poses.ndim != 3 or len(poses) < 2 or between < 1:
+    if poses.ndim != 3 or len(poses) < 2:
         raise InputError(
             what="a path needs two poses or more",
             found=f"an array of shape {poses.shape}",
             expected="(n, 4, 4)",
         )
-    places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * between + 1)
+    places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * BETWEEN + 1)
     found = reachable(limits, _at(poses, places))
     leaves, why = _leaving(limits, poses, places, found)
     nearest = np.where(np.isfinite(found.singularity), found.singularity, np.inf)
     k = int(np.argmin(nearest))
-    own = slice(None, None, between)
+    own = slice(None, None, BETWEEN)
     return PathCheck(
         inside=found.inside[own],
         leaves=leaves,
