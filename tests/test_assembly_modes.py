@@ -7,7 +7,7 @@ import pytest
 
 from pkmcal.geometry.rigid import perturb
 from pkmcal.mechanisms import assembly_modes, catalogue, load_mechanism
-from pkmcal.mechanisms.closure import pose_rows
+from pkmcal.mechanisms.closure import closure
 from test_kinematics import CONVERGED, hexapod, machine_of, tripod, workspace, yawed
 
 APART = 1e-6
@@ -78,7 +78,7 @@ def test_every_mode_closes_the_machine_once(name):
     machine = load_mechanism(name)
     readings = machine.inverse(machine.home())
     found = machine.assembly_modes_result(readings, np.random.default_rng(0))
-    rows = pose_rows(machine.layout, machine.values, readings, found.poses, found.internal)
+    rows = closure(machine.layout, machine.values, readings, found.poses, found.internal)
     assert np.abs(rows.value).max() < CONVERGED
     # home is the first, with its own sign
     np.testing.assert_allclose(found.poses[0], machine.home(), atol=1e-6)

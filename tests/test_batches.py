@@ -7,8 +7,8 @@ import pytest
 
 from pkmcal.geometry.batches import batch_last, damped_step, is_batch_last, stepped
 from pkmcal.geometry.rigid import perturb
-from pkmcal.mechanisms import catalogue, kinematics, load_mechanism
-from pkmcal.mechanisms.closure import base_ends, closure, platform_ends, pose_rows, rows_between
+from pkmcal.mechanisms import catalogue, load_mechanism
+from pkmcal.mechanisms.closure import base_ends, closure, platform_ends, rows_between
 from pkmcal.mechanisms.kinematics import CHUNK, base_batch_last
 from test_kinematics import SMALL, hexapod, workspace
 
@@ -41,25 +41,11 @@ def test_many_poses_are_solved_as_one_is(machine):
         np.testing.assert_allclose(found.T_base_platform[k], one.T_base_platform, atol=1e-13)
 
 
-def test_light_rows_are_the_closures_own(machine):
-    """Kinematics and identification have one closure: values and derivatives are the same bits."""
-    rng = np.random.default_rng(11)
-    poses = workspace(machine, 4, 12)
-    theta = machine.values + 1e-3 * rng.normal(size=(2, 1, len(machine.values)))
-    readings = machine.inverse(poses) + 1e-3
-    internal = 0.1 * rng.normal(size=(4, machine.layout.n_internal))
-    full = closure(machine.layout, theta, readings, poses, internal)
-    light, by_reading = kinematics.rows_and_drives(machine.layout, theta, readings, poses, internal)
-    for name in ("value", "by_pose", "by_internal", "u", "distance"):
-        np.testing.assert_array_equal(getattr(light, name), getattr(full, name))
-    np.testing.assert_array_equal(by_reading, full.by_reading)
-
-
 def test_rows_in_the_other_order_of_memory_are_the_same(machine):
     poses = workspace(machine, 6, 13)
     readings = machine.inverse(poses)
     internal = np.zeros((6, machine.layout.n_internal))
-    plain = pose_rows(machine.layout, machine.values, readings, poses, internal)
+    plain = closure(machine.layout, machine.values, readings, poses, internal)
     last, layout, theta = batch_last(poses), machine.layout, machine.values
     base = base_batch_last(base_ends(layout, theta, readings))
     platform = platform_ends(layout, theta, last, batch_last(internal))

@@ -72,7 +72,7 @@ def ideal_rotary(radius=0.052, angles=(90.4, 209.5, 330.8)):
 
 def test_an_ideal_linear_delta_is_recovered():
     machine = ideal_linear()
-    fit = fitted(delta_of(machine, "x"), klipper.LINEAR, "x")
+    fit = fitted(delta_of(machine, "x"), klipper.LINEAR)
     assert fit.largest < 1e-4
     assert fit.radius == pytest.approx(110, abs=1e-3)
     # turned by the base frame's tilt about z, to first order
@@ -87,7 +87,7 @@ def test_an_ideal_linear_delta_is_recovered():
 
 def test_an_ideal_rotary_delta_is_recovered():
     machine = ideal_rotary()
-    fit = fitted(delta_of(machine, "x"), Freedoms(reprap.NOMINAL), "x")
+    fit = fitted(delta_of(machine, "x"), Freedoms(reprap.NOMINAL))
     assert fit.largest < 1e-4
     assert fit.order.tolist() == [1, 2, 0]
     assert fit.radius == pytest.approx(52, abs=1e-3)

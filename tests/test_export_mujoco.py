@@ -20,7 +20,7 @@ from pkmcal.export.samples import samples
 from pkmcal.geometry.rigid import pose_difference
 from pkmcal.mechanisms import catalogue
 from pkmcal.mechanisms.carriers.crank import Crank
-from pkmcal.mechanisms.carriers.rigid import RigidPlatform
+from pkmcal.mechanisms.carriers.joint import RigidPlatform
 from pkmcal.mechanisms.kinematics import forward
 
 PLACE, TURN = 1e-12, 1e-11
@@ -221,7 +221,7 @@ def test_the_header_says_what_it_is():
     for word in ("Better than the drawing.", "sigma 1.5e-05 m", "T_base_platform",
                  "PLACEHOLDERS", "legs[3].length.constant = 0.22 m"):  # fmt: skip
         assert word in header
-    assert exporters()["mujoco"].notes({}, Source(drawing))
+    assert exporters()["mujoco"].notes(Source(drawing))
 
 
 def test_a_name_cannot_break_the_text():

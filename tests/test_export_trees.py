@@ -322,7 +322,7 @@ def test_what_is_not_known_is_said(to):
     assert "Drawing only, not calibrated." in flat
     assert "NOT KNOWN: masses and inertias" in flat
     assert "<inertial" not in text
-    told = " ".join(note.text for note in exporters()[to].notes(files, source))
+    told = " ".join(note.text for note in exporters()[to].notes(source))
     assert "photographs weigh nothing" in told
     assert {"urdf": "A URDF is a tree", "sdf": "may leave them open"}[to] in told
 

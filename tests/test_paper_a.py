@@ -30,7 +30,7 @@ from pkmcal.studies.paper_a import (
     thirty,
 )
 from pkmcal.studies.simulated import Noise
-from pkmcal.studies.statistics import coverage, rms
+from pkmcal.studies.statistics import covered, mean, rms
 from pkmcal.studies.tasks import Batch
 
 
@@ -69,7 +69,7 @@ def test_what_it_states_is_what_it_errs_by(reduced):
     errors, sigma = found.values["parameters"], found.sigma["parameters"]
     assert sigma.shape == errors.shape == (75, 30)
     for share in (0.5, 0.95):
-        inside = coverage(errors, sigma, share)
+        inside = mean(covered(errors, sigma, share))
         assert abs(inside.value - share) < 3.5 * inside.error + 0.005
         assert inside.error < 0.03
 

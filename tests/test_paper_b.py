@@ -11,8 +11,8 @@ import pkmcal
 from pkmcal.cameras import camera_models
 from pkmcal.commands.comparison import compare
 from pkmcal.geometry.cylinders import edge_normals, line_through, tangent_basis
-from pkmcal.geometry.rigid import apply, look_at, perturb
-from pkmcal.papers import conics, linear
+from pkmcal.geometry.rigid import apply, dot, look_at, perturb
+from pkmcal.papers import linear
 from pkmcal.simulation import Settings
 from pkmcal.simulation.placement import StationPlace
 from rendered import rendered
@@ -24,6 +24,25 @@ CONFIGURATIONS, LEGS = 60, 6
 def mirror():
     parameters = np.array([173.6, 173.3, 319.8, 240.2, 1.0, 0, 0, 0, 0])
     return camera_models()["unified"]((640, 480), parameters)
+
+
+def plane_of(rays, by_pixel, leg_ray):
+    """Normals (..., 3) of the planes of an edge's rays (..., n, 3), away from the leg, and their
+    covariance (..., 2, 2) in :func:`tangent_basis` at the mean ray for noise of 1 px: maximum
+    likelihood by Gauss-Newton, weights 1 / (n' J J' n), by_pixel J (..., n, 3, 2).
+    """
+    normal = np.linalg.svd(rays.mT @ rays)[2][..., -1, :]
+    normal = -normal * np.sign(dot(normal, leg_ray))[..., None]
+    for _ in range(6):
+        basis = tangent_basis(normal, rays.mean(axis=-2))
+        slope = (normal[..., None, None, :] @ by_pixel)[..., 0, :]
+        rows = rays @ basis
+        weighted = (rows / dot(slope, slope)[..., None]).mT
+        misfit = dot(rays, normal[..., None, :])[..., None]
+        turn = np.linalg.solve(weighted @ rows, weighted @ misfit)
+        normal = normal - (basis @ turn)[..., 0]
+        normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    return normal, np.linalg.inv(weighted @ rows)
 
 
 def edges_around_a_mirror(rng):
@@ -43,7 +62,7 @@ def edges_around_a_mirror(rng):
     pixel = camera.project(points) + 0.2 * rng.normal(size=(*points.shape[:-1], 2))
     rays = camera.ray(pixel)
     leg = (a + 0.2 * u)[:, :, None] * np.ones((1, 1, 2, 1))
-    normal, covariance = conics.weighted(rays, camera.ray_jacobians(pixel)[0], leg)
+    normal, covariance = plane_of(rays, camera.ray_jacobians(pixel)[0], leg)
     basis = tangent_basis(normal, rays.mean(axis=-2))
     spread = basis @ (0.04 * covariance) @ np.swapaxes(basis, -1, -2)
     return normal.reshape(LEGS, -1, 3), spread.reshape(LEGS, -1, 3, 3), centres

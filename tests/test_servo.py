@@ -15,7 +15,6 @@ from pkmcal.control.seen import legs_at, seen_machine, true_edges
 from pkmcal.control.simulation import (
     End,
     LoopSettings,
-    aspect_at,
     loop_factor,
     one_image,
     outside,
@@ -263,7 +262,7 @@ def test_coming_to_a_singular_pose():
     weak = machine.forward_result(machine.inverse(turned), turned).singularity
     first = int(np.argmax(weak < NEAR_SINGULAR / 2))
     goal = turned[first : first + 1]
-    assert aspect_at(machine, goal) == aspect_at(machine, start)
+    assert machine.same_assembly(start[0], goal[0])
     runs = simulate(eye, eye.true, start, goal, CLEAN, np.random.default_rng(0))
     assert runs.end == (End.SINGULAR,)
     assert runs.last[0] > 3
@@ -276,7 +275,7 @@ def test_wrong_assembly_as_start():
     goal = turned_home(machine, 0.0)
     readings = machine.inverse(goal)[0]
     modes = machine.assembly_modes(readings, np.random.default_rng(0))
-    start = next(m for m in modes if aspect_at(machine, m[None]) != aspect_at(machine, goal))
+    start = next(m for m in modes if not machine.same_assembly(m, goal[0]))
     runs = simulate(eye, eye.true, start[None], goal, CLEAN, np.random.default_rng(0))
     assert runs.end == (End.WRONG_ASSEMBLY,)
     assert runs.last[0] == 0

@@ -19,14 +19,13 @@ from pkmcal.studies import engine
 from pkmcal.studies.calibrations import (
     ESTIMATE,
     SimulatedCalibrations,
-    covered,
     judged,
     tool_difference,
 )
 from pkmcal.studies.capture import captured
 from pkmcal.studies.estimates import Fitted
 from pkmcal.studies.findings import SweepResult, clustered, study
-from pkmcal.studies.statistics import Summary
+from pkmcal.studies.statistics import Summary, covered
 from pkmcal.studies.study_report import document_of
 from pkmcal.studies.sweep import cells_of, in_words, parsed, scaled, subject_of
 from pkmcal.wording import brief

@@ -21,7 +21,7 @@ from pkmcal.studies.calibrations import (
     ESTIMATE,
 )
 from pkmcal.studies.findings import study
-from pkmcal.studies.paper_a_joint import JointByAxes
+from pkmcal.studies.paper_a import JointByAxes
 from pkmcal.studies.store import Store
 from pkmcal.studies.study_report import document_of, runs_bytes
 from pkmcal.studies.sweep import cells_of, subject_of

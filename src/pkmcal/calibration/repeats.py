@@ -217,8 +217,7 @@ class _Look:
         same = same_edges(edges)
         turn = deviations(edges, same)
         ends = legs_in_camera(machine, T_camera_base, poses, photographs.joints)
-        radii = machine.radii()
-        radius = np.array([radii[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)])
+        radius = machine.radii_of(edges.leg, edges.tube)
         return cls(
             station=s,
             edges=edges,

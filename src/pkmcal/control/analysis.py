@@ -16,9 +16,10 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.control.laws import Task, task_of
 from pkmcal.control.seen import SeenMachine, legs_at, moved_to, true_edges
-from pkmcal.control.simulation import aspect_at, outside, platform_joints
+from pkmcal.control.simulation import outside, platform_joints
 from pkmcal.geometry.rigid import dot, perturb
 from pkmcal.mechanisms.kinematics import on_manifold
+from pkmcal.mechanisms.velocities import assembly_sign
 
 BLIND = 1e-6
 """Visibility below which a motion is not seen at all: rounding leaves 1e-9."""
@@ -132,7 +133,8 @@ def equilibria(seen: SeenMachine, law: str, goals: Array, starts: Array) -> Equi
     distance = np.sqrt(np.mean(dot(off, off), axis=-1))
     readings, wanted = machine.inverse(poses), machine.inverse(goal)
     inside = ~outside(machine, readings)
-    inside &= aspect_at(machine, poses) * aspect_at(machine, goal) >= 0
+    here, there = (assembly_sign(machine.layout, seen.theta, T) for T in (poses, goal))
+    inside &= here * there >= 0
     looks = size < ALIKE
     flat = np.sqrt(dot(slope, slope)) < FLAT * largest * np.maximum(size, ALIKE)
     at_goal = looks & (distance < APART)

@@ -141,16 +141,6 @@ def edge_interaction(
         )
 
 
-def direction_error(measured: Array, goal: Array) -> Array:
-    """The error u x u* (..., s, 3) of edges' normals (..., s, 2, 3), errata, "Servoing"."""
-    return cross(directions_of(measured), directions_of(goal))
-
-
-def edge_error(measured: Array, goal: Array) -> Array:
-    """The error n x n* (..., s, 2, 3) of edges' normals, errata, "Servoing"."""
-    return cross(measured, goal)
-
-
 class Law(ABC):
     """What is regulated to zero: its error and the matrix by which a twist changes it.
 
@@ -173,7 +163,7 @@ class Law(ABC):
 
 @final
 class DirectionLaw(Law):
-    """[B] 8-9: e = u x u*, N = -[u*]x L."""
+    """[B] 8-9 and errata, "Servoing": e = u x u*, N = -[u*]x L."""
 
     name: ClassVar = "directions"
     title: ClassVar = "directions of the legs"
@@ -181,7 +171,7 @@ class DirectionLaw(Law):
     @staticmethod
     def error(measured: Array, goal: Array) -> Array:
         """One vector a leg, (..., s, 1, 3)."""
-        return direction_error(measured, goal)[..., None, :]
+        return cross(directions_of(measured), directions_of(goal))[..., None, :]
 
     @staticmethod
     def matrix(seen: SeenMachine, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
@@ -193,7 +183,7 @@ class DirectionLaw(Law):
 
 @final
 class EdgeLaw(Law):
-    """Errata: e = n x n*, N = -[n*]x J L."""
+    """Errata, "Servoing": e = n x n*, N = -[n*]x J L."""
 
     name: ClassVar = "edges"
     title: ClassVar = "edges of the legs"
@@ -201,7 +191,7 @@ class EdgeLaw(Law):
     @staticmethod
     def error(measured: Array, goal: Array) -> Array:
         """Two vectors a leg, (..., s, 2, 3)."""
-        return edge_error(measured, goal)
+        return cross(measured, goal)
 
     @staticmethod
     def matrix(seen: SeenMachine, legs: Legs, normals: Array, goal: Array, rate: Rates) -> Array:
@@ -298,7 +288,6 @@ def joint_velocities(
     readings: Array,
     gain: float,
     *,
-    near: Array | None = None,
     at: Where = "measured",
     goal_readings: Array | None = None,
 ) -> Array:
@@ -306,14 +295,13 @@ def joint_velocities(
 
     law : "directions" or "edges". measured, goal : (..., s, 2, 3) unit normals of the seen legs'
     edges, camera frame, sides as in :mod:`pkmcal.geometry.cylinders`. readings : (..., m).
-    gain : 1/s. near : (..., 4, 4) see :func:`pkmcal.control.seen.legs_from_image`.
-    at : where N is taken; "goal" and "mean" need the goal_readings (..., m).
+    gain : 1/s. at : where N is taken; "goal" and "mean" need the goal_readings (..., m).
     NaN where an edge has no place, or a limb cannot be where the readings put it.
     """
-    legs = legs_from_image(seen, directions_of(measured), readings, near)
+    legs = legs_from_image(seen, directions_of(measured), readings)
     goal_legs = None
     if at != "measured" and goal_readings is not None:
-        goal_legs = legs_from_image(seen, directions_of(goal), goal_readings, near)
+        goal_legs = legs_from_image(seen, directions_of(goal), goal_readings)
     task = task_of(law, seen, measured, goal, legs, goal_legs, at)
     return -gain * (task.readings @ solution(task)[..., None])[..., 0]
 

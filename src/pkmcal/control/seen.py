@@ -21,20 +21,21 @@ import numpy as np
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.errors import InputError
 from pkmcal.geometry.cylinders import SIDE_SIGNS, edge_normal, line_through
-from pkmcal.geometry.rigid import apply, cross, dot, inverse, register, skew
+from pkmcal.geometry.rigid import apply, cross, dot, register, skew
 from pkmcal.mechanisms import Machine
+from pkmcal.mechanisms.carriers.contract import by_pose
 from pkmcal.mechanisms.closure import (
     Closure,
     LimbEnds,
     along,
     base_ends,
+    by_motors,
     closure,
     limb_ends,
     rod_lengths,
     rod_rates,
 )
-from pkmcal.mechanisms.kinematics import forward, inverse_result
-from pkmcal.mechanisms.velocities import by_motors
+from pkmcal.mechanisms.kinematics import closure_at, forward
 
 
 @dataclass(frozen=True)
@@ -77,10 +78,6 @@ class SeenMachine:
         """The drawing's home pose (4, 4)."""
         return self.machine.with_values(self.machine.parameters.drawing).home()
 
-    def camera_centre(self) -> Array:
-        """The camera's centre of projection, (..., 3) m, base frame."""
-        return inverse(self.T_camera_base)[..., :3, 3]
-
 
 def seen_machine(
     machine: Machine, T_camera_base: Array, legs: Integers | None = None
@@ -100,9 +97,7 @@ def seen_machine(
             expected=f"some of {', '.join(str(j + 1) for j in tubed)}" if tubed else "tubes",
             next_step="give the visible cylinders under tubes in the mechanism file, or other legs",
         )
-    tubes = visible_tubes(machine, wanted)
-    radii = machine.radii()
-    radius = np.array([radii[j][t] for j, t in zip(wanted, tubes, strict=True)])
+    radius = machine.radii_of(wanted, visible_tubes(machine, wanted))
     return SeenMachine(machine, T_camera_base, wanted, radius)
 
 
@@ -148,9 +143,9 @@ def legs_at(seen: SeenMachine, T_base_platform: Array, readings: Array | None = 
     kinematics unless given. The twist is the project's: the pivot is the platform's origin.
     """
     layout, theta = seen.machine.layout, seen.theta
-    found, internal = inverse_result(layout, theta, T_base_platform)
-    q = found if readings is None else readings
-    c = closure(layout, theta, q, T_base_platform, internal)
+    c = closure_at(layout, theta, T_base_platform)
+    if readings is not None:
+        c = closure(layout, theta, readings, T_base_platform, c.internal)
     return _of_closure(seen, c, c.u, T_base_platform[..., :3, 3])
 
 
@@ -221,13 +216,11 @@ def _by_image(seen: SeenMachine, u: Array, readings: Array) -> Legs:
     a = np.broadcast_to(base.a, u.shape)
     b = a + length[..., None] * u
     pivot = b.mean(axis=-2)
-    by_pose = np.zeros((*b.shape, 6))
-    by_pose[..., :3] = -skew(b - pivot[..., None, :])
-    by_pose[..., 3:] = np.eye(3)
+    b_by_pose = by_pose(b - pivot[..., None, :])
     by_reading = -dot(u, base.by_reading) - rod_rates(layout, theta)
     return Legs(
-        a, b, u, length, pivot, np.broadcast_to(base.by_reading, u.shape), by_pose,
-        np.zeros((*b.shape, 0)), along(u, by_pose), np.zeros((*length.shape, 0)),
+        a, b, u, length, pivot, np.broadcast_to(base.by_reading, u.shape), b_by_pose,
+        np.zeros((*b.shape, 0)), along(u, b_by_pose), np.zeros((*length.shape, 0)),
         by_motors(layout, by_reading),
     )  # fmt: skip
 
@@ -236,25 +229,26 @@ def _of_closure(seen: SeenMachine, c: Closure, u: Array, pivot: Array) -> Legs:
     """The limbs of a closed machine, with the directions (..., L, 3) given: the lengths' rows are
     by these, and the axes' rows stay.
     """
-    layout, ends = seen.machine.layout, c.ends
+    layout, a_by_reading = c.layout, np.broadcast_to(c.a_by_reading, u.shape)
+    b_by_internal = c.platform.by_internal
     rows, hinges, by_reading = c.by_pose, c.by_internal, c.by_reading
     if u is not c.u:
         rows, hinges, by_reading = (np.array(x) for x in (rows, hinges, by_reading))
         keep, n = layout.closing, int(layout.closing.sum())
         own = u[..., keep, :]
-        rows[..., :n, :] = along(own, ends.b_by_pose[..., keep, :, :])
-        hinges[..., :n, :] = along(own, ends.b_by_internal[..., keep, :, :])
-        moved = dot(own, np.broadcast_to(ends.a_by_reading, u.shape)[..., keep, :])
+        rows[..., :n, :] = along(own, c.b_by_pose[..., keep, :, :])
+        hinges[..., :n, :] = along(own, b_by_internal[..., keep, :, :])
+        moved = dot(own, a_by_reading[..., keep, :])
         by_reading[..., :n] = -moved - rod_rates(layout, seen.theta)[..., keep]
     return Legs(
-        a=np.broadcast_to(ends.a, u.shape),
-        b=np.broadcast_to(ends.b, u.shape),
+        a=np.broadcast_to(c.a, u.shape),
+        b=np.broadcast_to(c.b, u.shape),
         u=u,
         length=np.broadcast_to(c.distance, u.shape[:-1]),
         pivot=pivot,
-        a_by_reading=np.broadcast_to(ends.a_by_reading, u.shape),
-        b_by_pose=np.broadcast_to(ends.b_by_pose, (*u.shape, 6)),
-        b_by_internal=np.broadcast_to(ends.b_by_internal, (*u.shape, layout.n_internal)),
+        a_by_reading=a_by_reading,
+        b_by_pose=np.broadcast_to(c.b_by_pose, (*u.shape, 6)),
+        b_by_internal=np.broadcast_to(b_by_internal, (*u.shape, layout.n_internal)),
         rows=rows,
         hinges=hinges,
         drives=by_motors(layout, by_reading),
@@ -277,10 +271,9 @@ def seen_ends(
 ) -> tuple[Array, Array]:
     """Ends a and b (..., s, 3) of the seen legs, camera frame, m."""
     layout, theta = seen.machine.layout, seen.theta
-    q, internal = inverse_result(layout, theta, T_base_platform)
-    ends: LimbEnds = limb_ends(
-        layout, theta, q if readings is None else readings, T_base_platform, internal
-    )
+    ends: LimbEnds = closure_at(layout, theta, T_base_platform)
+    if readings is not None:
+        ends = limb_ends(layout, theta, readings, T_base_platform, ends.internal)
     T = seen.T_camera_base[..., None, :, :]
     return apply(T, ends.a[..., seen.legs, :]), apply(T, ends.b[..., seen.legs, :])
 

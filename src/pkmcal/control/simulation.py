@@ -18,8 +18,7 @@ from pkmcal.control.laws import Where, joint_velocities, law_named, limited, sol
 from pkmcal.control.seen import SeenMachine, directions_of, legs_from_image
 from pkmcal.geometry.rigid import dot
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import limb_ends
-from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, forward, inverse_result
+from pkmcal.mechanisms.kinematics import NEAR_SINGULAR, closure_at, forward
 from pkmcal.mechanisms.velocities import assembly_sign
 from pkmcal.simulation.edges import EdgeNoise
 
@@ -299,11 +298,13 @@ def _begin(eye: Eye, starts: Array, goals: Array) -> _Now:
     machine = eye.true.machine
     readings, wanted = machine.inverse(starts), machine.inverse(goals)
     n = len(starts)
-    sign = aspect_at(machine, starts)
+    sign, wanted_sign = (
+        assembly_sign(machine.layout, machine.values, poses) for poses in (starts, goals)
+    )
     now = _Now(starts, np.nan_to_num(readings), sign, np.full(n, -1), np.zeros(n, dtype=int))
     out = outside(machine, readings) | outside(machine, wanted)
     now = _stopped(now, out, End.LEFT_WORKSPACE, 0)
-    return _stopped(now, sign * aspect_at(machine, goals) < 0, End.WRONG_ASSEMBLY, 0)
+    return _stopped(now, sign * wanted_sign < 0, End.WRONG_ASSEMBLY, 0)
 
 
 def _stopped(now: _Now, which: Booleans, end: End, sample: int) -> _Now:
@@ -325,7 +326,7 @@ def _moved(machine: Machine, now: _Now, step: Array, sample: int) -> _Now:
     wanted = np.where(now.active[:, None], wanted, now.readings)
     found = forward(machine.layout, machine.values, wanted, now.poses)
     poses, closed = found.T_base_platform, found.converged
-    turned = aspect_at(machine, poses) * now.sign < 0
+    turned = assembly_sign(machine.layout, machine.values, poses) * now.sign < 0
     now = _stopped(
         now, closed & (turned | (found.singularity < NEAR_SINGULAR)), End.SINGULAR, sample
     )
@@ -345,21 +346,9 @@ def outside(machine: Machine, readings: Array) -> Booleans:
     return (beyond | ~np.isfinite(readings)).any(axis=-1)
 
 
-def aspect_at(machine: Machine, poses: Array) -> Array:
-    """Sign (R,) of the assembly at poses (R, 4, 4): it changes where a way from one assembly to
-    another crosses a singular pose. 0 where rows and freedoms differ in number, and where a limb
-    cannot reach.
-    """
-    layout, theta = machine.layout, machine.values
-    readings, internal = inverse_result(layout, theta, poses)
-    return assembly_sign(layout, theta, readings, poses, internal)
-
-
 def platform_joints(machine: Machine, poses: Array) -> Array:
     """The platform's joint centres (R, L, 3) at poses (R, 4, 4), m, base frame."""
-    layout, theta = machine.layout, machine.values
-    readings, internal = inverse_result(layout, theta, poses)
-    return limb_ends(layout, theta, np.nan_to_num(readings), poses, internal).b
+    return closure_at(machine.layout, machine.values, poses).b
 
 
 @dataclass(frozen=True)

@@ -112,14 +112,11 @@ def edge_misfits(
     """
     machine = seen.machine
     c = closure(machine.layout, machine.values, readings, T_base_platform)
-    a, b = (apply(seen.T_camera_base, p[seen.legs]) for p in (c.ends.a, c.ends.b))
+    a, b = (apply(seen.T_camera_base, p[seen.legs]) for p in (c.a, c.b))
     own = edges.leg[:, None] == seen.legs
     edges = edges.select(own.any(axis=1))
     leg = own[own.any(axis=1)].argmax(axis=1)
-    radii = machine.radii()
-    radius = np.array(
-        [radii[j][k] for j, k in zip(edges.leg, edges.tube, strict=True)], dtype=float
-    )
+    radius = machine.radii_of(edges.leg, edges.tube)
     at = edge_normal_jacobians(a[leg], b[leg], radius, edges.side)
     to_tangent = edges.basis.mT
     off = SHADING * edges.shift
@@ -232,7 +229,7 @@ def corrected_pose(
         return T_base_platform
     motion, c, rot = seen.machine.layout.motion, rows.closure, seen.T_camera_base[:3, :3]
     leg, misfit, information = seen.legs[rows.leg[use]], rows.misfit[use], rows.information[use]
-    jac = rows.by_b[use] @ (rot @ c.ends.b_by_pose[leg]) @ motion
+    jac = rows.by_b[use] @ (rot @ c.b_by_pose[leg]) @ motion
     square = dot(misfit, (information @ misfit[..., None])[..., 0])
     weight = 1 / (1 + square / (4 * max(float(np.median(square)), 2.0)))
     to_right = jac.mT @ information * weight[:, None, None]

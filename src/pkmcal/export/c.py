@@ -104,9 +104,8 @@ class CSource(Exporter):
             ),
         ]
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """How to run the self-test, and what is not in the source."""
-        del files
         out = [
             Finding(
                 Level.NOTE,

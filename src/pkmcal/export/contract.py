@@ -69,9 +69,9 @@ class Exporter(ABC):
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
         """The texts read again, as the other program reads them, beside the machine."""
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
-        """What a person should know of these files beside what stands in them."""
-        del files, source
+    def notes(self, source: Source) -> tuple[Finding, ...]:
+        """What a person should know of the files beside what stands in them."""
+        del source
         return ()
 
 
@@ -134,7 +134,7 @@ def export(source: Source, name: str, *, force: bool = False) -> Export:
                 expected=f"at most {difference.limit:.3g} {difference.unit}",
                 next_step="This is a defect of pkmcal: report it, with the mechanism file",
             )
-    return Export(exporter, files, differences, tuple(exporter.notes(files, source)))
+    return Export(exporter, files, differences, tuple(exporter.notes(source)))
 
 
 def write(made: Export, folder: Path) -> None:

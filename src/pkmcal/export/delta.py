@@ -62,17 +62,18 @@ Inverse = Callable[[Array], Array]
 class Delta:
     """A machine's three legs, in the order of its file; mm and degrees as firmwares have them.
 
-    kind : linear or rotary. joint : (3,) reading's column. hinge : (3, 3) m, a tower's joint at
-    reading zero, or an arm's axis, less the platform's joint: what the rod's far end, moved to the
-    platform's origin, hangs on. arm, rod : (3,) m. rate, zero : (3,) the firmware's motor position
-    (carriage height in mm, or angle above the horizontal in degrees) is rate * reading + zero, for
-    an ideal machine. ends : (3,) readings at the upper end of the range.
-    positions : (n, 3) m, T_base_platform's, over the workspace. readings : (n, 3), by leg.
+    program : the firmware that asks. kind : linear or rotary. joint : (3,) reading's column.
+    hinge : (3, 3) m, a tower's joint at reading zero, or an arm's axis, less the platform's joint:
+    what the rod's far end, moved to the platform's origin, hangs on. arm, rod : (3,) m.
+    rate, zero : (3,) the firmware's motor position (carriage height in mm, or angle above the
+    horizontal in degrees) is rate * reading + zero, for an ideal machine. ends : (3,) readings at
+    the upper end of the range. poses : (n, 4, 4) over the workspace. readings : (n, 3), by leg.
     by_reading : (n, 3, 3) m of the platform's position by the legs' readings. bed : z of the
     platform's origin on a bed that was felt, m; None where none was.
     """
 
     machine: Machine
+    program: str
     kind: str
     joint: Integers
     hinge: Array
@@ -95,7 +96,7 @@ class Delta:
 def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
     """The machine as a delta; InputError with a sentence where it is none.
 
-    program : who asks, for the sentence. bed : as of :class:`Delta`.
+    program, bed : as of :class:`Delta`.
     """
     limbs, motion = limbs_of(machine), machine.document.motion
     if motion != "translation" or set(limbs.drive) not in ({SLIDE}, {TURN}):
@@ -122,6 +123,7 @@ def delta_of(machine: Machine, program: str, bed: float | None = None) -> Delta:
     poses, readings, by_reading = _workspace(machine, rods.joint, arm)
     return Delta(
         machine=machine,
+        program=program,
         kind="linear" if linear else "rotary",
         joint=rods.joint,
         hinge=rods.base - rods.platform @ machine.home()[:3, :3].T,
@@ -237,12 +239,12 @@ class Freedoms:
 class Fit:
     """A firmware's parameters, mm and degrees; arrays (3,) in the firmware's order of towers.
 
-    order : the legs of the mechanism file, from 0. angle : tower directions.
-    T_firmware_base : (4, 4) m.
+    delta : the machine that they are to follow. order : the legs of the mechanism file, from 0.
+    angle : tower directions. T_firmware_base : (4, 4) m.
     largest, rms : mm, error at the tool over the grid, its poses taken as commands.
     """
 
-    kind: str
+    delta: Delta
     order: Integers
     radius: float
     angle: Array
@@ -254,6 +256,25 @@ class Fit:
     T_firmware_base: Array
     largest: float = 0.0
     rms: float = 0.0
+
+    @property
+    def kind(self) -> str:
+        """Linear or rotary."""
+        return self.delta.kind
+
+    @property
+    def end_motors(self) -> Array:
+        """Motor positions (3,) at the end switches."""
+        return self.rate * self.delta.ends[self.order] + self.zero
+
+    @property
+    def sentence(self) -> str:
+        """How well the settings follow the machine; rounded up, so that it holds."""
+        largest = math.ceil(self.largest * 1e3) / 1e3
+        return (
+            f"{self.delta.program}'s model follows this machine with the tool off by"
+            f" {largest:.3f} mm at most, {self.rms:.3f} mm root mean square."
+        )
 
     def motors(self, points: Array, near: Array) -> Array:
         """Motor positions (n, 3) at points (n, 3) mm in the firmware's frame; of an arm's two the
@@ -274,7 +295,13 @@ class Fit:
         return np.where(np.abs(both[0] - near) < np.abs(both[1] - near), both[0], both[1])
 
 
-def fitted(delta: Delta, freedoms: Freedoms, program: str) -> Fit:
+def fit_of(source: Source, program: str, linear: Freedoms, rotary: Freedoms) -> Fit:
+    """A firmware's parameters for a source's machine; by its kind what they leave free."""
+    delta = delta_of(source.machine, program, source.bed)
+    return fitted(delta, linear if delta.kind == "linear" else rotary)
+
+
+def fitted(delta: Delta, freedoms: Freedoms) -> Fit:
     """The parameters that put the tool nearest to where it should be, over the workspace.
 
     Raises InputError where they leave an error of more than :data:`REFUSED`.
@@ -299,7 +326,7 @@ def fitted(delta: Delta, freedoms: Freedoms, program: str) -> Fit:
     )
     if not found.largest <= REFUSED:
         raise InputError(
-            f"{program} cannot follow this machine: its parameters leave the tool off",
+            f"{delta.program} cannot follow this machine: its parameters leave the tool off",
             found=f"{found.largest:.2f} mm",
             expected=f"at most {REFUSED:g} mm over the workspace",
             next_step="Set towers or arms nearer to the drawing, or export the machine with --to c",
@@ -377,7 +404,7 @@ def _start(delta: Delta, freedoms: Freedoms) -> Fit:
     )
     zero = delta.zero[order] + (lift if delta.kind == "linear" else 0.0)
     return Fit(
-        kind=delta.kind,
+        delta=delta,
         order=order,
         radius=float(np.linalg.norm(away, axis=1).mean()),
         angle=nominal + off if freedoms.angles else nominal,
@@ -445,14 +472,13 @@ def scales_of(fit: Fit) -> Array:
     return np.abs(fit.rate) / (MM if fit.kind == "linear" else DEGREE)
 
 
-def about(
-    source: Source, delta: Delta, fit: Fit, names: str, program: str, correcting: str
-) -> list[str]:
+def about(source: Source, fit: Fit, names: str, correcting: str) -> list[str]:
     """Header lines: conventions, which leg is which motor, the frame, and the error that is left.
 
     names : the motors' letters, in the firmware's order. correcting : what to do about a motor
     whose reading has a scale.
     """
+    delta = fit.delta
     unit, word = ("mm", "m") if fit.kind == "linear" else ("degrees", "rad")
     motors = [
         f"Motor {name} is leg {j + 1}, joint {delta.joint[j] + 1}:"
@@ -477,13 +503,14 @@ def about(
     sort = "Towers" if fit.kind == "linear" else "Arms' angles above the horizontal"
     return [
         *source.header(),
-        f"For {program}. Units: mm and degrees. {sort}; the rod's length is a value of its own.",
+        f"For {delta.program}. Units: mm and degrees. {sort}; the rod's length is a value of its"
+        " own.",
         *motors,
         *factors,
         *([correcting] if factors else []),
         f"The firmware's frame: p_firmware = firmware_from_base p_base, mm. {tip}",
         *rows,
-        f"{error_sentence(fit, program)} Compared over {len(delta.poses)} poses of the workspace.",
+        f"{fit.sentence} Compared over {len(delta.poses)} poses of the workspace.",
         "End switches are taken to be at the upper end of each motor's range in the mechanism"
         f" file: readings {', '.join(f'{q:.6g}' for q in delta.ends[fit.order])} {word}."
         " Where a switch is elsewhere, add the difference to that motor's value below.",
@@ -494,20 +521,6 @@ def _in_mm(transform: Array) -> Array:
     out = np.array(transform)
     out[:3, 3] *= MM
     return out
-
-
-def error_sentence(fit: Fit, program: str) -> str:
-    """How well the settings follow the machine; rounded up, so that it holds."""
-    largest = math.ceil(fit.largest * 1e3) / 1e3
-    return (
-        f"{program}'s model follows this machine with the tool off by {largest:.3f} mm at most,"
-        f" {fit.rms:.3f} mm root mean square."
-    )
-
-
-def end_motors(delta: Delta, fit: Fit) -> Array:
-    """Motor positions (3,) at the end switches, in the firmware's order."""
-    return fit.rate * delta.ends[fit.order] + fit.zero
 
 
 def placed(text: str) -> Array:
@@ -525,11 +538,12 @@ def stated(text: str) -> float:
     return float(found.group(1)) / MM if found else 0.0
 
 
-def tool_difference(text: str, delta: Delta, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
+def tool_difference(text: str, fit: Fit, inverse: Inverse, zero: Array) -> Difference:
     """The firmware's formulas on the text's values, the machine's own forward kinematics after.
 
     zero : (3,) motor positions at reading zero by the text's end switches.
     """
+    delta = fit.delta
     points = MM * apply(placed(text), delta.positions)
     readings = np.zeros_like(delta.readings)
     readings[:, delta.joint[fit.order]] = (inverse(points) - zero) / fit.rate
@@ -559,9 +573,9 @@ def redo(source: Source) -> tuple[Finding, ...]:
     return (Finding(Level.NOTE, text),)
 
 
-def follows(fit: Fit, program: str) -> Finding:
+def follows(fit: Fit) -> Finding:
     """The note on how well, a doubt where it is not well."""
-    text = error_sentence(fit, program)
+    text = fit.sentence
     if fit.largest > FOLLOWS:
         cause = "towers that are not parallel" if fit.kind == "linear" else "tilted arms"
         text += f" It has no values for {cause} and the like; --to c has them all."

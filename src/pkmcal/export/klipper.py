@@ -19,14 +19,11 @@ from pkmcal.errors import InputError
 from pkmcal.export.contract import Difference, Exporter, commented
 from pkmcal.export.delta import (
     DEGREE,
-    Delta,
     Fit,
     Freedoms,
     about,
     degrees,
-    delta_of,
-    end_motors,
-    fitted,
+    fit_of,
     follows,
     mm,
     redo,
@@ -46,9 +43,8 @@ MARK = (
 """klippy/configfile.py, _find_autosave_data."""
 
 
-def _fit(source: Source) -> tuple[Delta, Fit]:
-    delta = delta_of(source.machine, PROGRAM, source.bed)
-    return delta, fitted(delta, LINEAR if delta.kind == "linear" else ROTARY, PROGRAM)
+def _fit(source: Source) -> Fit:
+    return fit_of(source, PROGRAM, LINEAR, ROTARY)
 
 
 @final
@@ -60,12 +56,12 @@ class Klipper(Exporter):
 
     def files(self, source: Source) -> dict[str, str]:
         """One file of configuration; pins, speeds and the like are the printer's own."""
-        delta, fit = _fit(source)
+        fit = _fit(source)
         word = "Multiply its rotation_distance" if fit.kind == "linear" else "Divide its gear_ratio"
-        lines = about(source, delta, fit, STEPPERS, PROGRAM, f"{word} by that.")
+        lines = about(source, fit, STEPPERS, f"{word} by that.")
         lines.append("Put these values into the sections of the printer's own configuration.")
         lines.append(MARK)
-        sections = _linear(delta, fit) if fit.kind == "linear" else _rotary(delta, fit)
+        sections = _linear(fit) if fit.kind == "linear" else _rotary(fit)
         body = "".join(
             f"\n[{name}]\n" + "".join(f"{key}: {value}\n" for key, value in values.items())
             for name, values in sections.items()
@@ -74,23 +70,21 @@ class Klipper(Exporter):
 
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
         """Read as Klipper does, and moved by its formulas."""
-        delta, fit = _fit(source)
+        fit = _fit(source)
         text = files[FILE]
         found = ConfigParser(delimiters=(":",), comment_prefixes=("#",))
         found.read_string(text)
-        ends = fit.rate * delta.ends[fit.order]
         move = linear_motors if fit.kind == "linear" else rotary_motors
-        zero = homed(found) - ends
-        return [tool_difference(text, delta, fit, lambda points: move(found, points), zero)]
+        zero = homed(found) - fit.rate * fit.delta.ends[fit.order]
+        return [tool_difference(text, fit, lambda points: move(found, points), zero)]
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
-        del files
-        return (follows(_fit(source)[1], PROGRAM), Finding(Level.NOTE, MARK), *redo(source))
+        return (follows(_fit(source)), Finding(Level.NOTE, MARK), *redo(source))
 
 
-def _linear(delta: Delta, fit: Fit) -> dict[str, dict[str, str]]:
-    endstops = end_motors(delta, fit) - np.sqrt(fit.rod**2 - fit.radius**2)
+def _linear(fit: Fit) -> dict[str, dict[str, str]]:
+    endstops = fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
     sections = {
         "printer": {
             "kinematics": "delta",
@@ -106,8 +100,8 @@ def _linear(delta: Delta, fit: Fit) -> dict[str, dict[str, str]]:
     return sections
 
 
-def _rotary(delta: Delta, fit: Fit) -> dict[str, dict[str, str]]:
-    angle = end_motors(delta, fit) / DEGREE
+def _rotary(fit: Fit) -> dict[str, dict[str, str]]:
+    angle = fit.end_motors / DEGREE
     out = fit.radius + fit.arm * np.cos(angle)
     below = fit.rod**2 - out**2
     if np.any(below <= 0) or fit.radius <= 0:

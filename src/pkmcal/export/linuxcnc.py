@@ -27,13 +27,11 @@ from pkmcal.export.delta import (
     DEGREE,
     MM,
     TOLD,
-    Delta,
     Fit,
     Freedoms,
     about,
     degrees,
-    delta_of,
-    fitted,
+    fit_of,
     follows,
     mm,
     tool_difference,
@@ -70,8 +68,8 @@ class LinuxCnc(Exporter):
     def files(self, source: Source) -> dict[str, str]:
         """A HAL file and words for the INI file."""
         if source.machine.document.motion == "translation":
-            delta, fit = _fit(source)
-            return {HAL: _delta_hal(source, delta, fit), INI: _delta_ini(source, delta, fit)}
+            fit = _fit(source)
+            return {HAL: _delta_hal(source, fit), INI: _delta_ini(source, fit)}
         struts = _hexapod(source.machine)
         return {HAL: _hal(source, struts), INI: _ini(source, struts)}
 
@@ -80,12 +78,12 @@ class LinuxCnc(Exporter):
         hal, machine = files[HAL], source.machine
         offsets = np.array([float(word) for word in _OFFSET.findall(files[INI])])
         if machine.document.motion == "translation":
-            delta, fit = _fit(source)
+            fit = _fit(source)
             pins = {name: float(value) for name, value in _PIN.findall(hal)}
             if fit.kind == "linear":
-                return [tool_difference(hal, delta, fit, lambda p: linear_joints(pins, p), offsets)]
+                return [tool_difference(hal, fit, lambda p: linear_joints(pins, p), offsets)]
             # motors count upwards, LinuxCNC's joints downwards
-            return [tool_difference(hal, delta, fit, lambda p: -rotary_joints(pins, p), -offsets)]
+            return [tool_difference(hal, fit, lambda p: -rotary_joints(pins, p), -offsets)]
         poses, readings = samples(machine)
         rates = np.array([float(word) for word in _RATE.findall(files[INI])])
         off = largest((genhexkins(hal, world(poses)) - offsets) / rates, readings)
@@ -93,11 +91,10 @@ class LinuxCnc(Exporter):
             Difference(f"readings at {len(poses)} poses by genhexkins' formulas", off, ROUNDING)
         ]
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """Where offsets went, or how well the pins follow the machine."""
-        del files
         if source.machine.document.motion == "translation":
-            return (follows(_fit(source)[1], PROGRAM),)
+            return (follows(_fit(source)),)
         return (
             Finding(
                 Level.NOTE,
@@ -235,13 +232,12 @@ def genhexkins(hal: str, pose: Array) -> Array:
 # Deltas
 
 
-def _fit(source: Source) -> tuple[Delta, Fit]:
-    delta = delta_of(source.machine, PROGRAM, source.bed)
-    return delta, fitted(delta, LINEAR if delta.kind == "linear" else ROTARY, PROGRAM)
+def _fit(source: Source) -> Fit:
+    return fit_of(source, PROGRAM, LINEAR, ROTARY)
 
 
-def _delta_hal(source: Source, delta: Delta, fit: Fit) -> str:
-    lines = about(source, delta, fit, "012", PROGRAM, CORRECTING)
+def _delta_hal(source: Source, fit: Fit) -> str:
+    lines = about(source, fit, "012", CORRECTING)
     lines = [line for line in lines if not line.startswith("End switches")]
     if fit.kind == "linear":
         pins = [
@@ -261,7 +257,7 @@ def _delta_hal(source: Source, delta: Delta, fit: Fit) -> str:
     return "\n".join([commented(lines, "#"), loaded, *pins]) + "\n"
 
 
-def _delta_ini(source: Source, delta: Delta, fit: Fit) -> str:
+def _delta_ini(source: Source, fit: Fit) -> str:
     linear = fit.kind == "linear"
     sign = 1.0 if linear else -1.0  # arms count downwards
     rate, zero = sign * fit.rate, sign * fit.zero
@@ -280,7 +276,7 @@ def _delta_ini(source: Source, delta: Delta, fit: Fit) -> str:
         f"[KINS]\nKINEMATICS = {fit.kind}deltakins\nJOINTS = 3\n",
         "[TRAJ]\nCOORDINATES = XYZ\nLINEAR_UNITS = mm\nANGULAR_UNITS = degree",
     ]
-    ranges = delta.machine.joint_ranges[delta.joint][fit.order]
+    ranges = fit.delta.machine.joint_ranges[fit.delta.joint][fit.order]
     for n in range(3):
         ends = np.sort(rate[n] * ranges[n] + zero[n])
         ini.append(f"\n[JOINT_{n}]\nTYPE = {word}\nHOME_ABSOLUTE_ENCODER = 2")

@@ -3,14 +3,41 @@
 from __future__ import annotations
 
 from typing import ClassVar, final
+from xml.etree.ElementTree import Element, SubElement
 
+import numpy as np
+
+from pkmcal.arrays import Array
 from pkmcal.calibration.source import Source
 from pkmcal.export.agreement import differences
+from pkmcal.export.bodies import COLOURS, BodyTree, Loop, RoundBar, TreeBody, body_tree
 from pkmcal.export.contract import Difference, Exporter
-from pkmcal.export.markup import file_name
-from pkmcal.export.mujoco_model import mjcf
+from pkmcal.export.home import HomeState
+from pkmcal.export.markup import comment, document, file_name, numbers, plain
 from pkmcal.export.mujoco_read import read
+from pkmcal.geometry.rigid import quaternion
 from pkmcal.outcome import Finding, Level
+
+STEP = "0.001"
+"""s; the loops' time constant is twice that, the shortest that MuJoCo allows."""
+STIFF = 2.0e4
+"""N/m of a drive's position control: with the parts' masses it settles within some 20 ms."""
+DAMPED = 2.0e2
+"""N s/m of a drive."""
+LIGHT, PLATFORM = 0.1, 1.0
+"""kg of a part and of the platform: placeholders, since photographs weigh nothing."""
+CONVENTIONS = (
+    "Units: m, rad, kg, s. MuJoCo's world is the machine's base frame; the body 'platform' has the"
+    " platform frame, so its xpos and xmat are T_base_platform.",
+    "Actuators leg1, leg2, … (motor1, … where a motor moves several rods) have the machine's"
+    " readings as their values, and sensors of these names tell them: set data.ctrl to readings."
+    " Joints of these names have scale * reading: a rod's length is that + offset, a crank's angle"
+    " that + angle. An actuator's gear is 1 / scale; without one the scale is 1.",
+    "The keyframe 'home' is closed by pkmcal's kinematics, and is the model as drawn (qpos0)."
+    " Loops are closed by the equality constraints named after the legs.",
+    "PLACEHOLDERS: masses, inertias, damping and the actuators' gains. Photographs weigh nothing,"
+    " so this model is for kinematics. Gravity and contacts are off for that reason.",
+)
 
 
 @final
@@ -22,17 +49,160 @@ class MujocoExporter(Exporter):
 
     def files(self, source: Source) -> dict[str, str]:
         """The model's text."""
-        return {f"{file_name(source.machine.name)}.xml": mjcf(source)}
+        return {f"{file_name(source.machine.name)}.xml": _mjcf(source)}
 
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
         """By the text's own bodies, joints and loops."""
         return differences(read(next(iter(files.values()))), source.machine)
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """What the model does not know."""
-        del files, source
+        del source
         text = (
             "Masses, inertias, damping and gains in the model are placeholders: it is for "
             "kinematics. Gravity and contacts are off."
         )
         return (Finding(Level.NOTE, text),)
+
+
+def _mjcf(source: Source) -> str:
+    """The model's XML. Raises InputError for a machine that MuJoCo's bodies cannot be."""
+    tree = body_tree(source.machine)
+    home = tree.home
+    root = Element("mujoco", model=plain(source.machine.name))
+    _settings(root, home)
+    world = SubElement(root, "worldbody")
+    size = numbers(np.zeros(2), 5 * home.size)
+    SubElement(world, "light", pos=size, dir="0 0 -1", directional="true")
+    _fill(world, tree.bodies[0], tree)
+    equality = SubElement(root, "equality")
+    for coupling in tree.couplings:
+        comment(equality, coupling.said)
+        out = SubElement(equality, "joint", name=coupling.name, joint1=coupling.follower)
+        out.set("joint2", coupling.leader)
+        out.set("polycoef", "0 -1 0 0 0")
+    for loop in tree.loops:
+        kind, second = ("weld", f"{loop.name}_end") if loop.hinges else ("connect", loop.tip.name)
+        out = SubElement(equality, kind, name=loop.name, body1=loop.held.name, body2=second)
+        if not loop.hinges:
+            out.set("anchor", numbers(loop.point))
+    _drives(root, home)
+    _keyframe(root, home)
+    return document(root, source, CONVENTIONS)
+
+
+# Bodies
+
+
+def _fill(node: Element, body: TreeBody, tree: BodyTree) -> None:
+    """What a body has, and all that stands on it."""
+    for joint in body.joints:
+        made = _joint(node, joint.name, joint.kind, joint.axis, joint.value)
+        if joint.column >= 0:
+            limits = tree.home.values(joint.column)[1:]
+            if np.isfinite(limits).all():
+                made.set("limited", "true")
+                made.set("range", numbers(limits))
+            # N s/m or N m s
+            made.set("damping", numbers(DAMPED * tree.home.lever(joint.column) ** 2))
+    for shape in body.shapes:
+        _geom(node, shape)
+    for name, point in body.points.items():
+        SubElement(node, "site", name=name, pos=numbers(point))
+    for child in tree.children(body):
+        if child.said:
+            comment(node, child.said)
+        mass = PLATFORM if child is tree.platform else LIGHT
+        made = _body(node, child.name, child.T_parent_body, mass, child.middle, child.size)
+        if child.free:
+            SubElement(made, "freejoint", name=child.name)
+        _fill(made, child, tree)
+    for loop in tree.loops:
+        if loop.hinges and loop.tip is body:
+            _end(node, loop, tree.home.size / 10)
+
+
+def _end(node: Element, loop: Loop, size: float) -> None:
+    """The part of a joint whose axes count that the platform is welded to."""
+    place = np.eye(4)
+    place[:3, 3] = loop.end
+    last = _body(node, f"{loop.name}_end", place, LIGHT, np.zeros(3), size)
+    for kind, axis in loop.hinges:
+        _joint(last, f"{loop.name}_{kind}", "hinge", axis)
+
+
+def _body(parent: Element, name: str, T: Array, mass: float, middle: Array, size: float) -> Element:
+    """A body at a place (4, 4) of its parent's frame.
+
+    middle : (3,) its centre of mass. size : m, of a rod of that length; placeholders.
+    """
+    out = SubElement(parent, "body", name=name, pos=numbers(T[:3, 3]))
+    inertia = numbers(np.full(3, mass * size**2 / 12))
+    SubElement(out, "inertial", pos=numbers(middle), mass=numbers(mass), diaginertia=inertia)
+    if np.abs(T[:3, :3] - np.eye(3)).max() > 1e-15:  # rounding is no turn
+        out.set("quat", numbers(quaternion(T[:3, :3])))
+    return out
+
+
+def _joint(parent: Element, name: str, kind: str, axis: Array, ref: float = 0.0) -> Element:
+    """A ``hinge`` or ``slide`` at the body's origin; ``ref`` is its value as drawn (m, rad)."""
+    out = SubElement(parent, "joint", name=name, type=kind, axis=numbers(axis))
+    if ref:
+        out.set("ref", numbers(ref))
+    return out
+
+
+def _geom(parent: Element, shape: RoundBar) -> None:
+    size, rgba = numbers(shape.radius), COLOURS[shape.look]
+    if shape.stop is None:
+        SubElement(parent, "geom", type="sphere", pos=numbers(shape.start), size=size, rgba=rgba)
+    elif not shape.flat:  # MuJoCo takes no cylinder without a length
+        ends = numbers(shape.start, shape.stop)
+        geom = SubElement(parent, "geom", type="cylinder", fromto=ends, size=size, rgba=rgba)
+        if shape.name:
+            geom.set("name", shape.name)
+
+
+# Settings, drives, keyframe
+
+
+def _settings(root: Element, home: HomeState) -> None:
+    SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
+    option = SubElement(root, "option", timestep=STEP, gravity="0 0 0", integrator="implicitfast")
+    SubElement(option, "flag", contact="disable")
+    middle = np.concatenate([home.a, home.b]).mean(axis=0)
+    SubElement(root, "statistic", center=numbers(middle), extent=numbers(2 * home.size))
+    default = SubElement(root, "default")
+    SubElement(default, "geom", contype="0", conaffinity="0")
+    SubElement(default, "site", size=numbers(home.size / 100))
+    SubElement(default, "joint", damping="0.01")
+    # as stiff as the step allows: the loops are the machine's joints, not springs
+    SubElement(default, "equality", solref="0.002 1", solimp="0.99 0.9999 0.0001 0.5 2")
+
+
+def _drives(root: Element, home: HomeState) -> None:
+    """Position control of every reading, and sensors."""
+    actuator, sensor = SubElement(root, "actuator"), SubElement(root, "sensor")
+    for column in range(home.machine.n_joints):
+        name, limits = home.reading_name(column), home.machine.joint_ranges[column]
+        stiffness = numbers(STIFF * home.lever(column) ** 2)
+        drive = SubElement(actuator, "position", name=name, joint=name, kp=stiffness)
+        if home.scale(column) != 1:
+            drive.set("gear", numbers(1 / home.scale(column)))
+        if np.isfinite(limits).all():
+            drive.set("ctrllimited", "true")
+            drive.set("ctrlrange", numbers(limits))
+        SubElement(sensor, "actuatorpos", name=name, actuator=name)
+    for kind, name in (("framepos", "platform_position"), ("framequat", "platform_quaternion")):
+        SubElement(sensor, kind, name=name, objtype="xbody", objname="platform")
+
+
+def _keyframe(root: Element, home: HomeState) -> None:
+    """All joints' values at home in MuJoCo's order, which is the text's."""
+    world = root.iterfind("worldbody/")
+    values = [n.get("ref", "0.0") for part in world for n in part.iter("joint")]
+    free = next((n for n in root.iter("body") if n.find("freejoint") is not None), None)
+    if free is not None:  # the platform comes first
+        values[:0] = [free.get("pos", "0 0 0"), free.get("quat", "1 0 0 0")]
+    key = SubElement(SubElement(root, "keyframe"), "key", name="home", qpos=" ".join(values))
+    key.set("ctrl", numbers(home.readings))

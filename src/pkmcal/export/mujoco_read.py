@@ -1,5 +1,5 @@
 """MuJoCo's text read again, as its documentation of MJCF tells bodies, joints and equality
-constraints, as far as :mod:`pkmcal.export.mujoco_model` uses them.
+constraints, as far as :mod:`pkmcal.export.mujoco` uses them.
 """
 
 from __future__ import annotations

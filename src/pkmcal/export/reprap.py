@@ -9,6 +9,7 @@ larger angle of A plus its own.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import ClassVar, final
 
 import numpy as np
@@ -20,14 +21,11 @@ from pkmcal.export.contract import Difference, Exporter, commented
 from pkmcal.export.delta import (
     DEGREE,
     MM,
-    Delta,
     Fit,
     Freedoms,
     about,
     degrees,
-    delta_of,
-    end_motors,
-    fitted,
+    fit_of,
     follows,
     mm,
     reach,
@@ -43,9 +41,8 @@ STEEPEST = 90.0
 _WORD = re.compile(r"([A-Z])(-?[0-9.]+(?::-?[0-9.]+)*)")
 
 
-def _fit(source: Source) -> tuple[Delta, Fit]:
-    delta = delta_of(source.machine, PROGRAM, source.bed)
-    return delta, fitted(delta, Freedoms(NOMINAL), PROGRAM)
+def _fit(source: Source) -> Fit:
+    return fit_of(source, PROGRAM, Freedoms(NOMINAL), Freedoms(NOMINAL))
 
 
 @final
@@ -57,44 +54,43 @@ class RepRap(Exporter):
 
     def files(self, source: Source) -> dict[str, str]:
         """One file of G-code."""
-        delta, fit = _fit(source)
+        fit = _fit(source)
         way = "mm" if fit.kind == "linear" else "degree"
         correcting = f"Divide its steps per {way} (M92) by that."
-        lines = about(source, delta, fit, "XYZ", PROGRAM, correcting)
-        commands = _linear(delta, fit) if fit.kind == "linear" else _rotary(delta, fit)
+        lines = about(source, fit, "XYZ", correcting)
+        commands = _linear(fit) if fit.kind == "linear" else _rotary(fit)
         return {FILE: commented(lines, ";") + "\n".join(commands) + "\n"}
 
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
         """Read as the firmware does, and moved by its formulas."""
-        delta, fit = _fit(source)
+        fit = _fit(source)
         text = files[FILE]
         words = read_words(text)
-        ends = fit.rate * delta.ends[fit.order]
+        ends = fit.rate * fit.delta.ends[fit.order]
         linear = fit.kind == "linear"
         homed = homed_carriages(words) if linear else words["669A"][1] + _xyz(words, "666")
         move = linear_motors if linear else rotary_motors
-        return [tool_difference(text, delta, fit, lambda points: move(words, points), homed - ends)]
+        return [tool_difference(text, fit, lambda points: move(words, points), homed - ends)]
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """How well the settings follow the machine, and what to do after they are in."""
-        del files
-        return (follows(_fit(source)[1], PROGRAM), *redo(source))
+        return (follows(_fit(source)), *redo(source))
 
 
-def _linear(delta: Delta, fit: Fit) -> list[str]:
-    heights = end_motors(delta, fit) - np.sqrt(fit.rod**2 - fit.radius**2)
+def _linear(fit: Fit) -> list[str]:
+    heights = fit.end_motors - np.sqrt(fit.rod**2 - fit.radius**2)
     homed = float(heights.mean())
     corrections = fit.angle - np.array(NOMINAL)
     return [
         "M669 K3 ; linear delta",
-        f"M665 L{_three(fit.rod)} R{mm(fit.radius)} H{mm(homed)} B{mm(MM * reach(delta))}"
+        f"M665 L{_three(fit.rod)} R{mm(fit.radius)} H{mm(homed)} B{mm(MM * reach(fit.delta))}"
         f" {_letters(corrections, degrees)} ; L rods, R radius, H homed height, B print radius",
         f"M666 {_letters(heights - homed, mm)} A0 B0 ; endstop adjustments, mm; no tilt",
     ]
 
 
-def _rotary(delta: Delta, fit: Fit) -> list[str]:
-    homed = end_motors(delta, fit)
+def _rotary(fit: Fit) -> list[str]:
+    delta, homed = fit.delta, fit.end_motors
     largest = float(homed.mean())
     ranges = delta.machine.joint_ranges[delta.joint][fit.order]
     lowest = float((fit.rate[:, None] * ranges + fit.zero[:, None]).min())
@@ -121,8 +117,7 @@ def _three(values: Array) -> str:
     return ":".join(mm(v) for v in values)
 
 
-def _letters(values: Array, number: object) -> str:
-    write = mm if number is mm else degrees
+def _letters(values: Array, write: Callable[[float], str]) -> str:
     return " ".join(f"{letter}{write(float(v))}" for letter, v in zip("XYZ", values, strict=True))
 
 

@@ -73,9 +73,8 @@ class Ros(Exporter):
                 out.append(Difference(f"camera of {station} read again", worst, limit, "px"))
         return out
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """Cameras that are not in the files, and why."""
-        del files
         lost = [s for s in source.T_base_camera if s not in source.cameras]
         out: list[Finding] = []
         if lost:

@@ -62,9 +62,9 @@ class SdfExporter(Exporter):
         """By the text's own links and joints."""
         return differences(read(next(iter(files.values()))), source.machine)
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """What the model does not know, and what its readers may not do."""
-        del files, source
+        del source
         return (
             Finding(
                 Level.DOUBTFUL,

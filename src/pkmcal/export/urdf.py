@@ -70,19 +70,17 @@ class UrdfExporter(Exporter):
 
     def files(self, source: Source) -> dict[str, str]:
         """The tree's text, and the loops'."""
-        tree, name = body_tree(source.machine), file_name(source.machine.name)
-        loops = f"{name}.loops.yaml"
-        return {f"{name}.urdf": _urdf(tree, source, name, loops), loops: _loops(tree, source)}
+        tree, (name, loops) = body_tree(source.machine), _file_names(source)
+        return {name: _urdf(tree, source, loops), loops: _loops(tree, source)}
 
     def check(self, files: dict[str, str], source: Source) -> list[Difference]:
         """By the text's own links and joints, its loops closed as the other text says."""
         tree, loops = files.values()
         return differences(read(tree, loops), source.machine)
 
-    def notes(self, files: dict[str, str], source: Source) -> tuple[Finding, ...]:
+    def notes(self, source: Source) -> tuple[Finding, ...]:
         """What the tree does not hold."""
-        del source
-        tree, loops = files
+        tree, loops = _file_names(source)
         return (
             Finding(
                 Level.DOUBTFUL,
@@ -93,8 +91,13 @@ class UrdfExporter(Exporter):
         )
 
 
-def _urdf(tree: BodyTree, source: Source, name: str, loops: str) -> str:
-    root = Element("robot", name=name)
+def _file_names(source: Source) -> tuple[str, str]:
+    name = file_name(source.machine.name)
+    return f"{name}.urdf", f"{name}.loops.yaml"
+
+
+def _urdf(tree: BodyTree, source: Source, loops: str) -> str:
+    root = Element("robot", name=file_name(source.machine.name))
     for look, rgba in COLOURS.items():
         SubElement(SubElement(root, "material", name=look), "color", rgba=rgba)
     for body in tree.bodies:

@@ -247,8 +247,7 @@ def _edges(
 ) -> tuple[EdgeBlocks, EdgeData]:
     """The edges at their places, and the readings of the seen configurations."""
     edges, factor = measurements.edges, measurements.intrinsics_factor
-    tubes = zip(edges.leg, edges.tube, strict=True)
-    radius: Integers = np.array([machine.layout.radius[j][t] for j, t in tubes], dtype=int)
+    radius = machine.layout.radius_of(edges.leg, edges.tube)
     camera = np.asarray(measurements.camera_of_station)[edges.station]
     optics = np.zeros((len(edges), 2, 1 + factor.shape[-1]))
     optics[..., 0] = edges.shift

@@ -58,8 +58,8 @@ def joint_centres(drawing: Machine, calibrated: Machine, covariance: Array) -> t
     """Base and platform centres; covariance (P, P) as :func:`free_of_gauge` leaves it."""
     before, after = _ends(drawing), _ends(calibrated)
     sides = (
-        ("base", before.a, after.a, after.a_by, after.a_index),
-        ("platform", before.b, after.b, after.b_by, after.b_index),
+        ("base", before.a, after.a, after.a_by, drawing.layout.a_index),
+        ("platform", before.b, after.b, after.b_by, drawing.layout.b_index),
     )
     found: list[Centres] = []
     for side, old, new, by, index in sides:

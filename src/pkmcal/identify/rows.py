@@ -250,9 +250,9 @@ class EdgeRows:
     @property
     def by_machine(self) -> tuple[Array, Array, Array]:
         """By the parameters of both ends and by the radius, (n, 2g, ...) each."""
-        ends = self.closure.ends
+        c = self.closure
         radius = np.sum(self._pulls[0] + self._pulls[1], axis=0)[None]
-        return self._by_a(self._along(ends.a_by)), self._by_b(self._along(ends.b_by)), radius
+        return self._by_a(self._along(c.a_by)), self._by_b(self._along(c.b_by)), radius
 
     @property
     def by_station(self) -> Array:

@@ -16,7 +16,7 @@ from pkmcal.identify.centres import Centres, free_of_gauge, joint_centres
 from pkmcal.identify.estimate import Estimate
 from pkmcal.identify.gauge import freedoms, pose_generators, respecting_motion
 from pkmcal.mechanisms import Machine
-from pkmcal.mechanisms.closure import by_own, closure, dense
+from pkmcal.mechanisms.closure import by_own, closure, dense, limb_ends
 from pkmcal.mechanisms.kinematics import on_manifold
 
 SAMPLES = 40
@@ -55,7 +55,7 @@ def platform_by_parameters(machine: Machine, T_base_platform: Array) -> Array:
     ``norm(out @ v)`` is the joints' displacement (m, root mean square).
     """
     joints, poses = _around(machine, T_base_platform)
-    points = closure(machine.layout, machine.values, joints, poses).ends.b_by_pose
+    points = limb_ends(machine.layout, machine.values, joints, poses).b_by_pose
     moved = points @ pose_by_parameters(machine, joints, poses)[:, None]
     # whether its parameters can follow or not: frames are conventions
     frames = points @ (pose_generators(poses) @ respecting_motion(machine.layout.motion))[:, None]

@@ -12,10 +12,10 @@ import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
 from pkmcal.geometry.rigid import from_quaternion, pose, pose_difference, rotation
-from pkmcal.mechanisms.closure import base_ends, platform_ends
-from pkmcal.mechanisms.kinematics import CONVERGED, Closed, close, inverse_result, typical_reach
+from pkmcal.mechanisms.closure import base_ends, closure, platform_ends
+from pkmcal.mechanisms.kinematics import CONVERGED, Closed, close, scaled_rows, typical_reach
 from pkmcal.mechanisms.layout import LimbLayout
-from pkmcal.mechanisms.velocities import assembly_sign
+from pkmcal.mechanisms.velocities import assembly_sign, sign_of
 
 BATCH = 1000
 """Starts at a time."""
@@ -86,9 +86,8 @@ def assembly_modes(
     poses, internal = _of_coordinates(modes)
     near = np.argsort(np.linalg.norm(pose_difference(poses, home), axis=-1), kind="stable")
     poses, internal, found = poses[near], internal[near], found[near]
-    readings_home, internal_home = inverse_result(layout, theta, home)
-    at_home = assembly_sign(layout, theta, readings_home, home, internal_home)
-    sign = (assembly_sign(layout, theta, readings, poses, internal) * at_home).astype(int)
+    own = sign_of(scaled_rows(closure(layout, theta, readings, poses, internal)))
+    sign = (own * assembly_sign(layout, theta, home)).astype(int)
     missing = 1 - SURE ** (1 / closed) if closed else 1.0
     return AssemblyModes(poses, internal, found, sign, starts, closed, missing, complete)
 

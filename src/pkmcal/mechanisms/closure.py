@@ -1,10 +1,9 @@
 """The closure of every machine, |B_j - A_j| = length_j and what its joints' axes add.
 
-First the rows and how they change with the pose, which is all that kinematics needs
-(:func:`rows_between`); then their derivatives by the parameters (:func:`closure`). What moves with
-the readings only, :func:`base_ends`, is apart, so that a search for the pose finds it once. Where
-each limb finds its carriers, its parameters and its reading says its
-:class:`~pkmcal.mechanisms.layout.LimbLayout`.
+:func:`closure` gives the rows, how they change with the pose, and, where somebody asks, with the
+readings and the parameters. What moves with the readings only, :func:`base_ends`, is apart, so that
+a search for the pose finds it once. Where each limb finds its carriers, its parameters and its
+reading says its :class:`~pkmcal.mechanisms.layout.LimbLayout`.
 
 All functions take the parameter vector as an array (..., P), so that a whole Monte-Carlo batch of
 machines is one call: leading axes of parameters, readings and poses broadcast.
@@ -63,14 +62,6 @@ class Rows(NamedTuple):
     u: Array
     distance: Array
     w: Array
-
-
-def pose_rows(
-    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array | None = None
-) -> Rows:
-    """The rows at readings (..., m) and poses (..., 4, 4); theta (..., P), internal (..., n)."""
-    base = base_ends(layout, theta, readings)
-    return rows_between(layout, theta, base, platform_ends(layout, theta, poses, internal), poses)
 
 
 def base_ends(layout: LimbLayout, theta: Array, readings: Array) -> BaseEnds:
@@ -168,16 +159,6 @@ def _with_angles(
     )
 
 
-def by_readings(layout: LimbLayout, theta: Array, base: BaseEnds, rows: Rows) -> Array:
-    """Derivatives (..., E) of the rows by their legs' own readings, zero where there is none."""
-    by = -dot(rows.u, base.by_reading) - rod_rates(layout, theta)
-    by = by if layout.all_close else by[..., layout.closing]
-    if not len(layout.angles):
-        return by
-    angles = -dot(rows.w, base.by_reading[..., layout.angles.leg, :])
-    return stacked(by[..., None], angles[..., None])[..., 0]
-
-
 def _by_pose(arm: Array, w: Array) -> Array:
     """Rows (..., 6) of a point's motion along directions w (..., 3): (arm x w, w)."""
     out = fresh(w, (*np.broadcast_shapes(arm.shape, w.shape)[:-1], 6))
@@ -270,39 +251,11 @@ def skeletons(layout: LimbLayout, theta: Array, joint_value: Array) -> tuple[Arr
 
 @dataclass(frozen=True)
 class LimbEnds:
-    """Both ends of all limbs with derivatives; leading axes broadcast, then L legs.
-
-    a, b : (..., L, 3) m, base frame.
-    a_index, b_index : (L, n) parameters that each end depends on, P where there are fewer.
-    a_by, b_by : (..., L, 3, n) derivatives by those parameters.
-    a_by_reading : (..., L, 3). arm : (..., L, 3), what of b turns with the platform.
-    n_parameters : P. b_by_internal : (..., L, 3, n) by the pose's internal coordinates.
-    """
-
-    a: Array
-    b: Array
-    a_index: Integers
-    b_index: Integers
-    a_by: Array
-    b_by: Array
-    a_by_reading: Array
-    arm: Array
-    n_parameters: int
-    b_by_internal: Array
-
-    @cached_property
-    def b_by_pose(self) -> Array:
-        """(..., L, 3, 6) derivatives of b by the pose's six numbers."""
-        return by_pose(self.arm)
-
-
-@dataclass(frozen=True)
-class Closure:
-    """The closure's rows, (..., E): lengths of the legs that close, then the axes' equations.
+    """Both ends of all limbs; leading axes broadcast, then L legs.
 
     Made from the machine (layout, theta), readings, poses and internal coordinates: what the
-    readings decide (base), what the pose decides (platform), and the rows between them. Derivatives
-    by the parameters are found when they are asked for: a search that only tries a step does not.
+    readings decide (base), and what the pose decides (platform). Derivatives are found when they
+    are asked for: a search that only tries a step, and a picture, do not.
     """
 
     layout: LimbLayout
@@ -312,50 +265,77 @@ class Closure:
     internal: Array | None
     base: BaseEnds
     platform: PlatformEnds
-    rows: Rows
+
+    @cached_property
+    def a(self) -> Array:
+        """(..., L, 3) m, base frame."""
+        return self._at_readings(self.base.a)
 
     @property
-    def value(self) -> Array:
-        """(..., E) m."""
-        return self.rows.value
+    def b(self) -> Array:
+        """(..., L, 3) m, base frame."""
+        return self.platform.b
 
-    @property
-    def u(self) -> Array:
-        """(..., L, 3) unit directions from A to B of all legs."""
-        return self.rows.u
+    @cached_property
+    def a_by_reading(self) -> Array:
+        """(..., L, 3) derivatives of a by the legs' readings."""
+        return self._at_readings(self.base.by_reading)
 
-    @property
-    def distance(self) -> Array:
-        """(..., L) m."""
-        return self.rows.distance
+    def _at_readings(self, values: Array) -> Array:
+        shape = np.broadcast_shapes(self.theta.shape[:-1], self.readings.shape[:-1])
+        return np.broadcast_to(values, (*shape, self.layout.n_legs, 3))
 
-    @property
-    def by_pose(self) -> Array:
-        """(..., E, 6)."""
-        return self.rows.by_pose
+    @cached_property
+    def b_by_pose(self) -> Array:
+        """(..., L, 3, 6) derivatives of b by the pose's six numbers."""
+        return by_pose(self.platform.arm)
 
-    @property
-    def by_internal(self) -> Array:
-        """(..., E, n), n = 0 for a rigid platform."""
-        return self.rows.by_internal
+    @cached_property
+    def a_by(self) -> Array:
+        """(..., L, 3, n) derivatives of a by the parameters at the layout's ``a_index``."""
+        layout, theta = self.layout, self.theta
+        q = joint_values(layout, theta, self.readings)
+        by = [g.carrier.by_parameters(g.of(theta), q[..., g.legs]) for g in layout.base]
+        padded = _padded_to(layout.n_legs, layout.base, by)
+        if not layout.scales_move_a:
+            return padded
+        raw = _leg_readings(layout, self.readings) / scales(layout, theta)
+        return _side_by_side((padded, (self.a_by_reading * raw[..., None])[..., None]))
+
+    @cached_property
+    def b_by(self) -> Array:
+        """(..., L, 3, n) derivatives of b by the parameters at the layout's ``b_index``."""
+        layout, at_legs = self.layout, self.poses[..., None, :, :]
+        by = [
+            g.carrier.by_parameters(
+                g.of(self.theta), at_legs, own_internal(layout, g, self.internal)
+            )
+            for g in layout.platform
+        ]
+        return _padded_to(layout.n_legs, layout.platform, by)
+
+
+@dataclass(frozen=True)
+class Closure(LimbEnds):
+    """The closure's rows as in :class:`Rows`, with the limbs' ends that they are between."""
+
+    value: Array
+    by_pose: Array
+    by_internal: Array
+    u: Array
+    distance: Array
+    w: Array
 
     @cached_property
     def by_reading(self) -> Array:
         """(..., E) by the leg's own reading, zero where it has none."""
-        return by_readings(self.layout, self.theta, self.base, self.rows)
-
-    @cached_property
-    def ends(self) -> LimbEnds:
-        """The limbs' ends with their derivatives."""
-        return _with_parameters(
-            self.layout,
-            self.theta,
-            self.readings,
-            self.poses,
-            self.internal,
-            self.base,
-            self.platform,
-        )
+        layout, moved = self.layout, self.base.by_reading
+        by = -dot(self.u, moved) - rod_rates(layout, self.theta)
+        by = by if layout.all_close else by[..., layout.closing]
+        if not len(layout.angles):
+            return by
+        angles = -dot(self.w, moved[..., layout.angles.leg, :])
+        return stacked(by[..., None], angles[..., None])[..., 0]
 
     @property
     def index(self) -> Integers:
@@ -365,12 +345,10 @@ class Closure:
     @cached_property
     def by_theta(self) -> Array:
         """(..., E, n) derivatives by them."""
-        layout = self.layout
-        lengths = _by_length(layout, self.rows.u, self.ends, self.readings)
-        if not len(layout.angles):
+        lengths = self._by_length()
+        if not len(self.layout.angles):
             return lengths
-        line = (self.ends.b - self.ends.a)[..., layout.angles.leg, :]
-        angles = _by_angles(layout, self.theta, self.poses, line, self.ends)
+        angles = self._by_angles()
         width = self.index.shape[1]
         spares = (
             [(0, 0)] * (by.ndim - 1) + [(0, width - by.shape[-1])] for by in (lengths, angles)
@@ -378,6 +356,29 @@ class Closure:
         return stacked(
             *(np.pad(by, spare) for by, spare in zip((lengths, angles), spares, strict=True))
         )
+
+    def _by_length(self) -> Array:
+        """Of |B - A| - length of the legs that close."""
+        layout = self.layout
+        parts = (-along(self.u, self.a_by), along(self.u, self.b_by), np.full((1, 1), -1.0))
+        if layout.scales_move_rods:
+            grown = np.where(layout.rod_reads, _leg_readings(layout, self.readings), 0.0)
+            parts = (*parts, -grown[..., None])
+        by_theta = _side_by_side(parts)
+        return by_theta if layout.all_close else by_theta[..., layout.closing, :]
+
+    def _by_angles(self) -> Array:
+        """Of the axes' equations."""
+        layout, leg = self.layout, self.layout.angles.leg
+        line = (self.b - self.a)[..., leg, :]
+        rows = angle_rows(layout.angles, self.theta, self.poses[..., :3, :3], line)
+        parts = (
+            -along(rows.by_line, self.a_by[..., leg, :, :]),
+            along(rows.by_line, self.b_by[..., leg, :, :]),
+            rows.by_base_axis,
+            rows.by_platform_axis,
+        )
+        return _side_by_side(parts)
 
 
 def limb_ends(
@@ -390,45 +391,7 @@ def limb_ends(
     """
     base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
-    return _with_parameters(layout, theta, readings, poses, internal, base, platform)
-
-
-def _with_parameters(
-    layout: LimbLayout,
-    theta: Array,
-    readings: Array,
-    poses: Array,
-    internal: Array | None,
-    base: BaseEnds,
-    platform: PlatformEnds,
-) -> LimbEnds:
-    """The ends with their derivatives by the parameters."""
-    q, at_legs = joint_values(layout, theta, readings), poses[..., None, :, :]
-    a_by = [g.carrier.by_parameters(g.of(theta), q[..., g.legs]) for g in layout.base]
-    b_by = [
-        g.carrier.by_parameters(g.of(theta), at_legs, own_internal(layout, g, internal))
-        for g in layout.platform
-    ]
-    shape = np.broadcast_shapes(theta.shape[:-1], readings.shape[:-1])
-    a, by_reading = (
-        np.broadcast_to(x, (*shape, layout.n_legs, 3)) for x in (base.a, base.by_reading)
-    )
-    by_a = _padded_to(layout.n_legs, layout.base, a_by)
-    if layout.scales_move_a:
-        raw = _leg_readings(layout, readings) / scales(layout, theta)
-        by_a = _side_by_side((by_a, (by_reading * raw[..., None])[..., None]))
-    return LimbEnds(
-        a,
-        platform.b,
-        layout.a_index,
-        layout.b_index,
-        by_a,
-        _padded_to(layout.n_legs, layout.platform, b_by),
-        by_reading,
-        platform.arm,
-        layout.n_parameters,
-        platform.by_internal,
-    )
+    return LimbEnds(layout, theta, readings, poses, internal, base, platform)
 
 
 def _padded_to(n_legs: int, groups: tuple[CarrierGroup, ...], by_parameters: list[Array]) -> Array:
@@ -453,7 +416,12 @@ def closure(
     base = base_ends(layout, theta, readings)
     platform = platform_ends(layout, theta, poses, internal)
     rows = rows_between(layout, theta, base, platform, poses)
-    return Closure(layout, theta, readings, poses, internal, base, platform, rows)
+    return Closure(layout, theta, readings, poses, internal, base, platform, *rows)
+
+
+def by_motors(layout: LimbLayout, by_reading: Array) -> Array:
+    """Derivatives (..., E) by the legs' own readings as those by all, (..., E, m)."""
+    return np.where(layout.of_motor, by_reading[..., None], 0.0)
 
 
 def by_own(layout: LimbLayout, rows: Closure | Rows) -> Array:
@@ -462,16 +430,6 @@ def by_own(layout: LimbLayout, rows: Closure | Rows) -> Array:
     if not layout.n_internal:
         return by_pose
     return np.concatenate([by_pose, rows.by_internal], axis=-1)
-
-
-def _by_length(layout: LimbLayout, u: Array, ends: LimbEnds, readings: Array) -> Array:
-    """Derivatives (..., E, n) of |B - A| - length of the legs that close, by their parameters."""
-    parts = (-along(u, ends.a_by), along(u, ends.b_by), np.full((1, 1), -1.0))
-    if layout.scales_move_rods:
-        grown = np.where(layout.rod_reads, _leg_readings(layout, readings), 0.0)
-        parts = (*parts, -grown[..., None])
-    by_theta = _side_by_side(parts)
-    return by_theta if layout.all_close else by_theta[..., layout.closing, :]
 
 
 def _side_by_side(parts: tuple[Array, ...]) -> Array:
@@ -484,20 +442,6 @@ def _side_by_side(parts: tuple[Array, ...]) -> Array:
 def along(u: Array, by: Array) -> Array:
     """Derivatives (..., 3, n) of a point, along a direction (..., 3): (..., n)."""
     return (u[..., None, :] @ by)[..., 0, :]
-
-
-def _by_angles(
-    layout: LimbLayout, theta: Array, poses: Array, line: Array, ends: LimbEnds
-) -> Array:
-    """The same of the axes' equations."""
-    rows, leg = angle_rows(layout.angles, theta, poses[..., :3, :3], line), layout.angles.leg
-    parts = (
-        -along(rows.by_line, ends.a_by[..., leg, :, :]),
-        along(rows.by_line, ends.b_by[..., leg, :, :]),
-        rows.by_base_axis,
-        rows.by_platform_axis,
-    )
-    return _side_by_side(parts)
 
 
 def on_tangents(layout: LimbLayout, theta: Array, drawing: Array) -> Array:

@@ -20,14 +20,13 @@ from pkmcal.geometry.batches import WORTH, batch_last, damped_step, fresh, picke
 from pkmcal.geometry.rigid import perturb, pose, rotation
 from pkmcal.mechanisms.closure import (
     BaseEnds,
-    Rows,
+    Closure,
     base_ends,
     by_own,
-    by_readings,
+    closure,
     limb_lines,
     platform_ends,
     platform_parameters,
-    pose_rows,
     rod_lengths,
     rows_between,
     scales,
@@ -225,8 +224,8 @@ class ForwardResult:
         takes longer than the poses.
         """
         poses, phi = self.T_base_platform, self.internal
-        rows = pose_rows(self.layout, self.theta, self.readings, poses, phi)
-        return singularity_of(self.layout, scaled_rows(self.layout, self.theta, rows))
+        c = closure(self.layout, self.theta, self.readings, poses, phi)
+        return singularity_of(self.layout, scaled_rows(c))
 
 
 def inverse(layout: LimbLayout, theta: Array, poses: Array, near: Array | None = None) -> Array:
@@ -252,6 +251,12 @@ def inverse_result(
     columns = layout.actuated[None] == np.arange(layout.n_readings)[:, None]
     readings = legs @ (columns / columns.sum(axis=1, keepdims=True)).T
     return _settled(layout, theta, poses, readings, internal)
+
+
+def closure_at(layout: LimbLayout, theta: Array, poses: Array) -> Closure:
+    """The closure at poses (..., 4, 4), with the readings and hinges' turns that close it best."""
+    readings, internal = inverse_result(layout, theta, poses)
+    return closure(layout, theta, readings, poses, internal)
 
 
 def _upright(layout: LimbLayout, theta: Array, poses: Array, shape: tuple[int, ...]) -> Array:
@@ -297,8 +302,8 @@ def _settled(
     pick = layout.of_motor.astype(float)
     x = np.concatenate([readings, internal], axis=-1)
     for _ in range(SETTLING):
-        c, by_reading = rows_and_drives(layout, theta, x[..., :m], poses, x[..., m:])
-        jac = np.concatenate([by_reading[..., None] * pick, c.by_internal], axis=-1)
+        c = closure(layout, theta, x[..., :m], poses, x[..., m:])
+        jac = np.concatenate([c.by_reading[..., None] * pick, c.by_internal], axis=-1)
         # what is out of reach is NaN and stays so
         jac, value = np.nan_to_num(jac), np.nan_to_num(c.value)
         step = damped_step(jac, value, np.full(value.shape[:-1], 1e-14))
@@ -306,15 +311,6 @@ def _settled(
         if np.abs(step).max(initial=0.0) < SETTLED:
             break
     return x[..., :m], x[..., m:]
-
-
-def rows_and_drives(
-    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array
-) -> tuple[Rows, Array]:
-    """The closure's rows, and their derivatives (..., E) by their legs' own readings."""
-    base = base_ends(layout, theta, readings)
-    rows = rows_between(layout, theta, base, platform_ends(layout, theta, poses, internal), poses)
-    return rows, by_readings(layout, theta, base, rows)
 
 
 def forward(
@@ -362,12 +358,12 @@ def _at_least(
     Gauss-Newton: near it the squares are level to rounding, and tell a search nothing.
     """
     for _ in range(LEVELLING):
-        rows = pose_rows(layout, theta, readings, poses, internal)
-        back = np.linalg.pinv(np.nan_to_num(by_own(layout, rows)))
-        step = (back @ np.nan_to_num(rows.value)[..., None])[..., 0] @ layout.own_motion.T
+        c = closure(layout, theta, readings, poses, internal)
+        back = np.linalg.pinv(np.nan_to_num(by_own(layout, c)))
+        step = (back @ np.nan_to_num(c.value)[..., None])[..., 0] @ layout.own_motion.T
         poses, internal = perturb(poses, -step[..., :6]), internal - step[..., 6:]
-    rows = pose_rows(layout, theta, readings, poses, internal)
-    worst = np.abs(rows.value).max(axis=-1)
+    c = closure(layout, theta, readings, poses, internal)
+    worst = np.abs(c.value).max(axis=-1)
     return Closed(poses, internal, np.where(np.isfinite(worst), worst, np.inf))
 
 
@@ -382,11 +378,11 @@ def singularity(layout: LimbLayout, theta: Array, by_pose: Array) -> Array:
     return singularity_of(layout, own * scale[..., None, :])
 
 
-def scaled_rows(layout: LimbLayout, theta: Array, rows: Rows) -> Array:
+def scaled_rows(c: Closure) -> Array:
     """Rows (..., E, d + n) by the pose's own freedoms, hinges last, without units: turns, which the
     hinges' are too, count as the platform's joints' ways.
     """
-    return by_own(layout, rows) * own_scale(layout, theta)[..., None, :]
+    return by_own(c.layout, c) * own_scale(c.layout, c.theta)[..., None, :]
 
 
 def singularity_of(layout: LimbLayout, scaled: Array) -> Array:
@@ -449,11 +445,8 @@ def mobility(layout: LimbLayout, theta: Array, pose: Array) -> int:
     """In how many ways the machine moves near a pose (4, 4): unknowns and readings together, less
     the equations between them that differ. A machine with more readings is redundant.
     """
-    readings, internal = inverse_result(layout, theta, pose)
-    rows, drives = rows_and_drives(layout, theta, readings, pose, internal)
-    every = np.concatenate(
-        [scaled_rows(layout, theta, rows), drives[..., None] * layout.of_motor], axis=-1
-    )
+    c = closure_at(layout, theta, pose)
+    every = np.concatenate([scaled_rows(c), c.by_reading[..., None] * layout.of_motor], axis=-1)
     return every.shape[-1] - int(np.linalg.matrix_rank(every, tol=SAME_EQUATION))
 
 
@@ -474,11 +467,10 @@ def on_manifold(
     left, lost = np.arange(len(current)), np.zeros(len(current), dtype=int)
     for _ in range(steps if free else 0):
         own = every if every.ndim == 1 else every[left]
-        readings, phi = inverse_result(layout, own, current[left])
-        c, drives = rows_and_drives(layout, own, readings, current[left], phi)
-        value, blind = undriven(layout, c, drives)
+        c = closure_at(layout, own, current[left])
+        value, blind = undriven(c)
         value, by_pose = np.nan_to_num(value), np.nan_to_num(blind @ c.by_pose @ layout.motion)
-        lost[left] = np.where(np.isfinite(readings).all(axis=-1), 0, lost[left] + 1)
+        lost[left] = np.where(np.isfinite(c.readings).all(axis=-1), 0, lost[left] + 1)
         more = np.abs(value).max(axis=-1, initial=0.0) >= CONVERGED * 1e-2
         more &= lost[left] < GIVEN_UP
         left = left[more]
@@ -488,21 +480,22 @@ def on_manifold(
         current[left] = perturb(current[left], (layout.motion @ step)[..., 0])
     current = current.reshape(*shape, 4, 4)
     readings, phi = inverse_result(layout, theta, current)
-    c, drives = rows_and_drives(layout, theta, readings, current, phi)
+    c = closure(layout, theta, readings, current, phi)
     reached = np.isfinite(c.value).all(axis=-1)
-    off = np.abs(undriven(layout, c, drives)[0]).max(axis=-1, initial=0.0)
+    off = np.abs(undriven(c)[0]).max(axis=-1, initial=0.0)
     error = np.where(reached, off, np.inf)
     return ForwardResult(current, error < CONVERGED, error, phi, layout, theta, readings)
 
 
-def undriven(layout: LimbLayout, c: Rows, by_reading: Array) -> tuple[Array, Array]:
+def undriven(c: Closure) -> tuple[Array, Array]:
     """Combinations (..., r, E) of the closure's rows that neither drives nor hinges move, and
     their values (..., r).
     """
+    layout = c.layout
     passive = np.flatnonzero(layout.row_motor < 0)
     blind = np.eye(layout.n_equations)[passive]
     if layout.shares_motors:
-        drives = by_reading[..., None] * layout.of_motor
+        drives = c.by_reading[..., None] * layout.of_motor
         moved = np.concatenate([drives, c.by_internal], axis=-1)
         moved = np.nan_to_num(moved)
         q = np.linalg.qr(moved, mode="complete")[0]

@@ -207,6 +207,11 @@ class LimbLayout:
             index[group.legs, : group.index.shape[1]] = group.index
         return index
 
+    def radius_of(self, legs: Integers, tubes: Integers) -> Integers:
+        """Positions (n,) of the radii of legs' tubes, by the numbers of both, (n,) each."""
+        pairs = zip(legs, tubes, strict=True)
+        return np.array([self.radius[leg][tube] for leg, tube in pairs], dtype=int)
+
     @cached_property
     def free(self) -> Booleans:
         """(6,) which of (omega, tau) the motion has."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,10 +41,19 @@ from pkmcal.mechanisms.motors import (
     scale_tolerances,
 )
 from pkmcal.mechanisms.parameters import ParameterTable
-from pkmcal.wording import count, split_name
+from pkmcal.wording import count
 
-_Row = tuple[str, str, str, float, str, str]
-"""Name, unit, tolerance's name, drawing value, label, part of a parameter."""
+
+class _Row(NamedTuple):
+    """One parameter, as :class:`ParameterTable` has all; kind : the tolerance's name."""
+
+    name: str
+    unit: str
+    kind: str
+    label: str
+    part: str
+    drawing: float
+    tolerance: float
 
 
 @dataclass(frozen=True)
@@ -149,6 +158,10 @@ class Machine:
     def radii(self) -> tuple[Array, ...]:
         """Each leg's tube radii, m."""
         return tuple(self.values[index] for index in self.layout.radius)
+
+    def radii_of(self, legs: Integers, tubes: Integers) -> Array:
+        """Radii (n,) m of legs' tubes, by the numbers of both, (n,) each, from 0."""
+        return self.values[self.layout.radius_of(legs, tubes)]
 
     def home(self) -> Array:
         """A start for forward kinematics: the file's home, or the platform above the base."""
@@ -355,21 +368,20 @@ def machine_from_document(
     """
     check_drawing(document, where)
     rows = list(_parameter_rows(document))
-    names = [row[0] for row in rows]
     ties = (*document.tied, *built_in_ties(document))
     # a scale that is exact is held already
     exact = not (scale_tolerances(document) > 0).any()
     held = [entry for entry in document.fixed if not (exact and entry.endswith("].scale"))]
     table = ParameterTable(
-        names=tuple(names),
-        units=tuple(row[1] for row in rows),
-        kinds=tuple(row[2] for row in rows),
-        labels=tuple(row[4] for row in rows),
-        parts=tuple(row[5] for row in rows),
-        drawing=np.array([row[3] for row in rows]),
-        tolerance=np.array(_tolerances(document, rows)),
+        names=tuple(row.name for row in rows),
+        units=tuple(row.unit for row in rows),
+        kinds=tuple(row.kind for row in rows),
+        labels=tuple(row.label for row in rows),
+        parts=tuple(row.part for row in rows),
+        drawing=np.array([row.drawing for row in rows]),
+        tolerance=np.array([row.tolerance for row in rows]),
     ).with_roles((*held, *built_in_fixed(document)), ties)
-    positions = {name: k for k, name in enumerate(names)}
+    positions = {name: k for k, name in enumerate(table.names)}
     return Machine(document, table, layout_of(document, positions), table.drawing.copy())
 
 
@@ -380,35 +392,28 @@ def with_exact_scales(document: MechanismDocument) -> MechanismDocument:
 
 
 def _parameter_rows(document: MechanismDocument) -> Iterator[_Row]:
-    """Rows (name, unit, tolerance's name, drawing value, label, part), leg by leg."""
-    axes, unsure = axes_in_use(document), scale_tolerances(document) > 0
+    """Rows leg by leg; of a scale the tolerance is the one that its reading has."""
+    axes, scales = axes_in_use(document), scale_tolerances(document)
+    usual = document.tolerance.model_dump()
     for j, leg in enumerate(document.legs):
         path = f"legs[{j + 1}]"
         for side, carriers in (("base", base_carriers()), ("platform", platform_carriers())):
             node = getattr(leg, side)
             kinds = carriers[node.joint].parameters + (AXIS if (j, side) in axes else ())
-            yield from _rows_of(f"{path}.{side}", node, kinds)
+            yield from _rows_of(f"{path}.{side}", node, kinds, usual)
         if not isinstance(leg.length, PassiveLength):
             kind = OFFSET if isinstance(leg.length, ActuatedLength) else CONSTANT
-            yield from _rows_of(f"{path}.length", leg.length, (kind,))
-        if unsure[j]:
-            yield from _rows_of(path, leg, (SCALE,))
+            yield from _rows_of(f"{path}.length", leg.length, (kind,), usual)
+        if scales[j] > 0:
+            yield from _rows_of(path, leg, (SCALE,), {SCALE.tolerance: scales[j]})
         for t, tube in enumerate(leg.tubes, start=1):
-            yield f"{path}.tubes[{t}].radius", "m", "radius", tube.radius, f"tube {t} radius", ""
+            name, label = f"{path}.tubes[{t}].radius", f"tube {t} radius"
+            yield _Row(name, "m", "radius", label, "", tube.radius, usual["radius"])
 
 
-def _tolerances(document: MechanismDocument, rows: list[_Row]) -> list[float]:
-    """Each row's standard deviation; of a scale the one that its reading has."""
-    scale = scale_tolerances(document)
-    return [
-        scale[(split_name(name)[0] or 0) - 1]
-        if kind == SCALE.tolerance
-        else getattr(document.tolerance, kind)
-        for name, _, kind, *_ in rows
-    ]
-
-
-def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]) -> Iterator[_Row]:
+def _rows_of(
+    path: str, node: Any, kinds: tuple[ParameterKind, ...], tolerances: Mapping[str, float]
+) -> Iterator[_Row]:
     """Rows of one part: what its file gives, and not what is a constant."""
     for kind in kinds:
         value = of_part(node, kind)
@@ -418,7 +423,8 @@ def _rows_of(path: str, node: Any, kinds: tuple[ParameterKind, ...]) -> Iterator
                 "center", "centre"
             )
             part = kind.part or path.rpartition(".")[2]
-            yield name, kind.unit, kind.tolerance, value, label, part
+            tolerance = tolerances[kind.tolerance]
+            yield _Row(name, kind.unit, kind.tolerance, label, part, value, tolerance)
 
 
 def _assign(document: dict[str, Any], name: str, value: float) -> None:

@@ -17,36 +17,18 @@ nothing: two assemblies may have the same, and only a path between them tells.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans
 from pkmcal.geometry.rigid import dot, skew
-from pkmcal.mechanisms.closure import (
-    BaseEnds,
-    Rows,
-    base_ends,
-    by_own,
-    by_readings,
-    platform_ends,
-    pose_rows,
-    rows_between,
-)
-from pkmcal.mechanisms.kinematics import inverse_result, own_scale, platform_radius, scaled_rows
+from pkmcal.mechanisms.closure import BaseEnds, Closure, by_motors
+from pkmcal.mechanisms.kinematics import closure_at, own_scale, platform_radius, scaled_rows
 from pkmcal.mechanisms.layout import LimbLayout
 
 LOST = 1e-9
 """Smallest singular value of a scaled Jacobian that still gives rates: a pose is right to 1e-12 m
 (:data:`pkmcal.mechanisms.kinematics.CONVERGED`), so below it not three digits would be right."""
-
-
-class _Moving(NamedTuple):
-    """The closure at poses that inverse kinematics closes, and its derivatives by readings."""
-
-    base: BaseEnds
-    rows: Rows
-    by_reading: Array
 
 
 def inverse_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
@@ -58,14 +40,14 @@ def inverse_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     others it says what inverse kinematics would. NaN where a limb cannot reach, and at a serial
     singularity (a crank in line with its rod), where the twist tells the rate of no reading.
     """
-    c = _moving(layout, theta, poses)
+    c = closure_at(layout, theta, poses)
     if layout.shares_motors:
-        return _of_shared(layout, theta, c)
+        return _of_shared(c)
     rows = layout.driven_rows[np.argsort(layout.row_motor[layout.driven_rows])]
     legs = np.flatnonzero(layout.closing)[rows]
     gain = c.by_reading[..., rows]
     usable = np.abs(gain) > LOST * _reading_scale(layout, c.base)[..., legs]
-    return -c.rows.by_pose[..., rows, :] / np.where(usable, gain, np.nan)[..., None]
+    return -c.by_pose[..., rows, :] / np.where(usable, gain, np.nan)[..., None]
 
 
 def forward_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
@@ -77,42 +59,29 @@ def forward_jacobian(layout: LimbLayout, theta: Array, poses: Array) -> Array:
     motors locked. Where two rods or more hold the same freedom, rates that fit one pose only are
     answered exactly and others by least squares.
     """
-    c = _moving(layout, theta, poses)
+    c = closure_at(layout, theta, poses)
     scale = own_scale(layout, theta)
-    inverted = _pseudo_inverse(by_own(layout, c.rows) * scale[..., None, :])
+    inverted = _pseudo_inverse(scaled_rows(c))
     return -layout.own_motion[:6] @ (
         scale[..., :, None] * (inverted @ by_motors(layout, c.by_reading))
     )
 
 
-def by_motors(layout: LimbLayout, by_reading: Array) -> Array:
-    """The closure's derivatives (..., E) by the legs' own readings as those by all, (..., E, m)."""
-    return np.where(layout.of_motor, by_reading[..., None], 0.0)
-
-
-def _moving(layout: LimbLayout, theta: Array, poses: Array) -> _Moving:
-    readings, internal = inverse_result(layout, theta, poses)
-    base = base_ends(layout, theta, readings)
-    platform = platform_ends(layout, theta, poses, internal)
-    rows = rows_between(layout, theta, base, platform, poses)
-    return _Moving(base, rows, by_readings(layout, theta, base, rows))
-
-
-def _of_shared(layout: LimbLayout, theta: Array, c: _Moving) -> Array:
+def _of_shared(c: Closure) -> Array:
     """Readings' rates (..., m, 6) of machines with several rods a motor: with the hinges' rates,
     the best that all rows say, as the inverse kinematics settles them.
     """
-    m = layout.n_readings
+    layout, m = c.layout, c.layout.n_readings
     legs = np.flatnonzero(layout.closing)
     by_motor = layout.actuated[legs][:, None] == np.arange(m)
     largest = np.where(by_motor, _reading_scale(layout, c.base)[..., legs, None], 0.0).max(axis=-2)
-    hinges = own_scale(layout, theta)[..., layout.motion.shape[1] :]
+    hinges = own_scale(layout, c.theta)[..., layout.motion.shape[1] :]
     shape = np.broadcast_shapes(largest.shape[:-1], hinges.shape[:-1])
     parts = (1 / largest, hinges)
     scale = np.concatenate([np.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=-1)
     drives = by_motors(layout, c.by_reading)
-    jac = np.concatenate([drives, c.rows.by_internal], axis=-1) * scale[..., None, :]
-    rates = -_pseudo_inverse(jac) @ c.rows.by_pose
+    jac = np.concatenate([drives, c.by_internal], axis=-1) * scale[..., None, :]
+    rates = -_pseudo_inverse(jac) @ c.by_pose
     return (scale[..., :, None] * rates)[..., :m, :]
 
 
@@ -200,31 +169,16 @@ def _singular_values(jac: Array) -> Array:
     return np.where(known[..., None], values, np.nan)
 
 
-def determinant_of(scaled: Array) -> Array:
-    """Determinant (...) of scaled rows (..., E, d), see
-    :func:`pkmcal.mechanisms.kinematics.scaled_rows`. NaN where they are not known, and for machines
+def sign_of(scaled: Array) -> Array:
+    """Sign (...) of the determinant of scaled rows (..., E, d), 1 or -1; see
+    :func:`pkmcal.mechanisms.kinematics.scaled_rows`. 0 where they are not known, and for machines
     with more or fewer rows than freedoms, which have none.
     """
     if scaled.shape[-1] != scaled.shape[-2]:
-        return np.full(scaled.shape[:-2], np.nan)
+        return np.zeros(scaled.shape[:-2])
     known = np.asarray(np.isfinite(scaled).all(axis=(-1, -2)))
     square = np.where(known[..., None, None], scaled, np.eye(scaled.shape[-1]))
-    return np.where(known, np.linalg.det(square), np.nan)
-
-
-def sign_of(scaled: Array) -> Array:
-    """Sign (...) of :func:`determinant_of`: 1 or -1; 0 where there is none."""
-    return np.nan_to_num(np.sign(determinant_of(scaled)))
-
-
-def assembly_sign(
-    layout: LimbLayout, theta: Array, readings: Array, poses: Array, internal: Array
-) -> Array:
-    """The sign (...) of assemblies: poses (..., 4, 4) and hinges' turns (..., n) that close the
-    machine at readings (..., m).
-    """
-    rows = pose_rows(layout, theta, readings, poses, internal)
-    return sign_of(scaled_rows(layout, theta, rows))
+    return np.where(known, np.sign(np.linalg.det(square)), 0.0)
 
 
 def same_assembly(layout: LimbLayout, theta: Array, poses: Array, reference: Array) -> Booleans:
@@ -234,8 +188,13 @@ def same_assembly(layout: LimbLayout, theta: Array, poses: Array, reference: Arr
     the module's docstring; machines without a determinant are always True, as are poses that a limb
     cannot reach.
     """
-    signs = []
-    for some in (poses, reference):
-        readings, internal = inverse_result(layout, theta, some)
-        signs.append(assembly_sign(layout, theta, readings, some, internal))
-    return np.asarray(signs[0] * signs[1] >= 0)
+    one, other = (assembly_sign(layout, theta, some) for some in (poses, reference))
+    return np.asarray(one * other >= 0)
+
+
+def assembly_sign(layout: LimbLayout, theta: Array, poses: Array) -> Array:
+    """The sign (...) of poses' assemblies, (..., 4, 4): it changes where a way from one to another
+    crosses a singular pose. 0 where rows and freedoms differ in number, and where a limb cannot
+    reach.
+    """
+    return sign_of(scaled_rows(closure_at(layout, theta, poses)))

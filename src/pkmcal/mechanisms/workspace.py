@@ -19,9 +19,9 @@ from pkmcal.geometry.rigid import perturb, pose, pose_difference
 from pkmcal.mechanisms.kinematics import (
     MAX_STEPS,
     NEAR_SINGULAR,
-    inverse_result,
+    closure_at,
+    inverse,
     on_manifold,
-    rows_and_drives,
     scaled_rows,
     singularity_of,
     typical_reach,
@@ -54,9 +54,7 @@ class Limits:
         """Home's sign and the singularity that counts as near: a machine that is weak at home is
         not refused everywhere for it.
         """
-        readings, internal = inverse_result(self.layout, self.theta, self.home)
-        rows, _ = rows_and_drives(self.layout, self.theta, readings, self.home, internal)
-        scaled = scaled_rows(self.layout, self.theta, rows)
+        scaled = scaled_rows(closure_at(self.layout, self.theta, self.home))
         least = 0.5 * float(singularity_of(self.layout, scaled))
         return float(sign_of(scaled)), min(NEAR_SINGULAR, least)
 
@@ -133,14 +131,12 @@ class Reach:
 
 def reachable(limits: Limits, poses: Array) -> Reach:
     """What stands against poses T_base_platform (..., 4, 4)."""
-    layout, theta = limits.layout, limits.theta
     with np.errstate(divide="ignore", invalid="ignore"):  # a platform's joint on a base joint
-        readings, internal = inverse_result(layout, theta, poses)
-        rows, by_reading = rows_and_drives(layout, theta, readings, poses, internal)
-    scaled = scaled_rows(layout, theta, rows)
-    singularity = singularity_of(layout, scaled)
+        c = closure_at(limits.layout, limits.theta, poses)
+        left = undriven(c)[0]
+    readings, scaled = c.readings, scaled_rows(c)
+    singularity = singularity_of(limits.layout, scaled)
     lost = np.isnan(readings)
-    left = undriven(layout, rows, by_reading)[0]
     off = np.where(lost.any(axis=-1), 0.0, np.abs(left).max(axis=-1, initial=0.0))
     sign, least = limits.at_home
     own = sign_of(scaled)
@@ -279,7 +275,7 @@ def _farthest(limits: Limits, twists: Array) -> Array:
 
 def _reach(limits: Limits) -> float:
     """A rod's length at home, m."""
-    readings = inverse_result(limits.layout, limits.theta, limits.home)[0]
+    readings = inverse(limits.layout, limits.theta, limits.home)
     return typical_reach(limits.layout, limits.theta, readings)
 
 
@@ -440,25 +436,25 @@ class PathCheck:
         )
 
 
-def check_path(limits: Limits, poses: Array, between: int = BETWEEN) -> PathCheck:
+def check_path(limits: Limits, poses: Array) -> PathCheck:
     """Look along a path T_base_platform (n, 4, 4), n >= 2, straight from each pose to the next.
 
-    between : poses looked at from one to the next; a singular pose that is crossed twice within
-    one of them, or a corner left so, is not seen.
+    A singular pose that is crossed twice within one of the steps looked at, or a corner left so, is
+    not seen.
     Raises InputError for a path that is none.
     """
-    if poses.ndim != 3 or len(poses) < 2 or between < 1:
+    if poses.ndim != 3 or len(poses) < 2:
         raise InputError(
             what="a path needs two poses or more",
             found=f"an array of shape {poses.shape}",
             expected="(n, 4, 4)",
         )
-    places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * between + 1)
+    places = np.linspace(0, len(poses) - 1, (len(poses) - 1) * BETWEEN + 1)
     found = reachable(limits, _at(poses, places))
     leaves, why = _leaving(limits, poses, places, found)
     nearest = np.where(np.isfinite(found.singularity), found.singularity, np.inf)
     k = int(np.argmin(nearest))
-    own = slice(None, None, between)
+    own = slice(None, None, BETWEEN)
     return PathCheck(
         inside=found.inside[own],
         leaves=leaves,

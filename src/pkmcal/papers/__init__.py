@@ -5,7 +5,7 @@
   ``registration`` (rigid bodies), ``four_step_checks`` and ``conditions`` (what data they need);
   ``axis_measurements`` (its Table 1).
 - [B] ``linear``, base centres from edges, each leg alone; ``linear_together``, all of them with the
-  drawing; ``conics``, the planes that they are found from.
+  drawing.
 - [C] ``hand_eye`` (camera and board), ``inverse_kinematic`` on the poses of ``measured_platform``,
   ``rotation_axis``.
 

@@ -256,18 +256,16 @@ def inverse_kinematic(
     start: State | None = None,
     *,
     form: Form = "implicit",
-    whitened: bool = True,
-    use_drawing: bool | None = None,
 ) -> State:
-    """One session's machine, stations and mounts from boards' poses and readings; [C] eq. 3 and 5.
+    """One session's machine, stations and mounts from boards' poses and readings; [C] eq. 3 and 5,
+    whitened, beside the drawing's values with their tolerances.
 
-    start : from the drawing by default, see :mod:`pkmcal.papers.hand_eye`. use_drawing : take
-    the drawing's values as measurements with their tolerances; by default where rows are whitened,
-    so that the two can be weighed. Platform poses are then by the readings and the new machine.
+    start : from the drawing by default, see :mod:`pkmcal.papers.hand_eye`. Platform poses are then
+    by the readings and the new machine.
     Raises InputError without a board on the platform, ResultError where the search fails.
     """
     begin = start_from_poses(machine, measurements) if start is None else start
-    fit = fit_session(machine, measurements, begin, form, whitened, use_drawing)
+    fit = fit_session(machine, measurements, begin, form)
     return _session_state(machine, measurements, begin, fit)
 
 
@@ -277,9 +275,11 @@ def fit_session(
     start: State,
     form: Form = "implicit",
     whitened: bool = True,
-    use_drawing: bool | None = None,
+    use_drawing: bool = True,
 ) -> PoseFit:
-    """The same as a fit of one run, with what was held."""
+    """The same as a fit of one run, with what was held; use_drawing : take the drawing's values as
+    measurements.
+    """
     poses = measurements.poses
     rows = np.flatnonzero(measurements.on_platform[poses.mount])
     if not rows.size:
@@ -298,9 +298,8 @@ def fit_session(
         form,
     )
     noise = np.linalg.inv(poses.whiten.mT @ poses.whiten)
-    prior = whitened if use_drawing is None else use_drawing
     return fit_poses(machine, problem, state, noise if whitened else None,
-                     measurements.joint_noise, prior)  # fmt: skip
+                     measurements.joint_noise, use_drawing)  # fmt: skip
 
 
 def pose_problem(

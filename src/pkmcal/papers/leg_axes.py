@@ -18,7 +18,6 @@ from pkmcal.geometry.rigid import cross, dot
 from pkmcal.measurements import EdgeSet, Measurements
 from pkmcal.mechanisms import Machine
 from pkmcal.mechanisms.closure import joint_values
-from pkmcal.papers import linear
 
 ONE_DIRECTION = 1e-6
 """Ratio of eigenvalues below which a leg counts as seen in one direction only, for its centre."""
@@ -189,7 +188,7 @@ def axes_from_edges(machine: Machine, measurements: Measurements, weights: Array
     photograph; both sides are needed, or the direction would be arbitrary. weights : (N,).
     """
     edges, n_legs = measurements.edges, machine.n_legs
-    radius = linear.edge_radii(machine, edges)
+    radius = machine.radii_of(edges.leg, edges.tube)
     photo, index = np.unique(
         edges.station * len(measurements.joints) + edges.configuration, return_inverse=True
     )
@@ -233,7 +232,7 @@ def through_centres(machine: Machine, edges: EdgeSet, centres: Array) -> EdgeSet
     along = edges.basis.mT @ a[..., None]
     gain = edges.covariance @ along
     spread = np.maximum((along.mT @ gain)[..., 0], 1e-300)
-    miss = np.where(known, dot(edges.normal, a) + linear.edge_radii(machine, edges), 0.0)
+    miss = np.where(known, dot(edges.normal, a) + machine.radii_of(edges.leg, edges.tube), 0.0)
     change = (edges.basis @ gain)[..., 0] * (miss[:, None] / spread)
     normal = edges.normal - change
     return replace(edges, normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True))

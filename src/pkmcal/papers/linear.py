@@ -17,7 +17,7 @@ import numpy as np
 
 from pkmcal.arrays import Array, Integers
 from pkmcal.geometry.rigid import dot
-from pkmcal.measurements import EdgeSet, Measurements
+from pkmcal.measurements import Measurements
 from pkmcal.mechanisms import Machine
 
 Method = Literal["plain", "huber", "tukey", "least-median", "robust", "errors-in-variables"]
@@ -122,7 +122,6 @@ def least_median(
     radius: Array,
     present: Array,
     rng: np.random.Generator,
-    triples: int = TRIPLES,
     noise: Array | None = None,
 ) -> Array:
     """Least median of squares: the best of random triples' exact solutions, A (..., 3).
@@ -132,7 +131,7 @@ def least_median(
     of its tube: in metres half of all edges are outliers to the other half. And A = 0, where wrong
     edges drive a solution, has residuals without bound.
     """
-    shape = (*present.shape[:-1], triples, 3)
+    shape = (*present.shape[:-1], TRIPLES, 3)
     count = np.sum(present > 0, axis=-1)[..., None, None]
     order = np.argsort(present <= 0, axis=-1, kind="stable")
     draw = np.minimum((rng.random(shape) * count).astype(int), np.maximum(count - 1, 0))
@@ -147,11 +146,11 @@ def least_median(
     half = np.minimum((count[..., 0] + 3) // 2, present.shape[-1] - 1)
     cost = np.empty(a.shape[:-1])
     # a residual of every edge for every triple: of thousands of photographs, leg after leg
-    each = max(RESIDUALS // (triples * max(present.shape[-1], 1)), 1)
+    each = max(RESIDUALS // (TRIPLES * max(present.shape[-1], 1)), 1)
     every = a, n, np.broadcast_to(radius, present.shape), present
     a_of, n_of, radius_of, present_of = (x.reshape(-1, *x.shape[present.ndim - 1 :]) for x in every)
     half_of = half.reshape(-1, 1)
-    flat = cost.reshape(-1, triples)
+    flat = cost.reshape(-1, TRIPLES)
     for first in range(0, len(flat), each):
         some = slice(first, first + each)
         r = np.abs(a_of[some] @ n_of[some].mT + radius_of[some, None])
@@ -213,9 +212,8 @@ def centres(
         out[group, place] = values
         return out
 
-    n, present, radius = (
-        padded(values) for values in (edges.normal, np.ones(len(edges)), edge_radii(machine, edges))
-    )
+    radii = machine.radii_of(edges.leg, edges.tube)
+    n, present, radius = (padded(x) for x in (edges.normal, np.ones(len(edges)), radii))
     noise = padded(edges.basis @ edges.covariance @ edges.basis.mT)
     rng = np.random.default_rng(0) if rng is None else rng
     a, weight, covariance = solve(n, radius, present, noise, method, rng)
@@ -283,9 +281,3 @@ def procrustes_scale(points: Array, drawing: Array) -> float:
     u, s, vt = np.linalg.svd(p.T @ d)
     s[-1] *= np.sign(np.linalg.det(u @ vt))
     return float(s.sum() / np.sum(d**2))
-
-
-def edge_radii(machine: Machine, edges: EdgeSet) -> Array:
-    """The machine's present radius of the tube that each edge bounds, (N,) m."""
-    radii = machine.radii()
-    return np.array([radii[j][t] for j, t in zip(edges.leg, edges.tube, strict=True)])

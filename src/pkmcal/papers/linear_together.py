@@ -194,7 +194,6 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
     n_shifts = int(shifts.max()) + 1
     table = machine.parameters
     n_free = table.free_matrix().shape[1]
-    tubes = zip(edges.leg, edges.tube, strict=True)
     system = _System(
         machine=machine,
         unknowns=Unknowns(
@@ -202,7 +201,7 @@ def _system(machine: Machine, measurements: Measurements) -> _System:
         ),
         edges=edges,
         centre=centre_index(machine.layout)[0][edges.leg],
-        radius=np.array([machine.layout.radius[j][t] for j, t in tubes], dtype=int),
+        radius=machine.layout.radius_of(edges.leg, edges.tube),
         shifts=shifts,
         noise=edges.basis @ edges.covariance @ edges.basis.mT,
         by_shift=(edges.basis @ edges.shift[..., None])[..., 0],

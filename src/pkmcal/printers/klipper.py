@@ -21,11 +21,10 @@ import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
-from pkmcal.export.klipper import STEPPERS, homed, linear_motors
+from pkmcal.export.klipper import LINEAR, STEPPERS, homed, linear_motors
 from pkmcal.files import shown
 from pkmcal.printers.printer import LARGEST, STEP, Printer, Touches
 
-NOMINAL = (210.0, 330.0, 90.0)
 SAVED = "#*#"
 _HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>")
 FULL_STEPS = 200.0
@@ -63,7 +62,7 @@ def printer(text: str, label: str) -> Printer:
     }
     each["angle"] = [
         _number(found, label, f"stepper_{s}", "angle", default)
-        for s, default in zip(STEPPERS, NOMINAL, strict=True)
+        for s, default in zip(STEPPERS, LINEAR.nominal, strict=True)
     ]
     config = ConfigParser()
     config.read_dict(

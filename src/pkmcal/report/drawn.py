@@ -127,7 +127,7 @@ def measured_curves(
     contour's rays, each turned into the measured plane: r - (r . n) n.
     """
     along = edges.span[:, :1] + (edges.span[:, 1:] - edges.span[:, :1]) * fraction
-    radius = machine.values[radius_positions(machine, edges)]
+    radius = machine.radii_of(edges.leg, edges.tube)
     at = photograph, edges.leg
     axis = legs.a[at][:, None] + along[..., None] * legs.u[at][:, None]
     normal = edges.normal[:, None]
@@ -140,7 +140,7 @@ def own_edges(
     machine: Machine, legs: LegsInCamera, photograph: Integers, edges: EdgeSet
 ) -> EdgeSet:
     """The edges as the machine itself would show them, as for :func:`measured_curves`."""
-    radius = radius_positions(machine, edges)
+    radius = machine.layout.radius_of(edges.leg, edges.tube)
     start, stop = edges.span.T
     each = TubeList(edges.leg, edges.tube, edges.side, start, stop, radius)
     at = photograph, edges.leg
@@ -162,12 +162,6 @@ def residual_words(shift: float, tilt: float, weight: float) -> str:
         f"residual {number(shift, 1, signed=True)} σ across, {number(tilt, 1, signed=True)} σ tilt;"
         f" weight {number(weight, 2)}"
     )
-
-
-def radius_positions(machine: Machine, edges: EdgeSet) -> Integers:
-    """Where each edge's radius stands among the machine's parameters, (N,)."""
-    pairs = zip(edges.leg.tolist(), edges.tube.tolist(), strict=True)
-    return np.array([machine.layout.radius[j][t] for j, t in pairs], dtype=int)
 
 
 def straightened(curve: Array) -> Array:

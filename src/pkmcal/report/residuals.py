@@ -23,7 +23,7 @@ from pkmcal.report.charts import (
     box,
     row_chart,
 )
-from pkmcal.report.drawn import SIDES, radius_positions
+from pkmcal.report.drawn import SIDES
 from pkmcal.report.links import Links
 from pkmcal.session.load import Session
 from pkmcal.wording import count, joined, named, number
@@ -90,7 +90,7 @@ def outward_shift(edges: EdgeSet, estimate: Estimate, joints: Array, camera: Int
         machine, state.T_camera_base[edges.station], state.T_base_platform[k], joints[k]
     )
     each = np.arange(len(edges))
-    radius = machine.values[radius_positions(machine, edges)]
+    radius = machine.radii_of(edges.leg, edges.tube)
     normal = edge_normal_jacobians(legs.a[each, j], legs.b[each, j], radius, edges.side).n
     error = -np.einsum("nij,ni->nj", edges.basis, normal)
     error -= edges.shift * state.edge_shift[camera[edges.station]][:, None]

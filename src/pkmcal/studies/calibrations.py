@@ -55,6 +55,7 @@ from pkmcal.simulation.placement import draw_configurations
 from pkmcal.solver import Stop, take
 from pkmcal.studies.capture import Capture, Design, captured
 from pkmcal.studies.estimates import Fitted
+from pkmcal.studies.statistics import covered
 from pkmcal.studies.tasks import Batch, Key, Population, Quantity, Sample
 
 ESTIMATE: Key = ("joint",)
@@ -282,16 +283,6 @@ def _along_axes(machine: Machine) -> Integers:
     axes = machine.parameters.axes
     largest = np.argmax(np.abs(machine.parameters.drawing[axes]), axis=1)
     return axes[np.arange(len(axes)), largest]
-
-
-def covered(errors: Array, sigma: Array, share: float = 0.95) -> Array:
-    """Part (B,) of a run's errors (B, ...) that lie in the intervals that their sigma promises."""
-    from scipy.special import ndtri
-
-    known = np.isfinite(sigma) & np.isfinite(errors)
-    inside = known & (np.abs(errors) <= float(ndtri(0.5 + share / 2)) * sigma)
-    axes = tuple(range(1, errors.ndim))
-    return np.sum(inside, axis=axes) / np.maximum(np.sum(known, axis=axes), 1)
 
 
 def _sizes(tool: Array) -> tuple[Array, Array]:

@@ -10,12 +10,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.studies.statistics import STATISTICS, Summary
+from pkmcal.studies.store import Store
 from pkmcal.studies.tasks import Batch, Done, Job, Key, Runner, Sample, Setting
 from pkmcal.studies.workers import on_cores
 
@@ -53,18 +54,6 @@ class StudyResult(Generic[S]):
         return self.samples[key].values[quantity]
 
 
-class KeptBatches(Protocol):
-    """Where finished batches are kept, so that a study goes on where it was stopped."""
-
-    def load(self, cell: int, number: int, batch: Batch) -> Done | None:
-        """A finished batch of a setting; None where it is still to be done."""
-        ...
-
-    def save(self, cell: int, number: int, done: Done) -> None:
-        """Keep a batch, whole or not at all."""
-        ...
-
-
 def run(setting: S, runs: int, seed: int, told: Told | None = None) -> StudyResult[S]:
     """The whole study of one setting. told : called with what is done and the share of it."""
     return run_all([setting], runs, seed, told)[0]
@@ -76,7 +65,7 @@ def run_all(
     seed: int,
     told: Told | None = None,
     runner: Runner | None = None,
-    kept: KeptBatches | None = None,
+    kept: Store | None = None,
     names: Sequence[str] = (),
 ) -> list[StudyResult[S]]:
     """Several settings with the same seeds: what they differ by is theirs, and not the draws'.

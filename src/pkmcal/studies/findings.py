@@ -15,12 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pkmcal.arrays import Array, Booleans, Integers, short_repr
+from pkmcal.arrays import Array, Integers, short_repr
 from pkmcal.errors import InputError
-from pkmcal.studies.calibrations import ESTIMATE, covered
+from pkmcal.studies.calibrations import ESTIMATE
 from pkmcal.studies.cluster import on_cluster
 from pkmcal.studies.engine import StudyResult, Told, batches, run_all
-from pkmcal.studies.statistics import Summary
+from pkmcal.studies.statistics import Summary, covered
 from pkmcal.studies.store import Store
 from pkmcal.studies.sweep import (
     Cell,
@@ -260,7 +260,7 @@ def found_of(cell: Cell, result: StudyResult[Setting]) -> CellFindings:
         held_tool=np.array([_mean(covered(t, st, float(share))) for share in SHARES]),
         chi2=_mean(values["chi2"][good]),
         parameters=tuple(name for name, _ in result.setting.parameters),
-        by_parameter=_by_parameter(e, s),
+        by_parameter=np.where(np.isfinite(s).any(axis=0), covered(e.T, s.T), np.nan),
     )
 
 
@@ -289,13 +289,6 @@ def _by_chance(one: float, other: float, freedom: int, pairs: int) -> float:
         return 0.0 if variance == 0 else np.inf
     told = freedom * variance**2 / (one**4 + other**4)
     return float(stdtrit(told, 1 - 0.025 / pairs) * np.sqrt(variance))
-
-
-def _by_parameter(errors: Array, sigma: Array) -> Array:
-    known: Booleans = np.isfinite(sigma)
-    inside = np.sum(known & (np.abs(errors) <= 1.959964 * sigma), axis=0)
-    count = np.sum(known, axis=0)
-    return np.where(count > 0, inside / np.maximum(count, 1), np.nan)
 
 
 def _percentile(values: Array) -> float:

@@ -50,7 +50,7 @@ from pkmcal.studies.reproduction import (
     deg,
     mm,
 )
-from pkmcal.studies.statistics import Summary, coverage, ratio
+from pkmcal.studies.statistics import Summary, covered, mean, ratio
 from pkmcal.wording import joined, number
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ def _words(
     apart = [f for f in figures if f.differs]
     of_drawing = [f for f in apart if (f.key, f.quantity) in FOLLOWS_DRAWING]
     joint = s.samples[JOINT,]
-    inside = coverage(joint.values["parameters"], joint.sigma["parameters"]).times(100)
+    inside = mean(covered(joint.values["parameters"], joint.sigma["parameters"])).times(100)
     return Words.of(
         "a",
         s,

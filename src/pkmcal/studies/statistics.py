@@ -52,12 +52,16 @@ def ratio(found: Summary, bound: Summary) -> Summary:
                                                  bound.error / bound.value)))  # fmt: skip
 
 
-def coverage(errors: Array, sigma: Array, share: float = 0.95) -> Summary:
-    """Part of the errors (B, n) that lie in the intervals that their stated sigma promises."""
+def covered(errors: Array, sigma: Array, share: float = 0.95) -> Array:
+    """Part (B,) of a run's errors (B, ...) that lie in the intervals that their stated sigma
+    promises, of those where both are known.
+    """
     from scipy.special import ndtri
 
-    inside = np.abs(errors) <= ndtri(0.5 + share / 2) * sigma
-    return mean(inside.reshape(len(errors), -1).mean(axis=1))
+    known = np.isfinite(sigma) & np.isfinite(errors)
+    inside = known & (np.abs(errors) <= float(ndtri(0.5 + share / 2)) * sigma)
+    axes = tuple(range(1, errors.ndim))
+    return np.sum(inside, axis=axes) / np.maximum(np.sum(known, axis=axes), 1)
 
 
 STATISTICS: Mapping[Statistic, Callable[[Array], Summary]] = {"rms": rms, "mean": mean}

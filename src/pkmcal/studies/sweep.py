@@ -28,8 +28,7 @@ from pkmcal.simulation.demo import camera_of_size
 from pkmcal.simulation.placement import check_drawable
 from pkmcal.studies.calibrations import SimulatedCalibrations
 from pkmcal.studies.capture import Design
-from pkmcal.studies.paper_a import HexapodByAxes
-from pkmcal.studies.paper_a_joint import JointByAxes
+from pkmcal.studies.paper_a import HexapodByAxes, JointByAxes
 from pkmcal.wording import listed
 
 PAPER = "a"

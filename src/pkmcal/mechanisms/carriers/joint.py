@@ -1,19 +1,30 @@
 """A joint at a limb's end as it stands in the file: a centre, and perhaps an axis.
 
 A spherical joint has a centre. A universal joint has its first axis, fixed to the body that it
-stands on; a revolute joint has one axis, and the limb turns about it.
+stands on; a revolute joint has one axis, and the limb turns about it. It stands on the base, where
+the reading does not move it, or on a platform that is one rigid body.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, final
 
 import numpy as np
 
 from pkmcal.arrays import Array
 from pkmcal.errors import InputError
 from pkmcal.files import Point, Schema
-from pkmcal.mechanisms.carriers.contract import AxisRole, Carrier, Chain, Direction, Site, vectors
+from pkmcal.geometry.batches import turned
+from pkmcal.mechanisms.carriers.contract import (
+    AxisRole,
+    BaseCarrier,
+    Carrier,
+    Chain,
+    Direction,
+    PlatformCarrier,
+    Site,
+    vectors,
+)
 
 
 class JointDocument(Schema):
@@ -63,3 +74,43 @@ class JointEnd(Carrier):
         """The centre, without a joint that a motor moves."""
         none = np.zeros_like(parameters)
         return Chain("fixed", parameters, none, none)
+
+
+@final
+class FixedPoint(JointEnd, BaseCarrier):
+    """Spherical, universal or revolute joint on the base; ``center`` in metres, base frame."""
+
+    @staticmethod
+    def place(parameters: Array, readings: Array) -> tuple[Array, Array]:
+        """A is the centre itself, (..., 3), whatever the reading."""
+        del readings
+        return parameters, np.zeros_like(parameters)
+
+    @classmethod
+    def by_parameters(cls, parameters: Array, readings: Array) -> Array:
+        """Identity."""
+        shape = np.broadcast_shapes(parameters.shape[:-1], readings.shape)
+        return np.broadcast_to(np.eye(3), (*shape, 3, 3))
+
+
+@final
+class RigidPlatform(JointEnd, PlatformCarrier):
+    """Spherical, universal or revolute joint on a platform that is one rigid body."""
+
+    @staticmethod
+    def place(
+        parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> tuple[Array, Array]:
+        """B = R b + t, the arm R b."""
+        del internal
+        arm = turned(T_base_platform[..., :3, :3], parameters)
+        return arm + T_base_platform[..., :3, 3], arm
+
+    @classmethod
+    def by_parameters(
+        cls, parameters: Array, T_base_platform: Array, internal: Array | None = None
+    ) -> Array:
+        """R."""
+        del internal
+        shape = np.broadcast_shapes(parameters.shape[:-1], T_base_platform.shape[:-2])
+        return np.broadcast_to(T_base_platform[..., :3, :3], (*shape, 3, 3))
