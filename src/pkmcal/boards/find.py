@@ -292,7 +292,7 @@ def _fitted(image: Integers, board: Board, raw: Raw) -> Corners:
     sides, bends = _axes(board, ids, fitted.pixels)
     if np.abs(bends).max() * REACH**2 / 2 < BENT:
         return fitted
-    return refine(image, fitted.pixels, sides, window, bends)
+    return refine(image, fitted.pixels, sides, window, bends, fitted)
 
 
 def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
@@ -389,6 +389,7 @@ def refine(
     axes: Array,
     window: Window,
     bends: Array | None = None,
+    before: Corners | None = None,
 ) -> Corners:
     """Fit corners near `start`.
 
@@ -397,6 +398,7 @@ def refine(
         marker's corner, of its side, away from the corner.
     bends : (n, 2, 2) px; second differences of the picture along the same axes, by which a lens
         or mirror bends the edges; none for straight ones.
+    before : an earlier fit, whose places are `start`, from where this one goes on.
     """
     if len(start) == 0:
         return Corners(start, np.zeros(0, dtype=bool), np.zeros(0), np.zeros((0, 7)))
@@ -405,6 +407,8 @@ def refine(
     places, weight = _window(image, start, axes, window, widened)
     grey = image[places[:, 1], places[:, 0]].astype(float)
     first = _first(grey, weight, axes, window.saddle)
+    if before is not None:
+        first[before.good] = before.unknowns[before.good]
     shape = _Shape(places - start[..., None], _curvature(first, axes, bends), window.saddle)
     return _judged(start, _fit(grey, weight, shape, first), grey, weight, scale)
 
