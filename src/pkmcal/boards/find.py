@@ -108,14 +108,21 @@ def charuco_detector(data: dict[str, Any], quick: bool = False) -> Any:
     """OpenCV's detector of a ChArUco board's fields; quick : by its finest threshold alone."""
     import cv2
 
-    board = cv2.aruco.CharucoBoard(
-        tuple(data["squares"]), data["square"], data["marker"], dictionary(data["dictionary"])
-    )
+    columns, rows = data["squares"]
+    markers = dictionary(data["dictionary"], 0, columns * rows // 2)
+    board = cv2.aruco.CharucoBoard((columns, rows), data["square"], data["marker"], markers)
     board.setLegacyPattern(bool(data.get("legacy", False)))
+    return cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), _thresholds(quick))
+
+
+def _thresholds(quick: bool) -> Any:
+    """How OpenCV looks for markers: by three thresholds, or quick, by the finest alone."""
+    import cv2
+
     how = cv2.aruco.DetectorParameters()
     if quick:
         how.adaptiveThreshWinSizeMax = how.adaptiveThreshWinSizeMin
-    return cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), how)
+    return how
 
 
 def _raw(corners: Any, ids: Any, width: int, mirrored: bool) -> Raw:
@@ -133,11 +140,18 @@ def _length(found: Any) -> int:
     return 0 if found is None else len(found)
 
 
-def dictionary(name: str) -> Any:
-    """OpenCV's dictionary of markers."""
+def dictionary(name: str, first: int = 0, count: int | None = None) -> Any:
+    """OpenCV's dictionary of markers, or ``count`` of them, numbered from ``first`` on.
+
+    A detector spends most of its time on comparing squares with all markers of its dictionary.
+    """
     import cv2
 
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    whole = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    if count is None:
+        return whole
+    some = whole.bytesList[first : first + count]
+    return cv2.aruco.Dictionary(some, whole.markerSize, whole.maxCorrectionBits)
 
 
 def marker_bits(name: str) -> int:
@@ -145,29 +159,36 @@ def marker_bits(name: str) -> int:
     return int(dictionary(name).markerSize)
 
 
-def detect_markers(image: Integers, name: str) -> tuple[Integers, Array]:
-    """Markers of a dictionary: ids (k,) and corners (k, 4, 2) px."""
+class Markers(NamedTuple):
+    """Markers in a photograph: ids (k,) and corners (k, 4, 2) px."""
+
+    ids: Integers
+    corners: Array
+
+
+def detect_markers(image: Integers, words: Any, quick: bool = False) -> Markers:
+    """The markers of a dictionary; quick : by the finest threshold alone."""
     import cv2
 
-    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary(name)).detectMarkers(image)
+    corners, ids, _ = cv2.aruco.ArucoDetector(words, _thresholds(quick)).detectMarkers(image)
     if _length(ids) == 0:
-        return np.zeros(0, dtype=int), np.zeros((0, 4, 2))
-    return np.asarray(ids).reshape(-1).astype(int), np.asarray(corners, float).reshape(-1, 4, 2)
+        return Markers(np.zeros(0, dtype=int), np.zeros((0, 4, 2)))
+    corners = np.asarray(corners, float).reshape(-1, 4, 2)
+    return Markers(np.asarray(ids).reshape(-1).astype(int), corners)
 
 
 def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     data = board.document
     count = board.counts[0] * board.counts[1]
+    words = dictionary(data["dictionary"], data.get("first_id", 0), count)
     for mirrored in (False, True):
         picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
-        ids, corners = detect_markers(picture, data["dictionary"])
-        ids = ids - data.get("first_id", 0)
-        ours = (ids >= 0) & (ids < count)
-        twice = np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
-        ours &= ~twice
-        if ours.sum() >= 2:
-            found = (4 * ids[ours, None] + np.arange(4)).reshape(-1)
-            return _raw(corners[ours], found, image.shape[1], mirrored), mirrored, ""
+        for quick, enough in ((True, count), (False, 2)):
+            ids, corners = detect_markers(picture, words, quick)
+            once = ~np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
+            if once.sum() >= enough:
+                found = (4 * ids[once, None] + np.arange(4)).reshape(-1)
+                return _raw(corners[once], found, image.shape[1], mirrored), mirrored, ""
     return _raw([], [], 0, False), False, "fewer than two of the board's markers are recognised"
 
 
