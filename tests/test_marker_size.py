@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pkmcal.boards.detect import detect_boards, marker_share
-from pkmcal.boards.find import detect_board
+from pkmcal.boards.find import detect_board, detect_markers, dictionary
 from pkmcal.errors import InputError
 from test_boards import CAMERAS, FILES, board_of, render
 from test_targets import poses_around
@@ -35,7 +35,11 @@ def described(tmp_path, marker):
 
 def test_markers_are_measured_in_photographs(images, tmp_path):
     board = board_of(tmp_path, FILES["charuco"])
-    shares = [marker_share(image, board, detect_board(image, board)) for image in images]
+    words = dictionary(board.document["dictionary"])
+    shares = [
+        marker_share(detect_markers(image, words), board, detect_board(image, board))
+        for image in images
+    ]
     np.testing.assert_allclose(shares, TRUE, rtol=0.03)
 
 

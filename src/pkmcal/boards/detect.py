@@ -14,9 +14,11 @@ from pkmcal.arrays import Array, Integers
 from pkmcal.boards.board import Board, Detection, board_from_document, chessboard, dictionaries
 from pkmcal.boards.find import (
     LEAST_CORNERS,
+    Markers,
     charuco_detector,
     detect_board,
     detect_markers,
+    dictionary,
     find_chessboard,
 )
 from pkmcal.errors import InputError
@@ -104,9 +106,14 @@ def check_boards(files: Sequence[Path], found: Sequence[Detection], board: Board
     for path, detection in seen[:LOOKED_AT]:
         # One photograph alone may show something beside the board that looks like more of it.
         image = decode(path, size, path.name)
-        other = _larger(image, board)
+        if board.type == "chessboard":
+            other = _larger(image, board)
+        else:
+            markers = detect_markers(image, dictionary(board.document["dictionary"]))
+            other = _beyond(image, board, markers)
+            if other is None and board.type == "charuco":
+                _check_size(markers, board, detection, path)
         if other is None:
-            _check_marker(image, board, detection, path)
             break
     if other is not None:
         raise _another(shown[0], other, board)
@@ -147,13 +154,13 @@ def _another(path: Path, other: str, board: Board) -> InputError:
     )
 
 
-def _check_marker(image: Integers, board: Board, detection: Detection, path: Path) -> None:
+def _check_size(markers: Markers, board: Board, detection: Detection, path: Path) -> None:
     """Raise `InputError` where a ChArUco board's markers have another size than described.
 
     Corners stay right to 0.02 px with any size, yet those of squares that seem to be full of
     marker, or empty, come out up to six times as uncertain as they are.
     """
-    share = marker_share(image, board, detection) if board.type == "charuco" else None
+    share = marker_share(markers, board, detection)
     if share is None:
         return
     square, marker = board.document["square"], board.document["marker"]
@@ -168,11 +175,11 @@ def _check_marker(image: Integers, board: Board, detection: Detection, path: Pat
     )
 
 
-def marker_share(image: Integers, board: Board, detection: Detection) -> float | None:
+def marker_share(markers: Markers, board: Board, detection: Detection) -> float | None:
     """Width of a ChArUco board's markers in squares, by the corners found; None for too few."""
     import cv2
 
-    ids, corners = detect_markers(image, board.document["dictionary"])
+    ids, corners = markers
     wide = np.linalg.norm(np.diff(corners, axis=1), axis=-1).reshape(len(ids), 3)
     large = wide.min(axis=1, initial=np.inf) > LEAST_MARKER
     corners, wide = corners[large], wide[large]
@@ -198,21 +205,24 @@ def other_board(image: Integers, board: Board, part: bool) -> str | None:
         return _other_markers(image, "") or _other_chessboard(image, board.counts, part)
     name = board.document["dictionary"]
     if board.type == "charuco":
-        best = _other_charuco(image, board)
+        best = _other_charuco(image, board, detect_markers(image, dictionary(name)))
         if best:
             return best
     return _other_markers(image, name) or _other_chessboard(image, (0, 0), part=True)
 
 
 def _larger(image: Integers, board: Board) -> str | None:
-    """More of the board than described, in a photograph in which the described one was found."""
-    if board.type == "chessboard":
-        columns, rows = board.counts
-        for counts in ((columns + 1, rows), (columns, rows + 1), (columns + 1, rows + 1)):
-            if _all_corners(image, counts):
-                return chessboard(counts, 1.0).described
-        return None
-    ids, _ = detect_markers(image, board.document["dictionary"])
+    """The larger chessboard of which the described one, which was found, is a part."""
+    columns, rows = board.counts
+    for counts in ((columns + 1, rows), (columns, rows + 1), (columns + 1, rows + 1)):
+        if _all_corners(image, counts):
+            return chessboard(counts, 1.0).described
+    return None
+
+
+def _beyond(image: Integers, board: Board, markers: Markers) -> str | None:
+    """What the markers show that the described board, which was found, does not have."""
+    ids = markers.ids
     if board.type == "aruco_grid":
         ids = ids - board.document.get("first_id", 0)
         count = board.counts[0] * board.counts[1]
@@ -223,7 +233,7 @@ def _larger(image: Integers, board: Board) -> str | None:
     if len(beyond) < 2:
         return None
     if board.type == "charuco":
-        return _other_charuco(image, board)
+        return _other_charuco(image, board, markers)
     return f"markers {listed([str(i) for i in sorted(beyond.tolist())], 4)} beyond its {count}"
 
 
@@ -258,9 +268,9 @@ def _all_corners(image: Integers, counts: tuple[int, int]) -> bool:
     return len(detect_board(image, chessboard(counts, 1.0)).ids) == counts[0] * counts[1]
 
 
-def _other_charuco(image: Integers, board: Board) -> str | None:
+def _other_charuco(image: Integers, board: Board, markers: Markers) -> str | None:
     """The counts of squares, or the older pattern, with which most corners are found."""
-    ids, corners = detect_markers(image, board.document["dictionary"])
+    ids, corners = markers
     if len(ids) < 2:
         return None
     most = int(ids.max()) + 1
@@ -304,7 +314,7 @@ def _other_markers(image: Integers, mine: str) -> str | None:
     wanted = [n for n in dictionaries() if _size_of(n) in (FAMILY, NO_SIZE) or n == mine]
     # some names differ by a capital only
     names = list({name.lower(): name for name in wanted}.values())
-    ids = {name: detect_markers(image, name)[0] for name in names}
+    ids = {name: detect_markers(image, dictionary(name)).ids for name in names}
     best = max(names, key=lambda name: len(ids[name]))
     count = len(ids[best])
     if count < 4 or (mine in ids and len(ids[mine]) > 0.7 * count):

@@ -108,14 +108,21 @@ def charuco_detector(data: dict[str, Any], quick: bool = False) -> Any:
     """OpenCV's detector of a ChArUco board's fields; quick : by its finest threshold alone."""
     import cv2
 
-    board = cv2.aruco.CharucoBoard(
-        tuple(data["squares"]), data["square"], data["marker"], dictionary(data["dictionary"])
-    )
+    columns, rows = data["squares"]
+    markers = dictionary(data["dictionary"], 0, columns * rows // 2)
+    board = cv2.aruco.CharucoBoard((columns, rows), data["square"], data["marker"], markers)
     board.setLegacyPattern(bool(data.get("legacy", False)))
+    return cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), _thresholds(quick))
+
+
+def _thresholds(quick: bool) -> Any:
+    """How OpenCV looks for markers: by three thresholds, or quick, by the finest alone."""
+    import cv2
+
     how = cv2.aruco.DetectorParameters()
     if quick:
         how.adaptiveThreshWinSizeMax = how.adaptiveThreshWinSizeMin
-    return cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), how)
+    return how
 
 
 def _raw(corners: Any, ids: Any, width: int, mirrored: bool) -> Raw:
@@ -133,11 +140,18 @@ def _length(found: Any) -> int:
     return 0 if found is None else len(found)
 
 
-def dictionary(name: str) -> Any:
-    """OpenCV's dictionary of markers."""
+def dictionary(name: str, first: int = 0, count: int | None = None) -> Any:
+    """OpenCV's dictionary of markers, or ``count`` of them, numbered from ``first`` on.
+
+    A detector spends most of its time on comparing squares with all markers of its dictionary.
+    """
     import cv2
 
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    whole = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    if count is None:
+        return whole
+    some = whole.bytesList[first : first + count]
+    return cv2.aruco.Dictionary(some, whole.markerSize, whole.maxCorrectionBits)
 
 
 def marker_bits(name: str) -> int:
@@ -145,29 +159,36 @@ def marker_bits(name: str) -> int:
     return int(dictionary(name).markerSize)
 
 
-def detect_markers(image: Integers, name: str) -> tuple[Integers, Array]:
-    """Markers of a dictionary: ids (k,) and corners (k, 4, 2) px."""
+class Markers(NamedTuple):
+    """Markers in a photograph: ids (k,) and corners (k, 4, 2) px."""
+
+    ids: Integers
+    corners: Array
+
+
+def detect_markers(image: Integers, words: Any, quick: bool = False) -> Markers:
+    """The markers of a dictionary; quick : by the finest threshold alone."""
     import cv2
 
-    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary(name)).detectMarkers(image)
+    corners, ids, _ = cv2.aruco.ArucoDetector(words, _thresholds(quick)).detectMarkers(image)
     if _length(ids) == 0:
-        return np.zeros(0, dtype=int), np.zeros((0, 4, 2))
-    return np.asarray(ids).reshape(-1).astype(int), np.asarray(corners, float).reshape(-1, 4, 2)
+        return Markers(np.zeros(0, dtype=int), np.zeros((0, 4, 2)))
+    corners = np.asarray(corners, float).reshape(-1, 4, 2)
+    return Markers(np.asarray(ids).reshape(-1).astype(int), corners)
 
 
 def _marker_grid(image: Integers, board: Board) -> tuple[Raw, bool, str]:
     data = board.document
     count = board.counts[0] * board.counts[1]
+    words = dictionary(data["dictionary"], data.get("first_id", 0), count)
     for mirrored in (False, True):
         picture = np.ascontiguousarray(image[:, ::-1]) if mirrored else image
-        ids, corners = detect_markers(picture, data["dictionary"])
-        ids = ids - data.get("first_id", 0)
-        ours = (ids >= 0) & (ids < count)
-        twice = np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
-        ours &= ~twice
-        if ours.sum() >= 2:
-            found = (4 * ids[ours, None] + np.arange(4)).reshape(-1)
-            return _raw(corners[ours], found, image.shape[1], mirrored), mirrored, ""
+        for quick, enough in ((True, count), (False, 2)):
+            ids, corners = detect_markers(picture, words, quick)
+            once = ~np.isin(ids, [i for i in np.unique(ids) if np.sum(ids == i) > 1])
+            if once.sum() >= enough:
+                found = (4 * ids[once, None] + np.arange(4)).reshape(-1)
+                return _raw(corners[once], found, image.shape[1], mirrored), mirrored, ""
     return _raw([], [], 0, False), False, "fewer than two of the board's markers are recognised"
 
 
@@ -292,7 +313,7 @@ def _fitted(image: Integers, board: Board, raw: Raw) -> Corners:
     sides, bends = _axes(board, ids, fitted.pixels)
     if np.abs(bends).max() * REACH**2 / 2 < BENT:
         return fitted
-    return refine(image, fitted.pixels, sides, window, bends)
+    return refine(image, fitted.pixels, sides, window, bends, fitted)
 
 
 def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
@@ -324,9 +345,13 @@ def _axes(board: Board, ids: Integers, pixels: Array) -> tuple[Array, Array]:
 
 def _padded(values: Array, axis: int, before: int, after: int) -> Array:
     """With NaN before and after along an axis."""
-    pad = [(0, 0)] * values.ndim
-    pad[axis] = (before, after)
-    return np.pad(values, pad, constant_values=np.nan)
+    shape = list(values.shape)
+    shape[axis] += before + after
+    out = np.full(shape, np.nan)
+    inner = [slice(None)] * values.ndim
+    inner[axis] = slice(before, shape[axis] - after)
+    out[tuple(inner)] = values
+    return out
 
 
 def _beside(step: Array, axis: int) -> Array:
@@ -369,15 +394,23 @@ class Window(NamedTuple):
 
 
 class Corners(NamedTuple):
-    """Fitted corners: places (n, 2) px, where the fit holds (n,), sigma (n,) px a coordinate."""
+    """Fitted corners: places (n, 2) px, where the fit holds (n,), sigma (n,) px a coordinate, and
+    the seven unknowns of the fit around those places (n, 7).
+    """
 
     pixels: Array
     good: Booleans
     sigma: Array
+    unknowns: Array
 
 
 def refine(
-    image: Integers, start: Array, axes: Array, window: Window, bends: Array | None = None
+    image: Integers,
+    start: Array,
+    axes: Array,
+    window: Window,
+    bends: Array | None = None,
+    before: Corners | None = None,
 ) -> Corners:
     """Fit corners near `start`.
 
@@ -386,52 +419,46 @@ def refine(
         marker's corner, of its side, away from the corner.
     bends : (n, 2, 2) px; second differences of the picture along the same axes, by which a lens
         or mirror bends the edges; none for straight ones.
+    before : an earlier fit, whose places are `start`, from where this one goes on.
     """
     if len(start) == 0:
-        return Corners(start, np.zeros(0, dtype=bool), np.zeros(0))
+        return Corners(start, np.zeros(0, dtype=bool), np.zeros(0), np.zeros((0, 7)))
     scale = np.sqrt(np.abs(np.linalg.det(axes)))
     widened = np.maximum(1.0, LEAST_RADIUS / np.maximum(window.reach * scale, 1e-6))
-    offsets, grey, inside = _pixels(image, start, axes, window.reach * widened)
-    weight = _weights(offsets, axes, window, widened) * inside
-    offsets, grey, weight = _packed(offsets, grey, weight)
+    places, weight = _window(image, start, axes, window, widened)
+    grey = image[places[:, 1], places[:, 0]].astype(float)
     first = _first(grey, weight, axes, window.saddle)
-    x, y = np.moveaxis(offsets, -1, 0).copy()
-    shape = _Shape(x, y, _curvature(first, axes, bends), window.saddle)
-    p, residual = _fit(grey, weight, shape, first)
-    return _judged(start, p, residual, grey, weight, scale, shape)
+    if before is not None:
+        first[before.good] = before.unknowns[before.good]
+    shape = _Shape(places - start[..., None], _curvature(first, axes, bends), window.saddle)
+    return _judged(start, _fit(grey, weight, shape, first), grey, weight, scale)
 
 
-def _pixels(
-    image: Integers, start: Array, axes: Array, reach: Array
-) -> tuple[Array, Array, Booleans]:
-    """Pixels around every corner: offsets from it (n, m, 2), grey (n, m), inside the picture."""
-    longest = float(np.max(reach * np.abs(axes).sum(axis=1).max(axis=-1), initial=0.0))
-    radius = int(np.clip(np.ceil(longest), 3, MOST_RADIUS))
-    dy, dx = np.mgrid[-radius : radius + 1, -radius : radius + 1]
-    base = np.rint(start).astype(int)
-    x, y = base[:, :1] + dx.ravel(), base[:, 1:] + dy.ravel()
-    height, width = image.shape
-    inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    grey = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
-    offsets = np.stack([x - start[:, :1], y - start[:, 1:]], axis=-1)
-    return offsets, grey, inside
+def _window(
+    image: Integers, start: Array, axes: Array, window: Window, widened: Array
+) -> tuple[Integers, Array]:
+    """Pixels x, y (n, 2, m) that count around every corner, and their weights (n, m).
 
-
-def _weights(offsets: Array, axes: Array, window: Window, widened: Array) -> Array:
-    """1 for pixels of the window, falling to 0 over the last fifth of its reach; (n, m)."""
-    board = np.abs(np.linalg.solve(axes.mT, offsets.mT))
-    along, across = board.max(axis=1), board.min(axis=1)
+    As wide as the largest window: a smaller one's pixels come first, then some of no weight.
+    """
     reach, margin = window.reach * widened[:, None], window.margin * widened[:, None]
+    longest = float(np.max(reach * np.abs(axes).sum(axis=1), initial=0.0))
+    radius = int(np.clip(np.ceil(longest), 3, MOST_RADIUS))
+    around = np.mgrid[-radius : radius + 1, -radius : radius + 1][::-1].reshape(2, -1)
+    places = np.rint(start).astype(int)[..., None] + around
+    offsets = places - start[..., None]
+    last = np.array(image.shape[::-1])[:, None] - 1
+    inside = ((places >= 0) & (places <= last)).all(axis=1)
+    board = np.abs(np.linalg.inv(axes.mT) @ offsets)
+    along, across = board.max(axis=1), board.min(axis=1)
+    # 1, falling to 0 over the last fifth of the reach
     taper = np.clip((reach - along) / (0.2 * reach), 0, 1)
-    return taper * (across < margin) * (np.abs(offsets).max(axis=-1) <= MOST_RADIUS)
-
-
-def _packed(offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
-    """Only the pixels that count, each corner's to the left, as wide as the largest window."""
+    near = np.abs(offsets).max(axis=1) <= MOST_RADIUS
+    weight = taper * (across < margin) * near * inside
     most = max(int(np.count_nonzero(weight, axis=1).max()), 1)
     order = np.argsort(weight == 0, axis=1, kind="stable")[:, :most]
-    rows = np.arange(len(order))[:, None]
-    return offsets[rows, order], grey[rows, order], weight[rows, order]
+    packed = np.take_along_axis(places, order[:, None], axis=2)
+    return np.clip(packed, 0, last), np.take_along_axis(weight, order, axis=1)
 
 
 def _first(grey: Array, weight: Array, axes: Array, saddle: bool) -> Array:
@@ -450,18 +477,23 @@ def _first(grey: Array, weight: Array, axes: Array, saddle: bool) -> Array:
     return np.stack([zero, zero, angle[:, 0], angle[:, 1], zero, mean, spread], axis=-1)
 
 
+def _directions(angle: Array) -> Array:
+    """Unit vectors (..., 2) along edges with these directions."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
 def _normals(angle: Array) -> Array:
     """Positive sides (..., 2) of edges with these directions."""
     return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
 
 
 class _Shape(NamedTuple):
-    """What a corner's picture is made of: pixels' offsets x and y (n, m), curvatures (n, 2) 1/px of
-    its two edges towards their positive sides, and whether two dark squares meet.
+    """What a corner's picture is made of: offsets x, y of its pixels from where it is looked for
+    (n, 2, m) px, curvatures (n, 2) 1/px of its two edges towards their positive sides, and whether
+    two dark squares meet.
     """
 
-    x: Array
-    y: Array
+    offsets: Array
     curvature: Array
     saddle: bool
 
@@ -472,7 +504,7 @@ class _Shape(NamedTuple):
 
     def select(self, keep: Booleans) -> _Shape:
         """Some of the corners."""
-        return _Shape(self.x[keep], self.y[keep], self.curvature[keep], self.saddle)
+        return _Shape(self.offsets[keep], self.curvature[keep], self.saddle)
 
 
 def _curvature(first: Array, axes: Array, bends: Array | None) -> Array:
@@ -483,8 +515,18 @@ def _curvature(first: Array, axes: Array, bends: Array | None) -> Array:
     return across / np.maximum(np.sum(axes**2, axis=-1), 1e-9)
 
 
+class _Fitted(NamedTuple):
+    """A fit that has ended: unknowns (n, 7), what is left of the grey levels (n, m), and the normal
+    matrix (n, 7, 7) there.
+    """
+
+    unknowns: Array
+    left: Array
+    normal: Array
+
+
 class _Fit(NamedTuple):
-    """A fit on its way: numbers (k,) of the corners that have not settled, their parameters (k, 7)
+    """A fit on its way: numbers (k,) of the corners that have not settled, their unknowns (k, 7)
     and pixels (k, m), what is left of the grey levels, and the model's derivatives (k, 7, m) there.
     """
 
@@ -500,16 +542,30 @@ class _Fit(NamedTuple):
 
     @classmethod
     def begun(cls, grey: Array, weight: Array, shape: _Shape, p: Array) -> _Fit:
-        """Before the first step."""
-        value, by = _model(p, shape)
-        left = grey - value
+        """Before the first step, with level and amplitude fitted: these two are linear."""
+        by = _model(np.concatenate([p[:, :6], np.ones((len(p), 1))], axis=1), shape)[1]
+        form = by[:, 6]
+        total = np.maximum(weight.sum(axis=1), 1e-9)
+        mean = np.sum(weight * form, axis=1) / total
+        off = form - mean[:, None]
+        variance = np.maximum(np.sum(weight * off * off, axis=1), 1e-9)
+        amplitude = np.sum(weight * off * grey, axis=1) / variance
+        level = np.sum(weight * grey, axis=1) / total - amplitude * mean
+        # the derivatives by place, directions and blur are in proportion to the amplitude
+        by[:, :5] *= amplitude[:, None, None]
+        p = np.concatenate([p[:, :5], level[:, None], amplitude[:, None]], axis=1)
+        left = grey - level[:, None] - amplitude[:, None] * form
         cost = np.sum(weight * left**2, axis=1)
         return cls(np.arange(len(p)), p, grey, weight, shape, left, by, cost, np.full(len(p), 1e-3))
 
+    @property
+    def normal(self) -> Array:
+        """Normal matrix (k, 7, 7)."""
+        return (self.by * self.weight[:, None]) @ self.by.mT
+
     def stepped(self) -> tuple[_Fit, Array]:
         """After a damped step, where it is better, and that step (k, 7)."""
-        weighted = self.by * self.weight[:, None]
-        normal, right = weighted @ self.by.mT, weighted @ self.left[..., None]
+        normal, right = self.normal, self.by @ (self.weight * self.left)[..., None]
         diagonal = np.einsum("nii->ni", normal)
         normal = normal + (self.damping[:, None] * diagonal + 1e-9)[..., None] * np.eye(7)
         step = np.clip(np.linalg.solve(normal, right)[..., 0], -LONGEST_STEP, LONGEST_STEP)
@@ -528,27 +584,29 @@ class _Fit(NamedTuple):
 
     def select(self, keep: Booleans) -> _Fit:
         """Of some of the corners."""
+        if keep.all():
+            return self
         parts = self._replace(shape=self.shape.select(keep))._asdict()
         return _Fit(**{n: v if n == "shape" else v[keep] for n, v in parts.items()})
 
 
-def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> tuple[Array, Array]:
-    """Weighted Levenberg-Marquardt of all corners at once; parameters (n, 7), residuals (n, m).
+def _fit(grey: Array, weight: Array, shape: _Shape, p: Array) -> _Fitted:
+    """Weighted Levenberg-Marquardt of all corners at once.
 
     Corners that have settled are not looked at again: a few bad ones never do.
     """
-    p = _levelled(grey, weight, shape, p)
-    residual = np.empty_like(grey)
     fit = _Fit.begun(grey, weight, shape, p)
-    for _ in range(STEPS):
+    out = _Fitted(np.empty_like(p), np.empty_like(grey), np.empty((len(p), 7, 7)))
+    for more in reversed(range(STEPS)):
         fit, step = fit.stepped()
-        p[fit.number], residual[fit.number] = fit.p, fit.left
-        on = np.abs(step[:, :2]).max(axis=1) >= SETTLED
+        on = (np.abs(step[:, :2]).max(axis=1) >= SETTLED) & (more > 0)
+        settled = fit.select(~on)
+        for all_of_them, these in zip(out, (settled.p, settled.left, settled.normal), strict=True):
+            all_of_them[settled.number] = these
         if not on.any():
             break
-        if not on.all():
-            fit = fit.select(on)
-    return p, residual
+        fit = fit.select(on)
+    return out
 
 
 def _taken(better: Booleans, trial: Array, before: Array) -> Array:
@@ -558,76 +616,46 @@ def _taken(better: Booleans, trial: Array, before: Array) -> Array:
     return np.where(better.reshape(-1, *[1] * (trial.ndim - 1)), trial, before)
 
 
-def _levelled(grey: Array, weight: Array, shape: _Shape, p: Array) -> Array:
-    """The start with level and amplitude fitted: these two are linear."""
-    form = _edge(p, shape, 0).form * _edge(p, shape, 1).form
-    total = np.maximum(weight.sum(axis=1), 1e-9)
-    mean = np.sum(weight * form, axis=1) / total
-    off = form - mean[:, None]
-    variance = np.maximum(np.sum(weight * off * off, axis=1), 1e-9)
-    p = p.copy()
-    p[:, 6] = np.sum(weight * off * grey, axis=1) / variance
-    p[:, 5] = np.sum(weight * grey, axis=1) / total - p[:, 6] * mean
-    return p
+def _model(p: Array, shape: _Shape) -> tuple[Array, Array]:
+    """Grey levels (n, m) and their derivatives by the seven unknowns, (n, 7, m).
 
-
-class _Edge(NamedTuple):
-    """One of a corner's edges at all pixels (n, m): how far along and across it they are, px, how
-    far from it in blurs, and how light they are for it, form.
+    Of both edges at once (n, 2, m): how far along and across them a pixel lies, px, how far off
+    in blurs times sqrt 2, z, and how light they make it, form.
     """
-
-    along: Array
-    across: Array
-    z: Array
-    form: Array
-
-
-def _edge(p: Array, shape: _Shape, k: int) -> _Edge:
     from scipy.special import erf
 
-    dx, dy = shape.x - p[:, :1], shape.y - p[:, 1:2]
-    cos, sin, blur = np.cos(p[:, 2 + k, None]), np.sin(p[:, 2 + k, None]), np.exp(p[:, 4:5])
-    along, across = dx * cos + dy * sin, dy * cos - dx * sin
-    off = across - 0.5 * shape.curvature[:, k, None] * along**2 if shape.bent else across
-    z = off / blur
+    directions, normals = _directions(p[:, 2:4]), _normals(p[:, 2:4])
+    blur, level, amplitude = np.sqrt(2) * np.exp(p[:, 4:5]), p[:, 5:6], p[:, 6:7]
+    offsets = shape.offsets - p[:, :2, None]
+    along, across = directions @ offsets, normals @ offsets
+    turned = shape.curvature[..., None] * along if shape.bent else None
+    off = across if turned is None else across - 0.5 * turned * along
+    z = off / blur[..., None]
     half = 1.0 if shape.saddle else 0.5
-    return _Edge(along, across, z, half * erf(z / np.sqrt(2)) + (1 - half))
-
-
-def _model(p: Array, shape: _Shape) -> tuple[Array, Array]:
-    """Grey levels (n, m) and their derivatives by the seven unknowns, (n, 7, m)."""
-    edges = _edge(p, shape, 0), _edge(p, shape, 1)
-    blur, level, amplitude = np.exp(p[:, 4:5]), p[:, 5:6], p[:, 6:7]
-    half = 1.0 if shape.saddle else 0.5
-    by = np.zeros((len(p), 7, shape.x.shape[1]))
-    for k, edge in enumerate(edges):
-        cos, sin = np.cos(p[:, 2 + k, None]), np.sin(p[:, 2 + k, None])
-        # by the signed distance from the edge, px
-        slope = np.exp(-0.5 * edge.z**2) * (amplitude * half * np.sqrt(2 / np.pi) / blur)
-        slope *= edges[1 - k].form
-        by[:, 4] -= slope * edge.z * blur
-        if not shape.bent:
-            by[:, 0] += slope * sin
-            by[:, 1] -= slope * cos
-            by[:, 2 + k] = -slope * edge.along
-            continue
-        turned = shape.curvature[:, k, None] * edge.along
-        by[:, 0] += slope * (sin + turned * cos)
-        by[:, 1] += slope * (turned * sin - cos)
-        by[:, 2 + k] = -slope * (edge.along + turned * edge.across)
+    form = half * erf(z) + (1 - half)
+    # by the signed distance from the edge, px
+    slope = np.exp(-z * z) * form[:, ::-1]
+    slope *= (amplitude * half * 2 / np.sqrt(np.pi) / blur)[..., None]
+    by = np.empty((len(p), 7, z.shape[-1]))
+    by[:, :2] = -normals.mT @ slope
+    by[:, 2:4] = -slope * along
+    by[:, 4] = -np.sum(slope * off, axis=1)
+    if turned is not None:
+        turning = slope * turned
+        by[:, :2] += directions.mT @ turning
+        by[:, 2:4] -= turning * across
     by[:, 5] = 1.0
-    by[:, 6] = edges[0].form * edges[1].form
+    by[:, 6] = form[:, 0] * form[:, 1]
     return level + amplitude * by[:, 6], by
 
 
-def _judged(
-    start: Array, p: Array, residual: Array, grey: Array, weight: Array, scale: Array, shape: _Shape
-) -> Corners:
+def _judged(start: Array, fitted: _Fitted, grey: Array, weight: Array, scale: Array) -> Corners:
     """Where the fit is a corner, and how sure its place is by what it leaves unexplained."""
+    p = fitted.unknowns
     total = np.maximum(weight.sum(axis=1), 1e-9)
     mean = np.sum(weight * grey, axis=1) / total
     variance = np.sum(weight * (grey - mean[:, None]) ** 2, axis=1) / total
-    left = np.sum(weight * residual**2, axis=1) / total
+    left = np.sum(weight * fitted.left**2, axis=1) / total
     blur, moved = np.exp(p[:, 4]), np.hypot(p[:, 0], p[:, 1])
     good = (
         (left < (1 - LEAST_SHARE) * variance)
@@ -637,10 +665,9 @@ def _judged(
         & (weight.sum(axis=1) > 12)
         & np.isfinite(p).all(axis=1)
     )
-    by = _model(p, shape)[1]
-    normal = (by * weight[:, None]) @ by.mT + 1e-9 * np.eye(7)
     # A grey level is rounded to whole numbers, so it is never better than 1 / sqrt 12.
     noise = np.maximum(left, 1 / 12)
-    covariance = np.linalg.inv(normal) * noise[:, None, None]
+    covariance = np.linalg.inv(fitted.normal + 1e-9 * np.eye(7)) * noise[:, None, None]
     sigma = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0) / 2)
-    return Corners(start + np.where(good[:, None], p[:, :2], 0.0), good, sigma)
+    pixels = start + np.where(good[:, None], p[:, :2], 0.0)
+    return Corners(pixels, good, sigma, np.concatenate([0 * p[:, :2], p[:, 2:]], axis=1))
