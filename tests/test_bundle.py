@@ -145,7 +145,7 @@ def test_shading_is_as_large_as_the_edges_say(sigma):
     """As little as is believed of it, or ten times that, as in hard light on polished metal: it is
     found, and the deviations are right with either."""
     rng = np.random.default_rng(8)
-    scene = shaded(make_scene(rng, runs=20, configurations=6, n_stations=2), sigma, rng)
+    scene = shaded(make_scene(rng, runs=8, configurations=6, n_stations=2), sigma, rng)
     assembled, truth = scene.batch(rng)
     result = solve_batch(assembled.problem, truth)
     found = np.sqrt(np.mean(result.problem.data.shading**2))

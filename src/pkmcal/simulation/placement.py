@@ -176,17 +176,21 @@ def _legs_apart(machine: Machine, T_base_platform: Array, joints: Array) -> Bool
     ends = limb_ends(machine.layout, machine.values, joints, T_base_platform)
     along = np.linspace(0.06, 0.97, 24)[:, None]
     points = ends.a[..., None, :] * (1 - along) + ends.b[..., None, :] * along
+    # components slowest: every point of a leg meets every point of another, long rows of numbers
+    on_leg = np.ascontiguousarray(np.moveaxis(points, (-1, 1), (0, 1)))
     widths = np.array([r.max() if len(r) else 0.0 for r in machine.radii()])
     drives = drives_of(machine)
     apart = np.ones(T_base_platform.shape[0], dtype=bool)
     for i, j in np.ndindex(machine.n_legs, machine.n_legs):
         if j < i:
             thick = widths[i] + widths[j]
-            gap = points[:, i, :, None] - points[:, j, None, :]
+            gap = on_leg[:, i, :, :, None] - on_leg[:, j, :, None, :]
+            gap *= gap
             meet = [
                 np.linalg.norm(end[:, i] - end[:, j], axis=1) < thick for end in (ends.a, ends.b)
             ]
-            apart &= (np.sqrt(dot(gap, gap).min(axis=(-1, -2))) > thick) | meet[0] | meet[1]
+            nearest = np.sqrt((gap[0] + gap[1] + gap[2]).min(axis=(-1, -2)))
+            apart &= (nearest > thick) | meet[0] | meet[1]
         # carriages side by side on one guide have their own legs beside it
         if j != i and drives.guides[j] and drives.away[i] @ drives.away[j] <= SIDE_BY_SIDE:
             for start, stop in pairwise(drives.ways[j]):
