@@ -49,9 +49,11 @@ def run(*words) -> Run:
 
 LONG = (
     "test_study", "test_board_session", "test_calibration", "test_fuzz", "test_cli",
-    "test_camera_calibration", "test_bad_input", "test_diagnose", "test_repeats", "test_check",
-    "test_departures", "test_boards", "test_pose_sessions", "test_watch_command", "test_validate",
-    "test_writing",
+    "test_camera_calibration", "test_study_workers", "test_bad_input", "test_diagnose",
+    "test_bundle", "test_pose_sessions", "test_calibrate_board", "test_boards", "test_repeats",
+    "test_view", "test_observe_search", "test_departures", "test_validate", "test_servo",
+    "test_paper_b", "test_check", "test_examples", "test_watch_command", "test_paper_c",
+    "test_handheld", "test_plan", "test_paper_a",
 )  # fmt: skip
 
 
