@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar, cast, runtime_checkable
 import numpy as np
 
 from pkmcal.arrays import Array, Booleans, Integers
-from pkmcal.solver.elimination import Linear, Memory, divisions
+from pkmcal.solver.elimination import Linear, divisions
 from pkmcal.solver.strips import (
     Compact,
     compact,
@@ -203,21 +203,18 @@ def minimise(problem: LeastSquares, start: Any, max_steps: int = 100) -> Solutio
 
 
 class _Divided(NamedTuple):
-    """A problem with its parts of some configurations each, small enough for the processor's cache,
-    and the memory that they write to in turn.
-    """
+    """A problem with its parts of some configurations each, small enough for the processor's cache."""
 
     problem: LeastSquares
     parts: list[tuple[slice, LeastSquares]]
-    memory: Memory
 
     @classmethod
     def of(cls, problem: LeastSquares, n_runs: int, count: int, rows: int) -> _Divided:
         """A problem of so many runs and configurations of so many rows, divided where it can be."""
         cuts = divisions(count, n_runs * rows)
         if not isinstance(problem, Divisible) or len(cuts) < 2:
-            return cls(problem, [(slice(0, count), problem)], Memory())
-        return cls(problem, [(cut, problem.among(cut)) for cut in cuts], Memory())
+            return cls(problem, [(slice(0, count), problem)])
+        return cls(problem, [(cut, problem.among(cut)) for cut in cuts])
 
     def select(self, runs: Integers) -> _Divided:
         """The same of some runs."""
@@ -343,7 +340,7 @@ def _try(
     values : the residuals at the state, where they are known.
     """
     damping = search.damping
-    normal = normal_equations(problem.rows(state, values), damping, problem.memory)
+    normal = normal_equations(problem.rows(state, values), damping)
     shared, own = normal.step(damping)
     trial = problem.problem.moved(state, shared, np.concatenate(own, axis=1))
     usable = [part.usable for part in normal.parts]
