@@ -246,7 +246,7 @@ class Problem:
         tube, line = self._own_columns
         (n_rows, n_runs, m, n), c = value.shape, ends_by.shape[-1]
         ends = [c, tube.shape[-1], u.n_optics, line.shape[-1], u.n_breathing, 1]
-        of_ends, of_radius, of_optics, of_line, of_breathing, residual = (
+        of_ends, _, of_optics, of_line, of_breathing, residual = (
             slice(stop - width, stop)
             for width, stop in zip(ends, np.cumsum(ends).tolist(), strict=True)
         )
@@ -254,7 +254,9 @@ class Problem:
         rows = out.reshape(n_runs, n, m * n_rows, sum(ends))
         by_ends = edges.by_ends().reshape(n_runs, n, m * n_rows, 6)
         np.matmul(by_ends, ends_by, out=rows[..., of_ends])
-        out[..., of_radius] = _views_first(edges.by_radius())[..., None] * tube
+        by_radius = _views_first(edges.by_radius())
+        for k in range(tube.shape[-1]):
+            np.multiply(by_radius, tube[..., k], out=out[..., c + k])
         out[..., of_optics] = np.moveaxis(_views_first(data.by_optics), 0, -1)
         if u.n_lines:
             out[..., of_line] = _views_first(data.by_line)[..., None] * line
@@ -393,6 +395,9 @@ class Problem:
     def _of_boards(self, poses: PoseRows) -> tuple[Array, Array]:
         """The same of the boards' poses by all shared unknowns, (B, K, 6 G, na)."""
         u, boards = self.unknowns, self.pose_blocks
+        if not boards.present.size:
+            none = np.zeros((*poses.value.shape[:2], 0, u.count))
+            return none, none[..., : self.layout.own_motion.shape[1]]
         parts = [
             (_columns(u.stations, boards.station, 6), poses.by_station),
             (_columns(u.optics, boards.camera, u.n_optics), poses.by_optics),
@@ -513,41 +518,49 @@ class Problem:
         """
         u, layout = self.unknowns, self.layout
         z = shared[:, u.machine]
-        by_moves = self.to_free @ move_generators(layout, self.theta(state), self.drawing)
-        moves = self.frames @ np.linalg.pinv(by_moves @ self.frames) @ z[..., None]
-        y, slides = moves[:, :12], moves[:, 12:, 0]
-
-        def less_frames(step: Array, by_frames: Array) -> Array:
-            """Steps (B, n, 6) of poses without what the frame change y does to them."""
-            return step - (by_frames @ y[:, None])[..., 0]
-
-        camera = shared[:, u.stations].reshape(len(z), u.n_stations, 6)
-        mount = shared[:, u.mounts].reshape(*state.T_mount.shape[:2], 6)
+        moves = z @ self._moves_of.T
+        y, slides = moves[:, :12], moves[:, 12:]
+        by_moves = move_generators(layout, self.theta(state), self.drawing) @ moves[..., None]
         motion = own @ layout.own_motion.T
-        on_platform = self.pose_blocks.on_platform
+        steps = (
+            shared[:, u.stations].reshape(len(z), u.n_stations, 6),
+            motion[..., :6],
+            shared[:, u.mounts].reshape(len(z), u.n_mounts, 6),
+        )
+        by_frames = (
+            station_generators(state.T_camera_base),
+            pose_generators(state.T_base_platform),
+            mount_generators(state.T_mount, self.pose_blocks.on_platform),
+        )
+        poses = np.concatenate([state.T_camera_base, state.T_base_platform, state.T_mount], axis=1)
+        less_frames = np.concatenate(by_frames, axis=1) @ y[:, None, :, None]
+        poses = perturb(poses, np.concatenate(steps, axis=1) - less_frames[..., 0])
+        first_pose, first_mount = u.n_stations, poses.shape[1] - u.n_mounts
         inner = BatchState(
-            state.z + (z - (by_moves @ moves)[..., 0]),
-            perturb(
-                state.T_camera_base, less_frames(camera, station_generators(state.T_camera_base))
-            ),
-            perturb(
-                state.T_base_platform,
-                less_frames(motion[..., :6], pose_generators(state.T_base_platform)),
-            ),
+            state.z + z - by_moves[..., 0] @ self.to_free.T,
+            poses[:, :first_pose],
+            poses[:, first_pose:first_mount],
             state.optics + shared[:, u.optics].reshape(state.optics.shape),
-            perturb(
-                state.T_mount, less_frames(mount, mount_generators(state.T_mount, on_platform))
-            ),
+            poses[:, first_mount:],
             state.internal + motion[..., 6:] + turned_back(layout, slides)[:, None],
             state.shading + shared[:, u.shading],
             state.breathing + shared[:, u.breathing],
             state.sizes + shared[:, u.sizes],
         )
-        return self._closed(state, self._in_frames(inner, y[..., 0], slides), shared, own)
+        return self._closed(state, self._in_frames(inner, y, slides), shared, own)
+
+    @cached_property
+    def _moves_of(self) -> Array:
+        """Frame changes and others (12 + n, nz) that a step of z makes, as far as they can, by
+        least squares at the drawing: what they leave to be added up is small in any case.
+        """
+        by_moves = self.to_free @ move_generators(self.layout, self.drawing, self.drawing)
+        return self.frames @ np.linalg.pinv(by_moves @ self.frames)
 
     def _in_frames(self, state: BatchState, y: Array, slides: Array) -> BatchState:
         """The state after exact frame changes y (B, 12) and others (B, n)."""
-        layout, e, f = self.layout, perturb(np.eye(4), y[:, :6]), perturb(np.eye(4), y[:, 6:])
+        layout = self.layout
+        e, f = perturb(np.eye(4), y.reshape(-1, 2, 6)).swapaxes(0, 1)
         theta = moved_centres(layout, slid(layout, self.theta(state), slides), e, f)
         theta = on_tangents(layout, theta, self.drawing)
         return replace(

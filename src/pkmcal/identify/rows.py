@@ -322,11 +322,15 @@ class EdgeRows:
     def by_ends(self) -> Array:
         """By both ends in the base frame, a before b, (B, N, m, 2g, 6)."""
         _, m, w = self.frame
-        n = self.cosine[:, None] * m[:, :, None] - self.sine * w[:, :, None]
-        out = np.empty((6, *self.by_frame.shape[2:]))
-        for k, pull in enumerate(self._pulls[:2]):
-            np.einsum("er...,ec...->cr...", pull, n, out=out[3 * k : 3 * k + 3])
-        return out.transpose(2, 4, 3, 1, 0)
+        normals = self.cosine[:, None] * m[:, :, None] - self.sine * w[:, :, None]
+        n_rows, n_runs, n_blocks, n_views = self.by_frame.shape[2:]
+        out = np.empty((n_runs, n_views, n_blocks, n_rows, 6))
+        for k, pulls in enumerate(self._pulls[:2]):
+            by_end = out.transpose(4, 3, 0, 2, 1)[3 * k : 3 * k + 3]
+            np.multiply(pulls[0], normals[0, :, None], out=by_end)
+            for pull, normal in zip(pulls[1:], normals[1:], strict=True):
+                by_end += pull * normal[:, None]
+        return out
 
     def by_radius(self) -> Array:
         """By their tube's radius, (2g, ...)."""
@@ -430,9 +434,8 @@ def closure_sigma(layout: LimbLayout, joint_noise: Array, by_reading: Array) -> 
     rod that is read always moves with its reading, whose noise is one of lengths: told by its
     scale, it would be the same but for a thousandth, and change with an unknown.
     """
-    rod = np.append(layout.rod_reads[layout.closing], np.zeros(len(layout.angles), dtype=bool))
-    sigma = np.abs(by_reading) * joint_noise
-    sigma = np.where(rod, joint_noise, np.maximum(sigma, PERFECT))
+    sigma = np.maximum(np.abs(by_reading) * joint_noise, PERFECT)
+    sigma = np.where(layout.row_is_rod, joint_noise, sigma)
     return np.where(layout.row_motor >= 0, sigma, PERFECT)
 
 
